@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.measurement import Measurement, median_seconds
 from fe.reduction.model_cache import reduced_model
-from fmu_asset.companions.build import build_companion
+from fmu_asset.companions.build import companion_bytes
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component, Connector, Setting, SystemStructure, expand_connection
 from fmu_asset.coupling.system import parts_of, system_description
@@ -20,6 +20,7 @@ from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.structure_fmu import build_fmu
+from reporting.files import atomic_write_bytes
 from scenarios import binding_files
 from twin_master.scenario.reading import load_scenario
 
@@ -52,9 +53,9 @@ def three_fmus(folder: Path) -> Wiring:
     """Return the system of the shipped scenario, its noise included."""
     asset = load_scenario("three_fmus").scenario.asset
     fmus = {
-        "damage": build_companion("damage_growth", folder / "damage.fmu").path,
+        "damage": atomic_write_bytes(folder / "damage.fmu", companion_bytes("damage_growth")),
         "wing": build_fmu(reduced_model(), folder / "wing.fmu").path,
-        "gauges": build_companion("strain_gauges", folder / "gauges.fmu").path,
+        "gauges": atomic_write_bytes(folder / "gauges.fmu", companion_bytes("strain_gauges")),
     }
     connections = tuple(
         connection

@@ -27,7 +27,6 @@ from fe.full import cholesky
 from fe.wing.design import load_design
 from fe.wing.operators import assemble
 from fe.full.statics import Factorisation
-from fe.wing.responses import solve_static
 
 def least(function, repeats):
     times = []

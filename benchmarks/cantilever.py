@@ -21,7 +21,7 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.models.acting import Acting, Course
+from discrepancy.models.acting import Acting, Course, Shown
 from discrepancy.models.interface import (
     Conditions,
     Model,
@@ -243,7 +243,7 @@ def _motion(
         else:
             acting = replace(acting, loads=[(row, Course.of(trial.time, force, trial.hold))])
         motion = system.motion(acting, laws, conditions.refinement)
-        response = motion.response(rows, [Quantity.DISPLACEMENT] * len(rows))
+        response = motion.seen([Shown(row) for row in rows])
         return response.values, response.rates, behind * force
     loads = np.outer(force, row)
     for n in range(len(force)):

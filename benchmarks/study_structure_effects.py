@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.model_choice import load_model
-from discrepancy.models.acting import Acting
+from discrepancy.models.acting import Acting, Shown
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
@@ -151,7 +151,7 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
             moved = system.motion(
                 Acting(time, np.zeros(len(end)), initial=initial, release=(end, release)), laws
             )
-            values = moved.response(rows, quantities).values
+            values = moved.seen([Shown(row) for row in rows]).values
         else:
             values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws).values @ rows.T
         for column, (name, quantity) in enumerate(zip(names, quantities, strict=True)):

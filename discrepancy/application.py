@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from calibration.result.file import load_calibration
-from calibration.result.plain import WingTailoring, tailoring
+from calibration.result.plain import tailoring
 from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.files.patch import (
     APPLIED,
@@ -233,19 +233,19 @@ def pack_patched(
         )
     rows = [{"id": item.identifier, "primitives": item.patch.to_list()} for item in patch.effects]
     content = {"schema": SCHEMA, "effects": rows, "channels": dict(patch.channels)}
-    base = WingTailoring(DigitalState(), "", {})
+    options: dict[str, Any] = {"state": DigitalState()}
     if choice.kind is ModelKind.CALIBRATION and choice.path is not None:
-        base = tailoring(load_calibration(choice.path))
-    values: dict[str, Any] = {item.name: item.mean for item in patch.parameters}
+        options = tailoring(load_calibration(choice.path))
+    options["state"] = changed(options["state"], **{item.name: item.mean for item in patch.parameters})
     effects = parse_patch(json.dumps(content).encode(), "The patch")
     pack_wing(
         choice.design,
         path,
-        tailoring=changed(base, state=changed(base.state, **values)),
         patch=effects,
         activate=activate,
         replace=replace,
         progress=progress,
+        **options,
     )
     return [f"effect.{effect.id}.active" for effect in effects.effects]
 

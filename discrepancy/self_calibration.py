@@ -31,8 +31,6 @@ from .errors import FitError, ModelError
 from .verdict import VerdictKind
 from .workflow import checked, investigate
 
-FloatArray = NDArray[np.float64]
-
 SELF_CALIBRATION_NAME = "self_calibration.json"
 SCHEMA = "uav-twin self calibration 1"
 NULL_SHARE = 3

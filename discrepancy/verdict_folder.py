@@ -10,15 +10,15 @@ from discrepancy.files.patch import PATCH_NAME, PATCHED, StoredPatch, fmu_output
 from discrepancy.files.residuals import RESIDUALS_NAME, write_residuals
 from discrepancy.files.verdict import VERDICT_NAME, write_verdict
 from discrepancy.judgement.conclusion import named_effects
-from discrepancy.report.figures import ReportInput, draw, report_figures
+from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.report.text import added_label
 from discrepancy.self_calibration import SELF_CALIBRATION_NAME, write_self_calibration
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import patch_draws
 from reporting.errors import FileNotWrittenError
-from reporting.figures import to_png
-from reporting.files import atomic_write_bytes, atomic_write_text, write_error
+from reporting.figures import save_figure
+from reporting.files import atomic_write_text, write_error
 from reporting.folders import fresh_folder, lock_folder, replace_folder, restore_folder
 
 REPORT_NAME = "report.html"
@@ -142,8 +142,5 @@ def _write(folder: Path, content: VerdictContent, *, report: bool) -> None:
     if not report:
         return
     figures = report_figures(content)
-    drawings = draw(figures)
-    for name, item in figures.items():
-        atomic_write_bytes(folder / FIGURES / f"{name}.svg", drawings[name])
-        atomic_write_bytes(folder / FIGURES / f"{name}.png", to_png(item.figure))
+    drawings = {name: save_figure(item.figure, folder / FIGURES, name) for name, item in figures.items()}
     atomic_write_text(folder / REPORT_NAME, render_report(content, drawings, figures))

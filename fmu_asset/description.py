@@ -12,7 +12,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from fmu_asset.slaves.variables import ENUMERATIONS, EnumerationType, FmuVariable, Unit
+from fmu_asset.slaves.variables import ENUMERATIONS, EnumerationType, FmuVariable
 
 _ELEMENT = re.compile(r"(?P<stem>.+)(?:\[(?P<index>[0-9]+)\]|\.(?P<label>[^.]+))")
 LOG_CATEGORIES = {
@@ -22,7 +22,6 @@ LOG_CATEGORIES = {
     "logStatusFatal": "Log messages with fmi2Fatal status.",
     "logAll": "Log all messages.",
 }
-
 
 PLACEHOLDER = "0_content_0_"
 """Stands for the tag, the first characters of the content hash, until that is known."""
@@ -40,10 +39,8 @@ class Declaration:
         One sentence for people.
     table : tuple of FmuVariable
         The variables, in order of their value reference. Local ones are states, and then as many derivatives.
-    units : tuple of Unit
-        Units of the table.
-    enumerations : tuple of EnumerationType
-        Enumerations of the table.
+    units : mapping of str to (mapping, mapping)
+        For each unit of the table exponents, factor and offset to SI, and factors of display units by name.
     dependencies : mapping of str to sequence of str
         For each output, the inputs that it depends on directly; an output that is missing depends on all.
     """
@@ -51,9 +48,13 @@ class Declaration:
     name: str
     description: str
     table: tuple[FmuVariable, ...]
-    units: tuple[Unit, ...]
-    enumerations: tuple[EnumerationType, ...] = ENUMERATIONS
+    units: Mapping[str, tuple[Mapping[str, float], Mapping[str, float]]]
     dependencies: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    @property
+    def enumerations(self) -> tuple[EnumerationType, ...]:
+        """Enumerations of the table."""
+        return tuple(item for item in ENUMERATIONS if item.name in {row.enumeration for row in self.table})
 
     @property
     def identifier(self) -> str:
@@ -72,6 +73,7 @@ def _templates() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters |= {"c_text": _c_text, "c_number": _c_number, "quoted": _quoted}
+    environment.filters["written"] = _written
     return environment
 
 
@@ -97,6 +99,14 @@ def _c_text(text: str) -> str:
 def _c_number(value: float | None, absent: str) -> str:
     """Return a float as a C constant that has the same bits."""
     return absent if value is None or math.isinf(value) else repr(float(value))
+
+
+def _written(value: float | None, kind: str) -> str | None:
+    """Return a value of a variable as XML has it."""
+    if value is None:
+        return None
+    shown = {"Real": float, "Boolean": bool}.get(kind, int)(value)
+    return repr(shown).lower() if kind == "Boolean" else repr(shown)
 
 
 @dataclass(frozen=True)
@@ -145,15 +155,16 @@ def _stem(row: FmuVariable) -> str | None:
     return None if match is None or row.causality == "parameter" or row.kind != "Real" else match["stem"]
 
 
-def model_description(
+def description_members(
     declared: Declaration,
     *,
     generation_tool: str,
+    host: str,
     source_files: Sequence[str] = (),
     fmi: int = 2,
     arrays: Sequence[ArrayVariable] = (),
-) -> bytes:
-    """Return modelDescription.xml of an FMU: for co-simulation, or with states for model exchange.
+) -> dict[str, bytes]:
+    """Return the files that say what an FMU is, for co-simulation or with states for model exchange.
 
     The placeholder stands for what the content hash will give. There is no generation date: equal content
     gives equal bytes.
@@ -164,6 +175,8 @@ def model_description(
         The model.
     generation_tool : str
         Attribute of the root element.
+    host : str
+        What the FMU runs in, for its documentation.
     source_files : sequence of str
         C sources in the folder `sources`; an FMU with none needs Python to run.
     fmi : {2, 3}
@@ -173,10 +186,9 @@ def model_description(
 
     Returns
     -------
-    bytes
-        UTF-8 XML.
+    dict of str to bytes
+        By name in the archive: the model description, and a page for people without any request.
     """
-    heads = {array.rows[0].reference: array for array in arrays}
     inner = {row.reference for array in arrays for row in array.rows[1:]}
     rows = [row for row in declared.table if row.reference not in inner]
     local = [row for row in rows if row.causality == "local"]
@@ -185,10 +197,8 @@ def model_description(
     state_of = {
         rate.reference: state.reference + (fmi == 2) for state, rate in zip(states, rates, strict=True)
     }
-    outputs = [row for row in rows if row.causality == "output"]
-    unknowns = [row for row in rows if row.causality in ("output", "local")]
     place = {row.name: row.reference + 1 for row in rows}
-    return rendered(
+    xml = rendered(
         "modelDescription.xml",
         declared=declared,
         fmi=fmi,
@@ -198,60 +208,15 @@ def model_description(
         sources=source_files,
         exchange=bool(local),
         categories=LOG_CATEGORIES,
-        variables=[
-            (row.kind, *_attributes(row, heads.get(row.reference), state_of.get(row.reference)))
-            for row in rows
-        ],
+        rows=rows,
+        heads={array.rows[0].reference: array for array in arrays},
+        state_of=state_of,
         dependencies={
             name: sorted(place[source] for source in sources)
             for name, sources in declared.dependencies.items()
         },
-        structure=(
-            ("Outputs", "Output", outputs),
-            ("Derivatives", "ContinuousStateDerivative", rates),
-            ("InitialUnknowns", "InitialUnknown", unknowns),
-        ),
+        rates=rates,
     )
-
-
-def _attributes(
-    row: FmuVariable, array: ArrayVariable | None, state: int | None
-) -> tuple[dict[str, Any], dict[str, Any], int]:
-    """Return what is said of a variable, what of it belongs to its type, and its length as an array."""
-    said = {
-        "name": row.name if array is None else array.name,
-        "valueReference": row.reference,
-        "description": row.description if array is None else array.description,
-        "causality": row.causality,
-        "variability": row.variability,
-        "initial": {"parameter": "exact", "input": None, "independent": None}.get(
-            row.causality, "calculated"
-        ),
-    }
-    ranged = row.kind in ("Real", "Integer")  # an enumeration's range is its items
-    rows = (row,) if array is None else array.rows
-    of_type = {
-        "declaredType": row.enumeration,
-        "unit": row.unit,
-        "displayUnit": row.display_unit,
-        "min": _written(row.kind, row.minimum) if ranged else None,
-        "max": _written(row.kind, row.maximum) if ranged else None,
-        "start": row.start if row.start is None else " ".join(
-            str(_written(row.kind, each.start or 0.0)) for each in rows
-        ),
-        "derivative": state,
-    }  # fmt: skip
-    return said, of_type, 0 if array is None else len(array.rows)
-
-
-def _written(kind: str, value: float | None) -> str | None:
-    if value is None or kind == "Real":
-        return None if value is None else repr(float(value))
-    return str(bool(value)).lower() if kind == "Boolean" else str(int(value))
-
-
-def documentation_page(
-    declared: Declaration, host: str, *, fmi: int = 2, interface: str = "co-simulation"
-) -> bytes:
-    """Return documentation/index.html: what the FMU is and its variables, as UTF-8 without any request."""
-    return rendered("index.html", declared=declared, host=host, fmi=fmi, interface=interface)
+    interface = "model-exchange" if local else "co-simulation"
+    page = rendered("index.html", declared=declared, host=host, fmi=fmi, interface=interface)
+    return {"modelDescription.xml": xml, "documentation/index.html": page}

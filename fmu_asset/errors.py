@@ -28,10 +28,6 @@ class FmuError(Exception):
         log = "".join(f"\n  the FMU says: {message}" for message in self.messages)
         super().__init__(sentence + log)
 
-    def __reduce__(self) -> "tuple[type[FmuError], tuple[str, tuple[str, ...], float | None]]":
-        """Pickle as the sentence, the messages and the time."""
-        return type(self), (self.sentence, self.messages, self.time)
-
 
 class FmuBuildError(FmuError, ValueError):
     """An FMU cannot be made from what was given."""

@@ -56,14 +56,15 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def _remove_leftovers(parent: Path) -> None:
-    """Remove folders of ours whose process is gone, once for each parent."""
-    if parent in _tidied:
+    """Remove folders of ours whose process is gone, once for each parent, where the system tells that."""
+    if parent in _tidied or not Path("/proc/self").exists():
         return
     _tidied.add(parent)
     for folder in parent.glob(f"{_prefix()}*"):
         number = folder.name.removeprefix(_prefix()).partition("-")[0]
         with suppress(OSError):
-            if number.isdigit() and folder.lstat().st_uid == os.getuid() and not _runs(int(number)):
+            own = number.isdigit() and folder.lstat().st_uid == os.getuid()
+            if own and not Path("/proc", number).exists():
                 end_processes(folder)
                 remove_folder(folder)
 
@@ -74,16 +75,6 @@ def _prefix() -> str:
         return f"uav-twin-fmu-{Path('/proc/self/ns/pid').stat().st_ino}-"
     except OSError:
         return "uav-twin-fmu-0-"
-
-
-def _runs(number: int) -> bool:
-    try:
-        os.kill(number, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        return True
-    return True
 
 
 def end_processes(folder: str | os.PathLike[str]) -> None:

@@ -13,6 +13,7 @@ import io
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Final
 
 import matplotlib as mpl
@@ -23,6 +24,7 @@ from matplotlib.ticker import LogFormatter
 from numpy.typing import ArrayLike
 
 from reporting.errors import InvalidFigureError
+from reporting.files import atomic_write_bytes
 from reporting.hover import annotated
 
 # Okabe and Ito's palette for colour-blind readers; each colour has one meaning everywhere.
@@ -194,6 +196,20 @@ def to_png(figure: Figure, resolution: float = PNG_RESOLUTION) -> bytes:
         _read_powers(figure)
         figure.savefig(buffer, format="png", dpi=resolution, metadata={"Software": None})
     return buffer.getvalue()
+
+
+def save_figure(figure: Figure, folder: Path, name: str) -> bytes:
+    """Write `name` as SVG and as PNG to a folder; return the SVG.
+
+    Raises
+    ------
+    FileNotWrittenError
+        If a file cannot be written.
+    """
+    drawing = to_svg(figure)
+    atomic_write_bytes(folder / f"{name}.svg", drawing)
+    atomic_write_bytes(folder / f"{name}.png", to_png(figure))
+    return drawing
 
 
 def _read_powers(figure: Figure) -> None:

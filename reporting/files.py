@@ -88,7 +88,7 @@ def refuse_filled(folder: Path | None, option: str = "--out") -> None:
 
 
 @contextmanager
-def atomic_file(path: str | os.PathLike[str], *, make_folder: bool = True) -> Iterator[Path]:
+def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path to write to, and move it to `path` when the block ends without an exception.
 
     For writers that want a file name (NetCDF, zip, VTU). The temporary file lies in the same folder and has
@@ -97,24 +97,21 @@ def atomic_file(path: str | os.PathLike[str], *, make_folder: bool = True) -> It
     Parameters
     ----------
     path
-        Destination; replaced if it exists. A symbolic link is followed.
-    make_folder
-        Create the folder of `path` if it is missing.
+        Destination; replaced if it exists, and its folder made if it is missing. A symbolic link is followed.
 
     Raises
     ------
     DiskFullError
         No space is left.
     FileNotWrittenError
-        The folder is missing or read-only, or `path` is a folder or a device.
+        The folder cannot be made or is read-only, or `path` is a folder or a device.
     """
     requested = Path(path)
     target = _destination(requested)
     label = f"{os.getpid()}-{next(_temporary_count)}"
     temporary = target.with_name(f".{target.stem}.{label}{TEMPORARY_SUFFIX}{target.suffix}")
     try:
-        if make_folder:
-            target.parent.mkdir(parents=True, exist_ok=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
         # Created here, with the permissions of the user's umask and not those of a private temporary file.
         os.close(os.open(temporary, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, 0o666))
         yield temporary
@@ -128,7 +125,7 @@ def atomic_file(path: str | os.PathLike[str], *, make_folder: bool = True) -> It
             temporary.unlink()
 
 
-def atomic_write_bytes(path: str | os.PathLike[str], data: bytes, *, make_folder: bool = True) -> Path:
+def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> Path:
     """Write bytes to `path` in one step; return the path.
 
     Raises
@@ -136,12 +133,12 @@ def atomic_write_bytes(path: str | os.PathLike[str], data: bytes, *, make_folder
     DiskFullError, FileNotWrittenError
         As `atomic_file`.
     """
-    with atomic_file(path, make_folder=make_folder) as temporary:
+    with atomic_file(path) as temporary:
         temporary.write_bytes(data)
     return Path(path)
 
 
-def atomic_write_text(path: str | os.PathLike[str], text: str, *, make_folder: bool = True) -> Path:
+def atomic_write_text(path: str | os.PathLike[str], text: str) -> Path:
     """Write text to `path` in UTF-8 with the line ends as given, in one step; return the path.
 
     Raises
@@ -149,7 +146,7 @@ def atomic_write_text(path: str | os.PathLike[str], text: str, *, make_folder: b
     DiskFullError, FileNotWrittenError
         As `atomic_file`.
     """
-    return atomic_write_bytes(path, text.encode("utf-8"), make_folder=make_folder)
+    return atomic_write_bytes(path, text.encode("utf-8"))
 
 
 def remove_leftovers(folder: str | os.PathLike[str]) -> int:

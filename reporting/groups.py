@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Group", "Variable", "write_groups"]
-
 
 @dataclass(frozen=True)
 class Variable:

@@ -108,14 +108,17 @@ class Words:
     name
         Of the file: ``[said]`` holds sentences by name, ``[figures]`` titles and captions, and ``[tables]``
         titles, captions and columns, each a heading, or ``{ number = heading, unit = unit }``.
+    **shared
+        What every template may name beside its own values, such as functions that print numbers.
     """
 
-    def __init__(self, package: str, name: str = "words.toml") -> None:
+    def __init__(self, package: str, name: str = "words.toml", **shared: Any) -> None:
+        self._shared = shared
         self.content = tomllib.loads(resources.files(package).joinpath(name).read_text(encoding="utf-8"))
 
     def say(self, name: str, /, **values: Any) -> str:
         """Return a sentence of the table ``[said]``."""
-        return filled(self.content["said"][name], **values)
+        return filled(self.content["said"][name], **self._shared, **values)
 
     def headings(self, name: str) -> tuple[str, ...]:
         """Return the headings of a table, for a terminal."""
@@ -125,7 +128,7 @@ class Words:
     def words(self, kind: str, name: str, /, **values: Any) -> dict[str, str]:
         """Return title and caption of one of the `figures` or `tables`."""
         told = self.content[kind][name]
-        return {part: filled(told[part], **values) for part in ("title", "caption")}
+        return {part: filled(told[part], **self._shared, **values) for part in ("title", "caption")}
 
     def figure(self, name: str, figure: Any, /, **values: Any) -> ReportFigure:
         """Return a figure with its words."""

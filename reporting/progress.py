@@ -10,8 +10,8 @@ Library code takes a `Progress` and never asks what it is::
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # rich takes a while to import, and most code only names what it reports to
     from rich.console import Console
@@ -22,45 +22,30 @@ SECONDS_BETWEEN_LINES = 10.0
 """On a pipe, how long a stage is silent at most while its parts advance."""
 
 
-@runtime_checkable
-class Stage(Protocol):
-    """One stretch of work under way."""
+class Stage:
+    """One stretch of work under way; this one shows nothing."""
 
     def advance(self, amount: int = 1, detail: str | None = None) -> None:
         """Report `amount` more parts done; `detail` (a few words) replaces the text beside the bar."""
 
 
-@runtime_checkable
-class Progress(Protocol):
-    """Where work reports how far it is."""
+class Progress:
+    """Where work reports how far it is; this one shows nothing: the default of every library function."""
 
-    def stage(
-        self, description: str, total: int | None = None, unit: str = ""
-    ) -> AbstractContextManager[Stage]:
+    @contextmanager
+    def stage(self, description: str, total: int | None = None, unit: str = "") -> Iterator[Stage]:
         """Open a stretch of work of `total` parts (None: unknown); it ends with the ``with`` block."""
+        yield Stage()
 
     def note(self, message: str) -> None:
         """Tell one line, such as where a file was written."""
 
 
-class _SilentStage:
-    def advance(self, amount: int = 1, detail: str | None = None) -> None:
-        """Do nothing."""
+SilentProgress = Progress
+"""By the name that says that nothing is shown."""
 
 
-class SilentProgress:
-    """Progress that shows nothing: the default of every library function."""
-
-    @contextmanager
-    def stage(self, description: str, total: int | None = None, unit: str = "") -> Iterator[Stage]:
-        """Give a stage that does nothing."""
-        yield _SilentStage()
-
-    def note(self, message: str) -> None:
-        """Do nothing."""
-
-
-class _BarStage:
+class _BarStage(Stage):
     def __init__(self, bars: "RichBars", task: "TaskID") -> None:
         self._bars = bars
         self._task = task
@@ -71,7 +56,7 @@ class _BarStage:
         self._bars.update(self._task, advance=amount, **told)
 
 
-class _LineStage:
+class _LineStage(Stage):
     """A stage on a pipe: a line now and then, so that nobody takes long work for a standstill."""
 
     def __init__(self, note: Callable[[str], None], description: str, total: int | None, unit: str) -> None:
@@ -96,7 +81,7 @@ class _LineStage:
         self._note(f"{self._description}: done, {time.perf_counter() - self._begin:.1f} s")
 
 
-class RichProgress:
+class RichProgress(Progress):
     """Progress on a terminal: a bar for each stage; on a pipe or in a log, lines as a stage begins and ends.
 
     Parameters
@@ -113,7 +98,6 @@ class RichProgress:
         self.console = console if console is not None else Console(stderr=True, highlight=False)
         self._lines = lines or not self.console.is_terminal
         self._bars: RichBars | None = None
-        self._open_stages = 0
 
     @contextmanager
     def stage(self, description: str, total: int | None = None, unit: str = "") -> Iterator[Stage]:
@@ -123,7 +107,8 @@ class RichProgress:
             yield stage
             stage.end()
             return
-        bars = self._start()
+        first = self._bars is None
+        bars = self._bars = self._bars or self._started()
         task = bars.add_task(description, total=total, unit=unit, detail="")
         try:
             yield _BarStage(bars, task)
@@ -135,33 +120,27 @@ class RichProgress:
             done = total if total is not None else 1
             bars.update(task, total=done, completed=done, detail="")
         finally:
-            self._stop()
+            if first:
+                bars.stop()
+                self._bars = None
 
     def note(self, message: str) -> None:
         """Print one line, above the bars if there are any."""
         console = self._bars.console if self._bars is not None else self.console
         console.print(message, markup=False, highlight=False, soft_wrap=True)
 
-    def _start(self) -> "RichBars":
-        if self._bars is None:
-            from rich import progress as rich
+    def _started(self) -> "RichBars":
+        from rich import progress as rich
 
-            self._bars = rich.Progress(
-                rich.SpinnerColumn(finished_text="✓"),
-                rich.TextColumn("{task.description}", markup=False),
-                rich.BarColumn(bar_width=28),
-                rich.MofNCompleteColumn(),
-                rich.TextColumn("{task.fields[unit]}", markup=False),
-                rich.TimeElapsedColumn(),
-                rich.TextColumn("{task.fields[detail]}", style="dim", markup=False),
-                console=self.console,
-            )
-            self._bars.start()
-        self._open_stages += 1
-        return self._bars
-
-    def _stop(self) -> None:
-        self._open_stages -= 1
-        if self._open_stages == 0 and self._bars is not None:
-            self._bars.stop()
-            self._bars = None
+        bars = rich.Progress(
+            rich.SpinnerColumn(finished_text="✓"),
+            rich.TextColumn("{task.description}", markup=False),
+            rich.BarColumn(bar_width=28),
+            rich.MofNCompleteColumn(),
+            rich.TextColumn("{task.fields[unit]}", markup=False),
+            rich.TimeElapsedColumn(),
+            rich.TextColumn("{task.fields[detail]}", style="dim", markup=False),
+            console=self.console,
+        )
+        bars.start()
+        return bars

@@ -8,7 +8,7 @@ and a number is written with the digits 0 to 9 and a point.
 import csv
 import io
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -83,14 +83,7 @@ class TextTable:
             )
         return self.columns[column]
 
-    def numbers(
-        self,
-        column: str,
-        needed_by: str,
-        convert: Callable[[str], float] = plain_number,
-        *,
-        empty_allowed: bool = False,
-    ) -> FloatArray:
+    def numbers(self, column: str, needed_by: str, *, empty_allowed: bool = False) -> FloatArray:
         """Return a column as numbers; NaN stands for an empty cell where it is allowed.
 
         Raises
@@ -103,7 +96,7 @@ class TextTable:
         cells = self.cells(column, needed_by)
         return np.array(
             [
-                np.nan if empty_allowed and not cell else self.number(column, row, convert, empty_allowed)
+                np.nan if empty_allowed and not cell else self.number(column, row, empty_allowed)
                 for row, cell in enumerate(cells)
             ]
         )
@@ -124,20 +117,12 @@ class TextTable:
             )
         return value
 
-    def number(
-        self,
-        column: str,
-        row: int,
-        convert: Callable[[str], float] = plain_number,
-        empty_allowed: bool = False,
-    ) -> float:
+    def number(self, column: str, row: int, empty_allowed: bool = False) -> float:
         """Return a cell as a number; rows count from 0, errors as `numbers`."""
         cell = self.columns[column][row]
         try:
             value = plain_number(cell)
-            if isfinite(value) and convert is not plain_number:
-                value = convert(cell)
-        except (ValueError, ArithmeticError):
+        except ValueError:
             came = repr(cell) if cell else "nothing"
             raise self.errors.layout(
                 f"{self._place(column, row)} must hold a number, and {came} came."
@@ -172,9 +157,7 @@ class TextTable:
                 )
 
 
-def read_table(
-    path: Path | str, errors: TableErrors, *, name: str | None = None, header: Sequence[str] | None = None
-) -> TextTable:
+def read_table(path: Path | str, errors: TableErrors, *, name: str | None = None) -> TextTable:
     """Read a table of comma-separated text.
 
     Parameters
@@ -185,8 +168,6 @@ def read_table(
         What is raised.
     name : str, optional
         What sentences about its content call it; the path if left out.
-    header : sequence of str, optional
-        Names of the columns where the file has no line for them.
 
     Raises
     ------
@@ -195,7 +176,7 @@ def read_table(
         another number of cells than the header.
     """
     text = read_text(path, errors.layout)
-    return parse_table(text, str(path) if name is None else name, errors, header=header)
+    return parse_table(text, str(path) if name is None else name, errors)
 
 
 def parse_table(
@@ -206,7 +187,10 @@ def parse_table(
     header: Sequence[str] | None = None,
     separator: str | None = ",",
 ) -> TextTable:
-    """Return the table of a text, separated by commas or (None) by blanks; errors as `read_table`."""
+    """Return the table of a text, separated by commas or (None) by blanks; errors as `read_table`.
+
+    `header` names the columns where the text has no line for them.
+    """
     # Comments and blanks become empty lines, so that the reader's line numbers stay those of the file.
     kept = ["" if not line.strip() or line.lstrip().startswith("#") else line for line in text.splitlines()]
     if separator is None:
@@ -263,11 +247,9 @@ def _separated(
     return found
 
 
-def table_text(header: Sequence[str], columns: Sequence[Sequence[str]], comment: str = "") -> str:
+def table_text(header: Sequence[str], columns: Sequence[Sequence[str]]) -> str:
     """Return the text of a table, which `parse_table` reads back."""
     stream = io.StringIO()
-    if comment:
-        stream.write(f"# {comment}\n")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(header)
     writer.writerows(zip(*columns, strict=True))

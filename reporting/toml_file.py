@@ -3,7 +3,6 @@
 import json
 import re
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +20,7 @@ LONGEST_ARRAY = 90
 """Characters of an array that stands in one line."""
 
 
-def read_toml(
-    path: Path | str, error: type[Exception], *, what: str = "file", parse_float: Callable[[str], Any] = float
-) -> dict[str, Any]:
+def read_toml(path: Path | str, error: type[Exception], *, what: str = "file") -> dict[str, Any]:
     """Return the content of a TOML file.
 
     Parameters
@@ -34,8 +31,6 @@ def read_toml(
         What is raised, with one sentence.
     what : str
         What the file is to be, for the sentence: "wing design".
-    parse_float : callable
-        What becomes of decimal numbers, as in `tomllib`; `str` keeps them as printed.
 
     Raises
     ------
@@ -44,27 +39,23 @@ def read_toml(
         integer that 64 bits cannot.
     """
     text = read_text(path, error, what=what)
-    return _parsed(text, f"The {what} {path}", error, parse_float)
+    return _parsed(text, f"The {what} {path}", error)
 
 
-def parse_toml(
-    content: bytes | str, source: str, error: type[Exception], *, parse_float: Callable[[str], Any] = float
-) -> dict[str, Any]:
+def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> dict[str, Any]:
     """Return the content of TOML that was read elsewhere; `source` names it in the sentence of `error`."""
     text = decoded(content, source, error) if isinstance(content, bytes) else content
-    return _parsed(text, source, error, parse_float)
+    return _parsed(text, source, error)
 
 
-def _parsed(
-    text: str, subject: str, error: type[Exception], parse_float: Callable[[str], Any]
-) -> dict[str, Any]:
+def _parsed(text: str, subject: str, error: type[Exception]) -> dict[str, Any]:
     # The time that `tomllib` takes for a dotted key grows with the square of its parts.
     if any(line.count(".") >= DEEPEST_NESTING for line in text.split("\n")):
         keys = (found[1] or "" for found in _KEYS.finditer(text))
         if any(key.count(".") >= DEEPEST_NESTING < len(re.findall(_PART, key)) for key in keys):
             raise error(too_deep(subject))
     try:
-        content = tomllib.loads(text, parse_float=parse_float)
+        content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as cause:
         raise error(f"{subject} is not valid TOML: {cause}.") from cause
     except RecursionError:

@@ -116,7 +116,7 @@ def solved(deck: Deck, folder: Path, forces: Iterable[tuple[int, Point]]) -> lis
         lines += [f"{node},{axis},{value}" for axis, value in enumerate(force, start=1) if value]
         lines += ["*NODE PRINT, NSET=NALL", "U", "*END STEP"]
     tables = read_tables(run_calculix("\n".join(lines) + "\n", folder, "static"))
-    return [{int(row[0]): row[1:] for row in table.rows} for table in tables]
+    return [{int(row[0]): row[1:] for row in rows} for rows in tables["NALL"]]
 
 
 def frequencies(deck: Deck, folder: Path, count: int = 6) -> FloatArray:

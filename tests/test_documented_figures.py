@@ -13,7 +13,6 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.strain_library import load_strain_library
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.network.rewards import error_reward
 from twin_master.scenario.reading import load_scenario
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -31,7 +30,8 @@ def test_the_error_reward_with_and_without_the_load_factor() -> None:
     load_factor = np.array([control.values["load_factor"] for control in scenario.control])
 
     def mean(normaliser: np.ndarray) -> float:
-        rewards = error_reward(flight.observed, predicted, scenario.rewards.error_scale, normaliser)
+        distance = np.nanmean(np.abs(flight.observed - predicted) / scenario.rewards.error_scale, axis=-1)
+        rewards = -distance / normaliser
         return float(np.einsum("ts,st->t", flight.filtered, rewards.mean(axis=0)).mean())
 
     page = (DOCS / "departures.md").read_text(encoding="utf-8")

@@ -1,9 +1,12 @@
-"""The wing's reduced model in motion, by the names of its digital state."""
+"""The wing's reduced model in motion, and its static test, by the names of its digital state."""
 
 from typing import Any
 
 from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import Losses
 from fe.runtime.transient import ModalIntegrator
+from fe.wing.operators import AffineWing
+from fe.wing.responses import solve_static
 
 
 def wing_integrator(
@@ -11,3 +14,9 @@ def wing_integrator(
 ) -> ModalIntegrator:
     """Return the integrator at values by name, the losses together as `stiffness_loss`."""
     return ModalIntegrator(model, model.vector(**values), damping_alpha, damping_beta)
+
+
+def tip_stiffness(wing: AffineWing, young_modulus_factor: float = 1.0, loss: Losses = ()) -> float:
+    """Stiffness [N/m] of the static test of the full wing: force near the tip over the displacement there."""
+    found = solve_static(wing, young_modulus_factor, loss, load_factor=0.0, tip_force=1.0)
+    return 1.0 / float(wing.load_tip @ found.displacement)

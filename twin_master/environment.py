@@ -10,9 +10,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fmu_asset.errors import FmuEndedError
+from reporting.arrays import Float
 from reporting.progress import Progress, SilentProgress
 from twin_master.assets.interface import Asset
 from twin_master.assets.resolution import Overrides, given_overrides, resolve_scenario
@@ -27,8 +27,6 @@ try:
     import gymnasium
 except ImportError:
     raise MissionInputError("a ScenarioEnvironment needs gymnasium: pip install 'uav-twin[gym]'.") from None
-
-Float = NDArray[np.float64]
 
 
 class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):

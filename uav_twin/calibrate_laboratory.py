@@ -60,15 +60,13 @@ def calibrate_ringdown(
     terminal.print_table(headings, _cells(rows, ".5g"))
     if out is not None:
         from calibration.dynamics.figures import ring_down_figure
-        from reporting.figures import to_png, to_svg
-        from reporting.files import atomic_write_bytes, atomic_write_text
+        from reporting.figures import save_figure
+        from reporting.files import atomic_write_text
 
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows((headings, *_cells(rows, ".10g")))
         atomic_write_text(out / "ringdown.csv", text.getvalue())
-        figure = ring_down_figure(trials)
-        atomic_write_bytes(out / "figures" / "ringdown.svg", to_svg(figure))
-        atomic_write_bytes(out / "figures" / "ringdown.png", to_png(figure))
+        save_figure(ring_down_figure(trials), out / "figures", "ringdown")
 
 
 def _cells(rows: Sequence[tuple[str, str, tuple[float, ...]]], digits: str) -> list[tuple[str, ...]]:

@@ -205,7 +205,7 @@ def _build_wing(
     platforms: tuple[Platform, ...] = ("linux64", "win64") if windows else ("linux64",)
     effects = None if patch is None else load_patch(patch)
     check_form(kind, fmi, interface, patched=effects is not None, platforms=platforms)
-    tailored = None
+    options = {}
     if calibration is None:
         shape = load_design(design)
     else:
@@ -213,11 +213,10 @@ def _build_wing(
         from calibration.result.plain import tailoring
 
         wing = load_calibration(calibration)
-        shape, tailored = wing.wing_design, tailoring(wing)
+        shape, options = wing.wing_design, tailoring(wing)
     info = pack_wing(
         shape,
         out,
-        tailoring=tailored,
         kind=kind,
         patch=effects,
         activate=activate,
@@ -226,6 +225,7 @@ def _build_wing(
         platforms=platforms,
         replace=replace,
         progress=terminal.progress(),
+        **options,
     )
     if calibration is not None:
         terminal.say(f"Calibrated for {wing.asset}.")

@@ -2,7 +2,7 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from fmu_asset.door.binding import Binding, Interpolation
-    from fmu_asset.door.reading import ObservationHistory
+    from fmu_asset.door.binding import Binding
+    from fmu_asset.door.layout import ObservationHistory
     from fmu_asset.door.session import FmiAsset
 
 OutFile = Annotated[Path | None, typer.Option(help="The file to write: CSV, or NetCDF (.nc) with units.")]
@@ -74,7 +74,7 @@ def interpolated(binding: "Binding", kind: str | None) -> "Binding":
         return binding
     if kind not in ("zero-order", "linear"):
         raise FmuInputError(f"--interpolation must be zero-order or linear, and {kind!r} came.")
-    return binding.with_interpolation(cast("Interpolation", kind))
+    return binding.with_header(interpolation=kind)
 
 
 def finish(

@@ -110,10 +110,9 @@ def simulate(
     refuse_files(out, plot, replace=replace)
     given = _single_numbers(values or [])
     with tempfile.TemporaryDirectory() as folder:
-        structure = read_ssp(file, folder)
-        wiring = join_ssp(structure, delay or ())
+        wiring = join_ssp(read_ssp(file, folder), delay or ())
         _warn(left_out_sentence(wiring, file))
-        described = system_description(wiring, span=structure.span)
+        described = system_description(wiring)
         planned = default_experiment(described, stop_time=stop_time, step_size=step_size, values=given)
         with CoupledAsset(
             wiring,

@@ -14,7 +14,7 @@ from uav_twin.verify import Check, end_with, print_checks
 if TYPE_CHECKING:
     from fe.structure.affine import DesignedStructure
     from fe.structure.operators import Structure
-    from fe.verification.calculix_comparison import StructureAgreement
+    from fe.verification.calculix_comparison import Agreement
 
 DISPLACEMENT_LIMIT, STRAIN_LIMIT, FREQUENCY_LIMIT = 1e-5, 1e-5, 1e-6
 """Largest differences to CalculiX, each relative to the largest of its kind."""
@@ -169,9 +169,9 @@ def _parts(structure: "Structure") -> Iterator[dict[str, Any]]:
             nodes = mesh.nodes_of(load.set, load.name)
             faces = len(mesh.faces_between(load.set, nodes))
             yield part("load", load.name, load.set, faces or len(nodes), "faces" if faces else "nodes")
-    for gauge, place in zip(design.gauge, structure.gauge_places, strict=True):
-        moved = f"put onto the surface, {place.moved / mesh.unit:.3g} {mesh.unit_name} away"
-        yield part("gauge", gauge.name, "", 1, "place", moved if place.moved > 1e-6 * mesh.size else "")
+    for gauge, distance in zip(design.gauge, structure.gauges_moved.tolist(), strict=True):
+        moved = f"put onto the surface, {distance / mesh.unit:.3g} {mesh.unit_name} away"
+        yield part("gauge", gauge.name, "", 1, "place", moved if distance > 1e-6 * mesh.size else "")
 
 
 @structure_app.command("verify")
@@ -209,7 +209,7 @@ def verify(
                     {"of": check.group, "what": check.name, "difference": check.value, "limit": check.limit}
                     for check in checks
                 ],
-                "frequencies": {key: getattr(agreement.modes, key).tolist() for key in ("ours", "calculix")},
+                "frequencies": {key: getattr(agreement, key).tolist() for key in ("ours", "calculix")},
                 "passed": all(check.passed for check in checks),
             }
         )
@@ -220,7 +220,7 @@ def verify(
     end_with(checks)
 
 
-def _differences(agreement: "StructureAgreement") -> Iterator[Check]:
+def _differences(agreement: "Agreement") -> Iterator[Check]:
     for load in agreement.loads:
         of = f"load {load.load}"
         yield Check(of, "nodal displacements", load.field, DISPLACEMENT_LIMIT)
@@ -228,8 +228,7 @@ def _differences(agreement: "StructureAgreement") -> Iterator[Check]:
             yield Check(of, "displacement outputs", load.output, DISPLACEMENT_LIMIT)
         if load.strain is not None:
             yield Check(of, "gauge strains", load.strain, STRAIN_LIMIT)
-    modes = agreement.modes
-    yield Check(f"{len(modes.ours)} modes", "frequencies", modes.relative, FREQUENCY_LIMIT)
+    yield Check(f"{len(agreement.ours)} modes", "frequencies", agreement.modal, FREQUENCY_LIMIT)
 
 
 structure_app.command("reduce")(reduce)

@@ -88,7 +88,7 @@ def field(
 ) -> None:
     """Solve the full structure under all its loads, and write its field as VTU for ParaView."""
     from fe.structure.field import write_structure_vtu
-    from reporting.files import refuse_existing, write_error
+    from reporting.files import refuse_existing
 
     refuse_existing(out, replace=replace)
     structure = assembled(file, memory_limit)
@@ -106,11 +106,8 @@ def field(
                 param_hint="--at",
             )
         values[name] = value
-    try:
-        with terminal.progress().stage("Solving and writing the field"):
-            write_structure_vtu(out, structure, values)
-    except OSError as error:
-        raise write_error(error, out) from error
+    with terminal.progress().stage("Solving and writing the field"):
+        write_structure_vtu(out, structure, values)
     terminal.say(f"{out}: {len(structure.mesh.cells):,} cells, displacement, strain, material, region, loss")
 
 

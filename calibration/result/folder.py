@@ -16,7 +16,7 @@ from calibration.result.text import (
     parameter_rows,
     reading_rows,
 )
-from reporting.figures import to_png, to_svg
+from reporting.figures import save_figure
 from reporting.files import atomic_write_bytes, atomic_write_text, write_error
 from reporting.page import Page, ReportFigure
 from reporting.progress import Progress
@@ -81,9 +81,7 @@ def write_calibration_folder(
 
 def add_figure(page: Page, figure: ReportFigure, folder: Path) -> None:
     """Add a figure to a page, and leave it in the folder of the page."""
-    drawing = to_svg(figure.figure)
-    atomic_write_bytes(folder / FIGURES / f"{figure.name}.svg", drawing)
-    atomic_write_bytes(folder / FIGURES / f"{figure.name}.png", to_png(figure.figure))
+    drawing = save_figure(figure.figure, folder / FIGURES, figure.name)
     page.add_figure(drawing, figure.caption, title=figure.title)
 
 

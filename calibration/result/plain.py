@@ -1,8 +1,6 @@
 """A calibration as plain data, ready for JSON: for runs of a twin and for FMUs."""
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,7 +8,6 @@ from numpy.typing import NDArray
 
 from calibration.result.file import SCHEMA, result_bytes
 from calibration.result.record import STATE, Calibration
-from fe.runtime.state import DigitalState
 from reporting.provenance import hash_bytes
 
 RESOURCE_NAME = "calibration.json"
@@ -19,32 +16,18 @@ RESOURCE_NAME = "calibration.json"
 _GRID_POINTS = 401
 
 
-@dataclass(frozen=True)
-class WingTailoring:
-    """What an FMU takes of the calibration of a wing.
+def tailoring(calibration: Calibration) -> dict[str, Any]:
+    """Return what the FMU of a calibrated wing carries, as options of `fmu_asset`'s `pack_wing`.
 
-    Attributes
-    ----------
-    state : DigitalState
-        Means of the samples of e, masses and damping.
-    note : str
-        Name of the wing and the standard deviations, for the description.
-    resources : dict of str to bytes
-        `RESOURCE_NAME`: the figures with intervals and correlations.
+    It starts at the means of the samples of e, masses and damping; its description has the name of the wing
+    and the standard deviations, and `RESOURCE_NAME` the figures with intervals and correlations. Equal input
+    gives equal bytes.
     """
-
-    state: DigitalState
-    note: str
-    resources: Mapping[str, bytes]
-
-
-def tailoring(calibration: Calibration) -> WingTailoring:
-    """Return what the FMU of a calibrated wing carries; equal input gives equal bytes."""
     text = json.dumps(
         plain_record(calibration), indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False
     )
-    record = {RESOURCE_NAME: f"{text}\n".encode()}
-    return WingTailoring(calibration.mean_state(), description(calibration), record)
+    resources = {RESOURCE_NAME: f"{text}\n".encode()}
+    return {"state": calibration.mean_state(), "note": description(calibration), "resources": resources}
 
 
 def description(calibration: Calibration) -> str:

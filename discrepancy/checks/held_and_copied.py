@@ -6,13 +6,9 @@ from collections.abc import Iterator
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Trial
+from discrepancy.campaign.records import BoolArray, Campaign, FloatArray, Trial
 from discrepancy.checks.fault import DataFault, FaultKind, fault, place_of
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 LEAST_HELD = 8
 """Fewest equal readings in a row that are looked at."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from discrepancy.campaign.records import Campaign, Hold, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Hold, Quantity, Trial, TrialKind
 from discrepancy.checks.fault import DataFault, FaultKind, fault
 from discrepancy.checks.observability import unobservable
 from discrepancy.checks.rest import rest_faults
@@ -19,8 +19,6 @@ from discrepancy.checks.unit_slips import unit_slips
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
-
-FloatArray = NDArray[np.float64]
 
 LEAST_PERIODS = 3.0
 """Fewest periods of the first mode in a record in time."""

@@ -7,13 +7,9 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from discrepancy.campaign.noise_records import repeated
-from discrepancy.campaign.records import Campaign, Channel, Trial
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
 
 LARGEST_SHARE = 0.03
 """Largest share of a record in time that may be left out; above it the record is at fault."""

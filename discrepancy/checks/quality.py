@@ -10,19 +10,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
 from discrepancy.campaign.noise_records import repeat_record
-from discrepancy.campaign.records import Campaign, Channel, Trial
+from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
 from discrepancy.checks.fault import DataFault, FaultKind, fault
 from discrepancy.checks.held_and_copied import copy_faults, held_faults, roughness
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers, mark_outliers
 from discrepancy.checks.rest import rest_faults
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 __all__ = ["DataFault", "FaultKind", "check_against_model", "check_data", "mark_outliers"]
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
 from discrepancy.campaign.noise import MAINS, line_near, without_lines
-from discrepancy.campaign.records import Campaign, NoiseRecord
+from discrepancy.campaign.records import Campaign, FloatArray, NoiseRecord
 from discrepancy.checks.fault import DataFault, FaultKind, fault
-
-FloatArray = NDArray[np.float64]
 
 SHORTEST = 128
 """Fewest samples of a noise record that is judged."""

@@ -4,13 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import TrialKind
+from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
 from fe.runtime.patch import ModelPatch
-
-FloatArray = NDArray[np.float64]
 
 FREE_SHAPE = " (free shape)"
 """What marks the identifier of an effect whose shape is free: its family."""

@@ -3,12 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
-
-FloatArray = NDArray[np.float64]
 
 
 def finite(values: FloatArray) -> FloatArray:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from discrepancy.campaign.records import FloatArray
+
 IntArray = NDArray[np.int64]
 
 

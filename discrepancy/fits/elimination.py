@@ -7,13 +7,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
+
 from .candidate import Candidate
 from .cholesky import Cholesky
 from .derivatives import TrialDerivatives
 from .linearisation import Linearisation, Point
 from .problem import Problem
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
@@ -45,6 +46,16 @@ class TrialBlock:
         """What the trial's own unknowns (L, K) do less of where the shared ones do more."""
         return self.factor.solve(self.cross)
 
+    @property
+    def matrix(self) -> FloatArray:
+        """What is left of the shared ones' (K, K) when the trial's own unknowns follow."""
+        return self.shared - self.cross.T @ self.followed
+
+    @property
+    def gradient(self) -> FloatArray:
+        """The same of the gradient (K,)."""
+        return self.shared_gradient - self.followed.T @ self.local_gradient
+
 
 class Fitted(Protocol):
     """Where a candidate stands: a fit, or a state on the way to it."""
@@ -63,9 +74,14 @@ class Fitted(Protocol):
 
 
 def trial_block(
-    problem: Problem, number: int, found: Fitted, candidate: Candidate, precision: FloatArray
+    problem: Problem,
+    number: int,
+    found: Fitted,
+    candidate: Candidate,
+    precision: FloatArray,
+    damping: float = 0.0,
 ) -> TrialBlock:
-    """Return the normal equations of a trial, by precisions of all channels."""
+    """Return the normal equations of a trial, by precisions of all channels, its own unknowns damped."""
     data, point = problem.trials[number], found.point
     derivatives = problem.derivatives(number, point, found.linearisations[number], candidate)
     products = derivatives.products()
@@ -73,8 +89,9 @@ def trial_block(
     normal = derivatives.normal(products, weights)
     gradient = derivatives.onto(found.residuals[number].T * weights[:, np.newaxis])
     u, prior, count = point.local[number], data.unknowns.precision, derivatives.local_size
+    local = normal[:count, :count] + np.diag(prior + 1e-12)
     return TrialBlock(
-        local=normal[:count, :count] + np.diag(prior + 1e-12),
+        local=local + damping * np.diag(np.diag(local)),
         cross=normal[:count, count:],
         shared=normal[count:, count:],
         local_gradient=gradient[:count] - prior * u,
@@ -83,14 +100,6 @@ def trial_block(
         products=products,
         precision=weights,
     )
-
-
-def trial_blocks(
-    problem: Problem, found: Fitted, candidate: Candidate, precision: FloatArray
-) -> list[TrialBlock]:
-    """Return the normal equations of all trials."""
-    numbers = range(len(problem.trials))
-    return [trial_block(problem, number, found, candidate, precision) for number in numbers]
 
 
 class Eliminated(NamedTuple):
@@ -102,20 +111,49 @@ class Eliminated(NamedTuple):
         Of each trial.
     matrix, gradient : (Q + E, Q + E), (Q + E,) ndarray
         With prior.
+    prior : (Q + E,) ndarray
+        Its precision.
     """
 
     blocks: list[TrialBlock]
     matrix: FloatArray
     gradient: FloatArray
+    prior: FloatArray
 
 
-def eliminated(problem: Problem, found: Fitted, candidate: Candidate, precision: FloatArray) -> Eliminated:
-    """Return the normal equations of a problem."""
-    blocks = trial_blocks(problem, found, candidate, precision)
-    prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
+def eliminated(
+    problem: Problem,
+    found: Fitted,
+    candidate: Candidate,
+    precision: FloatArray,
+    *,
+    effect_precision: FloatArray | None = None,
+    damping: float = 0.0,
+) -> Eliminated:
+    """Return the normal equations of a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    found : Fitted
+        Where they are taken.
+    candidate : Candidate
+        Its effect parameters are unknowns.
+    precision : (channels,) ndarray
+        Of the noise of each channel.
+    effect_precision : (E,) ndarray, optional
+        Of the prior of the effect parameters; one if left out.
+    damping : float
+        Of the trials' own unknowns.
+    """
+    effect_prior = np.ones(candidate.size) if effect_precision is None else effect_precision
+    prior = np.concatenate((problem.shared.precision, effect_prior))
     matrix = np.diag(prior + 1e-12)
     gradient = -prior * np.concatenate((found.point.shared, found.point.effect))[: len(prior)]
+    numbers = range(len(problem.trials))
+    blocks = [trial_block(problem, number, found, candidate, precision, damping) for number in numbers]
     for block in blocks:
-        matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ block.followed
-        np.add.at(gradient, block.index, block.shared_gradient - block.followed.T @ block.local_gradient)
-    return Eliminated(blocks, matrix, gradient)
+        matrix[np.ix_(block.index, block.index)] += block.matrix
+        np.add.at(gradient, block.index, block.gradient)
+    return Eliminated(blocks, matrix, gradient, prior)

@@ -8,18 +8,16 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
 
 from .candidate import Candidate
 from .cholesky import Cholesky, finite
-from .elimination import eliminated, trial_blocks
+from .elimination import eliminated
 from .linearisation import Base, Linearisation, Point
 from .problem import Problem
 from .remainder import Remainder
-
-FloatArray = NDArray[np.float64]
 
 LARGEST_EFFECT = 8.0
 """Effect parameters stay within this many prior deviations of their median."""
@@ -258,11 +256,25 @@ class _Descent:
         return _State(point, objective, tuple(residuals), tuple(responses), sums, tuple(parts))
 
     def step(self, state: _State, damping: float) -> tuple[Point, float]:
-        """Return the step and the decrease it promises [nat]."""
-        step, promised, self.deviation = _step(
-            self.problem, self.candidate, state, damping, local_only=self.local_only
+        """Return the step and the decrease it promises [nat], and keep the deviations of the effects."""
+        problem, shared = self.problem, self.problem.shared.size
+        blocks, matrix, gradient, prior = eliminated(
+            problem, state, self.candidate, problem.precisions(state.sums), damping=damping
         )
-        return step, promised
+        size, diagonal = len(prior), prior.copy()
+        for block in blocks:
+            np.add.at(diagonal, block.index, np.diag(block.shared))
+        variance = np.diag(Cholesky.of(matrix).solve(np.eye(size)[:, shared:])[shared:])
+        self.deviation = np.sqrt(variance)
+        damped = Cholesky.of(matrix + damping * np.diag(diagonal))
+        step = np.zeros(size) if self.local_only else damped.solve(finite(gradient))
+        promised = 0.5 * float(gradient @ step)
+        local_steps = []
+        for block in blocks:
+            own = block.factor.solve(block.local_gradient)
+            promised += 0.5 * float(block.local_gradient @ own)
+            local_steps.append(np.asarray(own - block.followed @ step[block.index]))
+        return Point(step[:shared], tuple(local_steps), step[shared:]), promised
 
     def following(self, state: _State, step: Point, damping: float) -> _State | None:
         """Return the state after a step, or None if none better was found.
@@ -287,36 +299,6 @@ class _Descent:
         return None
 
 
-def _step(
-    problem: Problem, candidate: Candidate, state: _State, damping: float, *, local_only: bool = False
-) -> tuple[Point, float, FloatArray]:
-    """Return the step, the decrease it promises [nat], and the deviations (E,) of the effect parameters."""
-    shared_size = problem.shared.size
-    size = shared_size + candidate.size
-    prior = np.concatenate((problem.shared.precision, np.ones(candidate.size)))
-    matrix, diagonal = np.diag(prior + 1e-12), np.zeros(size)
-    gradient = -prior * np.concatenate((state.point.shared, state.point.effect))
-    blocks = trial_blocks(problem, state, candidate, problem.precisions(state.sums))
-    inner, inner_gradients = [], []
-    for block in blocks:
-        local = block.local + damping * np.diag(np.diag(block.local))
-        solved = np.linalg.solve(finite(local), np.column_stack((block.cross, block.local_gradient)))
-        inner.append(solved[:, :-1])
-        inner_gradients.append(solved[:, -1])
-        matrix[np.ix_(block.index, block.index)] += block.shared - block.cross.T @ inner[-1]
-        np.add.at(diagonal, block.index, np.diag(block.shared))
-        np.add.at(gradient, block.index, block.shared_gradient - block.cross.T @ inner_gradients[-1])
-    variance = np.diag(Cholesky.of(matrix).solve(np.eye(size)[:, shared_size:])[shared_size:])
-    damped = matrix + damping * np.diag(diagonal + prior)
-    step = np.zeros(size) if local_only else Cholesky.of(damped).solve(finite(gradient))
-    promised = 0.5 * float(gradient @ step)
-    local_steps = []
-    for block, followed, own in zip(blocks, inner, inner_gradients, strict=True):
-        promised += 0.5 * float(block.local_gradient @ own)
-        local_steps.append(np.asarray(own - followed @ step[block.index], dtype=np.float64))
-    return Point(step[:shared_size], tuple(local_steps), step[shared_size:]), promised, np.sqrt(variance)
-
-
 def _finished(
     problem: Problem, candidate: Candidate, state: _State, converged: bool, evidence: bool
 ) -> CandidateFit:
@@ -324,7 +306,7 @@ def _finished(
     covariance, log_evidence = np.zeros((size, size)), -state.objective
     spent = np.zeros(len(problem.channel_names))
     if evidence:
-        blocks, matrix, _ = eliminated(problem, state, candidate, problem.precisions(state.sums))
+        blocks, matrix, *_ = eliminated(problem, state, candidate, problem.precisions(state.sums))
         factor = Cholesky.of(matrix)
         covariance = factor.solve(np.eye(size))
         log_evidence -= 0.5 * sum(item.log_determinant for item in (factor, *(b.factor for b in blocks)))

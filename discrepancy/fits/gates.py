@@ -1,7 +1,6 @@
 """Gates that a name must pass: absolute fit against the noise record, shape against its family."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from discrepancy.campaign.noise_tests import (
@@ -11,14 +10,13 @@ from discrepancy.campaign.noise_tests import (
     pooled_variance_p_value,
     variance_p_value,
 )
+from discrepancy.campaign.records import FloatArray
 from discrepancy.verdict import Gate
 from fe.runtime.patch import ModelPatch
 
 from .candidate import Candidate
 from .fitting import CandidateFit
 from .problem import Problem
-
-FloatArray = NDArray[np.float64]
 
 ABSOLUTE_LEVEL = 1e-3
 """Level of the absolute gate; a true name fails it this often."""

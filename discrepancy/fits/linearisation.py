@@ -2,10 +2,7 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-FloatArray = NDArray[np.float64]
+from discrepancy.campaign.records import FloatArray
 
 PARAMETER_STEP = 1e-2
 """Step of the differences in scaled variables."""

@@ -4,8 +4,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import EffectParameter, ShapeParameter
 from discrepancy.search_settings import SEARCH
 
@@ -14,8 +14,6 @@ from .fitting import CandidateFit, attempt
 from .linearisation import Point
 from .problem import Problem
 from .screening import is_magnitude
-
-FloatArray = NDArray[np.float64]
 
 
 def is_box(candidate: Candidate) -> bool:

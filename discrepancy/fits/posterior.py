@@ -11,16 +11,14 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import NINETY
 from discrepancy.errors import DiscrepancyError
 
 from .fitting import LARGEST_EFFECT, CandidateFit
 from .problem import Problem
 from .screening import Screen
-
-FloatArray = NDArray[np.float64]
 
 LEAST_RISE = 0.6
 """Rise of the misfit [nat] at the ends of a Gaussian 90 % interval below which the posterior is drawn from;

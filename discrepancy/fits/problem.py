@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.noise import NoiseModel
-from discrepancy.campaign.records import Campaign, Trial
+from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
 from discrepancy.models.interface import Model
@@ -28,7 +28,6 @@ from .linearisation import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Base, Linear
 from .trial_data import TrialData, noise_models
 from .unknowns import GlobalUnknowns, global_unknowns
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 KEPT = 2000

@@ -9,17 +9,16 @@ Changes of several effects add, so pairs and scales cost inner products only. G 
 effects before data are looked at.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 from math import sqrt
-from typing import NamedTuple, TypeGuard
+from typing import TypeGuard
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from discrepancy.campaign.records import TrialKind
+from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.catalogue.entry import EffectParameter, ShapeParameter
 from discrepancy.errors import DiscrepancyError
 from discrepancy.search_settings import SEARCH
@@ -27,12 +26,9 @@ from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch
 
 from .candidate import Candidate, Term
 from .cholesky import Cholesky, finite
-from .derivatives import TrialDerivatives
 from .elimination import eliminated
 from .fitting import LARGEST_EFFECT, CandidateFit
 from .problem import Problem
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -78,18 +74,6 @@ class Change:
         return not sizes or any(shape != "log_normal" for shape in sizes)
 
 
-class _Piece(NamedTuple):
-    """One trial of a screen."""
-
-    derivatives: TrialDerivatives
-    own: FloatArray  # (L, L): what a change leaves to the trial's own unknowns
-    followed: FloatArray  # (K, L): what these take from the shared ones
-    root: FloatArray  # (C, 1), weights
-    residual: FloatArray  # (C, N), weighted
-    gradient: FloatArray  # (L,)
-    nothing: FloatArray  # (C N,), no change
-
-
 class Screen:
     """Inner products of changes at a fit.
 
@@ -101,25 +85,27 @@ class Screen:
         Where the nuisances stand; its own effects stay as they are.
     record_noise : bool
         Whether residuals count by the noise record (else by what the fit left).
+    effect_precision : (E,) ndarray, optional
+        Of the prior of the fit's own effect parameters, which follow a change with the nuisances then.
     """
 
-    def __init__(self, problem: Problem, fit: CandidateFit, *, record_noise: bool = True) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        fit: CandidateFit,
+        *,
+        record_noise: bool = True,
+        effect_precision: FloatArray | None = None,
+    ) -> None:
         self.problem, self.fit = problem, fit
         known = problem.freedom > 0.0
         left = problem.precisions(fit.sums)
         precision = np.where(known, 1.0, left) if record_noise else left
-        blocks, matrix, gradient = eliminated(problem, fit, Candidate(), precision)
-        self._pieces: list[_Piece] = []
-        for block, residual in zip(blocks, fit.residuals, strict=True):
-            root = np.sqrt(block.precision)[:, np.newaxis]
-            own = block.factor.half(np.eye(len(block.local)))
-            self._pieces.append(
-                _Piece(
-                    block.derivatives, own, block.followed.T, root, np.ascontiguousarray(residual.T) * root,
-                    own @ block.local_gradient, np.zeros(residual.size),
-                )
-            )  # fmt: skip
-        self._size = problem.shared.size
+        following = Candidate() if effect_precision is None else fit.candidate
+        self._blocks, matrix, gradient, _ = eliminated(
+            problem, fit, following, precision, effect_precision=effect_precision
+        )
+        self._size = len(matrix)
         self._inverse = Cholesky.of(matrix).half(np.eye(self._size))
         self._gradient = self._inverse @ gradient
 
@@ -148,32 +134,37 @@ class Screen:
     ) -> tuple[FloatArray, float, float]:
         """Return vector, b and G of the change to a candidate, in trials and channels that it touches."""
         problem, fit = self.problem, self.fit
-        total = np.zeros(self._size)
-        parts, fits, square = [], 0.0, 0.0
-        tail = []
         patch = candidate.patch(problem.setting, effect)
-        for number, (data, piece) in enumerate(zip(problem.trials, self._pieces, strict=True)):
-            touched = None
-            if channels:
-                touched = [column for column, name in enumerate(data.trial.channels) if name in channels]
-            if data.trial.kind not in acting or touched == []:
-                parts.append(piece.nothing)
-                tail.append(np.zeros(len(piece.own)))
-                continue
-            change = np.zeros(piece.residual.shape)
-            parts.append(change.reshape(-1))
-            at = slice(None) if touched is None else touched
-            response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
-            gains = 1.0 + problem.shared.gains(fit.point.shared, data.trial.channels)
-            moved = gains[at] * (response[:, at] - fit.responses[number][:, at])
-            d = data.standardised(moved, touched).T * piece.root[at]
-            change[at] = d
-            onto = piece.derivatives.onto(d * piece.root[at], touched)
-            local = onto[: len(piece.own)]
-            z = piece.own @ local
-            total[piece.derivatives.index] += onto[len(piece.own) :] - piece.followed @ local
-            fits += float(np.vdot(piece.residual[at], d)) - float(piece.gradient @ z)
-            square += float(np.vdot(d, d)) - float(z @ z)
+        changes: dict[int, FloatArray] = {}
+        for number, data in enumerate(problem.trials):
+            names = data.trial.channels
+            touched = [column for column, name in enumerate(names) if not channels or name in channels]
+            if data.trial.kind in acting and touched:
+                response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
+                gains = 1.0 + problem.shared.gains(fit.point.shared, names)
+                change = changes[number] = np.zeros(response.shape)
+                moved = gains[touched] * (response - fit.responses[number])[:, touched]
+                change[:, touched] = data.standardised(moved, touched)
+        return self.projected(changes)
+
+    def projected(self, changes: Mapping[int, FloatArray]) -> tuple[FloatArray, float, float]:
+        """Return vector, b and G of standardised changes (N, C) of predictions, by number of the trial."""
+        total = np.zeros(self._size)
+        parts, tail, fits, square = [], [], 0.0, 0.0
+        for number, block in enumerate(self._blocks):
+            whole, z = np.zeros(self.fit.residuals[number].T.shape), np.zeros(len(block.local))
+            if number in changes:
+                touched = np.flatnonzero(changes[number].any(axis=0)).tolist()
+                root = np.sqrt(block.precision[touched])[:, np.newaxis]
+                d = whole[touched] = changes[number].T[touched] * root
+                onto = block.derivatives.onto(d * root, touched)
+                local = onto[: len(z)]
+                z = block.factor.half(local)
+                total[block.index] += onto[len(z) :] - block.followed.T @ local
+                fits += float(np.vdot(self.fit.residuals[number].T[touched] * root, d))
+                fits -= float(block.factor.half(block.local_gradient) @ z)
+                square += float(np.vdot(d, d)) - float(z @ z)
+            parts.append(whole.reshape(-1))
             tail.append(z)
         y = self._inverse @ total
         fits -= float(self._gradient @ y)
@@ -226,8 +217,8 @@ class Screen:
     @property
     def sign(self) -> FloatArray:
         """Signs (D,) of the inner product: changes count, their projections are taken off."""
-        samples = sum(piece.residual.size for piece in self._pieces)
-        rest = sum(len(piece.own) for piece in self._pieces) + self._size
+        samples = sum(residual.size for residual in self.fit.residuals)
+        rest = sum(len(block.local) for block in self._blocks) + self._size
         return np.concatenate((np.ones(samples), -np.ones(rest)))
 
     def changes(self, term: Term, *, fine: bool = True) -> Iterator[Change]:

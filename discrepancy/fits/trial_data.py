@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.campaign.noise import NoiseModel, noise_model
-from discrepancy.campaign.records import Campaign, Trial
+from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.models.interface import Model
 
 from .unknowns import LocalUnknowns, local_unknowns
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 

@@ -12,10 +12,9 @@ from math import isinf
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Quantity, Start, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.models.interface import Conditions, Model
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 FREE_MOTION = 3.0

@@ -10,16 +10,13 @@ have none.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from discrepancy.campaign.noise_tests import SHORTEST_SERIES, combine, ljung_box, variance_p_value
+from discrepancy.campaign.records import BoolArray, FloatArray
 
 from .fitting import CandidateFit, attempt
 from .problem import Problem
 from .remainder import Remainder
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 LEVEL = 1e-3
 """p-value below which what is left is more than noise, or no white noise."""

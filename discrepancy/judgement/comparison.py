@@ -7,6 +7,7 @@ from math import nan
 
 import numpy as np
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt
@@ -28,7 +29,7 @@ from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 
-from .conclusion import FloatArray, sizes
+from .conclusion import sizes
 from .consistency_gate import consistency_gate
 from .court import Court
 from .proof import held_out_gate

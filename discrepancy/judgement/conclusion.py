@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import NINETY, EffectParameter, ShapeParameter
 from discrepancy.fits.candidate import FREE_SHAPE, Candidate
 from discrepancy.fits.fitting import CandidateFit
@@ -24,8 +24,6 @@ from discrepancy.verdict import (
     VerdictKind,
 )
 from reporting.words import listing
-
-FloatArray = NDArray[np.float64]
 
 
 class Hypothetic(Protocol):

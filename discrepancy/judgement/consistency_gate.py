@@ -11,22 +11,18 @@ from dataclasses import dataclass
 from math import isinf
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
-from discrepancy.campaign.records import Quantity, TrialKind
+from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.fits.candidate import Candidate, Term
-from discrepancy.fits.cholesky import Cholesky
-from discrepancy.fits.elimination import trial_block
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
+from discrepancy.fits.screening import Screen
 from discrepancy.fits.trial_data import TrialData
 from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 from fe.runtime.patch import SENSORS
 from reporting.words import counted
-
-FloatArray = NDArray[np.float64]
 
 CONSISTENCY_LEVEL = 1e-3
 """Level of the gate, by Bonferroni over its tests; a true name fails it this often."""
@@ -128,7 +124,18 @@ def score_tests(
     directions = [item for group in groups.values() for item in group.values()]
     if not directions:
         return []
-    gradient, information, whole = _projected(problem, fit, directions)
+    # effect parameters that the data determine follow without their prior: that they are unlikely says
+    # nothing of what they leave
+    determined = np.diag(fit.effect_covariance) < IDENTIFIED**2
+    screen = Screen(problem, fit, record_noise=False, effect_precision=np.where(determined, 0.0, 1.0))
+    standardised = [
+        {number: problem.trials[number].standardised(column) for number, column in item.items()}
+        for item in directions
+    ]
+    changes, fits, _ = zip(*(screen.projected(item) for item in standardised), strict=True)
+    rows_of, sign = np.array(changes), screen.sign
+    gradient, information = np.array(fits), (rows_of * sign) @ rows_of.T
+    whole = (rows_of[:, sign > 0.0] ** 2).sum(axis=1)
     tests = []
     at = 0
     for name, group in groups.items():
@@ -184,57 +191,6 @@ def _freedom(problem: Problem, fit: CandidateFit, directions: list[Direction]) -
         return np.inf, 1.0
     left = float(np.sum(known - fit.spent[rows]))
     return left, left / float(known.sum())
-
-
-def _projected(
-    problem: Problem, fit: CandidateFit, directions: list[Direction]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return gradient (K,) and information (K, K) of directions as all unknowns follow, and sizes (K,).
-
-    Effect parameters that the data determine follow without their prior: that they are unlikely says nothing
-    of what they leave.
-    """
-    shared_size, count = problem.shared.size, len(directions)
-    size = shared_size + fit.candidate.size
-    determined = np.diag(fit.effect_covariance) < IDENTIFIED**2
-    precision = np.concatenate((problem.shared.precision, np.where(determined, 0.0, 1.0)))
-    position = np.concatenate((fit.point.shared, fit.point.effect))
-    matrix = np.zeros((size + count, size + count))
-    matrix[:size, :size] = np.diag(precision + 1e-12)
-    gradient = np.concatenate((-precision * position, np.zeros(count)))
-    whole = np.zeros(count)
-    weights = problem.precisions(fit.sums)
-    for number, data in enumerate(problem.trials):
-        residual = fit.residuals[number]
-        block = trial_block(problem, number, fit, fit.candidate, weights)
-        acting = np.array([k for k, item in enumerate(directions) if number in item], dtype=np.int64)
-        extra = [problem.trials[number].standardised(directions[k][number]) for k in acting]
-        weighted = [column * weights[data.groups] for column in extra]
-        products = np.array([[np.vdot(a, b) for b in weighted] for a in extra]).reshape(2 * (len(acting),))
-        whole[acting] += np.diag(products)
-        local_size = len(block.local)
-        onto = np.array([block.derivatives.onto(column.T) for column in weighted])
-        onto = onto.reshape(len(acting), block.derivatives.size).T
-        cross = np.concatenate((block.cross, onto[:local_size]), axis=1)
-        between = onto[local_size:]
-        shared = np.block([[block.shared, between], [between.T, products]])
-        along = np.array([np.vdot(residual, column) for column in weighted])
-        index = np.concatenate((block.index, size + acting))
-        inner = block.factor.solve(cross)
-        matrix[np.ix_(index, index)] += shared - cross.T @ inner
-        np.add.at(
-            gradient, index,
-            np.concatenate((block.shared_gradient, along)) - inner.T @ block.local_gradient,
-        )  # fmt: skip
-    known, between = matrix[:size, :size], matrix[:size, size:]
-    scale = 1.0 / np.sqrt(np.diag(known))
-    factor = Cholesky.of(known * np.outer(scale, scale) + 1e-12 * np.eye(size))
-    followed = scale[:, np.newaxis] * factor.solve(scale[:, np.newaxis] * between)
-    return (
-        gradient[size:] - followed.T @ gradient[:size],
-        matrix[size:, size:] - between.T @ followed,
-        whole,
-    )
 
 
 def directions(problem: Problem, fit: CandidateFit) -> dict[str, dict[str, Direction]]:

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import logsumexp
 from scipy.stats import chi2
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import ABSOLUTE_LEVEL
@@ -26,7 +27,7 @@ from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 
-from .conclusion import FloatArray, Hypothetic
+from .conclusion import Hypothetic
 
 COUNTER = -0.1
 """Share below which trials in which a law has hardly any force speak against it all the same."""

@@ -9,10 +9,9 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from discrepancy.campaign.records import Campaign, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.cholesky import finite
 from discrepancy.fits.fitting import CandidateFit
@@ -21,8 +20,6 @@ from discrepancy.fits.problem import Problem
 from discrepancy.sentences import SENTENCES
 from discrepancy.verdict import Experiment
 from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass
-
-FloatArray = NDArray[np.float64]
 
 SAMPLES = 300
 """Simulated outcomes of a trial for each hypothesis."""

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from discrepancy.campaign.noise_tests import SHORTEST_SERIES, ljung_box, variance_p_value
+from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
 from discrepancy.location.omnibus_tests import mean_square
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.sentences import said
 from discrepancy.verdict import Gate, Proof, Scores
-
-FloatArray = NDArray[np.float64]
 
 PIT_BINS = 10
 """Bins of the histogram of probability integral transforms."""

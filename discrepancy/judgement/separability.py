@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 from math import inf, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, NoiseRecord, Start, Trial
+from discrepancy.campaign.records import Campaign, FloatArray, NoiseRecord, Start, Trial
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Term
@@ -22,8 +21,6 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen
 from discrepancy.fits.trial_data import stand_in
 from discrepancy.models.interface import Model
-
-FloatArray = NDArray[np.float64]
 
 CONFUSED = 9.0
 """Squared distance [sigma^2] below which two effects form a confusion group."""

@@ -10,16 +10,14 @@ DerSimonian and Laird 1986 (Controlled Clinical Trials 7, 177-188).
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.elimination import trial_block
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import is_magnitude
 from discrepancy.sentences import said
-
-FloatArray = NDArray[np.float64]
 
 LEVEL = 1e-3
 """p-value of Cochran's Q below which sizes do not agree."""
@@ -87,8 +85,7 @@ def sizes_by_trial(problem: Problem, found: CandidateFit) -> list[SizeByTrial]:
     first = problem.shared.size
     for number, data in enumerate(problem.trials):
         block = trial_block(problem, number, found, found.candidate, precision)
-        matrix = block.shared - block.cross.T @ block.followed
-        gradient = block.shared_gradient - block.followed.T @ block.local_gradient
+        matrix, gradient = block.matrix, block.gradient
         at = first
         for row, term in zip(rows, found.candidate.terms, strict=True):
             for place, item in enumerate(term.parameters):

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from math import log, nan, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.dynamics.damped_cosine import DampedCosines, Solution
+from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
-
-FloatArray = NDArray[np.float64]
 
 SMALLEST_SIGNAL = 4.0
 """A mode counts in a window while its amplitude there is this many standard errors."""

@@ -8,13 +8,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
+from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.location.residuals import FittedTrial
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _FREE_SHARE = 0.02  # of a direction's square must survive the fit, else it says nothing
 

@@ -12,7 +12,8 @@ from scipy import stats
 from scipy.linalg import block_diag
 
 from discrepancy.campaign.noise_tests import periodogram
-from discrepancy.location.columns import FloatArray, Part, explained, features, part_of
+from discrepancy.campaign.records import FloatArray
+from discrepancy.location.columns import Part, explained, features, part_of
 from discrepancy.location.modal_motion import MotionByMode, modal_motion
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from discrepancy.campaign.noise_tests import holm, variance_p_value
+from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
 from discrepancy.location.dependence import (
     Explanation,
@@ -28,8 +28,6 @@ from discrepancy.location.omnibus_tests import (
 from discrepancy.location.patterns import SingularPattern, singular_patterns
 from discrepancy.location.residuals import FittedTrial, ResidualSet, at_own_scale
 from discrepancy.sentences import said
-
-FloatArray = NDArray[np.float64]
 
 GLOBAL_LEVEL = 0.01
 """Rate of false alarms of the global verdict."""

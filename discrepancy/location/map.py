@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from discrepancy.campaign.noise_tests import benjamini_yekutieli, periodogram, variance_p_value
-from discrepancy.campaign.records import Trial
-from discrepancy.location.columns import BoolArray, FloatArray, envelope, explained, features, part_of
+from discrepancy.campaign.records import BoolArray, FloatArray, Trial
+from discrepancy.location.columns import envelope, explained, features, part_of
 from discrepancy.location.residuals import FittedTrial, ResidualSet, quadratic_moments
 
 BINS = 6

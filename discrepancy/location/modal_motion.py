@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from discrepancy.campaign.records import FloatArray
 
 _PERIODS = 2.0  # of the lowest frequency, or of the closest difference, in a window
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from discrepancy.campaign.noise_tests import (
     SHORTEST_SERIES,
@@ -17,10 +16,9 @@ from discrepancy.campaign.noise_tests import (
     ljung_box,
     variance_p_value,
 )
+from discrepancy.campaign.records import FloatArray
 from discrepancy.location.residuals import ResidualSet, quadratic_moments
 from discrepancy.sentences import said
-
-FloatArray = NDArray[np.float64]
 
 NOISE_RECORD_LEVEL = 1e-3
 """p-value below which a noise record itself counts as not white, or as holding a line."""

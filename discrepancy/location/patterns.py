@@ -7,13 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.location.dependence import kinds
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.sentences import said
-
-FloatArray = NDArray[np.float64]
 
 ALIKE = 0.9
 """Squared cosine from which two patterns over the channels count as the same."""

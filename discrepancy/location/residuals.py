@@ -11,13 +11,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Channel, NoiseRecord, Trial
+from discrepancy.campaign.records import BoolArray, Channel, FloatArray, NoiseRecord, Trial
 from discrepancy.errors import FitError
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 def sensitivity(jacobian: FloatArray, covariance: FloatArray, noise_deviation: FloatArray) -> FloatArray:

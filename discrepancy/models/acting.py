@@ -45,10 +45,8 @@ class Course:
         key = (known, time.tobytes(), values.tobytes())
         return _courses.get(key, lambda: Course(time, values, known))
 
-    @property
-    def edges(self) -> tuple[float, ...]:
-        """Moments at which it jumps between the stamps: none."""
-        return ()
+    edges: ClassVar[tuple[float, ...]] = ()
+    """Moments at which it jumps between the stamps: none."""
 
     @property
     def is_smooth(self) -> bool:
@@ -207,6 +205,8 @@ class Acting:
     release : tuple of ((n,) ndarray, Release), optional
         How a structure was let go, and the row of the release point: row . u is its displacement, and the
         holding force acts along it.
+    basis : (K, n + m) ndarray, optional
+        Of a system of K unknowns, in whose coordinates all this is; None: it is in those of the system.
     clock : tuple of float
         Rate and zero of the samples beside the inputs.
     references : mapping of str to sequence of Load
@@ -222,6 +222,13 @@ class Acting:
     clock: tuple[float, float] = (0.0, 0.0)
     references: Mapping[str, Sequence[Load]] = field(default_factory=dict)
     release: tuple[FloatArray, Release] | None = None
+    basis: FloatArray | None = None
+
+    def along(self, basis: FloatArray) -> "Acting":
+        """Return it in the coordinates of a basis (n + m, k)."""
+        release = None if self.release is None else (self.release[0] @ basis, self.release[1])
+        loads = [(row @ basis, course) for row, course in self.loads]
+        return replace(self, constant=self.constant @ basis, loads=loads, release=release, basis=basis)
 
     @property
     def sampled(self) -> FloatArray:
@@ -269,9 +276,9 @@ def order_of(quantity: Quantity) -> int:
     return quantity.moving.index(quantity) if quantity.moving else 0
 
 
-def shown_rows(rows: FloatArray, quantities: Sequence[Quantity]) -> list[Shown]:
+def shown_rows(rows: FloatArray, outputs: Sequence[tuple[str, Quantity]]) -> list[Shown]:
     """Return what sensors of displacements and their derivatives show at rows (C, n)."""
-    return [Shown(row, order_of(quantity)) for row, quantity in zip(rows, quantities, strict=True)]
+    return [Shown(row, order_of(quantity)) for row, (_, quantity) in zip(rows, outputs, strict=True)]
 
 
 def refined(trial: Trial, parts: int) -> Trial:

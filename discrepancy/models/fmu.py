@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -12,8 +13,8 @@ from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_ports import SAFE_TURN
-from discrepancy.models.fmu_runs import FmuRuns, Run, State
-from discrepancy.models.fmu_trials import FmuPatch, FmuTrials, sampled
+from discrepancy.models.fmu_runs import FmuRuns, State
+from discrepancy.models.fmu_trials import Asked, FmuPatch, FmuTrials, sampled
 from discrepancy.models.interface import (
     Conditions,
     Outputs,
@@ -26,12 +27,13 @@ from discrepancy.models.interface import (
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.port_system import PortSystem
 from discrepancy.models.questions import (
+    LoadChange,
+    check_carried,
     check_outputs,
     check_parameters,
     check_plain,
     laws_at,
     prior_mean,
-    sorted_patch,
 )
 from fe.runtime.motion import NO_LAWS
 from fe.runtime.patch import (
@@ -74,10 +76,11 @@ class FmuModel(DescribedModel):
         self.description: FmuModelDescription = description
         self.runs = FmuRuns(description, Path(folder))
         super().__init__(description, self.runs.quantities)
+        self.length = description.scales.length
         self._trials = FmuTrials(description, self.runs)
         self._check_settings()
         means = Conditions(np.array([item.mean for item in self.parameters]))
-        nominal = self._trials.state(_any_trial(TrialKind.RINGDOWN, 1.0), means, (), 0)
+        nominal = self._trials.state(Asked(_any_trial(TrialKind.RINGDOWN, 1.0), means))
         self.motion = FmuMotion(description, self.runs, nominal)
 
     @classmethod
@@ -137,24 +140,19 @@ class FmuModel(DescribedModel):
             return forces and description.inputs.bending_moment is not None
         return primitive in INTERNAL_FORCES and primitive is not StiffnessDrift and bool(description.port)
 
-    def stations(self) -> tuple[float, float] | None:
-        """Return 0 and the length [m] if the file states one, else None."""
-        length = self.description.scales.length
-        return None if length is None else (0.0, length)
-
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign: those of the file, else what the FMU shows."""
         given, conditions = self.description.scales, Conditions(prior_mean(campaign, self.declared))
         largest = np.zeros(len(self.ports()))
         for trial in campaign.trials:
             if trial.is_dynamic:
-                moved = self.motion.free(self._trials.run(trial, conditions, FmuPatch(), self.motion, 1))
+                moved = self.motion.free(self._trials.run(Asked(trial, conditions), self.motion, 1))
             else:
-                moved = self._at_rest_values(trial, replace(conditions, health=trial.health), FmuPatch())
+                moved = self._at_rest(Asked(trial, replace(conditions, health=trial.health)))
             largest = np.maximum(largest, np.max(np.abs(moved[:, self.motion.ports.x]), axis=0))
         stiffness, frequency = self._stiffness(campaign, conditions)
         forces = zip(self.motion.ports.forces, stiffness, strict=True)
-        pushed = [pair for force, pair in forces if force in self._trials.forces]
+        pushed = [pair for force, pair in forces if force in self._trials.forces.values()]
         modal, tip = (pushed or stiffness or [(1.0, 1.0)])[0]
         frequency = given.angular_frequency or frequency or 1.0
         return Scales(
@@ -176,17 +174,17 @@ class FmuModel(DescribedModel):
         given, ports = self.description.scales.angular_frequency, range(len(self.ports()))
         for trial in campaign.trials:
             if trial.is_dynamic:
-                state = self._trials.state(trial, conditions, (), 0)
+                state = self._trials.state(Asked(trial, conditions))
                 step = self.motion.step(trial, 1)
                 found = [self.motion.ports.stiffness(number, state, step) for number in ports]
                 return found, given or self.motion.measured_frequency(trial, state)
         still = campaign.trials[0] if campaign.trials else _any_trial(TrialKind.STATIC, 1.0)
-        state = self._trials.state(still, replace(conditions, health=still.health), (), 0)
+        state = self._trials.state(Asked(still, replace(conditions, health=still.health)))
         flexible = self.motion.flexibility(state)
         frequency, interval = given, 0.01
         for _ in range(0 if campaign.trials or given else 3):  # until the interval suits the frequency
             trial = _any_trial(TrialKind.RINGDOWN, interval)
-            state = self._trials.state(trial, conditions, (), 0)
+            state = self._trials.state(Asked(trial, conditions))
             frequency = self.motion.measured_frequency(trial, state)
             interval = 0.3 / frequency
         return [(1.0 / float(flexible[port, port]),) * 2 for port in ports], frequency
@@ -201,28 +199,19 @@ class FmuModel(DescribedModel):
         check_plain(trial, f"the FMU model {self.name!r}")
         check_parameters(f"The FMU model {self.name!r}", self.parameters, conditions.parameters)
         columns = self._columns(outputs)
-        parts = self._parts(patch)
+        asked = Asked(trial, conditions, self._parts(patch))
         if not trial.is_dynamic:
             if any(quantity.is_rate for _, quantity in outputs):
                 raise ModelError(
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )
-            return Response(self._at_rest_values(trial, conditions, parts)[:, columns])
-        return self._moving(trial, conditions, parts, columns, self._orders(outputs))
+            return Response(self._at_rest(asked)[:, columns])
+        return self._moving(asked, columns, self._orders(outputs))
 
-    def _moving(
-        self,
-        trial: Trial,
-        conditions: Conditions,
-        patch: FmuPatch,
-        columns: Sequence[int],
-        orders: Sequence[int],
-    ) -> Response:
+    def _moving(self, asked: Asked, columns: Sequence[int], orders: Sequence[int]) -> Response:
         """Return columns of the FMU's outputs at the samples of a dynamic trial, derived so many times."""
-
-        def excite(refined: int) -> Run:
-            return self._trials.run(trial, conditions, patch, self.motion, refined)
-
+        trial, conditions, patch = asked
+        excite = partial(self._trials.run, asked, self.motion)
         if len(patch.laws):
             values, step = self.motion.with_laws(patch.laws, excite, trial, conditions.refinement, columns)
         else:
@@ -242,8 +231,7 @@ class FmuModel(DescribedModel):
             If the FMU is not linear, or its answers to forces at the ports do not tell its system.
         """
         means = np.array([item.mean for item in self.declared])
-        settings = self._parts(self.patch).settings
-        base, found = (self._port_system(trial, values, settings) for values in (means, parameters))
+        base, found = (self._port_system(trial, values) for values in (means, parameters))
         if base is None or found is None or len(base.transition) != len(found.transition):
             raise ModelError(
                 f"The FMU model {self.name!r} does not tell by its answers to single forces how its ports "
@@ -252,12 +240,10 @@ class FmuModel(DescribedModel):
         shown = list(zip(self._columns(outputs), self._orders(outputs), strict=True))
         return found.in_state_of(base).ported(self.ports(), self.motion.ports.x, self.motion.ports.v, shown)
 
-    def _port_system(
-        self, trial: Trial, parameters: FloatArray, settings: tuple[tuple[str, float], ...]
-    ) -> PortSystem | None:
+    def _port_system(self, trial: Trial, parameters: FloatArray) -> PortSystem | None:
         """Return the system of the ports by steps so small that no mode turns by half a circle."""
         conditions = Conditions(parameters, health=trial.health[:1])
-        state = self._trials.state(trial, conditions, settings, 0)
+        state = self._trials.state(Asked(trial, conditions, self._parts(self.patch)))
         for refinement in FINER:
             step = self.motion.step(trial, refinement)
             found = self.motion.ports.system(state, step, len(trial.time)) if self.ports() else None
@@ -267,17 +253,18 @@ class FmuModel(DescribedModel):
 
     def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        parts = self._parts(self.patch)._replace(laws=NO_LAWS)
-        found = self._moving(trial, conditions, parts, self.motion.ports.x, [0] * len(self.ports()))
+        asked = Asked(trial, conditions, self._parts(self.patch)._replace(laws=NO_LAWS))
+        found = self._moving(asked, self.motion.ports.x, [0] * len(self.ports()))
         assert found.rates is not None  # of a motion there are
         return found.values, found.rates
 
     # ------------------------------------------------------------ rest
 
-    def _at_rest_values(self, trial: Trial, conditions: Conditions, patch: FmuPatch) -> FloatArray:
+    def _at_rest(self, asked: Asked) -> FloatArray:
         """Return all outputs (N, C) of a static trial or a flight."""
-        loads = self._trials.loads_at_rest(trial, patch, conditions)
-        states = [self._trials.state(trial, conditions, patch.settings, row) for row in range(len(loads))]
+        trial, _, patch = asked
+        loads = self._trials.loads_at_rest(asked)
+        states = [self._trials.state(asked, row) for row in range(len(loads))]
         if not len(patch.laws):
             return np.stack(
                 [self._rest(trial, row, *held) for row, held in enumerate(zip(states, loads, strict=True))]
@@ -296,11 +283,15 @@ class FmuModel(DescribedModel):
     def _parts(self, patch: ModelPatch) -> FmuPatch:
         """Return a patch by what is done with it; raises `ModelError` if the model cannot carry it."""
         effects, what = self.description.effects, f"The FMU model {self.name!r}"
-        own, forces, load, _ = sorted_patch(patch, self, what, effects)
+        check_carried(patch, self, what)
+        rest = ModelPatch(tuple(item for item in patch if item.kind not in effects))
+        load = LoadChange.of(rest)
         if load.along_chord and self.description.inputs.torque is None:
             raise ModelError(f"{what} names no torque in [inputs], so a load cannot move along the chord.")
         settings: dict[str, float] = {}
-        for item in own:
+        for item in patch:
+            if item.kind not in effects:
+                continue
             effect = f"effect.{effects[item.kind]}"
             if f"{effect}.active" in settings:
                 raise ModelError(
@@ -309,7 +300,7 @@ class FmuModel(DescribedModel):
                 )
             values = {key: value for key, value in item.to_mapping().items() if key != "kind"}
             settings |= {f"{effect}.{key}": float(value) for key, value in {"active": 1.0, **values}.items()}
-        laws = laws_at(forces, self.ports(), in_windows=False)
+        laws = laws_at(rest.of(*INTERNAL_FORCES), self.ports(), in_windows=False)
         return FmuPatch(laws, tuple(sorted(settings.items())), load)
 
     def _columns(self, outputs: Outputs) -> list[int]:

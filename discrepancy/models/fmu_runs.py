@@ -95,11 +95,11 @@ class FmuRuns:
     ----------
     columns : dict of str to int
         Column of each output of the description, and of `port.NAME.displacement` and `.velocity`.
+    asset : FmiAsset
+        The door to the FMU, for what it declares.
     input_factors : dict of str to float
         By which an `[[input]]` of the description is multiplied, by the FMU's name: revolutions in a minute
         stand for an angular velocity and have no unit that converts to rad/s.
-    step_count : int
-        Steps that have been asked of the FMU so far.
 
     Raises
     ------
@@ -112,13 +112,12 @@ class FmuRuns:
         self._path = folder / description.fmu
         self._assets = Memory(MOST_INSTANCES, end=FmiAsset.close)
         self._kept = Memory(KEPT_BYTES, lambda found: found.nbytes)
-        self.step_count = 0
         with self._refusals():
             file = binding_file(description, folder)
             self._base = None if file is None else load_binding(file)
             self._binding = self._made_binding()
-            self._first = FmiAsset(self._path, self._binding, isolated=description.isolated)
-        self._none = dict.fromkeys(self._first.binding.load, 0.0)
+            self.asset = FmiAsset(self._path, self._binding, isolated=description.isolated)
+        self._none = dict.fromkeys(self.asset.binding.load, 0.0)
 
     @contextmanager
     def _refusals(self) -> Iterator[None]:
@@ -150,7 +149,6 @@ class FmuRuns:
     def _made_binding(self) -> Binding:
         given, base = self._description, self._base
         wanted = given.inputs
-        inputs: dict[str, Input] = {}
         self.input_factors: dict[str, float] = {}
         units: dict[str | None, str] = {
             **dict.fromkeys(wanted.forces.values(), "N"),
@@ -166,10 +164,8 @@ class FmuRuns:
             turning = held.quantity is Quantity.ANGULAR_VELOCITY and unit in REVOLUTIONS
             self.input_factors[self.variable(driven)] = 30.0 / pi if turning else 1.0
             units[driven] = unit if turning or held.quantity is Quantity.SIGNAL else _si(held.quantity)
-        for name, unit in units.items():
-            if name is not None:
-                variable = self.variable(name)
-                inputs[variable] = Input(variable=variable, unit=unit)
+        named = ((self.variable(name), unit) for name, unit in units.items() if name is not None)
+        inputs = {variable: Input(variable=variable, unit=unit) for variable, unit in named}
         parameters = {
             key: Parameter(variable=item.variable, unit=item.unit, value=item.value)
             for key, item in (base.parameter if base is not None else {}).items()
@@ -233,11 +229,6 @@ class FmuRuns:
         found = read_fmu(self._path).variable(variable)
         return (found.unit if found is not None else None) or "1"
 
-    @property
-    def asset(self) -> FmiAsset:
-        """The door to the FMU, for what it declares."""
-        return self._first
-
     # ------------------------------------------------------------ running
 
     def remembered(self, key: Hashable, make: Callable[[], FloatArray]) -> FloatArray:
@@ -254,8 +245,7 @@ class FmuRuns:
         """Return the instance of a step size [s], as it was left."""
 
         def opened() -> FmiAsset:
-            header = self._binding.binding.model_copy(update={"step_size": step})
-            binding = self._binding.model_copy(update={"binding": header})
+            binding = self._binding.with_header(step_size=step)
             return FmiAsset(self._path, binding, isolated=self._description.isolated)
 
         return self._assets.get(step, opened)
@@ -321,19 +311,17 @@ class FmuRuns:
         self, asset: FmiAsset, histories: Mapping[str, FloatArray | float], steps: int
     ) -> FloatArray:
         """Return the outputs (steps, C) at the ends of steps, inputs held in each; raises `ModelError`."""
-        self.step_count += steps
         with self._refusals():
             return asset.simulate(load=histories, steps=steps).values
 
     def stepped(self, asset: FmiAsset, inputs: Mapping[str, float]) -> FloatArray:
         """Return the outputs (C,) after one step; `ModelError` if the FMU refuses."""
-        self.step_count += 1
         with self._refusals():
             return asset.step(load=inputs).values
 
     def input_limit(self, name: str) -> float:
         """Return the largest size that an input may have, both signs."""
-        low, high = self._first.input_range("load", self.variable(name))
+        low, high = self.asset.input_range("load", self.variable(name))
         return min(abs(low), abs(high))
 
 

@@ -50,6 +50,14 @@ class FmuPatch(NamedTuple):
     load: LoadChange = LoadChange()
 
 
+class Asked(NamedTuple):
+    """What is asked of the FMU: a trial, in conditions and under a patch."""
+
+    trial: Trial
+    conditions: Conditions
+    patch: FmuPatch = FmuPatch()
+
+
 class FmuTrials:
     """Trials in the names and units of an FMU.
 
@@ -59,23 +67,22 @@ class FmuTrials:
         The model's file.
     runs : FmuRuns
         Its FMU.
+
+    Attributes
+    ----------
+    forces : dict of str to str
+        The FMU's inputs of applied forces, by load place.
     """
 
     def __init__(self, description: FmuModelDescription, runs: FmuRuns) -> None:
         self._description, self._runs, self._name = description, runs, description.name
         self._keys = [runs.parameter(item.variable or item.name) for item in description.parameter]
-        self._forces = {place: runs.variable(name) for place, name in description.inputs.forces.items()}
+        self.forces = {place: runs.variable(name) for place, name in description.inputs.forces.items()}
         self._inputs = {item.name: runs.variable(item.variable or item.name) for item in description.input}
 
-    @property
-    def forces(self) -> tuple[str, ...]:
-        """The FMU's inputs of applied forces."""
-        return tuple(self._forces.values())
-
-    def run(
-        self, trial: Trial, conditions: Conditions, patch: FmuPatch, motion: FmuMotion, refinement: int
-    ) -> Run:
+    def run(self, asked: Asked, motion: FmuMotion, refinement: int) -> Run:
         """Return the run by which the FMU follows a dynamic trial."""
+        trial, conditions, _ = asked
         step = motion.step(trial, refinement)
         rate, zero = conditions.clock
         end = max((1.0 + rate) * float(trial.time[-1]) + zero, float(trial.time[-1]))
@@ -84,8 +91,8 @@ class FmuTrials:
         if trial.kind is TrialKind.RINGDOWN:
             loads = self._release(trial, conditions, motion)
         else:
-            loads = self._forced(trial, patch, step, steps)
-        return Run(self.state(trial, conditions, patch.settings, 0), step, steps, loads)
+            loads = self._forced(asked, step, steps)
+        return Run(self.state(asked), step, steps, loads)
 
     def _release(
         self, trial: Trial, conditions: Conditions, motion: FmuMotion
@@ -113,9 +120,8 @@ class FmuTrials:
             (Excitation("velocity"), unit * speed * float(first[1])),
         ]
 
-    def _forced(
-        self, trial: Trial, patch: FmuPatch, step: float, steps: int
-    ) -> list[tuple[Excitation, float]]:
+    def _forced(self, asked: Asked, step: float, steps: int) -> list[tuple[Excitation, float]]:
+        trial, _, patch = asked
         course = Course.of(trial.time, trial.force, trial.hold)
         begins, ends = course.ends(np.linspace(0.0, steps * step, steps + 1))
         held, first = 0.5 * (begins + ends), float(trial.force[0])
@@ -133,13 +139,13 @@ class FmuTrials:
         inputs = self._description.inputs
         moments = ((inputs.bending_moment, patch.load.along_span), (inputs.torque, patch.load.along_chord))
         what, where = f"the FMU model {self._name!r}", f"the trial {trial.name!r}"
-        place = place_among([*self._forces], trial.load_place, what, where)
+        place = place_among([*self.forces], trial.load_place, what, where)
         return [
-            (self._forces[place], 1.0),
+            (self.forces[place], 1.0),
             *((self._runs.variable(name), lever) for name, lever in moments if name is not None and lever),
         ]
 
-    def loads_at_rest(self, trial: Trial, patch: FmuPatch, conditions: Conditions) -> list[dict[str, float]]:
+    def loads_at_rest(self, asked: Asked) -> list[dict[str, float]]:
         """Return the inputs of each row of a static trial or a flight.
 
         Raises
@@ -147,6 +153,7 @@ class FmuTrials:
         ModelError
             If the FMU has no input for the load.
         """
+        trial, conditions, patch = asked
         inputs = self._description.inputs
         flight = trial.kind is TrialKind.FLIGHT
         if flight and inputs.load_factor is None:
@@ -182,11 +189,9 @@ class FmuTrials:
             found[variable] = self._runs.input_factors[variable] * (item.values + offset)
         return found
 
-    def state(
-        self, trial: Trial, conditions: Conditions, settings: tuple[tuple[str, float], ...], row: int
-    ) -> State:
+    def state(self, asked: Asked, row: int = 0) -> State:
         """Return parameters and constant inputs of a row of a trial."""
-        wanted = self._description.inputs
+        (trial, conditions, patch), wanted = asked, self._description.inputs
         inputs: dict[str, float] = {}
         health = conditions.health[min(row, len(conditions.health) - 1)]
         for name, value in ((wanted.z1, health[0]), (wanted.z2, health[1])):
@@ -200,7 +205,7 @@ class FmuTrials:
         parameters = {self._runs.parameter(name): value for name, value in table.parameters.items()}
         for key, value in zip(self._keys, conditions.parameters, strict=True):
             parameters[key] = float(value)
-        parameters |= dict(settings)
+        parameters |= dict(patch.settings)
         return State(tuple(sorted(parameters.items())), tuple(sorted(inputs.items())))
 
 

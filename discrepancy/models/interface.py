@@ -250,6 +250,12 @@ class Model(ABC):
         For people.
     parameters : tuple of ModelParameter
         Calibrated parameters.
+    quantities : mapping of str to Quantity
+        What each output is, by name.
+    port_names : tuple of str
+        See `ports`.
+    length : float or None
+        Largest station or characteristic length [m], if it has any.
     patch : ModelPatch
         What is added to every question: a known addition, or an effect that was found.
     follows_windows : bool
@@ -260,6 +266,9 @@ class Model(ABC):
 
     name: str
     parameters: tuple[ModelParameter, ...]
+    quantities: Mapping[str, Quantity] = MappingProxyType({})
+    port_names: tuple[str, ...] = ()
+    length: float | None = None
     patch: ModelPatch = NO_PATCH
     follows_windows: ClassVar[bool] = False
     shows_ports: ClassVar[bool] = False
@@ -272,9 +281,9 @@ class Model(ABC):
 
     # ------------------------------------------------------------ what each model says
 
-    @abstractmethod
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is, or None if the model has no such output."""
+        return self.quantities.get(output)
 
     @abstractmethod
     def supports(self, primitive: type[Primitive]) -> bool:
@@ -290,11 +299,11 @@ class Model(ABC):
 
     def ports(self) -> tuple[str, ...]:
         """Names of the ports where internal forces can act on one motion; user effects act at these."""
-        return ()
+        return self.port_names
 
     def stations(self) -> tuple[float, float] | None:
         """Return the least and largest station [m] along the structure, None if it has no length."""
-        return None
+        return None if self.length is None else (0.0, self.length)
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of the state at the begin of a trial; empty: it is never unknown."""

@@ -10,7 +10,7 @@ put right at every step. The wing, a structure on springs and a lumped rig are s
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.linalg import cho_factor, eigh, null_space
@@ -34,11 +34,81 @@ ROUNDING = 1e-10
 
 
 class Rest(NamedTuple):
-    """Displacements and states `values` (L, N) at rest, forces (L, J) and memory of the laws (None: none)."""
+    """Rest under L load levels.
 
-    values: FloatArray
+    Attributes
+    ----------
+    amounts, answers : (L, k), (k, N) ndarray
+        How much of each of k loads acts, and what a unit of each gives.
+    forces, flexible : (L, J), (J, N) ndarray
+        Of the laws, and what a unit of each gives.
+    memory : ndarray, optional
+        Of the laws; None: there are none.
+    """
+
+    amounts: FloatArray
+    answers: FloatArray
     forces: FloatArray
+    flexible: FloatArray
     memory: FloatArray | None
+
+    def seen(self, rows: FloatArray) -> FloatArray:
+        """Return what rows (C, N) show at each level, (L, C)."""
+        return np.asarray(self.amounts @ (self.answers @ rows.T) - self.forces @ (self.flexible @ rows.T))
+
+    @property
+    def values(self) -> FloatArray:
+        """Displacements and states (L, N)."""
+        return np.asarray(self.amounts @ self.answers - self.forces @ self.flexible)
+
+
+class Resting(Protocol):
+    """What has a rest under loads."""
+
+    def resting(self, loads: FloatArray) -> FloatArray:
+        """Return displacements and states (L, N) at rest under loads (L, N)."""
+
+
+def at_rest(
+    system: Resting,
+    units: FloatArray,
+    amounts: FloatArray,
+    laws: Laws,
+    rows: FloatArray,
+    memory: FloatArray | None = None,
+    before: FloatArray | None = None,
+    held: FloatArray | float = 0.0,
+) -> Rest:
+    """Return the rest under load levels that follow one another from zero.
+
+    Parameters
+    ----------
+    system : Resting
+        What is loaded.
+    units, amounts : (k, N), (L, k) ndarray
+        Loads, and how much of each acts at each level.
+    laws : Laws
+        Internal forces.
+    rows : (J, N) ndarray
+        By which they see and act.
+    memory, before : ndarray, optional
+        Of the laws, and the amounts (k,) where the first level is reached from; by default never loaded.
+    held : (N,) ndarray, optional
+        Where something holds the system.
+
+    Raises
+    ------
+    ModelError
+        If nothing holds the system, or a law takes more than it has.
+    """
+    found = system.resting(np.concatenate((units, rows)))
+    answers, flexible = found[: len(units)] + held, found[len(units) :]
+    if not len(laws):
+        return Rest(amounts, answers, np.zeros((len(amounts), 0)), flexible, None)
+    at_ports = answers @ rows.T
+    start = None if before is None else before @ at_ports
+    solution = solved(laws, amounts @ at_ports, rows @ flexible.T, memory, start)
+    return Rest(amounts, answers, solution.forces, flexible, solution.memory)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +135,12 @@ class LinearSystem:
         Rows whose motion is prescribed.
     actions : mapping of str to (N,) ndarray
         Rows along which laws at ports act, where that is not how they see.
+    basis : (K, N) ndarray, optional
+        A system of K unknowns is this times the N that are followed here; None: all are.
+    known : tuple of ((M,) ndarray, (N, M) ndarray, int), optional
+        Its modes, as `modes` returns them, where they need not be computed.
+    compliance : (N, N) ndarray, optional
+        K^-1, where it is known.
     """
 
     mass: FloatArray
@@ -77,6 +153,9 @@ class LinearSystem:
     states: int = 0
     drives: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     actions: Mapping[str, FloatArray] = field(default_factory=dict)
+    basis: FloatArray | None = None
+    known: tuple[FloatArray, FloatArray, int] | None = None
+    compliance: FloatArray | None = None
 
     @property
     def displacements(self) -> int:
@@ -99,8 +178,10 @@ class LinearSystem:
         return found
 
     @cached_property
-    def _modes(self) -> tuple[FloatArray, FloatArray, int]:
+    def modes(self) -> tuple[FloatArray, FloatArray, int]:
         """Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
+        if self.known is not None:
+            return self.known
         n, most = self.displacements, self.mode_count
         mass, stiffness = self.mass[:n, :n], 0.5 * (self.stiffness[:n, :n] + self.stiffness[:n, :n].T)
         free = np.eye(n)
@@ -132,17 +213,17 @@ class LinearSystem:
     @property
     def angular_frequency(self) -> FloatArray:
         """Angular frequencies (M,) [rad/s] of what is free, rising; zero for rigid motions and states."""
-        return self._modes[0]
+        return self.modes[0]
 
     @property
     def shapes(self) -> FloatArray:
         """Mass-normalised shapes (N, M) of what is free."""
-        return self._modes[1]
+        return self.modes[1]
 
     @property
     def moving(self) -> int:
         """How many of the coordinates are displacements; the others are states."""
-        return self._modes[2]
+        return self.modes[2]
 
     @property
     def truncated(self) -> bool:
@@ -162,7 +243,7 @@ class LinearSystem:
     @cached_property
     def free(self) -> CoupledModes:
         """What is free, with ports; what couples modes by rounding only does not."""
-        frequency, shapes, _ = self._modes
+        frequency, shapes, _ = self.modes
         damping, stiffness = (shapes.T @ matrix @ shapes for matrix in (self.damping, self.stiffness))
         diagonal, loose = np.diag(np.diag(damping)), self.mode_count is None
         if loose:
@@ -215,6 +296,8 @@ class LinearSystem:
 
     def flexibility(self, loads: FloatArray) -> FloatArray:
         """Return K^-1 loads, for loads (n,) or (n, k), of a structure that springs hold."""
+        if self.compliance is not None:
+            return np.asarray(self.compliance @ loads)
         # the LAPACK routine itself: checks of its arguments would take ten times as long
         solution, _ = dpotrs(self._factor[0], loads, lower=self._factor[1])
         return np.asarray(solution)
@@ -235,7 +318,7 @@ class LinearSystem:
         values = np.linalg.svd(matrix, compute_uv=False) if matrix.size else np.ones(1)
         return matrix, bool(values[-1] > LEAST_PIVOT * max(values[0], 1e-300))
 
-    def _resting(self, loads: FloatArray) -> FloatArray:
+    def resting(self, loads: FloatArray) -> FloatArray:
         """Return displacements and states (L, N) at rest under loads (L, N).
 
         Raises
@@ -257,46 +340,17 @@ class LinearSystem:
             )
         return np.asarray(found.T @ self.shapes.T)
 
-    def static(
-        self,
-        loads: FloatArray,
-        laws: Laws = NO_LAWS,
-        *,
-        drive: FloatArray | None = None,
-        memory: FloatArray | None = None,
-        before: FloatArray | None = None,
-    ) -> Rest:
-        """Return the rest under loads (L, N) that follow one another from zero.
+    def static(self, loads: FloatArray, laws: Laws = NO_LAWS, drive: FloatArray | None = None) -> Rest:
+        """Return the rest under loads (L, N) that follow one another from zero, see `at_rest`.
 
-        Parameters
-        ----------
-        loads : (L, N) ndarray
-            Levels.
-        laws : Laws
-            Internal forces; ports of states are at no position.
-        drive : (P,) ndarray, optional
-            Where the drives hold what they move.
-        memory, before : ndarray, optional
-            Of the laws, and the load (N,), where the first level is reached from; by default never loaded.
-
-        Raises
-        ------
-        ModelError
-            If nothing holds the system, or a law takes more than it has.
+        `drive` (P,) is where the drives hold what they move; ports of states are at no position.
         """
+        rows, held = self.port_rows(laws), np.zeros(len(self.mass))
+        rows[:, self.displacements :] = 0.0
         if drive is not None and len(drive):
             held = self.lift @ drive
-            linear = self._resting(loads - self.stiffness @ held) + held
-        else:
-            linear = self._resting(loads)
-        if not len(laws):
-            return Rest(linear, np.zeros((len(loads), 0)), None)
-        rows = self.port_rows(laws)
-        rows[:, self.displacements :] = 0.0
-        answer = self._resting(rows)
-        start = None if before is None else rows @ self._resting(before[None])[0]
-        solution = solved(laws, linear @ rows.T, rows @ answer.T, memory, start)
-        return Rest(linear - solution.forces @ answer, solution.forces, solution.memory)
+            loads = loads - self.stiffness @ held
+        return at_rest(self, loads, np.eye(len(loads)), laws, rows, held=held)
 
     # ------------------------------------------------------------ what acts, and what is seen
 

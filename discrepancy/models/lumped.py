@@ -6,33 +6,28 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import (
-    Conditions,
-    Outputs,
-    PortedSystem,
-    Response,
-    Scales,
-)
+from discrepancy.models.acting import Acting, Course, Drive, FormulaCourse, Load, Shown, order_of
+from discrepancy.models.interface import Conditions, Outputs, Place, Scales
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped
 from discrepancy.models.lumped_rig import LumpedRig
-from discrepancy.models.lumped_scales import lumped_scales, state_sizes
+from discrepancy.models.lumped_sections import InputSection
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
+from discrepancy.models.natural_scales import natural_scales, state_sizes
 from discrepancy.models.questions import (
     LoadChange,
-    SortedPatch,
-    check_lumped,
+    check_no_inputs,
     check_outputs,
-    check_parameters,
-    laws_at,
+    place_among,
     prior_mean,
-    sorted_patch,
+    release_of,
 )
+from discrepancy.models.second_order import SecondOrderSystem
+from discrepancy.models.system_model import Case, State, SystemModel
 from fe.runtime.laws import LAWS
-from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.patch import (
     INTERNAL_FORCES,
     SENSORS,
@@ -45,15 +40,18 @@ from fe.runtime.patch import (
     Primitive,
     RootCompliance,
     StiffnessDrift,
+    course_of,
 )
+from fe.runtime.state import Losses
 
+UNCHANGED = LoadChange()
 KEPT_RIGS = 128
 """Values of the parameters and structures that are remembered."""
 LEAST_STIFFNESS = 0.05
 """A temperature that leaves less than this share of the stiffness is refused."""
 
 
-class LumpedModel(DescribedModel):
+class LumpedModel(DescribedModel, SystemModel):
     """A lumped model (`discrepancy.models.interface.Model`).
 
     Parameters
@@ -70,8 +68,11 @@ class LumpedModel(DescribedModel):
     def __init__(self, description: LumpedDescription) -> None:
         self.description = description
         super().__init__(description, {item.name: item.quantity for item in description.output})
-        self._ports = {item.name: np.array(item.vector) for item in description.port}
+        self.displacements, self.length = description.size, description.characteristic_length
+        self.port_rows = {item.name: description.padded(item.vector) for item in description.port}
         self._stations = sorted(place.station for place in description.place)
+        self._inputs = {item.name: item for item in description.input}
+        self._outputs = {item.name: item for item in description.output}
         self._rigs = Memory(KEPT_RIGS)
 
     @classmethod
@@ -91,16 +92,15 @@ class LumpedModel(DescribedModel):
             RootCompliance: description.root is not None,
             LoadGain: True,
             LoadPlace: any(item.station_derivative is not None for item in description.input),
-            PortLoad: bool(self._ports),
+            PortLoad: bool(self.port_rows),
         }
         if primitive in carried:
             return carried[primitive]
         if primitive in LAWS and not primitive.of_speed:  # the position of a state's port means nothing
-            return bool(self._ports) and all(np.any(row[:n]) for row in self._ports.values())
-        return primitive in SENSORS or (primitive in INTERNAL_FORCES and bool(self._ports))
+            return bool(self.port_rows) and all(np.any(row[:n]) for row in self.port_rows.values())
+        return primitive in SENSORS or (primitive in INTERNAL_FORCES and bool(self.port_rows))
 
     follows_windows: ClassVar[bool] = True
-    shows_ports: ClassVar[bool] = True
 
     def stations(self) -> tuple[float, float] | None:
         """Return the least and largest station [m] of the places, None without places."""
@@ -108,91 +108,203 @@ class LumpedModel(DescribedModel):
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign."""
-        mean = prior_mean(campaign, self.declared)
-        return lumped_scales(self.rig(mean), mean, campaign, self.stations())
+        return natural_scales(self, campaign)
 
-    # ------------------------------------------------------------ response
+    # ------------------------------------------------------------ in a trial
 
-    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
-        """Return the response of a trial; `transverse` and `shear` are never known.
+    @property
+    def what(self) -> str:
+        """What it is called where a sentence begins."""
+        return f"The lumped model {self.name!r}"
 
-        The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
+    def check(self, trial: Trial) -> None:
+        """Refuse a flight, and a static trial under other inputs than a force."""
+        if trial.kind is TrialKind.FLIGHT:
+            raise ModelError(
+                f"The trial {trial.name!r} is a flight, but the lumped model {self.name!r} has no lift; "
+                "leave it out."
+            )
+        check_no_inputs(trial, f"the lumped model {self.name!r}")
+
+    def own_laws(self, parameters: FloatArray) -> ModelPatch:
+        """Return the laws of ports that it has as it is."""
+        return self.description.own_laws(self._factors(parameters))
+
+    def base(self, state: State, *, closed: bool = True) -> SecondOrderSystem:
+        """Return the rig without prescribed motions, with its controllers or without."""
+        return self.rig(state).system(closed=closed)
+
+    rest = base
+
+    def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
+        """Return the load (N,) at whose place stiffness and modal mass are the natural ones."""
+        places = [trial.load_place for trial in campaign.trials]
+        item = self._input_at(places[0]) if places else self.description.input[0]
+        return self._moved_row(self.rig(State(parameters)), item)
+
+    def loads(self, case: Case) -> tuple[FloatArray, FloatArray]:
+        """Return the loads (2, N) of a static trial, and how much of each (L, 2) acts in each row."""
+        rig, change, force = self.rig(case.state), LoadChange.of(case.patch), case.trial.force
+        row = self._moved_row(rig, self._input_at(case.trial.load_place), change)
+        amounts = np.column_stack((change.changed(force, force), np.ones(len(force))))
+        return np.stack((row, rig.constant)), amounts
+
+    def acting(self, case: Case) -> Acting:
+        """Return what acts in a dynamic trial.
+
+        Every motion that an input can prescribe and that the trial does not record is held at zero, if an
+        output is its reaction; else it is free.
+
+        Raises
+        ------
+        ModelError
+            If the trial records an input that the model does not have or that is of another quantity.
         """
-        check_lumped(trial, f"the lumped model {self.name!r}")
-        check_outputs(f"The lumped model {self.name!r}", self, outputs, self.quantities)
-        structure, forces, change, loads = self._parts(patch.in_trial(trial.name))
-        forces = self.description.own_laws(self._factors(conditions.parameters)) + forces
-        laws = laws_at(forces, self._ports)
-        if trial.kind is TrialKind.STATIC:
-            if loads or laws.spans:
-                raise ModelError(
-                    f"The trial {trial.name!r} has no time, which a law or a force in time asks for."
-                )
-            return self._static(trial, outputs, structure, laws, change, conditions)
-        rig = self.rig(conditions.parameters, structure, float(trial.temperature[0]))
-        motion = rig.moved(trial, conditions, laws, change, loads)
-        return motion.seen(rig.shown(outputs, motion.acting))
+        trial, conditions, patch, _ = case
+        rig, change, at_ports = self.rig(case.state), LoadChange.of(patch), patch.of(PortLoad)
+        if trial.kind is TrialKind.RINGDOWN:
+            self._check_released(trial, at_ports)
+            release = self._moved_row(rig, self._input_at(trial.load_place)), release_of(trial)
+            return Acting(
+                trial.time, rig.constant, initial=conditions.initial, clock=conditions.clock, release=release
+            )
+        recorded = self._recorded(trial)
+        loads, drives, references = list[Load](), dict[str, Drive](), dict[str, Sequence[Load]]()
+        offsets = (*conditions.offset, *(0.0,) * len(recorded))
+        for item, offset in zip(recorded, offsets, strict=False):
+            following = [loop for loop in rig.loops if loop.section.reference == item.name]
+            for loop in following:
+                references[loop.section.name] = loop.loads(trial, item, offset)
+                loads += references[loop.section.name]
+            if following:
+                continue
+            section = self._section(trial, item)
+            values = item.values + offset if offset else item.values
+            if section.quantity.moving:
+                if item.hold not in (None, Hold.SMOOTH):
+                    raise ModelError(
+                        f"The input {item.name!r} of the trial {trial.name!r} is a motion that "
+                        f"{self.name!r} prescribes, which no drive makes in steps or corners: leave "
+                        "`reference` and `hold` out."
+                    )
+                values = rig.factors.get(item.name, 1.0) * values
+                drives[item.name] = Drive.of(trial.time, values, order_of(item.quantity))
+                continue
+            if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
+                values = change.changed(values, item.values)
+            loads.append((self._moved_row(rig, section, change), Course.of(trial.time, values, item.hold)))
+        loads += [self._at_port(rig, item) for item in at_ports if isinstance(item, PortLoad)]
+        reactions = {item.reaction for item in self.description.output} - {item.name for item in recorded}
+        for name, section in self._inputs.items():
+            if section.quantity.moving and name in reactions:
+                drives[name] = Drive.of(trial.time, np.zeros(len(trial.time)))
+        return Acting(
+            trial.time, rig.constant, loads, drives, trial.begins, conditions.initial.ravel(),
+            conditions.clock, references,
+        )  # fmt: skip
 
-    def _static(
-        self,
-        trial: Trial,
-        outputs: Outputs,
-        structure: tuple[Primitive, ...],
-        laws: Laws,
-        change: LoadChange,
-        conditions: Conditions,
-    ) -> Response:
-        """Return what is shown at rest; levels of one temperature that follow one another go together."""
-        warm = trial.temperature if _coefficient(structure) else np.zeros(len(trial.force))
-        shown = self.rig(conditions.parameters, structure, float(warm[0])).shown(outputs)
-        rows, n = np.array([item.row for item in shown]), self.description.size
-        for (_, quantity), item in zip(outputs, shown, strict=True):
-            if quantity.is_rate and (item.further or np.any(item.row[:n])):
+    def _recorded(self, trial: Trial) -> tuple[RecordedInput, ...]:
+        """Return the recorded inputs of a trial; of one under a force this at its place."""
+        if trial.kind is TrialKind.DRIVEN:
+            return trial.inputs
+        item = self._input_at(trial.load_place)
+        return (RecordedInput(item.name, item.quantity, trial.force, trial.hold),)
+
+    def _input_at(self, place: Place) -> InputSection:
+        """Return the input of a load place; raises `ModelError` if there is none."""
+        forces = [name for name, item in self._inputs.items() if not item.quantity.moving]
+        known = [*self._inputs] if place in self._inputs else forces
+        return self._inputs[place_among(known, place, f"the lumped model {self.name!r}")]
+
+    def _moved_row(self, rig: LumpedRig, item: InputSection, change: LoadChange = UNCHANGED) -> FloatArray:
+        """Return the row (N,) along which an input acts, where its place has been moved to."""
+        row = np.array(item.vector)
+        if change.along_span or change.along_chord:
+            if item.station_derivative is None:
                 raise ModelError(
-                    f"The trial {trial.name!r} is static, but a channel measures velocity or acceleration."
+                    f"The input {item.name!r} of {self.name!r} declares no station_derivative, so its place "
+                    "cannot move."
                 )
-        values = np.empty((len(warm), len(shown)))
-        memory, before, start = None, None, 0
-        changes = (np.flatnonzero(np.diff(warm)) + 1).tolist() if warm.any() else []
-        for end in (*changes, len(warm)):
-            rig = self.rig(conditions.parameters, structure, float(warm[start]))
-            loads = rig.static_loads(trial, change)[start:end]
-            try:
-                found = rig.system().static(loads, laws, memory=memory, before=before)
-            except ModelError as cause:
-                raise ModelError(f"The trial {trial.name!r} is static, but {cause}") from cause
-            values[start:end] = found.values @ rows.T
-            memory, before, start = found.memory, loads[-1], end
-        return Response(values + [item.constant for item in shown])
+            row = row + change.along_span * np.array(item.station_derivative)
+            if item.chord_derivative is not None:
+                row = row + change.along_chord * np.array(item.chord_derivative)
+        return rig.along(row, item.through, item.name)
+
+    def _section(self, trial: Trial, item: RecordedInput) -> InputSection:
+        section = self._inputs.get(item.name)
+        if section is None:
+            raise ModelError(
+                f"The trial {trial.name!r} records the input {item.name!r}, which the lumped model "
+                f"{self.name!r} does not have; it has {', '.join(self._inputs) or 'none'}."
+            )
+        if item.quantity is not section.quantity and item.quantity not in section.quantity.moving:
+            raise ModelError(
+                f"The input {item.name!r} of the lumped model {self.name!r} is {section.quantity.value}, but "
+                f"the trial {trial.name!r} records {item.quantity.value}."
+            )
+        return section
+
+    def _check_released(self, trial: Trial, at_ports: ModelPatch) -> None:
+        """Refuse a ring-down that the model cannot begin."""
+        why = "which no force with a course in time can act on" if len(at_ports) else ""
+        if not self.description.is_plain:
+            why = f"which the lumped model {self.name!r} cannot begin: it is free, driven or has states"
+        if why:
+            raise ModelError(
+                f'The trial {trial.name!r} is a ring-down, {why}; say kind = "driven" and begins = "unknown".'
+            )
+
+    def _at_port(self, rig: LumpedRig, load: PortLoad) -> Load:
+        """Return the row and the course of a load at a port."""
+        rows = rig.system().acting_rows
+        if load.port not in rows:
+            raise ModelError(
+                f"A force acts at the port {load.port!r}, which {self.name!r} does not have; it has "
+                f"{', '.join(rows) or 'none'}."
+            )
+        spans = tuple(window.span for window in load.windows)
+        return rows[load.port], FormulaCourse(course_of(load.force, load.kind), spans)
+
+    def system(self, case: Case, acting: Acting, ports: tuple[str, ...]) -> SecondOrderSystem:
+        """Return the rig with the motions prescribed that the trial drives."""
+        return self.rig(case.state).system(tuple(acting.drives))
+
+    def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
+        """Return what each output shows under what acts; None: at rest."""
+        check_outputs(self.what, self, outputs, self.quantities)
+        drives, references = ({}, {}) if acting is None else (acting.drives, acting.references)
+        found, padded = [], self.description.padded
+        for name, quantity in outputs:
+            item = self._outputs[name]
+            further = 0 if quantity is item.quantity else quantity.derivatives_of(item.quantity)
+            if item.reaction is not None:
+                if item.reaction not in drives:
+                    raise ModelError(
+                        f"The output {name!r} of {self.name!r} is the reaction of {item.reaction!r}, whose "
+                        "motion this trial does not prescribe."
+                    )
+                found.append(Shown(padded(()), reaction=list(drives).index(item.reaction)))
+            elif item.controller is not None:
+                loops = {loop.section.name: loop for loop in self.rig(case.state).loops}
+                found.append(loops[item.controller].effort(references.get(item.controller, ())))
+            else:
+                row, order = padded(item.vector or ()), order_of(item.quantity) + further
+                found.append(Shown(row, order, further, constant=item.constant * (not further)))
+        return found
+
+    def _losses(self, trial: Trial, conditions: Conditions) -> list[Losses]:
+        return [()]
 
     @property
     def oscillates(self) -> bool:
         """Whether it has a mode that vibrates."""
-        return bool(np.any(self.rig(self._mean).system().angular_frequency > 0.0))
+        return bool(np.any(self.base(State(self._mean)).angular_frequency > 0.0))
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of the state at the begin of a driven or forced trial."""
-        mean = prior_mean(campaign, self.declared)
-        return state_sizes(self.rig(mean), campaign, trial, Conditions(mean))
+        return state_sizes(self, campaign, trial, Conditions(prior_mean(campaign, self.declared)))
 
     # ------------------------------------------------------------ ports
-
-    def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
-        """Return the system by which outputs see missing forces, in the modes of the prior means."""
-        warm, structure = float(trial.temperature[0]), self._parts(self.patch).structure
-        rig = self.rig(parameters, structure, warm)
-        acting = rig.acting(trial, Conditions(parameters))
-        base = self.rig(self._mean, structure, warm).system(tuple(acting.drives))
-        return rig.system(tuple(acting.drives)).seen_by(rig.shown(outputs, acting), base.shapes)
-
-    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
-        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        structure, _, change, loads = self._parts(self.patch.in_trial(trial.name))
-        rig = self.rig(conditions.parameters, structure, float(trial.temperature[0]))
-        motion = rig.moved(trial, conditions, NO_LAWS, change, loads)
-        rows = np.array(list(motion.system.ports.values())).reshape(-1, rig.width)
-        shapes = rows @ motion.system.all_shapes
-        return motion.q @ shapes.T, motion.velocity @ shapes.T
 
     @property
     def has_law(self) -> bool:
@@ -203,13 +315,13 @@ class LumpedModel(DescribedModel):
         """Return the linear model, and the laws that it has beside that, at the prior means."""
         linear, laws = super().apart()
         description = self.description.model_copy(update={"law": []})
-        own = self.description.own_laws(self._factors(self._mean))
-        return linear._changed(description=description, _rigs=Memory(KEPT_RIGS)), own + laws
+        linear = linear._changed(description=description, _rigs=Memory(KEPT_RIGS))
+        return linear, self.own_laws(self._mean) + laws
 
     def unit_of_state(self, port: str) -> str:
         """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""
         first = self.description.size
-        if not np.any(self._ports.get(port, np.zeros(0))[first:]):
+        if not np.any(self.port_rows.get(port, np.zeros(0))[first:]):
             return ""
         shown = {
             item.quantity for item in self.description.output if item.vector and any(item.vector[first:])
@@ -222,7 +334,7 @@ class LumpedModel(DescribedModel):
         It moves or turns as the unknowns do of which it is a sum or difference, and these as what is measured
         or prescribed of them.
         """
-        vector = self._ports.get(port)
+        vector = self.port_rows.get(port)
         if vector is None or not np.all(np.isin(vector, (-1.0, 0.0, 1.0))):
             return None
         told: dict[int, set[bool]] = {}
@@ -236,36 +348,25 @@ class LumpedModel(DescribedModel):
 
     # ------------------------------------------------------------ parts
 
-    def _parts(self, patch: ModelPatch) -> SortedPatch:
-        return sorted_patch(patch, self, f"The lumped model {self.name!r}")
-
-    @property
-    def _mean(self) -> FloatArray:
-        return np.array([item.mean for item in self.declared])
-
-    def rig(
-        self, parameters: FloatArray, structure: tuple[Primitive, ...] = (), temperature: float = 0.0
-    ) -> LumpedRig:
+    def rig(self, state: State) -> LumpedRig:
         """Return the model at values of the parameters and a temperature above the reference [K]."""
-        softening = _coefficient(structure) * temperature
+        parameters, _, structure, temperature = state
+        softening = temperature * sum(
+            (item.coefficient for item in structure if isinstance(item, ModulusTemperature)), 0.0
+        )
         if 1.0 - softening < LEAST_STIFFNESS:
             raise ModelError(
                 f"The temperature leaves {1.0 - softening:.2g} of the stiffness, which no structure has."
             )
         return self._rigs.get(
-            (parameters.tobytes(), structure, softening),
-            lambda: LumpedRig(self.description, self._factors(parameters), structure, softening),
+            (parameters.tobytes(), structure.primitives, softening),
+            lambda: LumpedRig(self.description, self._factors(parameters), structure.primitives, softening),
         )
 
     def _factors(self, parameters: FloatArray) -> dict[str, float]:
         """Return the factors of the terms at values of the parameters."""
-        check_parameters(f"The lumped model {self.name!r}", self.parameters, parameters)
         factors: dict[str, float] = {}
         for item, value in zip(self.description.parameter, parameters, strict=True):
             for term in item.scaled:
                 factors[term] = factors.get(term, 1.0) * float(value)
         return factors
-
-
-def _coefficient(structure: Sequence[Primitive]) -> float:
-    return sum((item.coefficient for item in structure if isinstance(item, ModulusTemperature)), 0.0)

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from discrepancy.campaign.records import FloatArray, Hold, RecordedInput, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course, Load, Shown
-from discrepancy.models.lumped_file import GAINS
+from discrepancy.models.lumped_file import GAINS, LumpedDescription
 from discrepancy.models.lumped_sections import ControllerSection
 
 
@@ -46,16 +46,13 @@ class Loop:
 
     def close(self, damping: FloatArray, stiffness: FloatArray) -> None:
         """Add the feedback to the matrices (N, N) of a rig."""
-        n = self.displacements
-        proportional, derivative, integral = self.gains
-        into = damping if self.of_speed else stiffness
-        into[:, :n] += proportional * np.outer(self.acts, self.sees[:n])
-        damping[:, n:] += proportional * np.outer(self.acts, self.sees[n:])
-        damping[:, :n] += derivative * np.outer(self.acts, self.sees[:n])
+        n, (row, speed) = self.displacements, self._gives
+        stiffness[:, :n] -= np.outer(self.acts, row[:n])
+        damping[:, n:] -= np.outer(self.acts, row[n:])
+        damping[:, :n] -= np.outer(self.acts, speed)
         if self.state is not None:
-            into[self.state, :n] += self.sees[:n]
+            (damping if self.of_speed else stiffness)[self.state, :n] += self.sees[:n]
             damping[self.state, n:] += self.sees[n:]
-            damping[:, self.state] -= integral * self.acts
 
     def loads(self, trial: Trial, item: RecordedInput, offset: float) -> list[Load]:
         """Return what a recorded reference does, as loads.
@@ -81,16 +78,21 @@ class Loop:
 
     def effort(self, loads: Sequence[Load]) -> Shown:
         """Return what it gives, from the `loads` of its reference (none where there is no reference)."""
-        n, row, speed = self.displacements, np.zeros(len(self.acts)), np.zeros(len(self.acts))
-        proportional, derivative, integral = self.gains
-        (speed if self.of_speed else row)[:n] -= proportional * self.sees[:n]
-        speed[:n] -= derivative * self.sees[:n]
-        row[n:] -= proportional * self.sees[n:]
-        if self.state is not None:
-            row[self.state] += integral
+        row, speed = self._gives
         along = self.acts / float(self.acts @ self.acts)
         courses = tuple((float(push @ along), course) for push, course in loads if push @ along != 0.0)
-        return Shown(row, speed=speed[:n], courses=courses)
+        return Shown(row, speed=speed, courses=courses)
+
+    @property
+    def _gives(self) -> tuple[FloatArray, FloatArray]:
+        """Rows (N,) of the unknowns and (n,) of the speeds that it gives without a reference."""
+        n, (proportional, derivative, integral) = self.displacements, self.gains
+        row, speed = -proportional * self.sees, -derivative * self.sees[:n]
+        if self.of_speed:
+            speed, row[:n] = speed + row[:n], 0.0
+        if self.state is not None:
+            row[self.state] += integral
+        return row, speed
 
 
 def _slope(course: Course, trial: Trial, section: ControllerSection) -> Course:
@@ -107,17 +109,14 @@ def _slope(course: Course, trial: Trial, section: ControllerSection) -> Course:
     return Course(course.time, np.append(slopes, slopes[-1]), Hold.ZERO_ORDER)
 
 
-def loops(
-    sections: Sequence[ControllerSection], size: int, states: int, factors: Mapping[str, float]
-) -> tuple[Loop, ...]:
-    """Return the controllers of a model with `size` displacements and `states` states of its own."""
-    width = size + states + sum(item.integral != 0.0 for item in sections)
-    found, next_state = [], size + states
-    for item in sections:
+def loops(description: LumpedDescription, factors: Mapping[str, float]) -> tuple[Loop, ...]:
+    """Return the controllers of a model; the integrals of their errors are its last unknowns."""
+    found, next_state = [], description.size + description.states
+    for item in description.controller:
         whole = factors.get(item.name, 1.0)
         gains = [whole * factors.get(f"{item.name}.{gain}", 1.0) * getattr(item, gain) for gain in GAINS]
         state = next_state if item.integral else None
         next_state += item.integral != 0.0
-        sees, acts = (np.pad(np.array(row), (0, width - size - states)) for row in (item.vector, item.acts))
-        found.append(Loop(item, (gains[0], gains[1], gains[2]), sees, acts, size, state))
+        sees, acts = description.padded(item.vector), description.padded(item.acts)
+        found.append(Loop(item, (gains[0], gains[1], gains[2]), sees, acts, description.size, state))
     return tuple(found)

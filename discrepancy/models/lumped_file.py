@@ -1,6 +1,6 @@
 """A lumped model as a TOML file: matrices, named vectors and calibrated parameters, checked strictly."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -95,6 +95,17 @@ class LumpedDescription(ModelDescription):
         return len(self.capacity)
 
     @cached_property
+    def width(self) -> int:
+        """Displacements, states, and the integrals of controllers."""
+        return self.size + self.states + sum(item.integral != 0.0 for item in self.controller)
+
+    def padded(self, row: Sequence[float] | FloatArray) -> FloatArray:
+        """Return a row of the file with the integrals of controllers after it."""
+        found = np.zeros(self.width)
+        found[: len(row)] = row
+        return found
+
+    @cached_property
     def is_plain(self) -> bool:
         """Whether it is a structure at rest on springs under one force at a time."""
         motion = any(item.quantity.moving or item.through for item in self.input)
@@ -135,9 +146,9 @@ class LumpedDescription(ModelDescription):
             raise ValueError("'damping' is missing")
         given = [(name, getattr(self, name)) for name in ("mass", "stiffness", "capacity", "conductance")]
         given.append(("damping.matrix", (self.damping and self.damping.matrix) or ()))
-        given += [(f"{kind} {part.name!r}", part.matrix) for kind in _PARTS for part in getattr(self, kind)]
+        given += [(f"{kind}_part {part.name!r}", part.matrix) for kind in KINDS for part in self.parts(kind)]
         for where, content in given:
-            count, reference = (m, "capacity") if where.startswith(_OF_STATES) else (n, "mass")
+            count, reference = (m, "capacity") if where.startswith(OF_STATES) else (n, "mass")
             needed = where == "conductance" and m and not self.conductance_part
             if content and not count:
                 raise ValueError(f"{where} is there, but {reference} is missing")
@@ -153,7 +164,7 @@ class LumpedDescription(ModelDescription):
             ("force_of_states", n, m), ("flow_of_speeds", m, n), ("flow_of_displacements", m, n),
         ):  # fmt: skip
             content = getattr(self.coupling, name)
-            if content is not None and np.atleast_2d(np.array(content)).shape != (rows, columns):
+            if content is not None and [len(row) for row in content] != [columns] * rows:
                 raise ValueError(f"coupling.{name} must be a {rows} x {columns} matrix by rows")
 
     def whole(self, name: str, factors: Mapping[str, float] = MappingProxyType({})) -> FloatArray:
@@ -163,9 +174,9 @@ class LumpedDescription(ModelDescription):
         """
         count = self.size if name in ("mass", "stiffness") else self.states
         base = getattr(self, name)
-        whole = matrix_of(base) if len(base) else np.zeros((count, count))
-        for part in getattr(self, f"{name}_part"):
-            whole = whole + factors.get(part.name, 1.0) * matrix_of(part.matrix)
+        whole = np.array(base) if len(base) else np.zeros((count, count))
+        for part in self.parts(name):
+            whole = whole + factors.get(part.name, 1.0) * np.array(part.matrix)
         return np.asarray(whole * factors.get(name, 1.0))
 
     def own_laws(self, factors: Mapping[str, float]) -> ModelPatch:
@@ -220,8 +231,7 @@ class LumpedDescription(ModelDescription):
         check_unique("input", [item.name for item in self.input])
         check_unique("input or reference", [*(item.name for item in self.input), *references])
         check_unique("place station", [f"{place.station:g}" for place in self.place])
-        kinds = ("mass", "stiffness", "damping", "capacity", "conductance")
-        check_unique("part", [*(part.name for kind in _PARTS for part in getattr(self, kind)), *kinds])
+        check_unique("part", [*(part.name for kind in KINDS for part in self.parts(kind)), *KINDS])
         named = (self.law,) if self.is_plain else (self.input, self.load, self.law, self.controller)
         gains = [f"{item.name}.{gain}" for item in self.controller for gain in GAINS]
         scaled = [*self.terms, *(item.name for items in named for item in items), *gains]
@@ -242,22 +252,23 @@ class LumpedDescription(ModelDescription):
             for term in parameter.scaled:
                 _check_known(f"parameter {parameter.name!r} scales", term, dict.fromkeys(scaled))
 
-    @property
-    def terms(self) -> dict[str, Matrix | None]:
-        """Matrices by what a parameter or `through` calls them; None for those that have parts."""
-        kinds = ("mass", "stiffness", "damping") if self.size else ()
-        found: dict[str, Matrix | None] = dict.fromkeys(
-            (*kinds, *(("capacity", "conductance") if self.states else ()))
-        )
-        for name in _PARTS:
-            found |= {part.name: part.matrix for part in getattr(self, name)}
+    def parts(self, kind: str) -> tuple[PartSection, ...]:
+        """Return the parts of the matrix of a kind."""
+        found: tuple[PartSection, ...] = getattr(self, f"{kind}_part")
         return found
 
+    @property
+    def terms(self) -> list[str]:
+        """Matrices and their parts by what a parameter or `through` calls them."""
+        kinds = (*(KINDS[:3] if self.size else ()), *(OF_STATES if self.states else ()))
+        return [*kinds, *(part.name for kind in KINDS for part in self.parts(kind))]
 
+
+KINDS = ("mass", "stiffness", "damping", "capacity", "conductance")
+"""Matrices of a lumped model; each can have parts."""
+OF_STATES = KINDS[3:]
 GAINS = ("proportional", "derivative", "integral")
 """Gains of a controller; NAME.proportional is what a parameter scales."""
-_PARTS = ("mass_part", "stiffness_part", "damping_part", "capacity_part", "conductance_part")
-_OF_STATES = ("capacity", "conductance")
 _LOOSE = (
     "; a structure that can float away has no static response: say `free = true` if it can, "
     "as a cart or a falling body"
@@ -272,26 +283,19 @@ def _check_known(what: str, name: str | None, known: Collection[str]) -> None:
 
 def _check_matrix(where: str, content: Matrix, count: int, reference: str) -> None:
     """Refuse a matrix of another size than the reference, that is not symmetric or feeds energy."""
-    lengths = {len(row) for row in content if isinstance(row, tuple)}
-    if len(content) != count or (lengths and lengths != {count}):
+    if [len(row) for row in content] != [count] * count:
         raise ValueError(
             f"{where} must be a {count} x {count} matrix (or {counted(count, 'diagonal value')}), as "
             f"{reference} has {counted(count, 'row')}"
         )
     if reference == "capacity" and where.startswith("conductance"):
         return
-    full = matrix_of(content)
+    full = np.array(content)
     size = float(np.max(np.abs(full)))
     if np.max(np.abs(full - full.T)) > 1e-9 * max(size, 1e-300):
         raise ValueError(f"{where} must be symmetric")
     if where.startswith("damping") and np.min(np.linalg.eigvalsh(full)) < -1e-9 * size:
         raise ValueError(f"{where} must not feed energy: it has a negative eigenvalue")
-
-
-def matrix_of(content: Matrix) -> FloatArray:
-    """Return a matrix from rows or from its diagonal."""
-    array = np.array(content, dtype=np.float64)
-    return np.diag(array) if array.ndim == 1 else array
 
 
 def parse_lumped(content: dict[str, Any], source: str = "the lumped model") -> LumpedDescription:

@@ -1,9 +1,11 @@
 """The tables of a lumped model's file: matrices, named vectors, laws, controllers and parameters."""
 
 from dataclasses import replace
+from functools import partial
 from math import isfinite
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from discrepancy.campaign.records import Quantity
@@ -22,26 +24,24 @@ from fe.runtime.patch import ModelPatch
 from reporting.section import shown
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
-
-
 def _numbers(value: object) -> tuple[float, ...]:
     """Return one number, or a list of them, as numbers: with one unknown nobody needs brackets."""
     found = value if isinstance(value, list | tuple) else (value,)
-    if not found or not all(_is_number(item) for item in found):
+    numbers = [isinstance(item, int | float) and not isinstance(item, bool) for item in found]
+    if not numbers or not all(numbers) or not all(map(isfinite, found)):
         raise ValueError(
             f"a list of finite numbers such as [1.0, 0.0] is expected, or one number, but {shown(value)} came"
         )
     return tuple(float(item) for item in found)
 
 
-def _matrix(value: object) -> tuple[tuple[float, ...], ...] | tuple[float, ...]:
-    """Return a matrix by rows, a diagonal, or one number as what it is."""
+def _rows(value: object, *, diagonal: bool = False) -> tuple[tuple[float, ...], ...]:
+    """Return a matrix by rows from these, from its `diagonal` or only row, or from one number."""
     try:
         if isinstance(value, list | tuple) and value and all(isinstance(row, list | tuple) for row in value):
             return tuple(map(_numbers, value))
-        return _numbers(value)
+        numbers = _numbers(value)
+        return tuple(map(tuple, np.diag(numbers).tolist())) if diagonal else (numbers,)
     except ValueError:
         raise ValueError(
             "a matrix of finite numbers by rows such as [[2.0, -1.0], [-1.0, 2.0]] is expected, or its "
@@ -50,7 +50,8 @@ def _matrix(value: object) -> tuple[tuple[float, ...], ...] | tuple[float, ...]:
 
 
 Vector = Annotated[tuple[Number, ...], BeforeValidator(_numbers)]
-Matrix = Annotated[tuple[tuple[Number, ...], ...] | tuple[Number, ...], BeforeValidator(_matrix)]
+Rows = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_rows)]
+Matrix = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(partial(_rows, diagonal=True))]
 
 
 Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
@@ -131,9 +132,9 @@ class LoadSection(NamedVector):
 class CouplingSection(Section):
     """`[coupling]` between n displacements and m states."""
 
-    force_of_states: Matrix | None = None
-    flow_of_speeds: Matrix | None = None
-    flow_of_displacements: Matrix | None = None
+    force_of_states: Rows | None = None
+    flow_of_speeds: Rows | None = None
+    flow_of_displacements: Rows | None = None
 
 
 class PortSection(NamedVector):

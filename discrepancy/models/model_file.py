@@ -72,15 +72,7 @@ class DescribedModel(Model):
     def __init__(self, description: ModelDescription, quantities: Mapping[str, Quantity]) -> None:
         self.name, self.quantities = description.name, quantities
         self.parameters = tuple(item.calibrated for item in description.parameter)
-        self._port_names = tuple(item.name for item in description.port)
-
-    def output_quantity(self, output: str) -> Quantity | None:
-        """Return what an output is, or None if the model has no such output."""
-        return self.quantities.get(output)
-
-    def ports(self) -> tuple[str, ...]:
-        """Names of the ports."""
-        return self._port_names
+        self.port_names = tuple(item.name for item in description.port)
 
 
 def check_unique(kind: str, names: list[str]) -> None:

@@ -15,8 +15,9 @@ from discrepancy.models.compiled_motion import law_functions
 from discrepancy.models.port_system import PortSystem
 from fe.compilation import callable_when_compiled, compiled
 from fe.runtime import laws
+from fe.runtime.arrays import IntArray
 from fe.runtime.motion import Laws
-from fe.runtime.motion_arrays import FIRST_PARTS, IntArray, Ports
+from fe.runtime.motion_arrays import FIRST_PARTS, Ports
 
 # ---------------------------------------------------------------- the laws, step by step
 

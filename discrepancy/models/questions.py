@@ -17,7 +17,6 @@ from fe.runtime.patch import (
     LoadPlace,
     ModelPatch,
     PortForce,
-    PortLoad,
     Primitive,
 )
 from reporting.words import counted
@@ -60,52 +59,13 @@ class LoadChange(NamedTuple):
         return np.asarray((1.0 + self.gain) * values + self.tare * (recorded != 0.0))
 
 
-class SortedPatch(NamedTuple):
-    """Structure (or what the model carries itself), internal forces, change of loads, loads at ports."""
-
-    structure: tuple[Primitive, ...]
-    forces: ModelPatch
-    change: LoadChange
-    loads: tuple[PortLoad, ...]
-
-
-def sorted_patch(patch: ModelPatch, model: Model, what: str, own: Collection[str] = ()) -> SortedPatch:
-    """Return the primitives of a patch by what they change; those of sensors are left out.
-
-    Parameters
-    ----------
-    patch : ModelPatch
-        The patch.
-    model : Model
-        Which shall carry it.
-    what : str
-        Its name in sentences.
-    own : collection of str
-        Kinds of primitives that it carries itself, whatever they change elsewhere.
-
-    Raises
-    ------
-    ModelError
-        If the model cannot carry one of them.
-    """
-    structure, forces, changes = list[Primitive](), list[Primitive](), list[Primitive]()
-    loads = list[PortLoad]()
+def check_carried(patch: ModelPatch, model: Model, what: str) -> None:
+    """Refuse a primitive that a model, `what`, cannot carry; those of sensors are not asked for."""
     for item in patch:
-        internal = isinstance(item, INTERNAL_FORCES)
-        if isinstance(item, SENSORS):
-            continue
-        if item.kind in own:
-            structure.append(item)
-        elif not (model.supports(type(item)) or (isinstance(item, PortForce) and item.port in model.ports())):
-            port = " (it has no port)" if internal and not model.ports() else ""
+        at_port = isinstance(item, PortForce) and item.port in model.ports()
+        if not (isinstance(item, SENSORS) or model.supports(type(item)) or at_port):
+            port = " (it has no port)" if isinstance(item, INTERNAL_FORCES) and not model.ports() else ""
             raise ModelError(f"{what} cannot carry the primitive {item.kind!r}{port}.")
-        elif internal:
-            forces.append(item)
-        elif isinstance(item, PortLoad):
-            loads.append(item)
-        else:
-            (changes if isinstance(item, LoadGain | LoadPlace) else structure).append(item)
-    return SortedPatch(tuple(structure), ModelPatch(tuple(forces)), LoadChange.of(changes), tuple(loads))
 
 
 def laws_at(forces: ModelPatch, ports: Collection[str], *, in_windows: bool = True) -> Laws:
@@ -173,13 +133,6 @@ def check_no_inputs(trial: Trial, what: str) -> None:
             f"The trial {trial.name!r} is static under the inputs {names}, which {what} does not have at "
             'rest: describe the asset as an FMU model with [[input]], or record the trial as "driven".'
         )
-
-
-def check_lumped(trial: Trial, what: str) -> None:
-    """Refuse a flight, and a static trial under other inputs than a force, for a model without either."""
-    if trial.kind is TrialKind.FLIGHT:
-        raise ModelError(f"The trial {trial.name!r} is a flight, but {what} has no lift; leave it out.")
-    check_no_inputs(trial, what)
 
 
 def check_plain(trial: Trial, what: str) -> None:

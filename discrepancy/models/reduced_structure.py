@@ -1,18 +1,19 @@
 """A structure from a mesh or matrices as a model: its reduced model, whose modes and statics are known."""
 
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Mapping
 
 import numpy as np
 from scipy.linalg import inv
 
 from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
+from discrepancy.models.acting import Acting, Shown, shown_rows
 from discrepancy.models.interface import ModelParameter, Outputs, Place
 from discrepancy.models.memory import Memory
 from discrepancy.models.questions import check_outputs, place_among
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.structural import Moving, State, StructuralModel
+from discrepancy.models.structural import StructuralModel
+from discrepancy.models.system_model import Case, State
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, ModelPatch, Primitive
 from fe.runtime.reduced import ReducedModel, ReducedState, dense_sum
 from fe.runtime.state import Losses
@@ -23,32 +24,6 @@ DEVIATION = 0.25
 """Standard deviation of a parameter whose calibration is not known, as a share of its range."""
 SAME = 1e-9
 """Difference of two rows, relative to the largest entry, that is rounding."""
-
-
-@dataclass(frozen=True, eq=False)
-class ReducedSystem(SecondOrderSystem):
-    """A structure in motion in the coordinates of `ReducedModel.at`, those of its modal and static bases.
-
-    Attributes
-    ----------
-    compliance : (n, n) ndarray
-        K^-1, in the static basis.
-    found : tuple of ndarray
-        Angular frequencies (M,) [rad/s] and shapes (n, M), in the modal basis.
-    """
-
-    compliance: FloatArray = field(kw_only=True)
-    found: tuple[FloatArray, FloatArray] = field(kw_only=True)
-
-    @cached_property
-    def _modes(self) -> tuple[FloatArray, FloatArray, int]:
-        return *self.found, len(self.found[0])
-
-    def flexibility(self, loads: FloatArray) -> FloatArray:
-        """Return K^-1 loads, for loads (n,) or (n, k)."""
-        return np.asarray(self.compliance @ loads)
-
-    solve = flexibility
 
 
 class StructureModel(StructuralModel):
@@ -71,13 +46,15 @@ class StructureModel(StructuralModel):
 
     def __init__(self, model: ReducedModel) -> None:
         nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
-        parameters = tuple(
-            ModelParameter(name, nominal[name], DEVIATION * (high - low), unit, low, high)
-            for names, unit in ((model.parameters, "1"), (model.masses, "kg"))
-            for name in names
-            for low, high in [model.validity[name]]
+        self.name, self.parameters = (
+            model.name,
+            tuple(
+                ModelParameter(name, nominal[name], DEVIATION * (high - low), unit, low, high)
+                for names, unit in ((model.parameters, "1"), (model.masses, "kg"))
+                for name in names
+                for low, high in [model.validity[name]]
+            ),
         )
-        super().__init__(model.name, parameters)
         self.model, self.regions = model, model.regions
         units = zip(model.controls, model.control_units.split(), strict=True)
         self.forces = tuple(name for name, unit in units if unit == "N")
@@ -95,63 +72,58 @@ class StructureModel(StructuralModel):
             (model.displacements, Quantity.DISPLACEMENT, displacements),
             (model.accelerations, Quantity.ACCELERATION, accelerations),
         )
-        self._outputs = {
-            name: (quantity, row)
-            for names, quantity, rows in named
-            for name, row in zip(names, rows, strict=True)
-        }
+        self.quantities = {name: quantity for names, quantity, _ in named for name in names}
+        self._rows = {name: row for names, _, rows in named for name, row in zip(names, rows, strict=True)}
         self._systems = Memory()
-        means = np.array([item.mean for item in parameters])
-        along = [self._load(means, **{force: 1.0}) for force in self.forces]
-        self.points = self.port_rows = {
+        means = np.array([item.mean for item in self.parameters])
+        along = [self._load(means, force) for force in self.forces]
+        self.port_rows = {
             name: row
             for push in along
             for name, row in zip(model.displacements, displacements, strict=True)
             if np.abs(row - push).max() <= SAME * np.abs(push).max()
         }
+        self.port_names = tuple(self.port_rows)
 
-    def _vector(self, parameters: FloatArray, losses: Losses) -> FloatArray:
-        model, vector = self.model, self.model.nominal.copy()
-        first = len(model.parameters)
-        vector[:first] = parameters[:first]
-        vector[first : first + len(losses)] = losses
-        masses = first + len(model.regions)
-        vector[masses : masses + len(model.masses)] = parameters[first:]
-        return vector
+    def _vector(
+        self, parameters: FloatArray, controls: Mapping[str, float], losses: Losses = ()
+    ) -> FloatArray:
+        names = (*self.model.parameters, *self.model.masses)
+        return self.model.vector({**dict(zip(names, parameters.tolist(), strict=True)), **controls}, losses)
 
-    def _load(self, parameters: FloatArray, **controls: float) -> FloatArray:
-        """Return what controls of given values add to the load (n,)."""
-        model = self.model
-        vector = self._vector(parameters, (0.0,) * len(model.regions))
-        vector[len(vector) - len(model.controls) :] = 0.0
-        without = model.load_coefficients(vector)
-        for name, value in controls.items():
-            vector[model.chosen.index(name)] = value
-        return np.asarray(model.rows[0] @ (model.load_coefficients(vector) - without))
+    def _load(self, parameters: FloatArray, control: str) -> FloatArray:
+        """Return what one of a control adds to the load (n,)."""
+        none = dict.fromkeys(self.model.controls, 0.0)
+        first, second = (
+            self.model.load_coefficients(self._vector(parameters, controls))
+            for controls in (none, {**none, control: 1.0})
+        )
+        return np.asarray(self.model.rows[0] @ (second - first))
 
-    def output_quantity(self, output: str) -> Quantity | None:
-        """Return what an output is, or None if there is no such output."""
-        return self._outputs[output][0] if output in self._outputs else None
+    def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
+        """Return what outputs show.
 
-    def output_rows(self, outputs: Outputs, component: int, losses: ModelPatch) -> FloatArray:
-        """Return the rows (C, n) of outputs; strains across gauges and in shear are not known.
+        Loads that always act shift what a motion shows.
 
         Raises
         ------
         ModelError
             If there is no such output, or it is of another quantity.
         """
-        if component:
-            raise ModelError(f"{self.name} does not tell strains across its gauges.")
-        known = (f"{name} ({quantity.value})" for name, (quantity, _) in self._outputs.items())
+        known = (f"{name} ({quantity.value})" for name, quantity in self.quantities.items())
         check_outputs(self.name, self, outputs, known)
         size = len(self.model.rows[0])
-        return np.array([self._outputs[output][1] for output, _ in outputs]).reshape(len(outputs), size)
+        rows = np.array([self._rows[output] for output, _ in outputs]).reshape(len(outputs), size)
+        found, always = shown_rows(rows, outputs), self.always(case.state.parameters)
+        if acting is None or always is None:
+            return found
+        still = self.rest(case.state).flexibility(always)
+        return [item._replace(constant=float(item.row @ still) * (item.order == 0)) for item in found]
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the structure can carry a primitive: sensors, laws at its ports, errors of its forces."""
         forces = primitive is LoadGain and bool(self.forces)
-        return primitive in SENSORS or forces or (primitive in INTERNAL_FORCES and bool(self.points))
+        return primitive in SENSORS or forces or (primitive in INTERNAL_FORCES and bool(self.port_names))
 
     def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
         """Return the load (n,) of 1 N of a force, or, where there is none, of the load factor.
@@ -162,7 +134,7 @@ class StructureModel(StructuralModel):
             If there is no such force, or none is named of several.
         """
         place = place_among(self.forces or (self.reference,), place, self.name)
-        return self._load(parameters, **{place: 1.0})
+        return self._load(parameters, place)
 
     def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
         """Return the loads (2, n) of the load factor and of its square, which is zero."""
@@ -170,21 +142,24 @@ class StructureModel(StructuralModel):
             raise ModelError(
                 f"The trial {trial.name!r} is a flight, but {self.name} has no control {LOAD_FACTOR}."
             )
-        row = self._load(parameters, **{LOAD_FACTOR: 1.0})
+        row = self._load(parameters, LOAD_FACTOR)
         return np.stack((row, np.zeros_like(row)))
 
     def always(self, parameters: FloatArray) -> FloatArray | None:
         """Return the load (n,) of constant loads and of controls that no trial records, if there is any."""
-        model = self.model
-        vector = self._vector(parameters, (0.0,) * len(model.regions))
-        for name in (*self.forces, LOAD_FACTOR):
-            if name in model.controls:
-                vector[model.chosen.index(name)] = 0.0
-        acting = model.load_coefficients(vector)
-        return np.asarray(model.rows[0] @ acting) if acting.any() else None
+        recorded = {name: 0.0 for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls}
+        acting = self.model.load_coefficients(self._vector(parameters, recorded))
+        return np.asarray(self.model.rows[0] @ acting) if acting.any() else None
 
-    def stiffness(self, state: State) -> ReducedSystem:
-        """Return the structure at parameters and losses.
+    def loads(self, case: Case) -> tuple[FloatArray, FloatArray]:
+        """Return the loads (k, n) of a trial at rest, and how much of each (L, k) acts in each row."""
+        units, amounts = super().loads(case)
+        if (always := self.always(case.state.parameters)) is None:
+            return units, amounts
+        return np.vstack((units, always)), np.column_stack((amounts, np.ones(len(amounts))))
+
+    def rest(self, state: State) -> SecondOrderSystem:
+        """Return the structure at parameters and losses, in the coordinates of `ReducedModel.at`.
 
         Raises
         ------
@@ -193,29 +168,25 @@ class StructureModel(StructuralModel):
         """
         parameters, losses, *_ = state
         key = parameters.tobytes(), losses
-        return self._systems.get(key, lambda: self._made(self._vector(parameters, losses)))
+        return self._systems.get(key, lambda: self._made(self._vector(parameters, {}, losses)))
 
-    def _made(self, vector: FloatArray) -> ReducedSystem:
+    def _made(self, vector: FloatArray) -> SecondOrderSystem:
         model, state = self.model, ReducedState(self.model, vector)
-        moving, size = model.modal_stiffness.shape[1], len(state.shapes)
-
-        def placed(part: FloatArray, begin: int) -> FloatArray:
-            whole = np.zeros((size, size))
-            whole[begin : begin + len(part), begin : begin + len(part)] = part
-            return whole
-
+        size, moving = len(state.shapes), model.modal_stiffness.shape[1]
         theta = model.stiffness_coefficients(vector)
-        mass, stiffness = (
-            placed(part, 0) for part in (state.modes.mass, dense_sum(theta, model.modal_stiffness))
-        )
+        mass, stiffness, compliance = np.zeros((3, size, size))
+        cross = dense_sum(model.mass_coefficients(vector), model.cross_mass)
+        mass[:moving, :moving], mass[:moving, moving:] = state.modes.mass, cross
+        mass[moving:, :moving] = cross.T
+        stiffness[:moving, :moving] = dense_sum(theta, model.modal_stiffness)
+        compliance[moving:, moving:] = inv(dense_sum(theta, model.static_stiffness))
         alpha, beta = model.damping
-        return ReducedSystem(
+        modes = 2.0 * np.pi * state.modes.frequency, np.ascontiguousarray(state.shapes), model.mode_count
+        return SecondOrderSystem(
             mass, alpha * mass + beta * stiffness, stiffness, self.port_rows, model.mode_count, float(beta),
-            compliance=placed(inv(dense_sum(theta, model.static_stiffness)), moving),
-            found=(2.0 * np.pi * state.modes.frequency, np.ascontiguousarray(state.shapes)),
+            known=modes, compliance=compliance,
         )  # fmt: skip
 
-    def moving(self, state: State, place: Place, ports: tuple[str, ...] = ()) -> Moving:
-        """Return the structure as it moves, in its own coordinates; errors as of `stiffness`."""
-        system = self.stiffness(state)
-        return Moving(np.eye(len(system.mass)), system)
+    def moving(self, state: State, place: Place, ports: tuple[str, ...] = ()) -> SecondOrderSystem:
+        """Return the structure as it moves; errors as of `rest`."""
+        return self.rest(state)

@@ -10,23 +10,14 @@ from functools import cached_property
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray, Hold, Quantity, Release, Start
-from discrepancy.campaign.sampling import is_even
+from discrepancy.campaign.records import FloatArray, Release, Start
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import SMOOTH_PARTS, Acting, Course, Shown, shown_rows
-from discrepancy.models.compiled_motion import Steps, compiled_kernel
-from discrepancy.models.interface import PortedSystem, Response
+from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown
+from discrepancy.models.compiled_motion import Steps
+from discrepancy.models.interface import Response
 from discrepancy.models.linear_system import LinearSystem, solved
-from discrepancy.models.stepwise import (
-    Begin,
-    Boundaries,
-    advance,
-    exact_steps,
-    exponentials,
-    free_motion,
-    substeps,
-)
-from fe.runtime.motion import Laws, ModalMotion, simulate
+from discrepancy.models.stepwise import Begin, Boundaries, advance, exact_steps, free_motion, substeps
+from fe.runtime.motion import Laws, ModalMotion
 
 
 @dataclass(frozen=True)
@@ -84,25 +75,23 @@ class Motion:
         found[: self.held] = 0.0
         return found
 
-    @cached_property
-    def _jerk(self) -> FloatArray:
-        if len(self.time) < 2:
-            return np.zeros_like(self.q)
-        return np.asarray(np.gradient(self.acceleration, self.time, axis=0))
-
     def derivative(self, order: int) -> FloatArray:
         """Return a derivative (N, M + P) of the modal coordinates, up to the third."""
         if order < 2:
             return (self.q, self.velocity)[order]
-        return self.acceleration if order == 2 else self._jerk
+        if order == 2:
+            return self.acceleration
+        if len(self.time) < 2:
+            return np.zeros_like(self.q)
+        return np.asarray(np.gradient(self.acceleration, self.time, axis=0))
 
-    def values(self, rows: FloatArray) -> FloatArray:
-        """Return row . u and row . x (N, C) of rows (C, n + m)."""
-        n, shapes = self.system.displacements, self.system.all_shapes
-        found = self.q @ (rows[:, :n] @ shapes[:n]).T
-        if self.system.states:
-            found += self.velocity @ (rows[:, n:] @ shapes[n:]).T
-        return found + self._left_out(rows) if self.system.truncated else np.asarray(found)
+    @property
+    def at_ports(self) -> tuple[FloatArray, FloatArray]:
+        """Positions and speeds (N, P) of the ports; that of a state is its integral."""
+        rows = np.array(list(self.system.ports.values())).reshape(-1, len(self.system.mass))
+        shapes = (rows @ self.system.all_shapes).T
+        still = self._left_out(rows) if self.system.truncated else 0.0
+        return self.q @ shapes + still, self.velocity @ shapes
 
     def _left_out(self, rows: FloatArray) -> FloatArray:
         """Return what omitted modes add to row . u (N, C).
@@ -122,10 +111,6 @@ class Motion:
             fading = np.exp(-np.maximum(self.time[:count], 0.0) / lag)
             found[:count] += np.outer(fading, self.holding @ residual)
         return found
-
-    def response(self, rows: FloatArray, quantities: Sequence[Quantity]) -> Response:
-        """Return what sensors at rows (C, n) show, and the rates; see `seen`."""
-        return self.seen(shown_rows(rows, quantities))
 
     def seen(self, shown: Sequence[Shown]) -> Response:
         """Return what outputs show, and the rates; omitted modes are in what is not derived only."""
@@ -158,6 +143,8 @@ class Motion:
 
 LEAST_PARTICIPATION = 0.03
 """A mode that moves the release point less than this share of the most moving one is scaled by the share."""
+INSTANT = 1e-6
+"""Duration of the step after a record that has one sample [s]."""
 LEAST_LEAD = 1e-9
 """A first sample that is later than the begin by less than this share of the record is at the begin."""
 
@@ -219,12 +206,6 @@ class SecondOrderSystem(LinearSystem):
             parts = [np.vstack((np.tile(first, (held, 1)), part)) for first, part in still]
         q, v, forces, lagged = parts
         return Motion(self, acting, times, q, v, forces, lagged, laws, held, holding)
-
-    def ported(
-        self, rows: FloatArray, quantities: Sequence[Quantity], shapes: FloatArray | None = None
-    ) -> PortedSystem:
-        """Return the system that outputs at rows (C, n) see missing forces by, in given shapes (n, M)."""
-        return self.seen_by(shown_rows(rows, quantities), self.shapes if shapes is None else shapes)
 
     # ------------------------------------------------------------ begin
 
@@ -299,7 +280,7 @@ class SecondOrderSystem(LinearSystem):
 
     def _backwards(self, q: FloatArray, v: FloatArray, duration: float) -> Begin:
         """Return the state a duration [s] earlier, without internal forces."""
-        step = exponentials(self.free, np.array([duration]))[0][0]
+        step = exact_steps(self.free, np.array([duration]))[0][0]
         state = np.linalg.solve(step, np.concatenate((q, v)))
         return Begin(state[: len(q)], state[len(q) :])
 
@@ -324,53 +305,38 @@ class SecondOrderSystem(LinearSystem):
         self, acting: Acting, laws: Laws, stamps: FloatArray, begin: Begin, refinement: int
     ) -> ModalMotion:
         """Return the motion at stamps from a state at the first of them."""
-        q, v, memory = begin
-        shapes, rows = self.shapes, self.port_rows(laws)
-        if self._is_plain(acting, laws) and (len(stamps) == 1 or is_even(stamps)):
-            force, shape, feed = np.zeros(len(stamps)), np.zeros(len(q)), np.zeros((2, len(laws)))
-            for row, course in acting.loads:
-                force, shape = course.at(stamps), row @ shapes
-                if self.truncated and len(laws):
-                    feed[0] = rows @ self.residual(row)
-            return simulate(
-                self.modal, laws, q=q, v=v, memory=memory, force=force, shape=shape, feed=feed,
-                interval=float(stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1) or 1.0,
-                start=float(stamps[0]), refinement=refinement, kernel=compiled_kernel(),
-            )  # fmt: skip
+        if len(stamps) == 1:  # a step that nobody looks at
+            found = self._advanced(acting, laws, stamps[0] + np.array([0.0, INSTANT]), begin, refinement)
+            return ModalMotion(*(part if part is found.memory else part[:1] for part in found))
         smooth = bool(acting.drives) or any(course.is_smooth for _, course in acting.loads)
         edges = (*laws.edges, *(moment for _, course in acting.loads for moment in course.edges))
         boundaries = substeps(self.modal, laws, stamps, refinement, SMOOTH_PARTS if smooth else 1, edges)
         feed = np.zeros((len(boundaries.time), len(laws)))
         if self.truncated and len(laws) and acting.loads:
-            feed = acting.load_at(boundaries.time, self.residual(rows.T))
+            feed = acting.load_at(boundaries.time, self.residual(self.port_rows(laws).T))
         return advance(self.modal, laws, self._steps(acting, boundaries, feed), begin)
-
-    def _is_plain(self, acting: Acting, laws: Laws) -> bool:
-        """Whether one force at most acts, straight between its samples, on modes that any steps suit."""
-        return (
-            self.mode_count is not None
-            and not laws.spans
-            and len(acting.loads) < 2
-            and all(isinstance(load, Course) and load.hold is Hold.LINEAR for _, load in acting.loads)
-        )
 
     def _steps(self, acting: Acting, boundaries: Boundaries, feed: FloatArray) -> Steps:
         """Return the steps of all coordinates; the drives follow from nothing but what is prescribed."""
         begin, end = self._modal_forces(acting, boundaries)
-        exact, time = exact_steps(self.free, boundaries), boundaries.time
+        (lengths, which), time = boundaries.alike, boundaries.time
+        exact, *by = exact_steps(self.free, lengths)
         count, whole = len(self.angular_frequency), begin.shape[1]
-        transition, push = exact.transition, exact.push(begin[:, :count], end[:, :count])
-        if acting.drives:
-            at, moved = np.r_[0:count, whole : whole + count], push
-            transition, push = (
-                np.zeros((len(transition), 2 * whole, 2 * whole)),
-                np.zeros((len(push), 2 * whole)),
-            )
-            transition[:, at[:, None], at], push[:, at] = exact.transition, moved
+        moved = sum(
+            forces @ part[0].T if len(lengths) == 1 else np.einsum("knm,km->kn", part[which], forces)
+            for part, forces in zip(by, (begin[:, :count], end[:, :count]), strict=True)
+        )
+        transition, push = np.zeros((len(exact), 2, whole, 2, whole)), np.zeros((len(begin), 2, whole))
+        transition[:, :, :count, :, :count] = exact.reshape(len(exact), 2, count, 2, count)
+        push[..., :count] = moved.reshape(len(push), 2, count)
         for number, drive in enumerate(acting.drives.values()):
-            for first, order in ((count, 0), (whole + count, 1)):
-                push[:, first + number] = self.heaviness * drive.at(time[1:], order)
-        return Steps(transition, exact.length, exact.which, push, begin, end, feed, time, boundaries.sample)
+            for order in range(2):
+                push[:, order, count + number] = self.heaviness * drive.at(time[1:], order)
+        size = 2 * whole
+        return Steps(
+            transition.reshape(-1, size, size), lengths, which, push.reshape(-1, size), begin, end, feed,
+            time, boundaries.sample,
+        )  # fmt: skip
 
     def _modal_forces(self, acting: Acting, boundaries: Boundaries) -> tuple[FloatArray, FloatArray]:
         """Return the modal forces (K, M + P) at both ends of each step, those of splines made good for it.

@@ -19,8 +19,6 @@ from fe.runtime.sensors import (
     uses_sensors,
 )
 
-__all__ = ["observe", "observe_response", "record_of", "uses_sensors"]
-
 
 def observe(
     model: Model,

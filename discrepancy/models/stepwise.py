@@ -70,48 +70,11 @@ class CoupledModes(ModalSystem):
         return np.asarray(found[found > 1e-7 * np.max(found, initial=0.0)])
 
 
-@dataclass(frozen=True)
-class ExactSteps:
-    """Exact steps of a linear structure under modal forces that are linear in time within each step.
-
-    Attributes
-    ----------
-    length : (S,) ndarray
-        Distinct lengths [s].
-    which : (K,) ndarray of int
-        That of each step.
-    transition : (S, 2M, 2M) ndarray
-        Of (q, v).
-    begin, end : (S, 2M, M) ndarray
-        By the modal forces at the begin and at the end of a step.
-    """
-
-    length: FloatArray
-    which: IntArray
-    transition: FloatArray
-    begin: FloatArray
-    end: FloatArray
-
-    def push(self, begin: FloatArray, end: FloatArray) -> FloatArray:
-        """Return what modal forces (K, M) at both ends of the steps add to (q, v), (K, 2M)."""
-        if len(self.length) == 1:
-            return np.asarray(begin @ self.begin[0].T + end @ self.end[0].T)
-        return np.asarray(
-            np.einsum("knm,km->kn", self.begin[self.which], begin)
-            + np.einsum("knm,km->kn", self.end[self.which], end)
-        )
-
-
-def exact_steps(system: CoupledModes, boundaries: "Boundaries") -> ExactSteps:
-    """Return the exact steps between boundaries."""
-    lengths, which = boundaries.alike
-    key = (system.whole.tobytes(), system.damping.tobytes(), lengths.tobytes())
-    return ExactSteps(lengths, which, *_kept.get(key, lambda: exponentials(system, lengths)))
-
-
-def exponentials(system: CoupledModes, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return transitions (S, 2M, 2M) and the parts of the force at both ends (S, 2M, M), of lengths [s]."""
-    return exact_step(system.whole if system.coupled else system.stiffness, system.damping, lengths)
+def exact_steps(system: CoupledModes, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what `exact_step` does: transitions (S, 2M, 2M), and the parts of the forces (S, 2M, M)."""
+    matrix = system.whole if system.coupled else system.stiffness
+    key = (matrix.tobytes(), system.damping.tobytes(), lengths.tobytes())
+    return _kept.get(key, lambda: exact_step(matrix, system.damping, lengths))
 
 
 @dataclass(frozen=True)

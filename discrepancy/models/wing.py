@@ -13,11 +13,13 @@ from calibration.result.file import load_calibration
 from calibration.result.record import STATE
 from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
+from discrepancy.models.acting import Acting, Shown, shown_rows
 from discrepancy.models.interface import ModelParameter, Outputs, Place, PortScale
 from discrepancy.models.memory import Memory
 from discrepancy.models.questions import check_outputs
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.structural import Moving, State, StructuralModel
+from discrepancy.models.structural import StructuralModel
+from discrepancy.models.system_model import Case, State
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import (
@@ -50,13 +52,15 @@ paper, its masses, and the damping of the joint posterior, whose spread holds th
 
 
 ROTATING_PORT = "root"
+KEPT_ANSWERS = 16
+"""Sets of loads whose displacements are kept with a stiffness."""
 
 
 class Stiffness:
     """Factorised stiffness (n, n) of the wing in one state."""
 
     def __init__(self, matrix: FloatArray) -> None:
-        self.matrix = matrix
+        self.matrix, self._answers = matrix, Memory(KEPT_ANSWERS)
         try:
             self._factor = cho_factor(matrix, lower=True, check_finite=False)
         except np.linalg.LinAlgError as cause:
@@ -67,6 +71,10 @@ class Stiffness:
     def solve(self, loads: FloatArray) -> FloatArray:
         """Return K^-1 loads, (n,) or (n, k)."""
         return np.asarray(cho_solve(self._factor, loads, check_finite=False))
+
+    def resting(self, loads: FloatArray) -> FloatArray:
+        """Return the displacements (L, n) at rest under loads (L, n)."""
+        return self._answers.get(loads.tobytes(), lambda: self.solve(loads.T).T)
 
 
 class WingModel(StructuralModel):
@@ -91,6 +99,7 @@ class WingModel(StructuralModel):
     """
 
     missing = STATION_PORTS
+    components = 3
     reference = LOAD_PLACE
 
     def __init__(
@@ -104,13 +113,15 @@ class WingModel(StructuralModel):
         self.wing = wing = PatchedWing(arrays)
         prior = prior or SHIPPED_PRIOR
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
-        parameters = tuple(
-            ModelParameter(item.name, item.mean, item.deviation, item.unit, item.low, item.high)
-            for item in wing_priors(box, **prior)
+        self.name, self.parameters = (
+            name,
+            tuple(
+                ModelParameter(item.name, item.mean, item.deviation, item.unit, item.low, item.high)
+                for item in wing_priors(box, **prior)
+            ),
         )
-        super().__init__(name, parameters)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
-        self.points = {port: wing.port_rows[port] for port in PORTS}
+        self.port_names = tuple(PORTS)
         self._stiffnesses, self._systems, self._rows = Memory(), Memory(), Memory()
 
     @classmethod
@@ -158,8 +169,8 @@ class WingModel(StructuralModel):
             return None
         return Quantity.STRAIN if output.startswith("strain") else Quantity.DISPLACEMENT
 
-    def output_rows(self, outputs: Outputs, component: int, losses: ModelPatch) -> FloatArray:
-        """Return the rows (C, n) of outputs; `component` 1 and 2: transverse and shear strain.
+    def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
+        """Return what outputs show; `component` 1 and 2: transverse and shear strain.
 
         Raises
         ------
@@ -167,13 +178,13 @@ class WingModel(StructuralModel):
             If there is no such output, or it is of another quantity.
         """
         rows = self._rows.get((outputs, component), lambda: self._made_rows(outputs, component))
-        factors = self.wing.strain_factors(losses)
-        if factors is None:
-            return rows
-        gauges = self._rows.get(
-            (outputs, "gauges"), lambda: np.array([strain_gauge(output) for output, _ in outputs])
-        )
-        return rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
+        factors = self.wing.strain_factors(case.patch.of(LocalStiffnessLoss))
+        if factors is not None:
+            gauges = self._rows.get(
+                (outputs, "gauges"), lambda: np.array([strain_gauge(output) for output, _ in outputs])
+            )
+            rows = rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
+        return shown_rows(rows if acting is None or acting.basis is None else rows @ acting.basis, outputs)
 
     def _made_rows(self, outputs: Outputs, component: int) -> FloatArray:
         places = f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction"
@@ -213,28 +224,29 @@ class WingModel(StructuralModel):
 
     # ------------------------------------------------------------ structure
 
-    def stiffness(self, state: State) -> Stiffness:
+    def rest(self, state: State) -> Stiffness:
         """Return the stiffness in a state."""
         factor = float(state.parameters[0])
         return self._stiffnesses.get(
             _stiffness_key(state), lambda: Stiffness(self.wing.stiffness(factor, *state[1:]))
         )
 
-    def moving(self, state: State, place: Place, ports: tuple[str, ...] = ()) -> Moving:
+    def moving(self, state: State, place: Place, ports: tuple[str, ...] = ()) -> SecondOrderSystem:
         """Return the wing as it moves when released from, or pushed at, a place, with forces at `ports`."""
         masses, held = state.structure.of(PointMass), self.wing.held_ports(ports)
 
-        def make() -> Moving:
+        def make() -> SecondOrderSystem:
             _, servo, pitot, alpha, beta = state.parameters.tolist()
-            stiffness, mass = self.stiffness(state), self.wing.mass(servo, pitot, masses)
+            stiffness, mass = self.rest(state), self.wing.mass(servo, pitot, masses)
             still = stiffness.solve(np.vstack((self.wing.force_row(place), *held.values())).T)
             basis = motion_basis(stiffness.solve, mass, self.wing.arrays.start_shapes, still)
             small_mass, small = basis.T @ mass @ basis, basis.T @ stiffness.matrix @ basis
             small_mass, small = 0.5 * (small_mass + small_mass.T), 0.5 * (small + small.T)
             rows = {port: row @ basis for port, row in held.items()}
             damping = alpha * small_mass + beta * small
-            system = SecondOrderSystem(small_mass, damping, small, rows, MODE_COUNT, beta, ON_MODES)
-            return Moving(basis, system)
+            return SecondOrderSystem(
+                small_mass, damping, small, rows, MODE_COUNT, beta, ON_MODES, basis=basis
+            )
 
         further = (masses.primitives, state.parameters[1:].tobytes(), place, tuple(held))
         return self._systems.get((_stiffness_key(state), further), make)

@@ -8,7 +8,7 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.entry import Effect
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
-from discrepancy.report.text import SAID, number, unit_text
+from discrepancy.report.text import WORDS, number, unit_text
 from reporting.words import listing
 
 HEADINGS = (
@@ -80,9 +80,9 @@ def group_lines(found: Separability, told: str = "the table says to which") -> l
     """Return one sentence for each confusion group, or one that there is none; `told`: where to look."""
     seen = [item for item in found.detectability if not item.reason and isfinite(item.detectable)]
     if not found.identifiers or not any(item.parameter and item.distance > 0.0 for item in seen):
-        return [SAID["nothing_shown"]]
+        return [WORDS.say("nothing_shown")]
     if not found.groups:
-        return [SAID["all_apart"]]
+        return [WORDS.say("all_apart")]
     lines = []
     for group in found.groups:
         names = [name.replace("_", " ") for name in group]
@@ -105,7 +105,7 @@ def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) ->
         apart = [kind for kind in TrialKind if kind in union - common and kind not in there]
         names = listing(name.replace("_", " ") for name in group)
         kinds = " or ".join(_KIND_WORDS[kind] for kind in apart)
-        lines.append(SAID["add_kinds" if apart else "vary"].format(names=names, kinds=kinds))
+        lines.append(WORDS.say("add_kinds" if apart else "vary", names=names, kinds=kinds))
     hidden = [
         item
         for item in found.detectability
@@ -115,9 +115,8 @@ def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) ->
         first = max(hidden, key=lambda item: item.distance)
         factor = (DETECTED / first.distance) ** 0.5 if first.distance > 0.0 else float("inf")
         unseen = [item.effect.identifier.replace("_", " ") for item in hidden]
-        told = SAID["unseen" if unseen[1:] else "unseen_one"]
-        name = first.effect.identifier.replace("_", " ")
-        lines.append(told.format(unseen=listing(unseen), first=name, factor=factor, trials=factor**2))
+        values = {"first": first.effect.identifier.replace("_", " "), "factor": factor, "trials": factor**2}
+        lines.append(WORDS.say("unseen" if unseen[1:] else "unseen_one", unseen=listing(unseen), **values))
     unknown = [name for name, channel in campaign.channels.items() if channel.noise is None]
-    lines += [SAID["give_noise"].format(names=", ".join(unknown))] if unknown else []
-    return lines if campaign.held_out else [*lines, SAID["hold_out"]]
+    lines += [WORDS.say("give_noise", names=", ".join(unknown))] if unknown else []
+    return lines if campaign.held_out else [*lines, WORDS.say("hold_out")]

@@ -17,7 +17,7 @@ from discrepancy.report.text import WORDS, added_label, force_sentence, scored
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.workflow import Investigation
 from fe.wing.design import WingDesign
-from reporting.figures import to_svg
+from reporting.page import ReportFigure
 from reporting.words import listing
 
 
@@ -52,16 +52,6 @@ class ReportInput:
     fmu: str = ""
 
 
-@dataclass(frozen=True)
-class ReportFigure:
-    """A figure with its words; `name` is that of its file."""
-
-    name: str
-    figure: Figure
-    title: str
-    caption: str
-
-
 def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     """Draw every figure that these data allow, by name; their words are in `words.toml`.
 
@@ -74,8 +64,7 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
 
     def add(name: str, figure: Figure | None, **words: object) -> None:
         if figure is not None:
-            told = WORDS["figures"][name]
-            found[name] = ReportFigure(name, figure, told["title"], told["caption"].format(**words))
+            found[name] = WORDS.figure(name, figure, **words)
 
     investigation = content.investigation
     verdict, proof, missing = investigation.verdict, investigation.proof, investigation.missing
@@ -123,8 +112,3 @@ def _held_out_words(residuals: ResidualSet) -> str:
         return "No trial is held out."
     them = "them" if names[1:] else "it"
     return f"Held out: {listing(names)}; nothing but release and zero was fitted to {them}."
-
-
-def draw(figures: dict[str, ReportFigure]) -> dict[str, bytes]:
-    """Return the figures as SVG."""
-    return {name: to_svg(item.figure) for name, item in figures.items()}

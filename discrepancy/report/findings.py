@@ -7,8 +7,8 @@ from discrepancy.judgement.conclusion import effects_text, named_effects
 from discrepancy.judgement.when import when_sentence
 from discrepancy.report import text as words
 from discrepancy.report.figures import ReportInput
-from discrepancy.report.kit import add_table
 from discrepancy.report.sizes import size_sentence
+from discrepancy.report.text import WORDS
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page
@@ -34,15 +34,13 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] = 
     catalogue = words.catalogue_of(investigation)
     if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:
         names = [catalogue[name].name if name in catalogue else name for name in verdict.resembles]
-        page.add_paragraph(words.told("nearest", names=listing(names)))
+        page.add_paragraph(WORDS.say("nearest", names=names))
     for effect in {item.identifier: item for item in verdict.effects}.values():
         entry = catalogue.get(effect.identifier)
         if entry is not None:
-            text = {"equation": words.formula(entry.equation), "reference": entry.reference.rstrip(".")}
-            signature = words.formula(entry.signature).rstrip(".")
-            name = f"{effect.name[0].upper()}{effect.name[1:]}"
-            page.add_paragraph(words.told("entry", name=name, signature=signature, **text))
-    told = {"whose": words.WORDS["sizes"].get(verdict.kind, words.WORDS["sizes"]["other"]), "patch": ""}
+            page.add_paragraph(WORDS.say("entry", effect=effect, entry=entry))
+    sizes = WORDS.content["sizes"]
+    told = {"whose": sizes.get(verdict.kind, sizes["other"]), "patch": ""}
     if content.intervals:
         of = "" if verdict.kind in words.NAMING else f" of {words.added_label(investigation)}"
         told["patch"] = f" patch.json holds the change{of} in SI units. {content.fmu}"
@@ -52,10 +50,10 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] = 
             for place, own in enumerate(map(_parameters, members.values()), start=1)
             for row in own
         ]
-        add_table(page, "members", rows, **told)
+        WORDS.add_table(page, "members", rows, **told)
     else:
         name = "added" if verdict.kind in words.NAMING else "could_be_added"
-        add_table(page, name, _parameters(verdict.effects), **told)
+        WORDS.add_table(page, name, _parameters(verdict.effects), **told)
 
 
 def _parameters(effects: tuple[NamedEffect, ...]) -> list[tuple[str, ...]]:
@@ -75,7 +73,7 @@ def _opening(investigation: Investigation) -> list[tuple[str, str]]:
     """Return in large print: the effect, its size, its share, its probability."""
     verdict, proof, force = investigation.verdict, investigation.proof, investigation.verdict.force
     what = _what(verdict)
-    items = [(what[:1].upper() + what[1:], words.WORDS["opening"].get(verdict.kind, verdict.kind.value))]
+    items = [(what[:1].upper() + what[1:], WORDS.content["opening"].get(verdict.kind, verdict.kind.value))]
     if force is not None:
         items.append((f"{words.number(force.rms)} {force.unit}", f"missing at {force.port}, rms"))
         share = next((one for one in (force.held_out, force.fitted) if one is not None and one.tested), None)
@@ -140,44 +138,39 @@ def closing_sentence(investigation: Investigation) -> str:
     added = "It" if verdict.kind in words.NAMING else "The best hypothesis, which is no name,"
     share = None if words.rests_on_force(verdict) else verdict.explained
     if share is not None:
-        ends = {"low": 100.0 * share.low, "high": 100.0 * share.high, "left": words.number(share.left, 2)}
-        return words.told("closes", added=added, percent=100.0 * share.value, found=share, **ends)
+        return WORDS.say("closes", added=added, found=share)
     if proof is None or not words.added_label(investigation):
         return ""
     before, after, where = words.scored(proof)
-    sizes = [item.chi_square_per_dof for item in (before, after)]
-    if not all(map(isfinite, sizes)):
+    if not all(isfinite(item.chi_square_per_dof) for item in (before, after)):
         return ""
-    course = f"{words.number(sizes[0])} before and {words.number(sizes[1])} after it"
-    percent = words.percent(proof.gap_closed)
-    how = "closed" if proof.gap_closed > 0.0 else "scored"
-    return words.told(how, added=added, percent=percent, where=where, course=course)
+    return WORDS.say("scored", added=added, proof=proof, before=before, after=after, where=where)
 
 
 def add_next(page: Page, investigation: Investigation) -> None:
     """Add the proposed experiments."""
-    page.add_paragraph(words.SAID["next"])
+    page.add_paragraph(WORDS.say("next"))
     if sentence := when_sentence(investigation.verdict.windows):
         page.add_paragraph(sentence)
     rows = [
         (item.description, item.reason, f"{item.information:.2f}", f"{item.cost:g}")
         for item in investigation.verdict.next_experiments
     ]
-    add_table(page, "next", rows)
+    WORDS.add_table(page, "next", rows)
 
 
 def add_location(page: Page, investigation: Investigation) -> None:
     """Add where the model as it was disagrees."""
     location = investigation.location
     if location is None:
-        page.add_paragraph(words.SAID["not_searched"])
+        page.add_paragraph(WORDS.say("not_searched"))
         return
     nothing = investigation.verdict.kind in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
     significant = sum(cell.significant for cell in location.cells)
     are = "is a discovery" if significant == 1 else "are discoveries"
     told = "disagrees" if location.disagrees else "agrees" if nothing else "hidden"
     cells = counted(len(location.cells), "cell")
-    page.add_paragraph(words.SAID[told].format(significant=significant, cells=cells, are=are))
+    page.add_paragraph(WORDS.say(told, significant=significant, cells=cells, are=are))
     findings = [item for item in location.disagreements if item.share >= LEAST_SHARE][:SHOWN_FINDINGS]
     for item in findings:
         page.add_paragraph(f"• {item.sentence}")
@@ -186,4 +179,4 @@ def add_location(page: Page, investigation: Investigation) -> None:
         (test.name, words.number(test.statistic, 4), words.p_value_text(test.p_value), said[test.rejected])
         for test in location.tests
     ]
-    add_table(page, "tests", rows)
+    WORDS.add_table(page, "tests", rows)

@@ -9,7 +9,7 @@ from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.report import text as words
 from discrepancy.report.check_tables import can_decide_rows, group_lines
 from discrepancy.report.figures import ReportInput
-from discrepancy.report.kit import add_table
+from discrepancy.report.text import WORDS
 from discrepancy.self_calibration import Share, outcomes
 from discrepancy.verdict import Gate, Proof, Scores, Verdict
 from discrepancy.workflow import Investigation
@@ -28,7 +28,7 @@ def add_gates(page: Page, investigation: Investigation) -> None:
         return
     passed = {None: "not applied", True: "yes", False: "no"}
     rows = [(gate.name, passed[gate.passed], *_compared(gate), gate.reason) for gate in gates]
-    add_table(page, "gates", rows)
+    WORDS.add_table(page, "gates", rows)
 
 
 def _compared(gate: Gate) -> tuple[str, str]:
@@ -62,7 +62,7 @@ def add_evidence(page: Page, verdict: Verdict) -> None:
     shown = [(name.replace("_", " "), p) for name, p in inclusion if p >= 1e-3][:6]
     part = listing(f"{name} {words.probability_text(p)}" for name, p in shown)
     takes_part = f" Probability that an effect takes part: {part}." if shown[1:] else ""
-    add_table(page, "evidence", rows, takes_part=takes_part)
+    WORDS.add_table(page, "evidence", rows, takes_part=takes_part)
 
 
 def add_not_compared(page: Page, verdict: Verdict) -> None:
@@ -73,7 +73,7 @@ def add_not_compared(page: Page, verdict: Verdict) -> None:
         reason = "screened out" if item.reason.startswith("screened out") else item.reason
         by_reason.setdefault(reason, []).append(item.identifier.replace("_", " ") + gain)
     rows = [(f"{reason[:1].upper()}{reason[1:]}", listing(names)) for reason, names in by_reason.items()]
-    add_table(page, "not_compared", rows)
+    WORDS.add_table(page, "not_compared", rows)
 
 
 def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
@@ -104,7 +104,7 @@ def add_parameters(page: Page, investigation: Investigation) -> None:
     rows = parameter_rows(investigation)
     added = words.added_label(investigation)
     told = f"without and with {added}" if added else "without any effect"
-    add_table(page, "parameters", rows, added=told)
+    WORDS.add_table(page, "parameters", rows, added=told)
 
 
 _SCORES: dict[str, Callable[[Scores], str]] = {
@@ -124,7 +124,7 @@ def add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
     """Add scores before and after."""
     if investigation.verdict.kind not in words.NAMING:
         label = words.added_label(investigation)
-        page.add_notice(words.SAID["not_named"].format(label=label))
+        page.add_notice(WORDS.say("not_named", label=label))
     page.add_paragraph(proof.remaining)
     before = investigation.before
     held = [] if before is None else [item.trial.name for item in before.trials if item.trial.held_out]
@@ -148,7 +148,7 @@ def add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
     if isfinite(proof.gap_closed) and (verdict.explained is None or words.rests_on_force(verdict)):
         closed = f"Gap closed: {words.percent(proof.gap_closed)} %."
     trials = f" Held out: {', '.join(held)}; only their own releases and zeros were adapted." if held else ""
-    add_table(page, "proof", rows, *scores, gain=gain, closed=closed, trials=trials)
+    WORDS.add_table(page, "proof", rows, more=scores, gain=gain, closed=closed, trials=trials)
 
 
 def add_separability(page: Page, content: ReportInput) -> None:
@@ -158,7 +158,7 @@ def add_separability(page: Page, content: ReportInput) -> None:
         return
     for line in group_lines(found):
         page.add_paragraph(line)
-    add_table(page, "decide", can_decide_rows(found))
+    WORDS.add_table(page, "decide", can_decide_rows(found))
 
 
 def _share(share: Share) -> str:
@@ -181,7 +181,7 @@ def add_self_calibration(page: Page, content: ReportInput) -> None:
     rows.append(("named rightly", "90 % intervals that hold the true value", _share(found.coverage())))
     names = ", ".join(found.not_detectable)
     absent = f" Never detectable in draws of their priors, so not hidden: {names}." if names else ""
-    add_table(page, "calibration", rows, absent=absent)
+    WORDS.add_table(page, "calibration", rows, absent=absent)
 
 
 def add_data(page: Page, investigation: Investigation) -> None:
@@ -203,7 +203,7 @@ def add_data(page: Page, investigation: Investigation) -> None:
         )
         for trial in campaign.trials
     ]  # fmt: skip
-    add_table(page, "trials", rows)
+    WORDS.add_table(page, "trials", rows)
 
 
 def _few(names: Sequence[str]) -> str:
@@ -223,4 +223,4 @@ def add_origin(page: Page, origin: Origin) -> None:
         ("software", ", ".join(f"{name} {version}" for name, version in provenance.versions.items())),
         ("sources", ", ".join(f"{name} {value[:12]}" for name, value in provenance.source_hashes.items())),
     ]
-    add_table(page, "origin", rows)
+    WORDS.add_table(page, "origin", rows)

@@ -1,4 +1,4 @@
-"""What figures and tables have in common: panels, the two models, maps of sizes, words of a table."""
+"""What figures have in common: panels, the two models, maps of sizes."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -14,9 +14,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.report.text import WORDS
 from reporting.figures import LEVELS, PAST, PREDICTION, REFERENCE, new_figure
-from reporting.page import Column, Page, Table, numbers
 
 AFTER = "with the effect"
 EMPTY = "#f0f1f2"
@@ -105,16 +103,3 @@ def heat_map(
             colour = "white" if dark else "black"
             axes.text(column, row, text, ha="center", va="center", fontsize=6.0, color=colour)
     return image
-
-
-def add_table(page: Page, name: str, rows: Sequence[Sequence[str]], *more: str, **words: object) -> None:
-    """Add a table with its words of `words.toml`, if it has rows; `more` are further columns of numbers."""
-    if not rows:
-        return
-    told = WORDS["tables"][name]
-    heads = [
-        Column(head) if isinstance(head, str) else numbers(head["number"], head.get("unit", ""))
-        for head in [*told["columns"], *({"number": head} for head in more)]
-    ]
-    table = Table(heads[: len(rows[0])], rows)
-    page.add_table(table, told["caption"].format(**words).strip(), title=told["title"])

@@ -3,9 +3,9 @@
 from functools import partial
 
 from discrepancy.report import findings, grounds
-from discrepancy.report.figures import ReportFigure, ReportInput
+from discrepancy.report.figures import ReportInput
 from discrepancy.verdict import VerdictKind
-from reporting.page import Page
+from reporting.page import Page, ReportFigure
 
 
 def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dict[str, ReportFigure]) -> str:

@@ -1,11 +1,8 @@
 """Numbers and sentences of the report and of the summary on the terminal."""
 
 import re
-import tomllib
 from collections.abc import Callable
 from math import floor, isfinite, isnan, log10
-from pathlib import Path
-from typing import Any
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.judgement.conclusion import effects_text
@@ -22,19 +19,10 @@ from discrepancy.verdict import (
     VerdictKind,
 )
 from discrepancy.workflow import Investigation
-from reporting.words import counted, listing
-
-WORDS: dict[str, Any] = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
-"""What each kind of verdict means, also where the absolute fit could not be judged, and words of figures."""
+from reporting.page import Words
 
 BEYOND_DOUBT = 1e6
 """Evidence [nat] of which no more is told."""
-SAID: dict[str, str] = WORDS["said"]
-"""Paragraphs and remarks."""
-
-TOLD: dict[str, str] = WORDS["told"]
-"""Of the missing force, of shares, of what is left."""
-
 NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
 """Verdicts that say what is missing, if not all of it."""
 
@@ -47,11 +35,6 @@ MOTIONS = {
     "N or N m": ("force", "m or rad", "m/s or rad/s"),
 }  # fmt: skip
 """What is missing at a port, and units of its displacement and speed, by the unit of the force."""
-
-
-def told(name: str, /, **values: object) -> str:
-    """Return a sentence of `TOLD` with its values."""
-    return TOLD[name].format(**values)
 
 
 def estimate_text(estimate: Estimate) -> tuple[str, str]:
@@ -127,7 +110,7 @@ def headline(verdict: Verdict) -> str:
         text = re.sub(whole, lambda _, name=name: name, text)  # type: ignore[misc]
     if isnan(verdict.probability) or "probability" in text:
         return text + "."
-    about = WORDS["probability"].get(verdict.kind)
+    about = WORDS.content["probability"].get(verdict.kind)
     if about is None:
         return text + "."
     return f"{text} ({about} {probability_text(verdict.probability)})."
@@ -152,31 +135,15 @@ def motion_of(force: ForceAtPort) -> tuple[str, str, str]:
 def force_sentence(force: ForceAtPort) -> str:
     """Return where a force is missing, how large, what orders it, and what share of it its law is."""
     what, place, rate = motion_of(force)
-    most = force.largest
-    order = ""
-    if not force.law:
-        names, share = listing(force.ordered_by), 100.0 * max(force.orders.values())
-        order = told("ordered", names=names, share=share) if names else told("not_ordered")
+    own = force.evidence[force.port]
     others = {name: value for name, value in force.evidence.items() if name != force.port}
-    own, beside = force.evidence[force.port], ""
-    if others:
-        nearest = max(others, key=lambda name: others[name])
-        ahead = own - others[nearest]
-        more = "more" if ahead >= 0.0 else "less"
-        beside = told("beside", evidence=nats(abs(ahead)), more=more, port=nearest)
-    at = f"{f'{number(most.displacement)} {place} and ' if place else ''}{number(most.speed)} {rate}"
-    sizes = {"rms": number(force.rms), "most": number(abs(most.force)), "own": nats(own)}
-    sentence = told("force", what=what, force=force, at=at, order=order, beside=beside, **sizes)
+    nearest = max(others, key=lambda name: others[name], default="")
     tested = [share for share in (force.fitted, force.held_out) if share is not None and share.tested]
-    if tested:
-        shares = []
-        for item in tested:
-            of = "what it does to predictions" if item.ahead else "it"
-            trials = counted(item.trials, "fitted trial" if item is force.fitted else "held-out trial")
-            shares.append(told("share", share=share_text(item), of=of, trials=trials))
-        left = {"left": number(tested[-1].left), "whole": number(tested[-1].whole), "unit": force.unit}
-        sentence += told("law", law=force.law[:1].upper() + force.law[1:], shares=listing(shares), **left)
-    return sentence
+    kinds = ["fitted" if share is force.fitted else "held-out" for share in tested]
+    shares = [WORDS.say("share", share=one, kind=kind) for one, kind in zip(tested, kinds, strict=True)]
+    evidence = {"own": own, "nearest": nearest, "ahead": own - others.get(nearest, own)}
+    port = {"what": what, "place": place, "rate": rate}
+    return WORDS.say("force", force=force, tested=tested, shares=shares, **evidence, **port)
 
 
 def share_text(share: ShareOfForce) -> str:
@@ -201,9 +168,7 @@ def shares_sentence(verdict: Verdict) -> str:
     found = verdict.explained
     if found is None or rests_on_force(verdict):
         return ""
-    whose = "The best hypothesis" if verdict.kind is VerdictKind.UNEXPLAINED else "The effect"
-    parts = {name: percent(getattr(found, name)) for name in ("effect", "remainder", "noise")}
-    return told("mean_square", whose=whose, found=found, **parts)
+    return WORDS.say("mean_square", found=found, unexplained=verdict.kind is VerdictKind.UNEXPLAINED)
 
 
 def residual_sizes(found: ExplainedShare) -> tuple[str, str]:
@@ -214,18 +179,14 @@ def residual_sizes(found: ExplainedShare) -> tuple[str, str]:
 
 def remainders_sentence(verdict: Verdict) -> str:
     """Return what is left in which channel, over what time; empty without a remainder."""
-    parts = []
-    for item in verdict.remainders:
-        swing = f", swinging at {number(item.frequency)} Hz" if item.frequency > 0.0 else ""
-        parts.append(f"{item.channel} {number(item.size, 2)} noises over {number(item.time, 2)} s{swing}")
-    return told("left", parts="; ".join(parts)) if parts else ""
+    return WORDS.say("left", remainders=verdict.remainders)
 
 
 def meaning(verdict: Verdict) -> str:
     """Return what the verdict means, in a sentence."""
     judged = all(gate.passed is not None for gate in verdict.gates if gate.name == "absolute fit")
-    meant: str = WORDS["meaning"][verdict.kind]
-    return meant if judged else WORDS["unjudged"].get(verdict.kind, meant)
+    meant: dict[str, str] = WORDS.content["meaning"] | ({} if judged else WORDS.content["unjudged"])
+    return meant[verdict.kind]
 
 
 def hypothesis_name(hypothesis: Hypothesis) -> str:
@@ -282,3 +243,9 @@ def percent(share: float) -> str:
 def nats(evidence: float) -> str:
     """Return an evidence; beyond all doubt its digits tell nothing."""
     return f"{evidence:,.0f}" if abs(evidence) < BEYOND_DOUBT else f"more than {BEYOND_DOUBT:,.0f}"
+
+
+WORDS = Words(
+    "discrepancy.report", number=number, percent=percent, nats=nats, share_text=share_text, formula=formula
+)
+"""Words of the report, of figures and of the summary on the terminal."""

@@ -6,9 +6,9 @@ from itertools import product
 from math import ceil
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Term
@@ -22,8 +22,6 @@ from discrepancy.search_settings import SEARCH
 
 from .hypotheses import Tell, in_silence
 from .starting_points import starts
-
-FloatArray = NDArray[np.float64]
 
 
 def gap_row(residual: FloatArray) -> int:

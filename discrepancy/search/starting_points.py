@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from math import inf
 
 import numpy as np
-from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Term
@@ -14,8 +14,6 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import SENSORS, MicroSlip
-
-FloatArray = NDArray[np.float64]
 
 
 def starts(screen: Screen, effect: Effect, count: int = SEARCH.starts) -> list[Change]:

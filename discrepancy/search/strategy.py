@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
@@ -23,8 +23,6 @@ from discrepancy.search_settings import SEARCH
 from .growing_records import Beginnings
 from .hypotheses import Hypotheses, Tell, in_silence
 from .starting_points import acts_within, are_related, pairs, slips, starts
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass

@@ -18,7 +18,6 @@ from discrepancy.errors import CampaignDataError, CampaignFileError, Discrepancy
 from discrepancy.models.wing import WingModel
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch
-from fmu_asset.packing.patched_runtime import output_channels
 from reporting.errors import DamagedFileError
 from reporting.folders import restore_folder
 from reporting.json_file import read_json
@@ -172,7 +171,7 @@ def run_model(folder: Path | str) -> WingModel:
     if patch is not None:
         try:
             sensors = len(_run(folder)["observed"]["sensor"])
-            effects = load_patch(patch).for_outputs(output_channels(sensors))
+            effects = load_patch(patch).for_gauges(sensors).effects
         except FmuError as cause:
             raise CampaignFileError(f"The patch of the twin's model cannot be read: {cause}") from cause
         for effect in effects:

@@ -149,11 +149,11 @@ def _bases(
     outputs = operators.gauge_output.toarray().T
     for i, j in np.argwhere(fitted_states()):
         factors = Factorisation(operators.stiffness(factor, (LEVELS[i], LEVELS[j])))
-        columns.append(factors.raw_solve(np.column_stack([operators.load_lift, outputs])))
+        columns.append(factors.riesz(np.column_stack([operators.load_lift, outputs])))
     healthy = Factorisation(operators.stiffness(factor))
-    first = healthy.raw_solve(np.column_stack([operators.load_tip, operators.load_lift, outputs]))
-    second = healthy.raw_solve(skin @ first)
-    third = healthy.raw_solve(skin @ second[:, :2])
+    first = healthy.riesz(np.column_stack([operators.load_tip, operators.load_lift, outputs]))
+    second = healthy.riesz(skin @ first)
+    third = healthy.riesz(skin @ second[:, :2])
     static = _orthonormal(np.hstack([*columns, first, second, third]), operators.stiffness(factor), DEPENDENT)
 
     servo = 0.5 * (MASS_TOTAL - REFERENCE_PITOT)
@@ -167,9 +167,9 @@ def _bases(
     # A change of a mode solves (K - w^2 M) x = image: two terms of K^-1 (1 + w^2 M K^-1 + ...), whose ratio
     # is
     # small because the lowest modes themselves are in the basis. Derivatives of slopes need the second one.
-    changed = healthy.raw_solve(images)
-    inertial = healthy.raw_solve(mass @ changed)
-    again = healthy.raw_solve(skin @ changed[:, :2])
+    changed = healthy.riesz(images)
+    inertial = healthy.riesz(mass @ changed)
+    again = healthy.riesz(skin @ changed[:, :2])
     modal = _orthonormal(np.hstack([shapes, changed, inertial, again]), stiffness, DEPENDENT_MODES)
     on_basis = modal.T @ (stiffness @ bending)  # the basis is orthonormal in the stiffness
     return static, modal, on_basis, order, np.sqrt(eigenvalues) / (2.0 * np.pi)

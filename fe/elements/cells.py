@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import sparse
 
-from .kinds import HEXAHEDRA_20, ElementKind, Rule
+from fe.runtime.arrays import FloatArray, IntArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from .kinds import HEXAHEDRA_20, ElementKind, Rule
 
 BATCH = 512
 """Cells whose arrays are contracted at once."""
@@ -112,21 +111,30 @@ def mass_blocks(kind: ElementKind, nodes: FloatArray, density: ArrayLike, rule: 
     return np.asarray(np.einsum("nq,qa,qb->nab", factor, values, values, optimize=True))
 
 
-def orthotropic_elasticity(
-    young_modulus: float, poisson_ratio: float, shear_23: float, shear_13: float, shear_12: float
-) -> FloatArray:
-    """Elasticity (6, 6) [Pa] of a material with equal Young's moduli and free shear moduli."""
-    compliance = np.zeros((6, 6))
-    compliance[:3, :3] = -poisson_ratio / young_modulus
-    compliance[range(3), range(3)] = 1.0 / young_modulus
-    compliance[range(3, 6), range(3, 6)] = 1.0 / shear_23, 1.0 / shear_13, 1.0 / shear_12
-    return np.asarray(np.linalg.inv(compliance), dtype=np.float64)
+def orthotropic_compliance(moduli: ArrayLike, ratios: ArrayLike, shear_moduli: ArrayLike) -> FloatArray:
+    """Compliance (6, 6) [1/Pa] of Young's moduli, ratios 12, 13, 23 and shear moduli 12, 13, 23 along axes.
+
+    Each is (3,), or one number for all three; ratio ij is the contraction along j under tension along i.
+    """
+    young, ratio, shear = (np.broadcast_to(values, 3) for values in (moduli, ratios, shear_moduli))
+    compliance = np.diag(1.0 / np.concatenate((young, shear[::-1])))
+    for (i, j), value in zip(((0, 1), (0, 2), (1, 2)), ratio, strict=True):
+        compliance[i, j] = compliance[j, i] = -value / young[i]
+    return compliance
 
 
-def isotropic_elasticity(young_modulus: float, poisson_ratio: float) -> FloatArray:
-    """Elasticity (6, 6) [Pa] of an isotropic material."""
+def isotropic_compliance(young_modulus: float, poisson_ratio: float) -> FloatArray:
+    """Compliance (6, 6) [1/Pa] of an isotropic material."""
     shear = young_modulus / (2.0 * (1.0 + poisson_ratio))
-    return orthotropic_elasticity(young_modulus, poisson_ratio, shear, shear, shear)
+    return orthotropic_compliance(young_modulus, poisson_ratio, shear)
+
+
+def axes_of(first: ArrayLike, second: ArrayLike) -> FloatArray:
+    """Axes (3, 3), rows of length one: along a vector, in the plane of both at right angles to it, across."""
+    one, other = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    across = np.cross(one, other)
+    axes = np.array([one, np.cross(across, one), across])
+    return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True))
 
 
 def rotate_elasticity(elasticity: FloatArray, axes: FloatArray) -> FloatArray:
@@ -220,17 +228,30 @@ class CellMesh:
         total = sparse.csr_array((size, size))
         together = max(BATCH, _TRIPLETS // (components * self.kind.node_count) ** 2)
         for start in range(0, len(cells), together):
-            rows, columns, values = [], [], []
             last = min(start + together, len(cells))
-            for first in range(start, last, BATCH):
-                part = slice(first, min(first + BATCH, last))
-                unknowns = self.unknowns_of(cells[part], components).astype(np.int32)
-                rows.append(np.repeat(unknowns, unknowns.shape[1], axis=1).ravel())
-                columns.append(np.tile(unknowns, (1, unknowns.shape[1])).ravel())
-                values.append(blocks(part).ravel())
-            places = (np.concatenate(rows), np.concatenate(columns))
-            total = total + sparse.coo_array((np.concatenate(values), places), shape=total.shape).tocsr()
+            unknowns = self.unknowns_of(cells[start:last], components).astype(np.int32)
+            width = unknowns.shape[1]
+            parts = (slice(first, min(first + BATCH, last)) for first in range(start, last, BATCH))
+            values = np.concatenate([blocks(part).ravel() for part in parts])
+            places = (np.repeat(unknowns, width, axis=1).ravel(), np.tile(unknowns, (1, width)).ravel())
+            total = total + sparse.coo_array((values, places), shape=total.shape).tocsr()
         return total
+
+
+def centre_strains(mesh: CellMesh, displacement: FloatArray) -> FloatArray:
+    """Strains (nc, 6) xx, yy, zz, yz, xz, xy, shear as engineering strain, at the centres of the cells.
+
+    Parameters
+    ----------
+    mesh : CellMesh
+        The cells.
+    displacement : (nodes, 3) m
+        Of all nodes.
+    """
+    centre = np.mean(mesh.kind.corners, axis=0)
+    slopes, _ = gradients(mesh.kind, mesh.nodes, centre[None])
+    moved = displacement[mesh.cells].reshape(len(mesh.cells), -1)
+    return np.asarray(np.einsum("nij,nj->ni", strain_matrix(slopes[:, 0]), moved))
 
 
 def hexahedra_20(points: FloatArray, cells: IntArray) -> CellMesh:

@@ -13,12 +13,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from skfem.quadrature import get_quadrature
 from skfem.refdom import RefTet, RefTri
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from fe.runtime.arrays import BoolArray, FloatArray, IntArray
+
 Rule = tuple[FloatArray, FloatArray]
 
 
@@ -129,20 +128,13 @@ class ElementKind:
         mirror = self.places[:, [1, 0, 2]]
         return np.asarray(np.abs(self.places[:, None] - mirror).sum(axis=2).argmin(axis=1))
 
-    @property
-    def is_tetrahedron(self) -> bool:
-        """Whether the reference cell is the unit tetrahedron."""
-        return len(self.corners) == 4
-
-    def inside(self, local: FloatArray, tolerance: float) -> NDArray[np.bool_]:
+    def inside(self, local: FloatArray, tolerance: float) -> BoolArray:
         """Whether local places (p, 3) lie in the reference cell, up to a tolerance."""
-        low = (local >= -tolerance).all(axis=1)
-        if self.is_tetrahedron:
-            return np.asarray(low & (local.sum(axis=1) <= 1.0 + tolerance))
-        if len(self.corners) == 6:
-            flat = local[:, 0] + local[:, 1] <= 1.0 + tolerance
-            return np.asarray(low & flat & (local[:, 2] <= 1.0 + tolerance))
-        return np.asarray(low & (local <= 1.0 + tolerance).all(axis=1))
+        found = np.ones(len(local), dtype=bool)
+        for face in range(len(self.faces)):
+            corner, tangents = self.face_places(face, np.zeros((1, 2)))
+            found &= (local - corner) @ np.cross(*tangents) <= tolerance
+        return found
 
     def shape_functions(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Values (q, k) and local gradients (q, k, 3) at local places (q, 3), nodes as in the file."""

@@ -11,29 +11,25 @@ Transactions on Mathematical Software 9 (1983).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cache, lru_cache
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import blas, lapack
 from threadpoolctl import ThreadpoolController
 
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import SolutionError
 
-from .dissection import separator_tree
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from .dissection import elimination_blocks
 
 LEAF_UNKNOWNS = 120
 """Parts of the mesh with up to so many unknowns are eliminated as one dense front."""
 _STRIP = 96  # rows that are added at once; only their part right of the diagonal is touched
 
 
-@dataclass(frozen=True)
-class Front:
+class Front(NamedTuple):
     """Unknowns that are eliminated together, by their places in the order of elimination.
 
     Attributes
@@ -52,8 +48,7 @@ class Front:
     parent: int
 
 
-@dataclass(frozen=True)
-class Elimination:
+class Elimination(NamedTuple):
     """Order of elimination of a sparse symmetric matrix.
 
     Attributes
@@ -79,13 +74,10 @@ def analyse(matrix: sparse.csr_array) -> Elimination:
     first, group = _twins(matrix)
     graph = matrix[first][:, first]
     size = np.bincount(group)
-    tree = separator_tree(graph, size.astype(np.float64), LEAF_UNKNOWNS)
-    rank = np.empty(len(tree.parent), dtype=np.int64)
-    rank[tree.postorder()] = np.arange(len(rank))
-    order = np.argsort(rank[tree.place], kind="stable")
+    block = elimination_blocks(graph, size.astype(np.float64), LEAF_UNKNOWNS)
+    order, starts = np.argsort(block, kind="stable"), np.unique(block)
     place = np.empty(len(order), dtype=np.int64)
     place[order] = np.arange(len(order))
-    starts = np.flatnonzero(np.diff(rank[tree.place[order]], prepend=-1))
     size = size[order]
     offset = np.concatenate(([0], np.cumsum(size)))
     fronts = tuple(
@@ -132,29 +124,11 @@ def _expanded(groups: IntArray, size: IntArray, offset: IntArray) -> IntArray:
     return np.asarray(np.repeat(offset[groups] - before, count) + np.arange(count.sum()))
 
 
-class _Pattern:
-    """Places of the entries of a matrix, to know it again: equal where the places are."""
-
-    def __init__(self, matrix: sparse.csr_array) -> None:
-        self.starts, self.columns = matrix.indptr.copy(), matrix.indices.copy()
-
-    def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, _Pattern)
-            and np.array_equal(self.starts, other.starts)
-            and np.array_equal(self.columns, other.columns)
-        )
-
-    def __hash__(self) -> int:
-        return hash((len(self.starts), len(self.columns)))
-
-
 @lru_cache(maxsize=2)
-def _analysed(pattern: _Pattern) -> Elimination:
+def _analysed(size: int, starts: bytes, columns: bytes) -> Elimination:
     """Analyse a pattern; a matrix of the same unknowns with other values, as after damage, asks again."""
-    size = len(pattern.starts) - 1
-    values = np.ones(len(pattern.columns), dtype=np.int8)
-    return analyse(sparse.csr_array((values, pattern.columns, pattern.starts), shape=(size, size)))
+    places = np.frombuffer(columns, dtype=np.int32), np.frombuffer(starts, dtype=np.int32)
+    return analyse(sparse.csr_array((np.ones(len(places[0]), dtype=np.int8), *places), shape=(size, size)))
 
 
 @cache
@@ -185,7 +159,8 @@ class Cholesky:
                 f"A matrix of {matrix.shape[0]} unknowns is not positive definite: it has a diagonal entry "
                 "that is not positive."
             )
-        elimination = _analysed(_Pattern(matrix))
+        places = (part.astype(np.int32).tobytes() for part in (matrix.indptr, matrix.indices))
+        elimination = _analysed(matrix.shape[0], *places)
         self._order, self._fronts = elimination.order, elimination.fronts
         self._factors: list[tuple[FloatArray, FloatArray]] = []
         with _threads().limit(limits=1):

@@ -10,16 +10,11 @@ References
 A. George, "Nested dissection of a regular finite element mesh", SIAM Journal on Numerical Analysis 10 (1973).
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 
 CUT_PLACES = (0.4, 0.5, 0.6)
 """Shares of a part's weight at which a cut is tried."""
@@ -28,38 +23,8 @@ LARGEST_HALF = 0.8
 _IMBALANCE_WEIGHT = 1.2
 
 
-@dataclass(frozen=True)
-class SeparatorTree:
-    """Tree of separators and leaves; a child's number is greater than its parent's.
-
-    Attributes
-    ----------
-    place : (n,)
-        Number of the separator or leaf that holds each vertex.
-    parent : (t,)
-        Number of the separator that cut each part from another, -1 for the first.
-    """
-
-    place: IntArray
-    parent: IntArray
-
-    def postorder(self) -> IntArray:
-        """Numbers (t,) of separators and leaves, each after all that hang on it."""
-        children: list[list[int]] = [[] for _ in self.parent]
-        for number, above in enumerate(self.parent.tolist()):
-            if above >= 0:
-                children[above].append(number)
-        order: list[int] = []
-        waiting = [0]
-        while waiting:  # parents first and last child first; read backwards, it is a postorder
-            number = waiting.pop()
-            order.append(number)
-            waiting += children[number]
-        return np.array(order[::-1], dtype=np.int64)
-
-
-class _Parts:
-    """The parts of one depth that are still to be cut.
+def best_cut(part: IntArray, weight: FloatArray, ends: IntArray) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Find the best cut of each part.
 
     Parameters
     ----------
@@ -69,80 +34,68 @@ class _Parts:
         Weight of each vertex.
     ends : (2, m)
         Vertices at the ends of each edge, both in one part.
+
+    Returns
+    -------
+    separator, side : (n,) bool
+        Whether a vertex belongs to the separator, and on which side of it the others lie.
+    done : (parts,) bool
+        Whether a part was cut; the others hang together too closely.
     """
-
-    def __init__(self, part: IntArray, weight: FloatArray, ends: IntArray) -> None:
-        self._part, self._weight, self._ends = part, weight, ends
-        self._count = int(part.max()) + 1
-        self._total = np.bincount(part, weights=weight, minlength=self._count)
-
-    def cut(self) -> tuple[BoolArray, BoolArray, BoolArray]:
-        """Find the best cut of each part.
-
-        Returns
-        -------
-        separator, side : (n,) bool
-            Whether a vertex belongs to the separator, and on which side of it the others lie.
-        done : (parts,) bool
-            Whether a part was cut; the others hang together too closely.
-        """
-        best = np.full(self._count, np.inf)
-        separator, side = np.zeros((2, len(self._part)), dtype=bool)
-        before = np.cumsum(self._total) - self._total
-        for coordinate in self._coordinates():
-            order = np.lexsort((coordinate, self._part))
-            reached = np.cumsum(self._weight[order])
-            for share in CUT_PLACES:
-                middle = order[np.searchsorted(reached, before + share * self._total)]
-                above = coordinate > coordinate[middle][self._part]
-                upper = above[self._ends]
-                crossing = upper[0] != upper[1]
-                for half in (True, False):  # the vertices on either side of the cut separate the halves
-                    on_cut = np.zeros(len(self._part), dtype=bool)
-                    on_cut[self._ends[:, crossing][upper[:, crossing] == half]] = True
-                    cost = self._cost(on_cut, above)
-                    better = cost < best
-                    best[better] = cost[better]
-                    chosen = better[self._part]
-                    separator[chosen], side[chosen] = on_cut[chosen], above[chosen]
-        return separator, side, np.isfinite(best)
-
-    def _cost(self, separator: BoolArray, side: BoolArray) -> FloatArray:
-        """Weight of each part's separator, more for uneven halves, infinite for too uneven ones."""
-        held, above = (
-            np.bincount(self._part, weights=self._weight * where, minlength=self._count)
-            for where in (separator, side & ~separator)
-        )
-        below = self._total - held - above
-        too_uneven = np.maximum(above, below) > LARGEST_HALF * self._total
-        cost = held * (1.0 + _IMBALANCE_WEIGHT * ((above - below) / self._total) ** 2)
-        return np.where(too_uneven, np.inf, cost)
-
-    def _coordinates(self) -> list[FloatArray]:
-        """Distances (n,) from two far ends of each part, and their difference."""
-        size = len(self._part)
-        graph = sparse.coo_array(
-            (np.ones(self._ends.shape[1]), tuple(self._ends)), shape=(size, size)
-        ).tocsr()
-
-        def distance(sources: IntArray) -> FloatArray:
-            found = csgraph.dijkstra(graph, directed=False, unweighted=True, indices=sources, min_only=True)
-            reached = np.isfinite(found)
-            # a piece that does not hang together with the rest is the farthest of all
-            return np.asarray(np.where(reached, found, found[reached].max() + 1.0))
-
-        def farthest(values: FloatArray) -> IntArray:
-            order = np.lexsort((-values, self._part))
-            part = self._part[order]
-            return np.asarray(order[np.concatenate(([True], part[1:] != part[:-1]))])
-
-        first = distance(farthest(distance(farthest(np.zeros(size)))))
-        second = distance(farthest(first))
-        return [first - second, first, second]
+    total = np.bincount(part, weights=weight)
+    best = np.full(len(total), np.inf)
+    separator, side = np.zeros((2, len(part)), dtype=bool)
+    before = np.cumsum(total) - total
+    for coordinate in _coordinates(part, ends):
+        order = np.lexsort((coordinate, part))
+        reached = np.cumsum(weight[order])
+        for share in CUT_PLACES:
+            middle = order[np.searchsorted(reached, before + share * total)]
+            above = coordinate > coordinate[middle][part]
+            upper = above[ends]
+            crossing = upper[0] != upper[1]
+            for half in (True, False):  # the vertices on either side of the cut separate the halves
+                on_cut = np.zeros(len(part), dtype=bool)
+                on_cut[ends[:, crossing][upper[:, crossing] == half]] = True
+                held, beyond = (
+                    np.bincount(part, weights=weight * where) for where in (on_cut, above & ~on_cut)
+                )
+                below = total - held - beyond
+                # The weight of the separator, more for uneven halves, infinite for too uneven ones.
+                cost = held * (1.0 + _IMBALANCE_WEIGHT * ((beyond - below) / total) ** 2)
+                cost[np.maximum(beyond, below) > LARGEST_HALF * total] = np.inf
+                better = cost < best
+                best[better] = cost[better]
+                chosen = better[part]
+                separator[chosen], side[chosen] = on_cut[chosen], above[chosen]
+    return separator, side, np.isfinite(best)
 
 
-def separator_tree(graph: sparse.csr_array, weight: FloatArray, leaf_weight: float) -> SeparatorTree:
-    """Dissect a graph until its parts are light.
+def _coordinates(part: IntArray, ends: IntArray) -> list[FloatArray]:
+    """Distances (n,) from two far ends of each part, and their difference."""
+    size = len(part)
+    graph = sparse.coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(size, size)).tocsr()
+
+    def distance(sources: IntArray) -> FloatArray:
+        found = csgraph.dijkstra(graph, directed=False, unweighted=True, indices=sources, min_only=True)
+        reached = np.isfinite(found)
+        # a piece that does not hang together with the rest is the farthest of all
+        return np.asarray(np.where(reached, found, found[reached].max() + 1.0))
+
+    def farthest(values: FloatArray) -> IntArray:
+        order = np.lexsort((-values, part))
+        return np.asarray(order[np.concatenate(([True], np.diff(part[order]) != 0))])
+
+    first = distance(farthest(distance(farthest(np.zeros(size)))))
+    second = distance(farthest(first))
+    return [first - second, first, second]
+
+
+def elimination_blocks(graph: sparse.csr_array, weight: FloatArray, leaf_weight: float) -> IntArray:
+    """Dissect a graph until its parts are light: first place (n,) of each vertex's leaf or separator.
+
+    The leaves and separators follow one another in the order of elimination: of a part first one half, then
+    the other, last its separator.
 
     Parameters
     ----------
@@ -157,23 +110,24 @@ def separator_tree(graph: sparse.csr_array, weight: FloatArray, leaf_weight: flo
     edges = graph.tocoo()
     once = edges.row < edges.col
     ends = np.stack((edges.row[once], edges.col[once])).astype(np.int64)
-    place, parent = np.zeros(size, dtype=np.int64), [-1]
-    # what is still to be cut: the numbers of the parts in the tree, the vertices and their parts
-    names, vertices, part = np.zeros(1, dtype=np.int64), np.arange(size), np.zeros(size, dtype=np.int64)
+    place = np.zeros(size, dtype=np.int64)
+    # what is still to be cut: the first places of the parts, the vertices and their parts
+    first, vertices, part = np.zeros(1, dtype=np.int64), np.arange(size), np.zeros(size, dtype=np.int64)
     while True:
-        heavy = np.bincount(part, weights=weight[vertices], minlength=len(names)) > leaf_weight
-        names, kept = names[heavy], heavy[part]
+        heavy = np.bincount(part, weights=weight[vertices], minlength=len(first)) > leaf_weight
+        first, kept = first[heavy], heavy[part]
         vertices, part = vertices[kept], (np.cumsum(heavy) - 1)[part[kept]]
         if not len(vertices):
-            return SeparatorTree(place, np.array(parent, dtype=np.int64))
+            return place
         index = np.full(size, -1)
         index[vertices] = np.arange(len(vertices))
         ends = ends[:, (index[ends] >= 0).all(axis=0) & (place[ends[0]] == place[ends[1]])]
-        separator, side, done = _Parts(part, weight[vertices], index[ends]).cut()
-        halves = 2 * (np.cumsum(done) - 1)[part] + side
-        kept = done[part] & ~separator
-        vertices, part = vertices[kept], halves[kept]
-        place[vertices] = len(parent) + part
-        parents = np.repeat(names[done], 2).tolist()
-        names = len(parent) + np.arange(len(parents))
-        parent += parents
+        separator, side, done = best_cut(part, weight[vertices], index[ends])
+        kept = done[part]
+        vertices = vertices[kept]
+        block = (3 * (np.cumsum(done) - 1)[part] + np.where(separator, 2, side))[kept]
+        count = np.bincount(block, minlength=3 * int(done.sum())).reshape(-1, 3)
+        starts = first[done, None] + np.cumsum(count, axis=1) - count
+        place[vertices] = starts.ravel()[block]
+        half = block % 3 < 2
+        vertices, part, first = vertices[half], (block // 3 * 2 + block % 3)[half], starts[:, :2].ravel()

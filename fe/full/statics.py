@@ -1,15 +1,13 @@
 """Factorised stiffness, and solutions whose accuracy is checked."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import norm
 
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import SolutionError
 
 from .cholesky import Cholesky
-
-FloatArray = NDArray[np.float64]
 
 BACKWARD_ERROR_LIMIT = 1e-12
 """Largest backward error max|b - K u| / (|K| max|u| + max|b|) of an accepted solution, in maximum norms."""
@@ -21,12 +19,17 @@ Thin cells make the condition number about 1e10, so that about 1e-6 is what doub
 
 
 class Factorisation:
-    """Factorised symmetric positive definite matrix.
+    """Factorised symmetric positive definite matrix X, its energy norm, and the norm dual to it.
 
     Parameters
     ----------
-    matrix : csr or csc (n, n)
-        The matrix; a copy of it is kept for the residual.
+    matrix : sparse (n, n)
+        X; a copy of it is kept for the residual.
+
+    Attributes
+    ----------
+    stiffness : csr (n, n)
+        X.
 
     Raises
     ------
@@ -35,23 +38,21 @@ class Factorisation:
     """
 
     def __init__(self, matrix: sparse.sparray) -> None:
-        self._matrix = matrix.tocsr()
-        self._norm = float(norm(self._matrix, np.inf))
+        self.stiffness = matrix.tocsr()
         try:
-            self._factors = Cholesky(self._matrix)
+            factors = Cholesky(self.stiffness)
         except SolutionError as error:
             raise SolutionError(
                 "The stiffness matrix cannot be factorised; some part of the structure is not held or has no "
                 f"stiffness. {error}"
             ) from None
+        self.riesz, self.whitened = factors.solve, factors.whitened
+        """X^-1 f (n,) or (n, k) of functionals f without a check of the residual, for iterations that check
+        their own; and L^-1 f, with X = L L', whose lengths are the dual norms of f."""
 
-    def raw_solve(self, right_hand_side: FloatArray) -> FloatArray:
-        """Solution (n,) or (n, k) without the residual check, for iterations that check their own."""
-        return self._factors.solve(right_hand_side)
-
-    def whitened(self, right_hand_side: FloatArray) -> FloatArray:
-        """Vectors (n,) or (n, k) of the length that functionals have in the norm dual to the matrix."""
-        return self._factors.whitened(right_hand_side)
+    def product(self, vectors: FloatArray) -> FloatArray:
+        """Return X times vectors (n, k)."""
+        return np.asarray(self.stiffness @ vectors)
 
     def solve(self, right_hand_side: FloatArray) -> FloatArray:
         """Solution (n,) or (n, k), refined once, its backward error and its accuracy checked.
@@ -62,8 +63,8 @@ class Factorisation:
             If the backward error exceeds `BACKWARD_ERROR_LIMIT` or refinement still changes the solution by
             more than `CORRECTION_LIMIT`.
         """
-        solution = self.raw_solve(right_hand_side)
-        correction = self.raw_solve(right_hand_side - self._matrix @ solution)
+        solution = self.riesz(right_hand_side)
+        correction = self.riesz(right_hand_side - self.stiffness @ solution)
         solution = solution + correction
         error = self.backward_error(solution, right_hand_side)
         change = float(np.linalg.norm(correction)) / max(float(np.linalg.norm(solution)), 1e-300)
@@ -77,6 +78,7 @@ class Factorisation:
 
     def backward_error(self, solution: FloatArray, right_hand_side: FloatArray) -> float:
         """Backward error max|b - K u| / (|K| max|u| + max|b|), in maximum norms (0 for a zero load)."""
-        scale = self._norm * float(np.abs(solution).max()) + float(np.abs(right_hand_side).max())
-        residual = float(np.abs(right_hand_side - self._matrix @ solution).max())
+        size = float(norm(self.stiffness, np.inf))
+        scale = size * float(np.abs(solution).max()) + float(np.abs(right_hand_side).max())
+        residual = float(np.abs(right_hand_side - self.stiffness @ solution).max())
         return residual / scale if scale > 0.0 else residual

@@ -1,54 +1,24 @@
 """Tools of the offline reduction: one factorised stiffness, its norm, and bases orthonormal in it."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import qr
 
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import SolutionError
 
 from .statics import Factorisation
 
-FloatArray = npt.NDArray[np.float64]
-
+Norm = Factorisation
+"""The energy norm of a stiffness is what its factorisation gives."""
 NEARLY_DEPENDENT = 0.1
 """Where less than this fraction of a vector is new, the pair is made to fit together again."""
 
 
-class Norm:
-    """The energy norm of one stiffness X, and the norm dual to it.
-
-    Parameters
-    ----------
-    stiffness : sparse (n, n)
-        X, symmetric positive definite; it is factorised here.
-
-    Raises
-    ------
-    SolutionError
-        If it is singular.
-    """
-
-    def __init__(self, stiffness: Any) -> None:
-        self.stiffness = stiffness
-        self._factorisation = Factorisation(stiffness)
-
-    def product(self, vectors: FloatArray) -> FloatArray:
-        """Return X times vectors (n, k)."""
-        return np.asarray(self.stiffness @ vectors)
-
-    def riesz(self, functionals: FloatArray) -> FloatArray:
-        """Return the representatives X^-1 functionals, (n, k) or (n,)."""
-        return self._factorisation.raw_solve(functionals)
-
-    def whitened(self, functionals: FloatArray) -> FloatArray:
-        """Return L^-1 functionals, (n, k) or (n,), with X = L L': their lengths are the dual norms."""
-        return self._factorisation.whitened(functionals)
-
-
 def conjugate_gradients(
-    matrix: Any,
+    matrices: Sequence[Any],
     preconditioner: Norm,
     right: FloatArray,
     start: FloatArray,
@@ -56,12 +26,14 @@ def conjugate_gradients(
     tolerance: float,
     most_iterations: int = 100,
 ) -> FloatArray:
-    """Return solutions of several systems with one matrix by preconditioned conjugate gradients.
+    """Return solutions of several systems by preconditioned conjugate gradients.
+
+    Applying the factors of the preconditioner to twelve columns takes hardly longer than to three.
 
     Parameters
     ----------
-    matrix : sparse (n, n)
-        The matrix, spectrally equivalent to the preconditioner.
+    matrices : sequence of sparse (n, n)
+        Each for as many of the columns, spectrally equivalent to the preconditioner.
     preconditioner : Norm
         The norm of a matrix nearby.
     right : (n, k) ndarray
@@ -83,15 +55,20 @@ def conjugate_gradients(
     SolutionError
         If the tolerance is not reached.
     """
+
+    def product(vectors: FloatArray) -> FloatArray:
+        parts = zip(matrices, np.split(vectors, len(matrices), axis=1), strict=True)
+        return np.concatenate([np.asarray(matrix @ part) for matrix, part in parts], axis=1)
+
     solution = np.array(start)
     wanted = tolerance**2 * np.einsum("ik,ik->k", right, preconditioner.riesz(right))
-    residual = right - matrix @ solution
+    residual = right - product(solution)
     direction = correction = preconditioner.riesz(residual)
     size = np.einsum("ik,ik->k", residual, correction)
     for _ in range(most_iterations):
         if np.all(size <= wanted):
             return solution
-        image = matrix @ direction
+        image = product(direction)
         curvature = np.einsum("ik,ik->k", direction, image)
         step = np.divide(size, curvature, out=np.zeros_like(size), where=curvature > 0.0)
         solution += step * direction
@@ -109,23 +86,6 @@ def conjugate_gradients(
         f"Conjugate gradients reached {reached:.2g} in {most_iterations} iterations, but {tolerance:g} "
         "is needed; the stiffness terms must be positive semi-definite."
     )
-
-
-class BlockDiagonal:
-    """Several matrices (n, n), each for as many columns of what it is multiplied with.
-
-    With it, `conjugate_gradients` solves with all of them in the time of one: applying the factors to twelve
-    columns takes hardly longer than to three.
-    """
-
-    def __init__(self, matrices: list[Any]) -> None:
-        self.matrices = matrices
-
-    def __matmul__(self, vectors: FloatArray) -> FloatArray:
-        parts = np.split(vectors, len(self.matrices), axis=1)
-        return np.concatenate(
-            [np.asarray(matrix @ part) for matrix, part in zip(self.matrices, parts, strict=True)], axis=1
-        )
 
 
 class FunctionalBasis:
@@ -175,8 +135,8 @@ class FunctionalBasis:
         return np.concatenate((inside * scale, outside[new]))
 
 
-class OrthonormalBasis:
-    """A growing basis, orthonormal in a norm, with its products kept.
+class ProjectedBasis:
+    """A growing basis, orthonormal in a norm, with sparse terms projected on it.
 
     Gram-Schmidt in blocks, repeated, on pairs of vectors v and their products p = X v. With a condition
     number of 1e10 either follows from the other to about 1e-6 only, so that what is left of both after a
@@ -184,61 +144,72 @@ class OrthonormalBasis:
 
     Parameters
     ----------
-    unknowns : int
-        Length n of the vectors.
     norm : Norm
         The norm of X.
+    sums : sequence of tuples of csr (n, n)
+        The terms of each sum.
     drop : float
         A new vector is dropped if less than this fraction of it is new.
 
     Attributes
     ----------
-    vectors, products : (n, k) ndarray
-        The basis, and X times the basis.
+    vectors : (n, k) ndarray
+        The basis.
+    inner : list of (T, k, k) ndarray
+        The terms of each sum in the basis.
     """
 
-    def __init__(self, unknowns: int, norm: Norm, *, drop: float) -> None:
-        self.vectors = np.empty((unknowns, 0))
-        self.products = np.empty((unknowns, 0))
-        self._norm, self._drop = norm, drop
+    def __init__(self, norm: Norm, sums: Sequence[tuple[Any, ...]], *, drop: float) -> None:
+        self._norm, self._sums, self._drop = norm, sums, drop
+        self.vectors = self._products = np.empty((sums[0][0].shape[0], 0))
+        self.inner = [np.empty((len(terms), 0, 0)) for terms in sums]
 
-    @property
-    def size(self) -> int:
-        """Number of vectors."""
-        return int(self.vectors.shape[1])
+    def extend(self, vectors: FloatArray) -> list[list[FloatArray]]:
+        """Add what is new in vectors (n, m); return the terms of each sum times what was added."""
+        before = self.vectors.shape[1]
+        if kept := self._new(vectors):
+            self.vectors = np.column_stack((self.vectors, *(vector for vector, _ in kept)))
+            self._products = np.column_stack((self._products, *(product for _, product in kept)))
+        new = self.vectors[:, before:]
+        images = [[np.asarray(term @ new) for term in terms] for terms in self._sums]
+        for number, (old, parts) in enumerate(zip(self.inner, images, strict=True)):
+            added = np.stack([self.vectors.T @ image for image in parts])
+            beside = added[:, :before]
+            self.inner[number] = np.block([[old, beside], [beside.swapaxes(1, 2), added[:, before:]]])
+        return images
 
-    def extend(self, vectors: FloatArray, products: FloatArray) -> int:
-        """Add vectors (n, k), given with their products; return how many were new enough to be kept."""
+    def _new(self, vectors: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+        """Return what is new enough in vectors (n, m), orthonormal, with its products."""
+        products = self._norm.product(vectors)
         length = np.sqrt(np.maximum(np.einsum("ik,ik->k", vectors, products), 0.0))
         used = np.flatnonzero(length > 0.0)
         vectors, products = vectors[:, used] / length[used], products[:, used] / length[used]
         for number in range(2):
-            share = self.products.T @ vectors
-            vectors, products = vectors - self.vectors @ share, products - self.products @ share
-            if number == 0 and self.size:
+            vectors, products = self._outside(vectors, products)
+            if number == 0 and self.vectors.size:
                 products = self._norm.product(vectors)
         kept: list[tuple[FloatArray, FloatArray]] = []
         for vector, product in zip(vectors.T, products.T, strict=True):
-            vector, product = self._without(kept, *self._without(kept, vector, product))
+            vector, product = _without(kept, *_without(kept, vector, product))
             size = float(vector @ product)
             if size < NEARLY_DEPENDENT**2:
-                product = self._norm.product(vector)
-                share = self.products.T @ vector
-                vector, product = vector - self.vectors @ share, product - self.products @ share
-                vector, product = self._without(kept, vector, product)
+                vector, product = self._outside(vector, self._norm.product(vector))
+                vector, product = _without(kept, vector, product)
                 size = float(vector @ product)
             if size > self._drop**2:
                 kept.append((vector / np.sqrt(size), product / np.sqrt(size)))
-        if kept:
-            self.vectors = np.column_stack((self.vectors, *(vector for vector, _ in kept)))
-            self.products = np.column_stack((self.products, *(product for _, product in kept)))
-        return len(kept)
+        return kept
 
-    @staticmethod
-    def _without(
-        others: list[tuple[FloatArray, FloatArray]], vector: FloatArray, product: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        for other, other_product in others:
-            part = other_product @ vector
-            vector, product = vector - part * other, product - part * other_product
-        return vector, product
+    def _outside(self, vectors: FloatArray, products: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return vectors (n,) or (n, m) and their products without what lies in the basis."""
+        share = self._products.T @ vectors
+        return vectors - self.vectors @ share, products - self._products @ share
+
+
+def _without(
+    others: list[tuple[FloatArray, FloatArray]], vector: FloatArray, product: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    for other, other_product in others:
+        part = other_product @ vector
+        vector, product = vector - part * other, product - part * other_product
+    return vector, product

@@ -10,16 +10,14 @@ from math import ceil
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from fe.full.subspace import FunctionalBasis, Norm
+from fe.full.subspace import FunctionalBasis, Norm, ProjectedBasis
+from fe.runtime.arrays import FloatArray
 from fe.runtime.reduced import ReducedModel, StaticResponse
 
 from .dual_solutions import dual_solutions
 from .settings import TOGETHER
-from .terms import ProjectedBasis, ReductionTerms, State, solved_together
-
-FloatArray = npt.NDArray[np.float64]
+from .terms import ReductionTerms, State, solved_together
 
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""

@@ -8,14 +8,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fe.full.subspace import Norm
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 
 from .terms import ReductionTerms, solved_together
-
-FloatArray = npt.NDArray[np.float64]
 
 DUAL_TOLERANCE, COMBINED_TOLERANCE = 0.05, 0.01
 """Relative residual of approximate dual solutions at their own states, taken alone and combined."""

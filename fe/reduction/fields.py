@@ -9,20 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from fe.elements.cells import CellMesh, centre_strains
 from fe.elements.kinds import HEXAHEDRA_20
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.reduced import ReducedModel
-from fe.structure.field import centre_strains, write_vtu
+from fe.structure.field import write_vtu
 
 if TYPE_CHECKING:
     from fe.wing.operators import AffineOperators
 
     from .reduced_basis import Reduction
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 _CELLS = HEXAHEDRA_20.file_type
 
@@ -108,14 +107,14 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
     ------
     OutsideModelError
         If a value lies outside the validity box of the model.
-    OSError
+    FileNotWrittenError
         If the file cannot be written.
     """
     displacement = wing.static_displacement @ wing.static_response(vector).coordinates
     loss = np.zeros(len(wing.region))
     for number, name in enumerate(wing.regions, start=1):
         loss[wing.region == number] = vector[wing.chosen.index(name)]
-    strain = centre_strains(HEXAHEDRA_20, wing.points, wing.cells, displacement)
+    strain = centre_strains(CellMesh(HEXAHEDRA_20, wing.points, wing.cells), displacement)
     cells = {
         "strain": strain,
         "spanwise_strain": -strain[:, 1],

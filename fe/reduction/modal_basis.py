@@ -8,17 +8,15 @@ from bisect import bisect_left
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import eigh
 
 from fe.full.affine import affine_sum
-from fe.full.subspace import Norm
+from fe.full.subspace import Norm, ProjectedBasis
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 
 from .settings import TOGETHER, ModalSettings
-from .terms import ModalState, ProjectedBasis, ReductionTerms
-
-FloatArray = npt.NDArray[np.float64]
+from .terms import ModalState, ReductionTerms
 
 START_ITERATIONS = 4
 

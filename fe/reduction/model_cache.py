@@ -4,7 +4,6 @@ A build works in one thread, because sums over several threads depend on their n
 bytes on a machine whatever its cores do.
 """
 
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -19,6 +18,7 @@ from fe.structure.design import load_structure, structure_hash
 from fe.structure.operators import assemble_structure
 from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress, SilentProgress
+from reporting.provenance import hash_bytes, hash_tree
 
 from .built_once import built_once, cache_folder
 from .fields import WingFields, field_basis
@@ -35,20 +35,14 @@ _Kept = TypeVar("_Kept", bound=KeptArrays)
 
 def modelling_hash() -> str:
     """Return the SHA-256 of the modelling code, hexadecimal."""
-    digest = hashlib.sha256()
-    package = Path(__file__).parents[1]
-    for room in MODELLING_ROOMS:
-        for path in sorted((package / room).rglob("*.py")):
-            content = path.read_bytes()
-            digest.update(f"{path.relative_to(package).as_posix()} {len(content)}\n".encode())
-            digest.update(content)
-    return digest.hexdigest()
+    rooms = (hash_tree(Path(__file__).parents[1] / room, suffixes=[".py"]) for room in MODELLING_ROOMS)
+    return hash_bytes("".join(rooms).encode())
 
 
 def entry(kind: str, design_hash: str, settings: object) -> Path:
     """Return the file of a cache entry: named by a hash of design, settings and modelling code."""
     content = f"{design_hash} {settings!r} {modelling_hash()}"
-    return cache_folder() / f"{kind}-{hashlib.sha256(content.encode()).hexdigest()[:32]}.npz"
+    return cache_folder() / f"{kind}-{hash_bytes(content.encode())[:32]}.npz"
 
 
 def _once(kind: type[_Kept], path: Path, design_hash: str, build: Callable[[], _Kept]) -> _Kept:

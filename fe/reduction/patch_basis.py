@@ -9,11 +9,11 @@ their solutions and modes, weighed by what is looked at most, are the basis that
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.linalg import eigh
 
 from fe.full.subspace import Norm
+from fe.runtime.arrays import FloatArray
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedStructure, PatchedWing
@@ -22,8 +22,6 @@ from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
 from reporting.progress import Progress, SilentProgress
 
 from .settings import PatchSettings
-
-FloatArray = npt.NDArray[np.float64]
 
 DAMAGED_ANCHOR = 0.7
 """Stiffness loss of every damage region in the second state of health at which the full model is solved."""

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fe.full.affine import affine_sum
 from fe.full.modes import most_moved
 from fe.full.subspace import Norm
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE, WING
@@ -25,8 +25,6 @@ from .certified_basis import StaticReduction, compressed, fewest_directions, gre
 from .modal_basis import eigenmodes, modal_basis
 from .settings import ModalSettings, ReductionSettings, StructureSettings, loss_splits
 from .terms import ReductionTerms, State
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

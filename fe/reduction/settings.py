@@ -3,12 +3,11 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-import numpy.typing as npt
 
+from fe.runtime.arrays import FloatArray
 from fe.runtime.state import wing_names
 from fe.structure.tables import ReductionLimits, StructureDesign
 
-FloatArray = npt.NDArray[np.float64]
 Range = tuple[float, float]
 
 MOST_GRID_REGIONS = 3

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fe.full.modes import lowest_eigenpairs
-from fe.full.statics import Factorisation
 from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure
+from fe.structure.field import natural_frequencies, static_response
 
 
 @dataclass(frozen=True)
@@ -68,15 +67,10 @@ def measured_errors(
         vector[first_control:] = np.where(
             nominal == 0.0, np.clip(1.0, *model.validity_box[first_control:].T), nominal
         )
-        stiffness, mass, load = structure.at(dict(zip(model.chosen, vector.tolist(), strict=True)))
-        full = Factorisation(stiffness).solve(load)
-        found = model.static_response(vector)
-        for what, rows in (
-            ("strain", structure.gauge_output),
-            ("displacement", structure.displacement_output),
-        ):
+        values = dict(zip(model.chosen, vector.tolist(), strict=True))
+        full, found = static_response(structure, values), model.static_response(vector)
+        for what, wanted in (("strain", full.strain), ("displacement", full.output)):
             came, error = getattr(found, what), getattr(found, f"{what}_error_bound")
-            wanted = np.asarray(rows @ full)
             if wanted.size:
                 size, missed = float(np.abs(wanted).max()), float(np.abs(came - wanted).max())
                 worst[what] = np.fmax(worst[what], missed / size)
@@ -84,8 +78,9 @@ def measured_errors(
                     broken.add(number)
                 worst["bound"] = max(worst["bound"], error / size)
         if number in (0, states - 1):
-            squares, _ = lowest_eigenpairs(stiffness, mass, model.mode_count)
-            ratio = model.modes(vector).frequency * 2.0 * np.pi / np.sqrt(squares)
+            ratio = (
+                model.modes(vector).frequency / natural_frequencies(structure, model.mode_count, values)[0]
+            )
             worst["frequency"] = max(worst["frequency"], float(np.abs(ratio - 1.0).max()))
     return MeasuredErrors(
         **{name: float(value) for name, value in worst.items()}, states=states, broken=len(broken)

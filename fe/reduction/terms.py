@@ -4,17 +4,16 @@ import itertools
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-import numpy.typing as npt
 from scipy import sparse
 from scipy.stats import qmc
 
 from fe.full.affine import AffineSum
-from fe.full.subspace import BlockDiagonal, Norm, OrthonormalBasis, conjugate_gradients
+from fe.full.subspace import Norm, conjugate_gradients
+from fe.runtime.arrays import FloatArray
 from fe.structure.affine import AffineStructure
 
 from .settings import MOST_GRID_REGIONS, default_anchors, remaining_levels
 
-FloatArray = npt.NDArray[np.float64]
 State = tuple[float, ...]
 """Parameters and losses."""
 ModalState = tuple[FloatArray, FloatArray]
@@ -201,50 +200,6 @@ class ReductionTerms:
         return np.array(found)
 
 
-class ProjectedBasis:
-    """A growing basis, orthonormal in a norm, with sparse terms projected on it.
-
-    Parameters
-    ----------
-    norm : Norm
-        The norm.
-    sums : tuple of tuples of csr (n, n)
-        The terms of each sum.
-    drop : float
-        A new vector is dropped if less than this fraction of it is new.
-
-    Attributes
-    ----------
-    inner : list of (T, k, k) ndarray
-        The terms of each sum in the basis.
-    """
-
-    def __init__(self, norm: Norm, sums: Sequence[tuple[sparse.csr_array, ...]], *, drop: float) -> None:
-        self._norm, self._sums = norm, sums
-        self._basis = OrthonormalBasis(sums[0][0].shape[0], norm, drop=drop)
-        self.inner = [np.empty((len(terms), 0, 0)) for terms in sums]
-
-    @property
-    def vectors(self) -> FloatArray:
-        """The basis (n, k)."""
-        return self._basis.vectors
-
-    def extend(self, vectors: FloatArray) -> list[list[FloatArray]]:
-        """Add what is new in vectors (n, m); return the terms of each sum times what was added."""
-        before = self._basis.size
-        self._basis.extend(vectors, self._norm.product(vectors))
-        new, size = self.vectors[:, before:], self._basis.size
-        images = [[np.asarray(term @ new) for term in terms] for terms in self._sums]
-        for number, parts in enumerate(images):
-            grown = np.empty((len(parts), size, size))
-            grown[:, :before, :before] = self.inner[number]
-            for inner, image in zip(grown, parts, strict=True):
-                inner[:, before:] = self.vectors.T @ image
-                inner[before:, :before] = inner[:before, before:].T
-            self.inner[number] = grown
-        return images
-
-
 def solved_together(
     terms: ReductionTerms,
     norm: Norm,
@@ -255,7 +210,7 @@ def solved_together(
 ) -> list[FloatArray]:
     """Solve the full model at coefficients (T,) for the same right-hand sides (n, k); returns (n, k) each."""
     solved = conjugate_gradients(
-        BlockDiagonal([terms.stiffness(theta) for theta in thetas]),
+        [terms.stiffness(theta) for theta in thetas],
         norm,
         np.concatenate([right] * len(thetas), axis=1),
         np.concatenate(starts, axis=1),

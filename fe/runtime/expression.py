@@ -12,8 +12,8 @@ from types import CodeType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import FloatArray
 from .errors import InvalidPatchError
 
 LONGEST = 600
@@ -122,7 +122,7 @@ class Expression:
         """
         return float(self._result(values))
 
-    def course(self, time: NDArray[np.float64], values: Mapping[str, float]) -> NDArray[np.float64]:
+    def course(self, time: FloatArray, values: Mapping[str, float]) -> FloatArray:
         """Return the values (N,) at times (N,), which are the name `time`; raises as `value`."""
         result = self._result({**values, "time": time}, " at every time")
         return np.array(np.broadcast_to(result, time.shape), dtype=np.float64)

@@ -9,9 +9,8 @@ from math import gamma
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import FloatArray
 from .errors import InvalidPatchError
-
-FloatArray = NDArray[np.float64]
 
 _SERIES_LIMIT = 30.0  # beyond it the asymptotic series of the confluent function is exact to rounding
 

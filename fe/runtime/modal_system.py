@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from .arrays import FloatArray
 
 
 def rayleigh_damping_ratio(alpha: float, beta: float, frequency: npt.ArrayLike) -> FloatArray:

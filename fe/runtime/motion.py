@@ -12,8 +12,8 @@ from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from .arrays import BoolArray, FloatArray, IntArray
 from .errors import InvalidPatchError, SolutionError
 from .laws import LAWS
 from .laws.interface import HEAD, PARAMETERS, PortForce
@@ -23,10 +23,6 @@ from .motion_kernel import integrate
 from .patch import ModelPatch, StiffnessDrift
 from .planform_forces import place_of
 from .static_path import static_path
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
-BoolArray = npt.NDArray[np.bool_]
 
 
 class Kernel(NamedTuple):

@@ -5,11 +5,9 @@ NumPy and relative imports only: this file is copied into the FMU.
 
 from typing import Any, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
+from .arrays import FloatArray as FloatArray
+from .arrays import IntArray as IntArray
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 Unnamed = tuple[Any, ...]
 """The fields of one of the records below."""
 

@@ -9,13 +9,12 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numpy import einsum
 from numpy.linalg import solve
 
+from .arrays import FloatArray
 from .reduced_arrays import ReducedArrays
 
-FloatArray = npt.NDArray[np.float64]
 multiply_outer = np.multiply.outer
 
 

@@ -12,11 +12,10 @@ from typing import Annotated, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from .arrays import FloatArray, IntArray
 from .errors import ReducedModelFileError
 from .reduced_arrays import RegionArrays
 from .state import wing_names
-
-FloatArray = npt.NDArray[np.float64]
 
 Positive = Annotated[float, float_info.min, inf]
 
@@ -91,8 +90,8 @@ class PatchArrays(RegionArrays):
     mass: Annotated[FloatArray, 3, "basis", "basis"]
     strip_lines: Annotated[FloatArray, "lines"]
     strip_stiffness: Annotated[npt.NDArray[np.float32], "parts", "triangle"]
-    strip_of: Annotated[npt.NDArray[np.int64], "parts"]
-    term_of: Annotated[npt.NDArray[np.int64], "parts"]
+    strip_of: Annotated[IntArray, "parts"]
+    term_of: Annotated[IntArray, "parts"]
     flap_row: Annotated[FloatArray, "basis"]
     flap_spring: Positive
     semi_span: Positive

@@ -10,8 +10,8 @@ from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from .arrays import FloatArray
 from .errors import InvalidPatchError
 from .motion import laws_of
 from .patch import LOADS, LoadGain, ModelPatch, ModulusTemperature, PointMass, RootCompliance
@@ -20,8 +20,6 @@ from .planform_forces import STATION_PORTS
 from .reduced import lowest_modes
 from .state import Losses
 from .wing_rows import EMPTY, LOAD_PLACE, WingRows, remaining_skin
-
-FloatArray = npt.NDArray[np.float64]
 
 ITERATIONS = 3
 """Steps of the subspace iteration for the modes of a patched wing."""

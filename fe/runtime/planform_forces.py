@@ -11,13 +11,11 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from .arrays import FloatArray
 from .laws.interface import PortForce
 from .patch import ModelPatch
 from .primitive import Primitive
-
-FloatArray = npt.NDArray[np.float64]
 
 PLANFORM = "planform"
 """The place of a force that is spread over the planform."""

@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from numpy.linalg import solve
 
+from .arrays import FloatArray
 from .errors import OutsideModelError
 from .online import OnlineArrays
 from .reduced_arrays import ReducedArrays
 
-FloatArray = npt.NDArray[np.float64]
 Values = Mapping[str, float] | FloatArray
 """What is chosen: by name, or all of it (V,) in the order of `ReducedArrays.chosen`."""
 

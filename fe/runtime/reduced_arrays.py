@@ -10,13 +10,11 @@ from math import inf
 from typing import Annotated, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
+from .arrays import FloatArray, IntArray
 from .errors import ReducedModelFileError
 from .kept_arrays import KeptArrays
 from .state import MOST_REGIONS, Losses, losses_of
-
-FloatArray = npt.NDArray[np.float64]
 
 MOST_ANCHORS = 16
 """Largest number of approximate dual solutions of a reduced model."""
@@ -154,8 +152,8 @@ class ReducedArrays(RegionArrays):
     acceleration_names: str
     nominal: Annotated[FloatArray, "chosen"]
     damping: Annotated[FloatArray, 2]
-    stiffness_factors: Annotated[npt.NDArray[np.int64], "terms", 2]
-    load_factors: Annotated[npt.NDArray[np.int64], "loads", 2]
+    stiffness_factors: Annotated[IntArray, "terms", 2]
+    load_factors: Annotated[IntArray, "loads", 2]
     mode_count: int
     followed_shapes: Annotated[FloatArray, "followed", "modal"]
     validity_box: Annotated[FloatArray, "chosen", 2]
@@ -167,7 +165,7 @@ class ReducedArrays(RegionArrays):
     residual_stiffness: Annotated[FloatArray, "residual", "terms", "static"]
     residual_allowance: Annotated[float, 0.0, inf]
     rounding_allowance: Annotated[float, 0.0, inf]
-    dual_counts: Annotated[npt.NDArray[np.int64], "regions"]
+    dual_counts: Annotated[IntArray, "regions"]
     dual_split: Annotated[FloatArray, "splits"]
     dual_correction: Annotated[FloatArray, "duals", "outputs", "residual"]
     dual_residual: Annotated[FloatArray, "anchors", "outputs", "dual rows", "dual columns"]

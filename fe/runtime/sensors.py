@@ -15,6 +15,7 @@ from math import exp, expm1, factorial, pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import BoolArray, FloatArray
 from .errors import InvalidPatchError
 from .high_pass import high_pass
 from .patch import (
@@ -35,8 +36,6 @@ from .patch import (
     ThermalStrain,
     course_of,
 )
-
-FloatArray = NDArray[np.float64]
 
 STRAIN = "strain"
 """Quantity of a strain gauge."""
@@ -191,7 +190,7 @@ def apply_sensors(
     return shown, None if rates is None else slopes
 
 
-def _acts(item: Primitive, time: FloatArray) -> NDArray[np.bool_]:
+def _acts(item: Primitive, time: FloatArray) -> BoolArray:
     """Return whether a primitive acts at each sample (N,); its windows are those of the record."""
     inside = np.full(len(time), not item.windows)
     for begin, end in (window.span for window in item.windows):

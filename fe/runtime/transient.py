@@ -17,13 +17,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from .arrays import FloatArray
 from .errors import InvalidStateError
 from .modal_system import ModalSystem, exact_step, rayleigh_damping_ratio
 
 if TYPE_CHECKING:
     from .motion import Laws, ModalMotion
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from .arrays import FloatArray, IntArray
 from .errors import InvalidPatchError
 from .patch import (
     INTERNAL_FORCES,
@@ -25,9 +25,6 @@ from .patch import (
 )
 from .patch_arrays import PatchArrays
 from .planform_forces import STATION_PORTS, PlanformStations, at_stations, planform_stations
-
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 TIP_OFFSET = 1.02
 """Where the weight of a part of the skin would vanish, in semi-spans."""
@@ -52,7 +49,7 @@ class RemainingSkin(NamedTuple):
 
     breaks: FloatArray
     exact: FloatArray
-    strip: npt.NDArray[np.int64]
+    strip: IntArray
     of_strips: FloatArray
 
 

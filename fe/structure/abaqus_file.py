@@ -14,9 +14,10 @@ import numpy as np
 
 from fe.elements.kinds import KINDS
 from fe.runtime.errors import MeshError
+from reporting.section import shown
 from reporting.text_file import read_text
 
-from .deck import FLAT, GLOBAL, Deck, System, fail, frame, included, real, shown, whole, words_of
+from .deck import FLAT, GLOBAL, Deck, System, fail, frame, included, real, whole, words_of
 
 _VARIANT = re.compile(r"(C3D\d+)(?:[IMR]?H?|T)")
 """Reduced, hybrid and other variants are the same cells; they are integrated here as the plain ones."""
@@ -120,15 +121,13 @@ def _add_nodes(deck: Deck, block: _Block, system: System) -> None:
     kind = block.parameters.get("SYSTEM", "R").upper()
     if kind not in ("R", "C"):
         fail(block.where, f"*NODE with SYSTEM={kind} is not read; give the nodes in SYSTEM=R or C.")
-    plain = kind == "R" and system is GLOBAL
-    system = replace(system, kind=kind)
-    added = []
-    for where, values in block.data:
-        place = [real(where, text) for text in (*values[1:], "", "", "")[:3]]
-        added.append(whole(where, values[0]))
-        deck.add_node(where, added[-1], place if plain else system.place(place))
+    numbers = [whole(where, values[0]) for where, values in block.data]
+    given = [[real(where, text) for text in (*values[1:], "", "", "")[:3]] for where, values in block.data]
+    places = replace(system, kind=kind).place(np.reshape(given, (-1, 3)))
+    for (where, _), number, place in zip(block.data, numbers, places.tolist(), strict=True):
+        deck.add_node(where, number, place)
     if "NSET" in block.parameters:
-        deck.members("NSET", block.name("NSET")).extend(added)
+        deck.members("NSET", block.name("NSET")).extend(numbers)
 
 
 def _add_elements(deck: Deck, block: _Block) -> None:

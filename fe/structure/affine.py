@@ -7,24 +7,22 @@ where acceleration fields act on the free masses too.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.full.affine import affine_sum
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidStateError
 from fe.runtime.state import losses_of
 
 from .tables import StructureDesign
 
-FloatArray = NDArray[np.float64]
 Values = Mapping[str, float]
 
 
-@dataclass(frozen=True)
-class StiffnessTerm:
+class StiffnessTerm(NamedTuple):
     """Stiffness (n, n) [N/m] that is proportional to a parameter and to what a region has kept."""
 
     matrix: sparse.csr_array
@@ -32,8 +30,7 @@ class StiffnessTerm:
     region: str | None = None
 
 
-@dataclass(frozen=True)
-class LoadTerm:
+class LoadTerm(NamedTuple):
     """Part (n,) of a load [N], or of a load on 1 kg of a free mass [N/kg]."""
 
     load: str
@@ -116,15 +113,8 @@ class AffineStructure:
             Stiffness losses of the regions, see `fe.runtime.state.losses_of`.
         """
         factor = _updated(self.parameters, parameters, "parameter")
-        loss = losses_of(stiffness_loss, self.regions)
-        kept = {name: 1.0 - z for name, z in zip(self.regions, loss, strict=True)}
-        return np.array(
-            [
-                (1.0 if term.parameter is None else factor[term.parameter])
-                * (1.0 if term.region is None else kept[term.region])
-                for term in self.stiffness_terms
-            ]
-        )
+        lost = {None: 0.0} | dict(zip(self.regions, losses_of(stiffness_loss, self.regions), strict=True))
+        return np.array([factor[term.parameter] * (1.0 - lost[term.region]) for term in self.stiffness_terms])
 
     def stiffness(
         self, parameters: Values | None = None, stiffness_loss: Values | Iterable[float] = ()
@@ -135,7 +125,7 @@ class AffineStructure:
 
     def mass(self, masses: Values | None = None) -> sparse.csr_array:
         """Mass (n, n) [kg]; `masses` [kg] are those free ones that differ from their nominal values."""
-        return affine_sum([1.0, *_updated(self.masses, masses, "free mass").values()], self.mass_terms)
+        return affine_sum([*_updated(self.masses, masses, "free mass").values()], self.mass_terms)
 
     def load(self, name: str, value: float | None = None, masses: Values | None = None) -> FloatArray:
         """Load (n,) [N].
@@ -152,11 +142,8 @@ class AffineStructure:
         control = self.loads[name]
         factor = (1.0 if control is None else self.controls[control]) if value is None else value
         kilograms = _updated(self.masses, masses, "free mass")
-        total = np.zeros(self.unknowns)
-        for term in self.load_terms:
-            if term.load == name:
-                total = total + factor * (1.0 if term.mass is None else kilograms[term.mass]) * term.vector
-        return total
+        parts = (factor * kilograms[term.mass] * term.vector for term in self.load_terms if term.load == name)
+        return sum(parts, np.zeros(self.unknowns))
 
     def at(self, values: Values) -> tuple[sparse.csr_array, sparse.csr_array, FloatArray]:
         """Stiffness [N/m], mass [kg] and the sum of all loads [N] at values by name.
@@ -170,10 +157,11 @@ class AffineStructure:
             {name: values[name] for name in names if name in values}
             for names in (self.parameters, self.regions, self.masses)
         )
-        load = np.zeros(self.unknowns)
-        for name, control in self.loads.items():
-            load = load + self.load(name, None if control is None else values.get(control), masses)
-        return self.stiffness(parameters, losses), self.mass(masses), load
+        chosen = {
+            name: None if control is None else values.get(control) for name, control in self.loads.items()
+        }
+        loads = (self.load(name, value, masses) for name, value in chosen.items())
+        return self.stiffness(parameters, losses), self.mass(masses), sum(loads, np.zeros(self.unknowns))
 
     def full_displacement(self, free: FloatArray) -> FloatArray:
         """Displacements (nodes, 3) [m] of all nodes from free unknowns (n,)."""
@@ -193,10 +181,48 @@ class DesignedStructure(AffineStructure):
     design: StructureDesign
 
 
-def names_of(design: StructureDesign) -> dict[str, Any]:
-    """Return what a structure file alone says of its affine model: names, nominal values, ranges, damping."""
+def designed(
+    design: StructureDesign,
+    expansion: sparse.csr_array,
+    mass: sparse.csr_array,
+    point_masses: Iterable[sparse.csr_array],
+    loads: Iterable[FloatArray],
+    outputs: Mapping[str, sparse.csr_array],
+) -> dict[str, Any]:
+    """Return fields of the affine model of a structure file, all but the stiffness terms and the hash.
+
+    Parameters
+    ----------
+    design : StructureDesign
+        What was asked for.
+    expansion : csr (full, n)
+        Free unknowns to all unknowns.
+    mass : csr (full, full) kg
+        Mass without point masses.
+    point_masses : iterable of csr (full, full) 1
+        Mass of 1 kg at each of the point masses of the design.
+    loads : iterable of (full,)
+        Of each of its loads the forces [N], or the field [m/s^2] of an acceleration, which acts on the free
+        masses, too.
+    outputs : mapping of str to csr (m, full)
+        Rows of the tables `gauge`, `displacement` and `acceleration`.
+    """
+    restriction = expansion.T.tocsr()
+    masses: dict[str | None, sparse.csr_array] = {None: mass}
+    for part, matrix in zip(design.mass, point_masses, strict=True):
+        if part.free:
+            masses[part.name] = matrix
+        else:
+            masses[None] = masses[None] + part.mass * matrix
+    terms = []
+    for load, vector in zip(design.load, loads, strict=True):
+        if load.acceleration is None:
+            terms.append(LoadTerm(load.name, restriction @ vector))
+        else:
+            terms += [LoadTerm(load.name, restriction @ (own @ vector), name) for name, own in masses.items()]
     free = tuple(part for part in design.mass if part.free)
     return {
+        "design": design,
         "parameters": {part.name: part.nominal for part in design.parameter},
         "masses": {part.name: part.mass for part in free},
         "controls": {part.name: part.nominal for part in design.control},
@@ -204,19 +230,26 @@ def names_of(design: StructureDesign) -> dict[str, Any]:
         "ranges": {part.name: part.range for part in (*design.parameter, *free, *design.control)}
         | {part.name: (0.0, part.largest_loss) for part in design.damage},
         "regions": tuple(part.name for part in design.damage),
+        "mass_terms": tuple((restriction @ own @ expansion).tocsr() for own in masses.values()),
         "loads": {part.name: part.control for part in design.load},
+        "load_terms": tuple(terms),
         "gauges": tuple(part.name for part in design.gauge),
         "displacements": tuple(part.name for part in design.displacement),
         "accelerations": tuple(part.name for part in design.acceleration),
+        **{f"{key}_output": (rows @ expansion).tocsr() for key, rows in outputs.items()},
+        "expansion": expansion,
         "damping_alpha": design.damping.alpha,
         "damping_beta": design.damping.beta,
     }
 
 
-def _updated(nominal: dict[str, float], changed: Values | None, what: str) -> dict[str, float]:
+def _updated(nominal: dict[str, float], changed: Values | None, what: str) -> dict[str | None, float]:
+    """Return the factors of terms by what they are times: of nothing one, then values by name."""
     unknown = set(changed or {}) - set(nominal)
     if unknown:
         raise InvalidStateError(
             f"The structure has no {what} named {min(unknown)!r}; there are {', '.join(nominal) or 'none'}."
         )
-    return nominal | dict(changed or {})
+    factors: dict[str | None, float] = {None: 1.0}
+    factors.update(nominal | dict(changed or {}))
+    return factors

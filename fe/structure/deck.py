@@ -14,16 +14,16 @@ from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fe.elements.cells import axes_of
 from fe.elements.kinds import KINDS, ElementKind
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
+from reporting.section import shown
 from reporting.toml_file import parse_toml
 
 from .mesh import StructureMesh
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 FLAT = {
     "vertex": (1, 1), "line": (2, 2), "line3": (3, 2), "triangle": (3, 3), "triangle6": (6, 3),
@@ -33,7 +33,6 @@ FLAT = {
 _MOST_NUMBERS = 5_000_000
 """Numbers that all sets may hold together: a short line can ask for any."""
 _LARGEST_NUMBER = 2**53
-_SHOWN = 60
 _NO_EXPONENT = re.compile(r"(?<=[\d.])(?=[+-])")
 
 
@@ -77,11 +76,6 @@ def included(where: str, files: tuple[Path, ...], name: str) -> tuple[Path, ...]
     if inner in files:
         fail(where, f"{inner} includes itself.")
     return (*files, inner)
-
-
-def shown(text: str) -> str:
-    """Return what came as it stands in a sentence, cut where it is long."""
-    return repr(text if len(text) <= _SHOWN else f"{text[:_SHOWN]}...")
 
 
 def whole(where: str, text: str) -> int:
@@ -191,8 +185,15 @@ class Deck:
                 source, f"{len(twins)} elements, such as {twins[0]}, have the nodes of another; delete them."
             )
 
+        points, own = np.array(list(self.nodes.values())), np.array(list(self.nodes), dtype=np.int64)
+        if not np.isfinite(points).all():
+            number = own[~np.isfinite(points).all(axis=1)][0]
+            fail(source, f"the coordinates of node {number} are not finite numbers.")
+        used = np.zeros(len(points), dtype=bool)
+        used[cells] = True
+        kept = np.where(used, np.cumsum(used) - 1, -1)
         node_sets = {
-            name: _once(self._places(members, f"the set {name!r}"))
+            name: kept[_once(self._places(members, f"the set {name!r}"))]
             for name, members in self._sets["NSET"].values()
         }
         cell_sets, face_sets = {}, {}
@@ -202,21 +203,13 @@ class Deck:
             if len(inside) or not flat:
                 cell_sets[name] = inside
                 continue
-            node_sets.setdefault(name, _once([node for _, nodes in flat for node in nodes]))
-            corners = (tuple(sorted(nodes[: FLAT[own][1]])) for own, nodes in flat)
-            if faces := frozenset(face for face in corners if len(face) > 2):
+            node_sets.setdefault(name, kept[_once([node for _, nodes in flat for node in nodes])])
+            corners = (np.sort(kept[nodes[: FLAT[what][1]]]) for what, nodes in flat)
+            if faces := frozenset(tuple(face.tolist()) for face in corners if len(face) > 2):
                 face_sets[name] = faces
         for name, rows in self.surfaces.items():
-            face_sets[name], nodes = self._faces(rows, kind, cells, cell)
+            face_sets[name], nodes = self._faces(rows, kind, kept[cells], cell)
             node_sets.setdefault(name, nodes)
-
-        points, own = np.array(list(self.nodes.values())), np.array(list(self.nodes), dtype=np.int64)
-        if not np.isfinite(points).all():
-            number = own[~np.isfinite(points).all(axis=1)][0]
-            fail(source, f"the coordinates of node {number} are not finite numbers.")
-        used = np.zeros(len(points), dtype=bool)
-        used[cells] = True
-        kept = np.where(used, np.cumsum(used) - 1, -1)
         return StructureMesh(
             source=source,
             kind=kind,
@@ -226,12 +219,9 @@ class Deck:
             unit_name=unit_name,
             node_numbers=own[used],
             cell_numbers=numbers,
-            node_sets={name: kept[nodes] for name, nodes in node_sets.items()},
+            node_sets=node_sets,
             cell_sets=cell_sets,
-            face_sets={
-                name: frozenset(tuple(kept[list(face)].tolist()) for face in faces)
-                for name, faces in face_sets.items()
-            },
+            face_sets=face_sets,
             loose=own[~used],
             remarks=tuple(
                 f"{notes[0]}{f' ({len(notes)} times)' * (len(notes) > 1)} is not known and was passed over; "
@@ -355,9 +345,7 @@ def frame(where: str, points: FloatArray, order: tuple[int, int, int] = (0, 1, 2
         If the points lie on a line.
     """
     first, second = points[1] - points[0], points[2] - points[0]
-    third = np.cross(first, second)
     size = np.linalg.norm(first) * np.linalg.norm(second)
-    if not np.linalg.norm(third) > _LEAST_SINE * size:
+    if not np.linalg.norm(np.cross(first, second)) > _LEAST_SINE * size:
         fail(where, "the three points of a coordinate system must not lie on a line.")
-    axes = np.array([first, np.cross(third, first), third])
-    return np.asarray((axes / np.linalg.norm(axes, axis=1)[:, None])[list(order)])
+    return axes_of(first, second)[list(order)]

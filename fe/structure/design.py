@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from fe.elements.cells import rotate_elasticity
+from fe.elements.cells import axes_of, isotropic_compliance, orthotropic_compliance, rotate_elasticity
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.runtime.state import MOST_REGIONS
 from reporting.section import checked
@@ -35,73 +35,65 @@ from .tables import (
     Vector,
 )  # fmt: skip
 
-FloatArray = NDArray[np.float64]
-
 LEAST_SINE = 1e-3
 """Two axes whose angle has a smaller sine do not span a plane."""
 
 
-class Gauge(Named):
-    """Strain gauge on the surface: mean strain along `direction`, positive in tension.
-
-    The mean is over `length` along the direction and `width` across it.
-    """
+class Spot(Part):
+    """Where a gauge lies: its strain is the mean over `length` along its direction and `width` across it."""
 
     point: Vector
-    direction: Direction
     length: float = Field(default=0.0, ge=0.0)
     width: float = Field(default=0.0, ge=0.0)
 
 
-class Rosette(Part):
-    """Gauges NAME_a, NAME_b, ... at one point, at `angles` [degrees] from axis 1 towards axis 2.
+class Gauge(Named, Spot):
+    """Strain gauge on the surface: mean strain along `direction`, positive in tension."""
 
-    Axis 1 is along the first vector of `axes`; axis 2 lies in the plane of both, at right angles to it.
-    """
+    direction: Direction
+
+
+def _span_a_plane(axes: tuple[Direction, Direction]) -> tuple[Direction, Direction]:
+    sizes = np.linalg.norm(axes[0]) * np.linalg.norm(axes[1])
+    if np.linalg.norm(np.cross(*axes)) <= LEAST_SINE * sizes:
+        raise ValueError("the two axes must not be parallel, and must point in two directions")
+    return axes
+
+
+Axes = Annotated[tuple[Direction, Direction], AfterValidator(_span_a_plane)]
+"""Axis 1 is along the first vector; axis 2 lies in the plane of both, at right angles to it."""
+
+
+class Rosette(Spot):
+    """Gauges NAME_a, NAME_b, ... at one point, at `angles` [degrees] from axis 1 towards axis 2."""
 
     name: Annotated[str, Field(max_length=30, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
-    point: Vector
-    axes: tuple[Vector, Vector]
+    axes: Axes
     angles: Annotated[tuple[float, ...], Field(min_length=2, max_length=6)] = (0.0, 45.0, 90.0)
-    length: float = Field(default=0.0, ge=0.0)
-    width: float = Field(default=0.0, ge=0.0)
-
-    @model_validator(mode="after")
-    def _spans_a_plane(self) -> "Rosette":
-        first, second = (np.asarray(axis) for axis in self.axes)
-        sizes = float(np.linalg.norm(first) * np.linalg.norm(second))
-        if np.linalg.norm(np.cross(first, second)) <= LEAST_SINE * sizes:
-            raise ValueError("the two axes must point in two directions of the surface")
-        return self
 
     def gauges(self) -> list[dict[str, Any]]:
         """Return its gauges as tables of a structure file."""
-        first = np.asarray(self.axes[0]) / np.linalg.norm(self.axes[0])
-        second = np.asarray(self.axes[1]) - (first @ np.asarray(self.axes[1])) * first
-        second /= np.linalg.norm(second)
-        turned = [
-            np.cos(angle) * first + np.sin(angle) * second for angle in np.radians(self.angles).tolist()
-        ]
-        common = {"point": self.point, "length": self.length, "width": self.width}
-        return [
-            {"name": f"{self.name}_{letter}", "direction": tuple(direction.tolist())} | common
-            for letter, direction in zip("abcdef", turned, strict=False)
-        ]
+        first, second, _ = axes_of(*self.axes)
+        common, found = self.model_dump(include={*Spot.model_fields}), []
+        for letter, angle in zip("abcdef", np.radians(self.angles).tolist(), strict=False):
+            direction = np.cos(angle) * first + np.sin(angle) * second
+            found.append({"name": f"{self.name}_{letter}", "direction": tuple(direction.tolist())} | common)
+        return found
 
 
-def with_rosettes(content: dict[str, Any], source: str, error: type[Exception]) -> dict[str, Any]:
+def with_rosettes(content: dict[str, Any], source: str) -> dict[str, Any]:
     """Return the content of a structure file whose rosettes have become gauges, behind its own.
 
     Raises
     ------
-    error
+    InvalidDesignError
         One sentence that names `source`, the rosette and its fault.
     """
     tables = content.get("rosette")
     if not isinstance(tables, list):
         return content
     rosettes = [
-        checked(Rosette, table, f"{source}: rosette[{number}]", error, what="a rosette")
+        checked(Rosette, table, f"{source}: rosette[{number}]", InvalidDesignError, what="a rosette")
         for number, table in enumerate(tables, start=1)
     ]
     kept = {key: value for key, value in content.items() if key != "rosette"}
@@ -139,8 +131,7 @@ class Material(Given):
     """Material of the cells of a set: isotropic, or orthotropic in axes given by two vectors.
 
     An orthotropic material gives three moduli along its axes 1, 2 and 3, Poisson's ratios 12, 13 and 23
-    (ratio ij is the contraction along j under tension along i) and shear moduli 12, 13 and 23. Axis 1 is
-    along the first vector; axis 2 lies in the plane of both vectors, at right angles to it.
+    (ratio ij is the contraction along j under tension along i) and shear moduli 12, 13 and 23.
     """
 
     name: Name
@@ -151,7 +142,7 @@ class Material(Given):
     young_moduli: tuple[Modulus, Modulus, Modulus] | None = None
     poisson_ratios: Vector | None = None
     shear_moduli: tuple[Modulus, Modulus, Modulus] | None = None
-    axes: tuple[Direction, Direction] | None = None
+    axes: Axes | None = None
     scaled_by: Name | None = None
     ways = (
         ("young_modulus", "poisson_ratio"),
@@ -160,32 +151,22 @@ class Material(Given):
 
     @model_validator(mode="after")
     def _is_stable(self) -> "Material":
-        if self.axes is not None:
-            if np.linalg.norm(np.cross(unit_vector(self.axes[0]), unit_vector(self.axes[1]))) < LEAST_SINE:
-                raise ValueError("the two axes must not be parallel")
-            if np.linalg.eigvalsh(self.compliance)[0] <= 0.0:
-                raise ValueError(
-                    "the moduli and Poisson's ratios belong to no stable material: its compliance is not "
-                    "positive definite"
-                )
+        if self.axes is not None and np.linalg.eigvalsh(self.compliance)[0] <= 0.0:
+            raise ValueError(
+                "the moduli and Poisson's ratios belong to no stable material: its compliance is not "
+                "positive definite"
+            )
         return self
 
     @property
     def compliance(self) -> FloatArray:
         """Compliance (6, 6) [1/Pa] in the axes of the material; strains 11, 22, 33, 23, 13, 12."""
         if self.young_modulus is not None and self.poisson_ratio is not None:
-            moduli = (self.young_modulus,) * 3
-            ratios = (self.poisson_ratio,) * 3
-            shears = (self.young_modulus / (2.0 * (1.0 + self.poisson_ratio)),) * 3
-        else:
-            assert self.young_moduli is not None
-            assert self.poisson_ratios is not None
-            assert self.shear_moduli is not None
-            moduli, ratios, shears = self.young_moduli, self.poisson_ratios, self.shear_moduli
-        found = np.diag(1.0 / np.array([*moduli, *shears[::-1]]))
-        for (i, j), ratio in zip(((0, 1), (0, 2), (1, 2)), ratios, strict=True):
-            found[i, j] = found[j, i] = -ratio / moduli[i]
-        return found
+            return isotropic_compliance(self.young_modulus, self.poisson_ratio)
+        assert self.young_moduli is not None
+        assert self.poisson_ratios is not None
+        assert self.shear_moduli is not None
+        return orthotropic_compliance(self.young_moduli, self.poisson_ratios, self.shear_moduli)
 
     @property
     def elasticity(self) -> FloatArray:
@@ -193,11 +174,7 @@ class Material(Given):
         local = np.asarray(np.linalg.inv(self.compliance), dtype=np.float64)
         if self.axes is None:
             return local
-        first = unit_vector(self.axes[0])
-        third = np.cross(first, self.axes[1])
-        third /= np.linalg.norm(third)
-        axes = np.array([[first, np.cross(third, first), third]])
-        return np.asarray(rotate_elasticity(local[None], axes)[0])
+        return np.asarray(rotate_elasticity(local[None], axes_of(*self.axes)[None])[0])
 
 
 class Support(Part):
@@ -246,7 +223,6 @@ class Load(Given, Commanded):
     point: Vector | None = None
     force: Direction | None = None
     pressure: float | None = None
-    acceleration: Direction | None = None
 
     ways = (("force", "set"), ("force", "point"), ("pressure", "set"), ("acceleration",))
 
@@ -309,7 +285,7 @@ def parse_structure(content: dict[str, Any], source: str = "the structure") -> M
     """
     if "stiffness_matrix" in content:
         return checked(MatrixDesign, content, source, InvalidDesignError, what="a structure from matrices")
-    content = with_rosettes(content, source, InvalidDesignError)
+    content = with_rosettes(content, source)
     return checked(MeshDesign, content, source, InvalidDesignError, what="a structure")
 
 

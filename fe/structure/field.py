@@ -1,6 +1,5 @@
 """Statics and modes of a structure, by the solver of `fe.full`, and its fields as VTU files for ParaView."""
 
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,21 +8,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.elements.cells import gradients, strain_matrix
-from fe.elements.kinds import ElementKind, meshio_with_wedges
+from fe.elements.cells import centre_strains
+from fe.elements.kinds import meshio_with_wedges
 from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import SolutionError
+from reporting.files import atomic_file
 
 from .affine import AffineStructure
 from .operators import Structure
 
-FloatArray = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class StaticResponse:
-    """Static response of a structure to one load.
+    """Static response of a structure.
 
     Attributes
     ----------
@@ -55,11 +54,22 @@ def static_responses(structure: AffineStructure) -> dict[str, StaticResponse]:
         return {}
     factors = Factorisation(structure.stiffness())
     fields = factors.solve(np.column_stack([structure.load(name) for name in structure.loads]))
-    return {name: response(structure, fields[:, number]) for number, name in enumerate(structure.loads)}
+    return {name: _response(structure, field) for name, field in zip(structure.loads, fields.T, strict=True)}
 
 
-def response(structure: AffineStructure, displacement: FloatArray) -> StaticResponse:
-    """Evaluate the outputs of free unknowns (n,)."""
+def static_response(structure: AffineStructure, values: Mapping[str, float]) -> StaticResponse:
+    """Solve for all loads together at values by name; what is left out is nominal, and healthy.
+
+    Raises
+    ------
+    SolutionError
+        As of `static_responses`.
+    """
+    stiffness, _, load = structure.at(values)
+    return _response(structure, Factorisation(stiffness).solve(load))
+
+
+def _response(structure: AffineStructure, displacement: FloatArray) -> StaticResponse:
     return StaticResponse(
         displacement=displacement,
         largest=float(np.linalg.norm(structure.full_displacement(displacement), axis=1).max()),
@@ -68,8 +78,10 @@ def response(structure: AffineStructure, displacement: FloatArray) -> StaticResp
     )
 
 
-def natural_frequencies(structure: AffineStructure, count: int) -> tuple[FloatArray, FloatArray]:
-    """Lowest frequencies (m,) [Hz], rising, and mass-normalised shapes (n, m), undamaged and undamped.
+def natural_frequencies(
+    structure: AffineStructure, count: int, values: Mapping[str, float] | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Lowest frequencies (m,) [Hz], rising, and mass-normalised shapes (n, m), undamped; see `at` for values.
 
     Raises
     ------
@@ -81,42 +93,19 @@ def natural_frequencies(structure: AffineStructure, count: int) -> tuple[FloatAr
             f"{count} modes were asked for, but a structure of {structure.unknowns} free unknowns gives at "
             f"most {structure.unknowns - 1}."
         )
-    if not structure.mass().diagonal().any():
+    stiffness, mass, _ = structure.at(values or {})
+    if not mass.diagonal().any():
         raise SolutionError("The structure has no mass, hence no modes; give its materials a density.")
-    values, shapes = lowest_eigenpairs(structure.stiffness(), structure.mass(), count)
-    shapes = shapes / np.sqrt(np.einsum("im,im->m", shapes, structure.mass() @ shapes))
-    return np.sqrt(values) / (2.0 * np.pi), shapes
+    squares, shapes = lowest_eigenpairs(stiffness, mass, count)
+    shapes = shapes / np.sqrt(np.einsum("im,im->m", shapes, mass @ shapes))
+    return np.sqrt(squares) / (2.0 * np.pi), shapes
 
 
 def weighed(structure: Structure) -> tuple[float, FloatArray]:
     """Mass [kg] with the nominal point masses, and the centre of gravity (3,) [m]."""
-    mesh, shares = structure.mesh, structure.nodal_mass
-    for name, value in structure.masses.items():
-        shares = shares + value * structure.point_weights[name]
+    shares, points = structure.nodal_mass, structure.mesh.points
     mass = float(shares.sum())
-    return mass, shares @ mesh.points / mass if mass > 0.0 else mesh.points.mean(axis=0)
-
-
-def centre_strains(
-    kind: ElementKind, points: FloatArray, cells: NDArray[np.int64], displacement: FloatArray
-) -> FloatArray:
-    """Strains (nc, 6) xx, yy, zz, yz, xz, xy, shear as engineering strain, at the centres of the cells.
-
-    Parameters
-    ----------
-    kind : ElementKind
-        Of the cells.
-    points : (nodes, 3) m
-        The nodes.
-    cells : (nc, k)
-        Nodes of the cells.
-    displacement : (nodes, 3) m
-        Of all nodes.
-    """
-    centre = kind.places[: len(kind.corners)].mean(axis=0)
-    slopes, _ = gradients(kind, points[cells], centre[None])
-    moved = displacement[cells].reshape(len(cells), -1)
-    return np.asarray(np.einsum("nij,nj->ni", strain_matrix(slopes[:, 0]), moved))
+    return mass, shares @ points / mass if mass > 0.0 else points.mean(axis=0)
 
 
 def write_structure_vtu(
@@ -140,13 +129,11 @@ def write_structure_vtu(
     ------
     SolutionError
         If the structure cannot be solved.
-    OSError
+    FileNotWrittenError
         If the file cannot be written.
     """
     given = dict(values or {})
-    stiffness, _, load = structure.at(given)
-    free = Factorisation(stiffness).solve(load)
-    displacement = structure.full_displacement(free)
+    displacement = structure.full_displacement(static_response(structure, given).displacement)
     mesh, loss = structure.mesh, np.zeros(len(structure.mesh.cells))
     for number, name in enumerate(structure.regions):
         loss[structure.region_of == number] = given.get(name, 0.0)
@@ -156,7 +143,7 @@ def write_structure_vtu(
         (mesh.kind.file_type, mesh.cells),
         {"displacement": displacement},
         {
-            "strain": centre_strains(mesh.kind, mesh.points, mesh.cells, displacement),
+            "strain": centre_strains(mesh, displacement),
             "material": structure.material_of + 1,
             "region": structure.region_of + 1,
             "stiffness_loss": loss,
@@ -167,18 +154,12 @@ def write_structure_vtu(
 def write_vtu(
     path: Path | str,
     points: FloatArray,
-    cells: tuple[str, NDArray[np.int64]],
+    cells: tuple[str, IntArray],
     point_data: dict[str, FloatArray],
     cell_data: dict[str, NDArray[Any]],
 ) -> None:
     """Write a VTU file, whole or not at all; `cells` are their kind in meshio and their nodes."""
-    meshio, path = meshio_with_wedges(), Path(path)
-    values = {name: [value] for name, value in cell_data.items()}
+    meshio, values = meshio_with_wedges(), {name: [value] for name, value in cell_data.items()}
     mesh = meshio.Mesh(points, [cells], point_data=point_data, cell_data=values)
-    try:
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
-            temporary = Path(folder) / "field.vtu"
-            meshio.write(temporary, mesh, file_format="vtu")
-            temporary.replace(path)
-    except OSError as error:  # with the name that was asked for, not that of the temporary file
-        raise OSError(error.errno, error.strerror, str(path)) from error
+    with atomic_file(path) as temporary:
+        meshio.write(temporary, mesh, file_format="vtu")

@@ -1,46 +1,23 @@
 """Strain gauges on the surface of a mesh, as rows on the nodal displacements."""
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.elements.cells import strain_weights
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidDesignError
 
 from .design import Gauge, Rosette
-from .location import Locator, SurfacePoint
+from .location import on_surface
 from .mesh import StructureMesh
-
-FloatArray = NDArray[np.float64]
 
 STEEPEST = 30.0
 """Largest angle [degrees] between a gauge's direction and the surface; less is turned into the surface."""
 _ALONG, _ACROSS = 20, 10  # points of a gauge that has a length, a width
 
 
-class GaugePlace(NamedTuple):
-    """Where a gauge came to lie.
-
-    Attributes
-    ----------
-    point, direction, normal : (3,)
-        Its place on the surface [m], its direction in the surface, and the outward normal there.
-    moved : float
-        Distance [m] from the place that was asked for.
-    """
-
-    point: FloatArray
-    direction: FloatArray
-    normal: FloatArray
-    moved: float
-
-
-def gauge_rows(
-    mesh: StructureMesh, locator: Locator, gauges: tuple[Gauge, ...]
-) -> tuple[sparse.csr_array, tuple[GaugePlace, ...]]:
-    """Strain rows (gauges, full) [1/m], positive in tension, and where the gauges lie.
+def gauge_rows(mesh: StructureMesh, gauges: tuple[Gauge, ...]) -> tuple[sparse.csr_array, FloatArray]:
+    """Strain rows (gauges, full) [1/m], positive in tension, and how far (gauges,) [m] each gauge was moved.
 
     A gauge without a length reads the strain at its point, the mean of the cells that meet there; one with
     a length reads the mean of 20 points along it, one with a width of 10 across, each put onto the surface.
@@ -50,18 +27,19 @@ def gauge_rows(
     InvalidDesignError
         If a gauge lies off the surface, reaches over its edge, or points out of it.
     """
-    rows, places = [sparse.csr_array((0, mesh.unknowns))], []
+    rows, moved = [sparse.csr_array((0, mesh.unknowns))], []
     for number, gauge in enumerate(gauges, start=1):
         where = f"gauge[{number}] ({gauge.name})"
         point = mesh.unit * np.asarray(gauge.point)
-        found = locator.on_surface(point, f"{where}: the point {mesh.place(point)}")
+        found = on_surface(mesh, point, f"{where}: the point {mesh.place(point)}")
         direction = _in_surface(np.asarray(gauge.direction), found.normal, where)
         spots = [found]
         if gauge.length or gauge.width:
             inside, corners = _spots(mesh, gauge, direction, np.cross(found.normal, direction))
             wide = f" and {gauge.width:g} {mesh.unit_name} wide" if gauge.width else ""
             spots = [
-                locator.on_surface(
+                on_surface(
+                    mesh,
                     point + off,
                     f"{where}: {gauge.length:g} {mesh.unit_name} long{wide}, the gauge reaches over the "
                     f"edge; its point {mesh.place(point + off)}",
@@ -70,13 +48,13 @@ def gauge_rows(
             ][: len(inside)]
         row = np.zeros(mesh.unknowns)
         for spot in spots:
-            _add_strain(mesh, spot, _in_surface(direction, spot.normal, where), 1.0 / len(spots), row)
+            along = _in_surface(direction, spot.normal, where)
+            weights = strain_weights(mesh.kind, mesh.nodes[spot.cell], spot.local, along)
+            share = 1.0 / (len(spots) * len(spot.cell))  # the mean of the cells that meet there
+            np.add.at(row.reshape(-1, 3), mesh.cells[spot.cell], share * weights)
         rows.append(sparse.csr_array(row[None]))
-        values, _ = mesh.kind.shape_functions(found.local[:1])
-        places.append(
-            GaugePlace(values[0] @ mesh.nodes[found.cell[0]], direction, found.normal, found.distance)
-        )
-    return sparse.vstack(rows).tocsr(), tuple(places)
+        moved.append(found.distance)
+    return sparse.vstack(rows).tocsr(), np.array(moved)
 
 
 def _spots(
@@ -108,34 +86,26 @@ def _in_surface(direction: FloatArray, normal: FloatArray, where: str) -> FloatA
     return np.asarray(inside / np.linalg.norm(inside))
 
 
-def _add_strain(
-    mesh: StructureMesh, spot: SurfacePoint, direction: FloatArray, share: float, row: FloatArray
-) -> None:
-    """Add the strain along a direction, the mean of the cells at a spot, to a row (full,)."""
-    weights = strain_weights(mesh.kind, mesh.nodes[spot.cell], spot.local, direction)
-    np.add.at(row.reshape(-1, 3), mesh.cells[spot.cell], share / len(spot.cell) * weights)
-
-
-def spread_rosettes(locator: Locator, count: int) -> list[Rosette]:
+def spread_rosettes(mesh: StructureMesh, count: int) -> list[Rosette]:
     """Return rosettes spread evenly over the faces of the surface, `spread_1` and on.
 
     Parameters
     ----------
-    locator : Locator
-        Of the mesh.
+    mesh : StructureMesh
+        The mesh.
     count : int
         At most how many rosettes; fewer where several would come to lie on one face.
     """
     from scipy.cluster.vq import kmeans2, vq
 
-    centre, _ = locator.faces
+    centre, _ = mesh.face_spheres
     near, _ = kmeans2(centre, min(count, len(centre)), minit="++", rng=0)
     found = []
     for number, face in enumerate(np.unique(vq(near, centre)[0]).tolist(), start=1):
-        normal = locator.on_surface(centre[face], "a face").normal
+        normal = on_surface(mesh, centre[face], "a face").normal
         first = np.eye(3)[np.argmin(np.abs(normal))]
         first -= (first @ normal) * normal
         axes = tuple(first.tolist()), tuple(np.cross(normal, first).tolist())
-        point = tuple((centre[face] / locator.mesh.unit).tolist())
+        point = tuple((centre[face] / mesh.unit).tolist())
         found.append(Rosette(name=f"spread_{number}", point=point, axes=axes))
     return found

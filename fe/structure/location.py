@@ -3,21 +3,16 @@
 Last the nodal loads (nodes, 3) [N] of forces and pressures there.
 """
 
-from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.elements.cells import CellMesh, point_jacobians
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError
 
 from .design import Load
 from .mesh import StructureMesh, Surface
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 FARTHEST = 0.1
 """A point may lie so far off the surface, in sizes of the nearest face: coordinates are rounded, and the
@@ -41,138 +36,110 @@ class SurfacePoint(NamedTuple):
         Outward unit normal.
     distance : float
         How far the point asked for lies off the surface [m].
-    size : float
-        Size of the face [m].
     """
 
     cell: IntArray
     local: FloatArray
     normal: FloatArray
     distance: float
-    size: float
 
 
-@dataclass(frozen=True)
-class Locator:
-    """Finds points in a mesh."""
+def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, FloatArray]:
+    """Find the cell and the local place (3,) of a point [m] in the structure or close to its surface.
 
-    mesh: StructureMesh
+    Raises
+    ------
+    InvalidDesignError
+        If it lies outside; the sentence begins with `where`.
+    """
+    near = np.linalg.norm(mesh.centres - point, axis=1) <= 1.001 * mesh.cell_radius
+    cells = np.flatnonzero(near)
+    if len(cells):
+        local = _local(mesh, cells, point)
+        inside = mesh.kind.inside(local, _INSIDE)
+        if inside.any():
+            first = int(np.flatnonzero(inside)[0])
+            return int(cells[first]), local[first]
+    found = on_surface(mesh, point, where)
+    return int(found.cell[0]), found.local[0]
 
-    @cached_property
-    def _cell_radius(self) -> FloatArray:
-        mesh = self.mesh
-        return np.asarray(np.linalg.norm(mesh.nodes - mesh.centres[:, None], axis=2).max(axis=1))
 
-    @cached_property
-    def faces(self) -> tuple[FloatArray, FloatArray]:
-        """Centres (m, 3) [m] of the faces of the surface and the radii (m,) [m] around them."""
-        mesh, surface = self.mesh, self.mesh.boundary
-        centre, radius = np.empty((len(surface), 3)), np.empty(len(surface))
-        for number, nodes in enumerate(mesh.kind.face_nodes):
-            on = np.flatnonzero(surface.face == number)
-            middle = np.full((1, 2), 1.0 / 3.0 if len(mesh.kind.faces[number]) == 3 else 0.5)
-            values, _ = mesh.kind.shape_functions(mesh.kind.face_places(number, middle)[0])
-            points = mesh.nodes[surface.cell[on]]
-            centre[on] = np.einsum("a,nai->ni", values[0], points)
-            radius[on] = np.linalg.norm(points[:, list(nodes)] - centre[on, None], axis=2).max(axis=1)
-        return centre, radius
+def _local(mesh: StructureMesh, cells: IntArray, point: FloatArray) -> FloatArray:
+    """Local places (n, 3) of a point in cells (n,), by Newton's method; far away where it is in none."""
+    kind, nodes = mesh.kind, mesh.nodes[cells]
+    local = np.tile(np.mean(kind.corners, axis=0), (len(cells), 1))
+    for _ in range(_STEPS):
+        residual = point - _position(mesh, cells, local)
+        jacobian = point_jacobians(kind, nodes, local)
+        # Outside its cell the map may fold: such a place is no solution, wherever the next step leads.
+        jacobian[np.linalg.det(jacobian) == 0.0] = np.eye(3)
+        step = np.linalg.solve(jacobian, residual[..., None])[..., 0]
+        local = np.clip(local + step, -2.0, 3.0)
+        if np.abs(step).max() < 1e-13:
+            break
+    miss = np.linalg.norm(point - _position(mesh, cells, local), axis=1) > 1e-9 * mesh.size
+    local[miss] = 9.0
+    return local
 
-    def attach(self, point: FloatArray, where: str) -> tuple[int, FloatArray]:
-        """Find the cell and the local place (3,) of a point [m] in the structure or close to its surface.
 
-        Raises
-        ------
-        InvalidDesignError
-            If it lies outside; the sentence begins with `where`.
-        """
-        mesh = self.mesh
-        near = np.linalg.norm(mesh.centres - point, axis=1) <= 1.001 * self._cell_radius
-        cells = np.flatnonzero(near)
-        if len(cells):
-            local = self._local(cells, point)
-            inside = mesh.kind.inside(local, _INSIDE)
-            if inside.any():
-                first = int(np.flatnonzero(inside)[0])
-                return int(cells[first]), local[first]
-        found = self.on_surface(point, where)
-        return int(found.cell[0]), found.local[0]
+def _position(mesh: StructureMesh, cells: IntArray, local: FloatArray) -> FloatArray:
+    values, _ = mesh.kind.shape_functions(local)
+    return np.asarray(np.einsum("na,nai->ni", values, mesh.nodes[cells]))
 
-    def _local(self, cells: IntArray, point: FloatArray) -> FloatArray:
-        """Local places (n, 3) of a point in cells (n,), by Newton's method; far away where it is in none."""
-        kind, nodes = self.mesh.kind, self.mesh.nodes[cells]
-        local = np.tile(np.mean(kind.corners, axis=0), (len(cells), 1))
-        for _ in range(_STEPS):
-            residual = point - self._position(cells, local)
-            jacobian = point_jacobians(kind, nodes, local)
-            # Outside its cell the map may fold: such a place is no solution, wherever the next step leads.
-            jacobian[np.linalg.det(jacobian) == 0.0] = np.eye(3)
-            step = np.linalg.solve(jacobian, residual[..., None])[..., 0]
-            local = np.clip(local + step, -2.0, 3.0)
-            if np.abs(step).max() < 1e-13:
-                break
-        miss = np.linalg.norm(point - self._position(cells, local), axis=1) > 1e-9 * self.mesh.size
-        local[miss] = 9.0
-        return local
 
-    def _position(self, cells: IntArray, local: FloatArray) -> FloatArray:
-        values, _ = self.mesh.kind.shape_functions(local)
-        return np.asarray(np.einsum("na,nai->ni", values, self.mesh.nodes[cells]))
+def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoint:
+    """Find the point of the surface that is nearest to a point (3,) [m].
 
-    def on_surface(self, point: FloatArray, where: str) -> SurfacePoint:
-        """Find the point of the surface that is nearest to a point (3,) [m].
-
-        Raises
-        ------
-        InvalidDesignError
-            If it lies farther off than `FARTHEST`; the sentence begins with `where`.
-        """
-        mesh, surface = self.mesh, self.mesh.boundary
-        centre, radius = self.faces
-        away = np.linalg.norm(centre - point, axis=1)
-        near = np.flatnonzero(away - 1.1 * radius <= away.min())
-        cells = surface.cell[near]
-        local, distance, normal = (np.empty((len(near), 3)), np.empty(len(near)), np.empty((len(near), 3)))
-        for number in np.unique(surface.face[near]):
-            on = np.flatnonzero(surface.face[near] == number)
-            local[on], distance[on], normal[on] = self._project(int(number), cells[on], point)
-        best = int(distance.argmin())
-        size = float(radius[near[best]])
-        if distance[best] > FARTHEST * size:
-            foot = self._position(cells[[best]], local[[best]])[0]
-            inside = float((point - foot) @ normal[best]) < 0.0
-            raise InvalidDesignError(
-                f"{where} lies {distance[best] / mesh.unit:.3g} {mesh.unit_name} off the surface of "
-                f"{mesh.source}{', inside' if inside else ''}; the nearest point of the surface is "
-                f"{mesh.place(foot)}."
-            )
-        same = (distance <= distance[best] + _SAME_PLACE * size) & (normal @ normal[best] > _SAME_SIDE)
-        mean = normal[same].mean(axis=0)
-        return SurfacePoint(
-            cells[same], local[same], mean / np.linalg.norm(mean), float(distance[best]), size
+    Raises
+    ------
+    InvalidDesignError
+        If it lies farther off than `FARTHEST`; the sentence begins with `where`.
+    """
+    surface, (centre, radius) = mesh.boundary, mesh.face_spheres
+    away = np.linalg.norm(centre - point, axis=1)
+    near = np.flatnonzero(away - 1.1 * radius <= away.min())
+    cells = surface.cell[near]
+    local, distance, normal = (np.empty((len(near), 3)), np.empty(len(near)), np.empty((len(near), 3)))
+    for number in np.unique(surface.face[near]):
+        on = np.flatnonzero(surface.face[near] == number)
+        local[on], distance[on], normal[on] = _project(mesh, int(number), cells[on], point)
+    best = int(distance.argmin())
+    size = float(radius[near[best]])
+    if distance[best] > FARTHEST * size:
+        foot = _position(mesh, cells[[best]], local[[best]])[0]
+        inside = float((point - foot) @ normal[best]) < 0.0
+        raise InvalidDesignError(
+            f"{where} lies {distance[best] / mesh.unit:.3g} {mesh.unit_name} off the surface of "
+            f"{mesh.source}{', inside' if inside else ''}; the nearest point of the surface is "
+            f"{mesh.place(foot)}."
         )
+    same = (distance <= distance[best] + _SAME_PLACE * size) & (normal @ normal[best] > _SAME_SIDE)
+    mean = normal[same].mean(axis=0)
+    return SurfacePoint(cells[same], local[same], mean / np.linalg.norm(mean), float(distance[best]))
 
-    def _project(
-        self, face: int, cells: IntArray, point: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Nearest local place (n, 3) on a face of cells (n,), its distance (n,) [m] and normal (n, 3)."""
-        kind, nodes = self.mesh.kind, self.mesh.nodes[cells]
-        triangle = len(kind.faces[face]) == 3
-        along = np.full((len(cells), 2), 1.0 / 3.0 if triangle else 0.5)
-        moved = np.inf
-        for step in range(_STEPS + 1):
-            local, tangents = kind.face_places(face, along)
-            values, slopes = kind.shape_functions(local)
-            residual = point - np.einsum("na,nai->ni", values, nodes)
-            edges = np.einsum("nai,naj,tj->nti", nodes, slopes, tangents)
-            if step == _STEPS or moved < 1e-14:
-                break
-            gram = np.einsum("nti,nsi->nts", edges, edges)
-            move = np.linalg.solve(gram, np.einsum("nti,ni->nt", edges, residual)[..., None])[..., 0]
-            before, along = along, _on_face(along + move, triangle=triangle)
-            moved = float(np.abs(along - before).max())
-        normal = np.cross(edges[:, 0], edges[:, 1])
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        return local, np.linalg.norm(residual, axis=1), normal
+
+def _project(
+    mesh: StructureMesh, face: int, cells: IntArray, point: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Nearest local place (n, 3) on a face of cells (n,), its distance (n,) [m] and normal (n, 3)."""
+    kind, nodes = mesh.kind, mesh.nodes[cells]
+    triangle = len(kind.faces[face]) == 3
+    along = np.full((len(cells), 2), 1.0 / 3.0 if triangle else 0.5)
+    moved = np.inf
+    for step in range(_STEPS + 1):
+        local, tangents = kind.face_places(face, along)
+        values, slopes = kind.shape_functions(local)
+        residual = point - np.einsum("na,nai->ni", values, nodes)
+        edges = np.einsum("nai,naj,tj->nti", nodes, slopes, tangents)
+        if step == _STEPS or moved < 1e-14:
+            break
+        gram = np.einsum("nti,nsi->nts", edges, edges)
+        move = np.linalg.solve(gram, np.einsum("nti,ni->nt", edges, residual)[..., None])[..., 0]
+        before, along = along, _on_face(along + move, triangle=triangle)
+        moved = float(np.abs(along - before).max())
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return local, np.linalg.norm(residual, axis=1), normal
 
 
 def _on_face(along: FloatArray, *, triangle: bool) -> FloatArray:
@@ -203,7 +170,7 @@ def area_shares(mesh: CellMesh, surface: Surface) -> FloatArray:
     return total
 
 
-def _face_points(mesh: CellMesh, surface: Surface) -> list[tuple[NDArray[np.int64], FloatArray, FloatArray]]:
+def _face_points(mesh: CellMesh, surface: Surface) -> list[tuple[IntArray, FloatArray, FloatArray]]:
     """Cells (n,), weighted outward normals (n, q, 3) [m^2] and shape functions (q, k), face by face."""
     kind, found = mesh.kind, []
     for number in np.unique(surface.face):
@@ -219,8 +186,8 @@ def _face_points(mesh: CellMesh, surface: Surface) -> list[tuple[NDArray[np.int6
     return found
 
 
-def surface_load(mesh: StructureMesh, locator: Locator, load: Load, where: str) -> FloatArray:
-    """Force or pressure (nodes, 3) [N]; `where` is the place in the design, for sentences.
+def nodal_load(mesh: StructureMesh, load: Load, where: str) -> FloatArray:
+    """Return forces (nodes, 3) [N], or an acceleration [m/s^2]; `where` names the load in sentences.
 
     Raises
     ------
@@ -229,13 +196,15 @@ def surface_load(mesh: StructureMesh, locator: Locator, load: Load, where: str) 
     InvalidDesignError
         If its point lies outside.
     """
+    if load.acceleration is not None:
+        return np.tile(load.acceleration, (len(mesh.points), 1))
     if load.pressure is not None:
         assert load.set is not None
         return np.asarray(-load.pressure * area_vectors(mesh, mesh.faces_of(load.set, where)))
     assert load.force is not None
     force = np.asarray(load.force)
     if load.point is not None:
-        return np.outer(point_shares(mesh, locator, load.point, where), force)
+        return np.outer(point_shares(mesh, load.point, where), force)
     assert load.set is not None
     nodes = mesh.nodes_of(load.set, where)
     surface = mesh.faces_between(load.set, nodes)
@@ -248,9 +217,7 @@ def surface_load(mesh: StructureMesh, locator: Locator, load: Load, where: str) 
     return np.outer(shares, force)
 
 
-def point_shares(
-    mesh: StructureMesh, locator: Locator, point: tuple[float, float, float], where: str
-) -> FloatArray:
+def point_shares(mesh: StructureMesh, point: tuple[float, float, float], where: str) -> FloatArray:
     """Share (nodes,) of each node in the displacement of a point [unit of length of the mesh].
 
     Raises
@@ -259,7 +226,7 @@ def point_shares(
         If it lies outside.
     """
     place = f"{where}: the point {mesh.place(mesh.unit * np.asarray(point))}"
-    cell, local = locator.attach(mesh.unit * np.asarray(point), place)
+    cell, local = attach(mesh, mesh.unit * np.asarray(point), place)
     shares = np.zeros(len(mesh.points))
     shares[mesh.cells[cell]] = mesh.kind.shape_functions(local[None])[0][0]
     return shares

@@ -4,28 +4,27 @@ Unknowns stay in the unit of length of the matrices, so that these are taken as 
 displacement, and masses and accelerations, are turned into SI units.
 """
 
+import itertools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.full.cholesky import Cholesky
 from fe.full.modes import lowest_eigenpairs
 from fe.full.statics import Factorisation
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError, SolutionError
 
-from .affine import DesignedStructure, LoadTerm, StiffnessTerm, names_of
+from .affine import DesignedStructure, StiffnessTerm, designed
 from .design import unit_vector
-from .matrix_design import Extension, MatrixDesign, MatrixMass, NodeOutput
+from .matrix_design import Extension, MatrixDesign, MatrixLoad, MatrixMass, NodeOutput
 from .matrix_files import Place, read_matrix, read_unknowns, read_vector
 from .tables import MOTIONS, Vector
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Shares = Mapping[int, tuple[float, ...]]
 
 READ: Shares = {
@@ -172,42 +171,30 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> D
         sum(files.matrix(name, key) for name in getattr(design, key))
         for key in ("stiffness_matrix", "mass_matrix")
     )
-    held = [
-        files.rows_of((node, MOTIONS.index(motion) + 1), f"support[{number}]")
-        for number, part in enumerate(design.support, start=1)
-        for node in part.nodes
-        for motion in part.hold
-    ]
     moves = (stiffness.diagonal() != 0.0) | (mass.diagonal() != 0.0)
-    moves[[row for rows in held for row in rows]] = False
+    for number, part in enumerate(design.support, start=1):
+        for node, motion in itertools.product(part.nodes, part.hold):
+            moves[files.rows_of((node, MOTIONS.index(motion) + 1), f"support[{number}]")] = False
     free = np.flatnonzero(moves)
     if not len(free):
         raise MeshError(f"{folder}: the matrices have no row that is free and has stiffness or mass.")
     _check_whole(stiffness[free][:, free], mass[free][:, free], [files.places[row] for row in free])
 
-    own = [_point_mass(part, design.unit, files, number) for number, part in enumerate(design.mass, start=1)]
-    masses: dict[str | None, sparse.csr_array] = {None: mass}
-    for part, matrix in zip(design.mass, own, strict=True):
-        if part.free:
-            masses[part.name] = matrix
-        else:
-            masses[None] = masses[None] + part.mass * matrix
-    gauges, displacements, accelerations = (
-        sparse.csr_array(np.array([*_rows(design, files, key)]).reshape(-1, len(files.places))[:, free])
-        for key in ("gauge", "displacement", "acceleration")
+    fields = designed(
+        design,
+        sparse.eye_array(len(moves), format="csc")[:, free].tocsr(),
+        mass,
+        (_point_mass(part, design.unit, files, f"mass[{n}]") for n, part in enumerate(design.mass, start=1)),
+        (_load(part, design.unit, files, f"load[{n}]") for n, part in enumerate(design.load, start=1)),
+        {
+            key: sparse.csr_array(np.array([*_rows(design, files, key)]).reshape(-1, len(moves)))
+            for key in ("gauge", "displacement", "acceleration")
+        },
     )
-    loads = _load_terms(design, files, masses)
     return DesignedStructure(
-        **names_of(design),
+        **fields | {"expansion": design.unit * _expansion(files)[:, free]},
         stiffness_terms=tuple(_stiffness_terms(design, files, stiffness, free)),
-        mass_terms=tuple(term[free][:, free] for term in masses.values()),
-        load_terms=tuple(replace(term, vector=term.vector[free]) for term in loads),
-        gauge_output=gauges,
-        displacement_output=displacements,
-        acceleration_output=accelerations,
-        expansion=design.unit * _expansion(files)[:, free],
         design_hash=design_hash,
-        design=design,
     )
 
 
@@ -226,9 +213,8 @@ def _places(design: MatrixDesign, folder: Path) -> list[Place]:
     return sorted(found)
 
 
-def _point_mass(part: MatrixMass, unit: float, files: Matrices, number: int) -> sparse.csr_array:
+def _point_mass(part: MatrixMass, unit: float, files: Matrices, where: str) -> sparse.csr_array:
     """Return the mass matrix (n, n) of 1 kg, in the unit of the matrices."""
-    where = f"mass[{number}]"
     if part.matrix is not None:
         return files.matrix(part.matrix, where, partial=True)
     assert part.node is not None
@@ -237,20 +223,15 @@ def _point_mass(part: MatrixMass, unit: float, files: Matrices, number: int) -> 
     return sparse.csr_array(unit * (column @ column.T))
 
 
-def _load_terms(
-    design: MatrixDesign, files: Matrices, masses: dict[str | None, sparse.csr_array]
-) -> Iterator[LoadTerm]:
-    """Yield the parts of every load on all rows; an acceleration acts on 1 kg of each free mass as well."""
-    for number, load in enumerate(design.load, start=1):
-        where = f"load[{number}]"
-        if load.vector is not None:
-            yield LoadTerm(load.name, files.vector(load.vector, where, PUSHED))
-        elif load.node is not None and load.force is not None:
-            yield LoadTerm(load.name, files.along(load.node, load.force, where, PUSHED))
-        elif load.acceleration is not None:
-            field = files.everywhere(load.acceleration, where) / design.unit
-            for name, term in masses.items():
-                yield LoadTerm(load.name, np.asarray(term @ field), name)
+def _load(load: MatrixLoad, unit: float, files: Matrices, where: str) -> FloatArray:
+    """Return the vector (n,) of a load, or of the field of an acceleration in the unit of the matrices."""
+    if load.vector is not None:
+        return files.vector(load.vector, where, PUSHED)
+    if load.acceleration is not None:
+        return files.everywhere(load.acceleration, where) / unit
+    assert load.node is not None
+    assert load.force is not None
+    return files.along(load.node, load.force, where, PUSHED)
 
 
 def _rows(design: MatrixDesign, files: Matrices, key: str) -> Iterator[FloatArray]:

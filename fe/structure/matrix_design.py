@@ -46,7 +46,6 @@ class MatrixLoad(Given, Commanded):
     vector: FileName | None = None
     node: Node | None = None
     force: Direction | None = None
-    acceleration: Direction | None = None
 
     ways = (("vector",), ("node", "force"), ("acceleration",))
 

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import io as scipy_io
 from scipy import sparse
 
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
 from reporting.text_file import read_text
 
@@ -24,7 +24,6 @@ from .deck import fail
 from .matrix_design import file_of
 from .nastran_file import cards
 
-FloatArray = NDArray[np.float64]
 Place = tuple[int, int]
 """Node and component: 1, 2, 3 along x, y, z, then 4, 5, 6 about them."""
 
@@ -173,9 +172,7 @@ def _from_table(path: Path, table: FloatArray) -> Any:
     return _by_place(whole[:, :2], whole[:, 2:], table[:, 4])
 
 
-def _mirrored(
-    rows: NDArray[np.int64], columns: NDArray[np.int64], values: FloatArray, size: int
-) -> sparse.csr_array:
+def _mirrored(rows: IntArray, columns: IntArray, values: FloatArray, size: int) -> sparse.csr_array:
     """Return a matrix of which one of each two entries that mirror each other may be left out."""
     matrix = sparse.coo_array((values, (rows, columns)), (size, size)).tocsr()
     pattern = sparse.coo_array((np.ones(len(rows)), (rows, columns)), (size, size)).tocsr()
@@ -185,7 +182,7 @@ def _mirrored(
     return matrix
 
 
-def _by_place(rows: NDArray[np.int64], columns: NDArray[np.int64], values: FloatArray) -> StoredMatrix:
+def _by_place(rows: IntArray, columns: IntArray, values: FloatArray) -> StoredMatrix:
     """Return a matrix whose rows and columns (n, 2) are nodes with their components."""
     places, number = np.unique(np.concatenate((rows, columns)), axis=0, return_inverse=True)
     row, column = number.reshape(2, -1)

@@ -6,13 +6,10 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.elements.cells import CellMesh
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 EVERYTHING = "all"
 """The set of all cells, which no file has to hold."""
@@ -96,6 +93,25 @@ class StructureMesh(CellMesh):
     def boundary(self) -> Surface:
         """Faces of one cell alone: the surface of the structure."""
         return self._boundary[0]
+
+    @cached_property
+    def cell_radius(self) -> FloatArray:
+        """Radii (nc,) [m] of the spheres around the centres of the cells that hold their nodes."""
+        return np.asarray(np.linalg.norm(self.nodes - self.centres[:, None], axis=2).max(axis=1))
+
+    @cached_property
+    def face_spheres(self) -> tuple[FloatArray, FloatArray]:
+        """Centres (m, 3) [m] of the faces of the surface and the radii (m,) [m] around them."""
+        surface = self.boundary
+        centre, radius = np.empty((len(surface), 3)), np.empty(len(surface))
+        for number, nodes in enumerate(self.kind.face_nodes):
+            on = np.flatnonzero(surface.face == number)
+            middle = np.full((1, 2), 1.0 / 3.0 if len(self.kind.faces[number]) == 3 else 0.5)
+            values, _ = self.kind.shape_functions(self.kind.face_places(number, middle)[0])
+            points = self.nodes[surface.cell[on]]
+            centre[on] = np.einsum("a,nai->ni", values[0], points)
+            radius[on] = np.linalg.norm(points[:, list(nodes)] - centre[on, None], axis=2).max(axis=1)
+        return centre, radius
 
     def place(self, point: FloatArray) -> str:
         """Return a place [m] as it stands in a sentence, in the unit of the file."""

@@ -11,21 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 
 from fe.elements.cells import BATCH, jacobians
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.full.cholesky import analyse
+from fe.runtime.arrays import IntArray
 from fe.runtime.errors import MeshError
 
 from .abaqus_file import read_abaqus
 from .deck import FLAT, Deck
 from .mesh import StructureMesh
 from .nastran_file import read_nastran
-
-IntArray = NDArray[np.int64]
 
 _READERS: dict[str, Callable[[Path], Deck]] = {
     ".inp": read_abaqus, ".bdf": read_nastran, ".nas": read_nastran, ".fem": read_nastran,

@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.elements.kinds import KINDS
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import MeshError
+from reporting.section import shown
 from reporting.text_file import read_text
 
-from .deck import FLAT, GLOBAL, Deck, System, fail, frame, included, real, shown, whole, words_of
-
-FloatArray = NDArray[np.float64]
+from .deck import FLAT, GLOBAL, Deck, System, fail, frame, included, real, whole, words_of
 
 _SOLIDS = {"CTETRA": 4, "CHEXA": 8, "CPENTA": 6}
 """Solid elements with the number of their corners."""

@@ -1,28 +1,24 @@
 """From a structure file and its mesh to affine operators."""
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.elements.kinds import Rule
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError, MeshError
 
-from .affine import DesignedStructure, LoadTerm, StiffnessTerm, names_of
-from .design import MeshDesign, load_structure, structure_hash
-from .gauges import GaugePlace, gauge_rows
-from .location import Locator, point_shares, surface_load
+from .affine import DesignedStructure, StiffnessTerm, designed
+from .design import Damage, Material, MeshDesign, load_structure, structure_hash
+from .gauges import gauge_rows
+from .location import nodal_load, point_shares
 from .matrices import assemble_matrices
 from .matrix_design import MatrixDesign
 from .mesh import StructureMesh
 from .mesh_file import check_memory, read_mesh
 from .supports import SupportedUnknowns, supported
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -41,12 +37,10 @@ class Structure(DesignedStructure):
         Number of the damage region of each cell, -1 for none.
     unknowns_held : SupportedUnknowns
         What the supports hold and spring.
-    gauge_places : tuple of GaugePlace
-        Where the gauges came to lie.
-    point_weights : dict of str to (nodes,)
-        Share of each node in the displacement of each point mass.
+    gauges_moved : (gauges,) m
+        How far each gauge lies from where it was asked for.
     nodal_mass : (nodes,) kg
-        Share of each node in the mass of the structure with its fixed point masses.
+        Share of each node in the mass of the structure with its point masses.
     """
 
     design: MeshDesign
@@ -54,8 +48,7 @@ class Structure(DesignedStructure):
     material_of: IntArray
     region_of: IntArray
     unknowns_held: SupportedUnknowns
-    gauge_places: tuple[GaugePlace, ...]
-    point_weights: dict[str, FloatArray]
+    gauges_moved: FloatArray
     nodal_mass: FloatArray
 
 
@@ -78,15 +71,17 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
     return replace(mesh, node_sets=mesh.node_sets | sets["nodes"], cell_sets=mesh.cell_sets | sets["cells"])
 
 
-def cells_by_set(mesh: StructureMesh, parts: tuple[tuple[str, str, str], ...], what: str) -> IntArray:
+def _owners(mesh: StructureMesh, key: str, parts: Sequence[Material | Damage], what: str) -> IntArray:
     """Find the number (nc,) of the part whose set holds each cell, -1 for none.
 
     Parameters
     ----------
     mesh : StructureMesh
         The mesh.
-    parts : tuple of (place in the design, name, set)
-        Materials or regions.
+    key : str
+        The table of the parts in the design.
+    parts : sequence of Material or Damage
+        The parts.
     what : str
         What they are, for the sentence.
 
@@ -96,28 +91,17 @@ def cells_by_set(mesh: StructureMesh, parts: tuple[tuple[str, str, str], ...], w
         If a set is missing or empty, or two overlap.
     """
     owner = np.full(len(mesh.cells), -1, dtype=np.int64)
-    for number, (where, name, chosen) in enumerate(parts):
-        cells = mesh.cells_of(chosen, where)
+    for number, part in enumerate(parts):
+        where = f"{key}[{number + 1}]"
+        cells = mesh.cells_of(part.set, where)
         taken = cells[owner[cells] >= 0]
         if len(taken):
             raise MeshError(
-                f"{where}: the {what}s {name!r} and {parts[owner[taken[0]]][1]!r} share {len(taken)} "
+                f"{where}: the {what}s {part.name!r} and {parts[owner[taken[0]]].name!r} share {len(taken)} "
                 f"elements, such as {mesh.cell_numbers[taken[0]]} at {mesh.place(mesh.centres[taken[0]])}; "
                 "their sets must not overlap."
             )
         owner[cells] = number
-    return owner
-
-
-def _materials(design: MeshDesign, mesh: StructureMesh) -> IntArray:
-    parts = tuple((f"material[{n}]", part.name, part.set) for n, part in enumerate(design.material, 1))
-    owner = cells_by_set(mesh, parts, "material")
-    bare = np.flatnonzero(owner < 0)
-    if len(bare):
-        raise MeshError(
-            f"{mesh.source}: {len(bare)} of {len(owner)} elements have no material, among them "
-            f"{mesh.cell_numbers[bare[0]]} at {mesh.place(mesh.centres[bare[0]])}."
-        )
     return owner
 
 
@@ -168,87 +152,42 @@ def assemble(
     design: MeshDesign, mesh: StructureMesh, design_hash: str, *, mass_as_stiffness: bool = False
 ) -> Structure:
     """Assemble the affine operators of a design on its mesh, see `load_and_assemble`."""
-    material_of = _materials(design, mesh)
-    regions = tuple((f"damage[{n}]", part.name, part.set) for n, part in enumerate(design.damage, 1))
-    region_of = cells_by_set(mesh, regions, "damage region")
+    material_of = _owners(mesh, "material", design.material, "material")
+    bare = np.flatnonzero(material_of < 0)
+    if len(bare):
+        raise MeshError(
+            f"{mesh.source}: {len(bare)} of {len(mesh.cells)} elements have no material, among them "
+            f"{mesh.cell_numbers[bare[0]]} at {mesh.place(mesh.centres[bare[0]])}."
+        )
+    region_of = _owners(mesh, "damage", design.damage, "damage region")
     held = supported(design, mesh)
-    expansion = held.expansion
-    restriction = expansion.T.tocsr()
-
-    locator = Locator(mesh)
-    weights = {
-        part.name: point_shares(mesh, locator, part.point, f"mass[{number}]")
-        for number, part in enumerate(design.mass, start=1)
-    }
-    structure_mass = _structure_mass(
-        design, mesh, material_of, mesh.kind.stiffness_rule if mass_as_stiffness else mesh.kind.mass_rule
-    )
-    for part in design.mass:
-        if not part.free:
-            structure_mass = structure_mass + part.mass * _outer(weights[part.name])
-    nodal_mass = np.asarray(structure_mass.sum(axis=1))
-    free = tuple(part for part in design.mass if part.free)
-    mass_terms = (structure_mass, *(_outer(weights[part.name]) for part in free))
-
-    gauges, places = gauge_rows(mesh, locator, design.gauge)
+    shares = [
+        point_shares(mesh, part.point, f"mass[{number}]") for number, part in enumerate(design.mass, start=1)
+    ]
+    density = np.array([part.density for part in design.material])[material_of]
+    rule = mesh.kind.stiffness_rule if mass_as_stiffness else mesh.kind.mass_rule
+    mass, three = mesh.mass(np.arange(len(mesh.cells)), density, rule), sparse.eye_array(3)
+    gauges, moved = gauge_rows(mesh, design.gauge)
     return Structure(
-        **names_of(design),
-        stiffness_terms=_stiffness_terms(design, mesh, material_of, region_of, held),
-        mass_terms=tuple(
-            (restriction @ sparse.kron(term, sparse.eye_array(3)) @ expansion).tocsr() for term in mass_terms
+        **designed(
+            design,
+            held.expansion,
+            sparse.kron(mass, three).tocsr(),
+            (own @ own.T for own in (sparse.kron(own[:, None], three, format="csr") for own in shares)),
+            (nodal_load(mesh, load, f"load[{n}]").ravel() for n, load in enumerate(design.load, start=1)),
+            {"gauge": gauges}
+            | {key: _point_rows(design, mesh, key) for key in ("displacement", "acceleration")},
         ),
-        load_terms=tuple(_load_terms(design, mesh, locator, restriction, nodal_mass, weights)),
-        gauge_output=(gauges @ expansion).tocsr(),
-        displacement_output=_point_rows(design, mesh, locator, "displacement") @ expansion,
-        acceleration_output=_point_rows(design, mesh, locator, "acceleration") @ expansion,
-        expansion=expansion,
+        stiffness_terms=_stiffness_terms(design, mesh, material_of, region_of, held),
         design_hash=design_hash,
-        design=design,
         mesh=mesh,
         material_of=material_of,
         region_of=region_of,
         unknowns_held=held,
-        gauge_places=places,
-        point_weights=weights,
-        nodal_mass=nodal_mass,
+        gauges_moved=moved,
+        nodal_mass=mass.sum(axis=1)
+        + sum(part.mass * own for part, own in zip(design.mass, shares, strict=True)),
     )
-
-
-def _load_terms(
-    design: MeshDesign,
-    mesh: StructureMesh,
-    locator: Locator,
-    restriction: sparse.csr_array,
-    nodal_mass: FloatArray,
-    weights: dict[str, FloatArray],
-) -> Iterator[LoadTerm]:
-    """Yield the parts of every load; an acceleration acts on 1 kg of each free mass as well."""
-    for number, load in enumerate(design.load, start=1):
-        if load.acceleration is None:
-            nodal = surface_load(mesh, locator, load, f"load[{number}]")
-            yield LoadTerm(load.name, restriction @ nodal.ravel())
-            continue
-        field = np.asarray(load.acceleration)
-        yield LoadTerm(load.name, restriction @ np.outer(nodal_mass, field).ravel())
-        for part in design.mass:
-            if part.free:
-                vector = restriction @ np.outer(weights[part.name], field).ravel()
-                yield LoadTerm(load.name, vector, part.name)
-
-
-def _outer(weights: FloatArray) -> sparse.csr_array:
-    column = sparse.csr_array(weights[:, None])
-    return (column @ column.T).tocsr()
-
-
-def _structure_mass(
-    design: MeshDesign, mesh: StructureMesh, material_of: IntArray, rule: Rule
-) -> sparse.csr_array:
-    """Mass (nodes, nodes) [kg] of one component, without point masses."""
-    total = sparse.csr_array((len(mesh.points), len(mesh.points)))
-    for number, part in enumerate(design.material):
-        total = total + mesh.mass(np.flatnonzero(material_of == number), part.density, rule)
-    return total
 
 
 def _stiffness_terms(
@@ -258,31 +197,31 @@ def _stiffness_terms(
     region_of: IntArray,
     held: SupportedUnknowns,
 ) -> tuple[StiffnessTerm, ...]:
-    """Sum the cells by pairs of a parameter and a region; the pair of none holds the springs too."""
-    restriction = held.expansion.T.tocsr()
-    found: dict[tuple[str | None, str | None], sparse.csr_array] = {}
-    for number, part in enumerate(design.material):
-        for region in np.unique(region_of[material_of == number]):
-            cells = np.flatnonzero((material_of == number) & (region_of == region))
-            matrix = restriction @ mesh.stiffness(cells, part.elasticity) @ held.expansion
-            pair = (part.scaled_by, None if region < 0 else design.damage[region].name)
-            found[pair] = found[pair] + matrix if pair in found else matrix
-    springs = held.stiffness
+    """Sum the cells by pairs of a parameter and a region, none last; the pair of none holds the springs."""
+    restriction, springs = held.expansion.T.tocsr(), held.stiffness
+    parameters = [*(part.name for part in design.parameter), None]
+    regions = [*(part.name for part in design.damage), None]
+    elasticity = np.array([part.elasticity for part in design.material])
+    scaled = np.array([parameters.index(part.scaled_by) for part in design.material])
+    pairs = scaled[material_of] * len(regions) + region_of % len(regions)
+    found: dict[int, sparse.csr_array] = {}
+    for pair in np.unique(pairs).tolist():
+        cells = np.flatnonzero(pairs == pair)
+        found[pair] = restriction @ mesh.stiffness(cells, elasticity[material_of[cells]]) @ held.expansion
     if springs.nnz and springs.max() > 0.0:
-        found[None, None] = found[None, None] + springs if (None, None) in found else springs
-    order = {name: number for number, name in enumerate(part.name for part in design.parameter)}
-    order |= {part.name: number for number, part in enumerate(design.damage)}
-    pairs = sorted(
-        found, key=lambda pair: [(name is None, 0 if name is None else order[name]) for name in pair]
+        last = len(parameters) * len(regions) - 1
+        found[last] = found[last] + springs if last in found else springs
+    return tuple(
+        StiffnessTerm(found[pair].tocsr(), parameters[pair // len(regions)], regions[pair % len(regions)])
+        for pair in sorted(found)
     )
-    return tuple(StiffnessTerm(found[pair].tocsr(), *pair) for pair in pairs)
 
 
-def _point_rows(design: MeshDesign, mesh: StructureMesh, locator: Locator, key: str) -> sparse.csr_array:
+def _point_rows(design: MeshDesign, mesh: StructureMesh, key: str) -> sparse.csr_array:
     """Rows (m, full) of the displacements of points along directions."""
     rows = [sparse.csr_array((0, mesh.unknowns))]
     for number, part in enumerate(getattr(design, key), start=1):
-        shares = point_shares(mesh, locator, part.point, f"{key}[{number}]")
+        shares = point_shares(mesh, part.point, f"{key}[{number}]")
         direction = np.asarray(part.direction) / np.linalg.norm(part.direction)
         rows.append(sparse.csr_array(np.outer(shares, direction).reshape(1, -1)))
     return sparse.vstack(rows).tocsr()

@@ -4,18 +4,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
+from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import MeshError
 
 from .design import MeshDesign, Support
 from .mesh import StructureMesh
 from .tables import MOTIONS
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
 
 _FREE = 1e-8
 """A rigid motion that the supports resist by less than this share of the stiffest one is free."""
@@ -180,13 +176,9 @@ def _described(motion: FloatArray, mesh: StructureMesh, centre: FloatArray) -> s
     if np.linalg.norm(motion[3:]) < 1e-6:
         return f"a shift along ({_text(shift / np.linalg.norm(shift))})"
     axis = turn / np.linalg.norm(turn)
-    foot = centre + np.cross(turn, shift) / (turn @ turn)
-    return f"a turn about the axis along ({_text(axis)}) through {mesh.place(_rounded(foot, mesh.size))}"
-
-
-def _rounded(point: FloatArray, size: float) -> FloatArray:
-    return np.asarray(np.where(np.abs(point) < 1e-9 * size, 0.0, point))
+    foot = mesh.size * np.round((centre + np.cross(turn, shift) / (turn @ turn)) / mesh.size, 9)
+    return f"a turn about the axis along ({_text(axis)}) through {mesh.place(foot)}"
 
 
 def _text(vector: FloatArray) -> str:
-    return ", ".join(f"{value + 0.0:.3g}" for value in np.where(np.abs(vector) < 1e-9, 0.0, vector))
+    return ", ".join(f"{value + 0.0:.3g}" for value in np.round(vector, 9))

@@ -129,6 +129,7 @@ class Commanded(Named):
     """A load, constant or times the value of a control."""
 
     control: Name | None = None
+    acceleration: Direction | None = None
 
 
 class Region(Named):

@@ -1,69 +1,31 @@
 """Structures and the wing against CalculiX on the identical mesh: statics, modes and a ring-down."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.elements.cells import gradients, strain_matrix
 from fe.full.statics import Factorisation
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
-from fe.runtime.state import TIP_FORCE, DigitalState, Losses
-from fe.structure.affine import AffineStructure
-from fe.structure.field import natural_frequencies, static_responses
+from fe.runtime.state import TIP_FORCE, DigitalState
+from fe.structure.field import natural_frequencies
 from fe.structure.operators import Structure
 from fe.wing.operators import AffineOperators
-from fe.wing.responses import eigenmodes
 
 from .calculix_deck import CalculixDeck
 from .calculix_job import read_frequencies, read_tables, run_calculix
-from .calculix_models import gauge_cells, structure_deck, structure_loads, wing_deck
-
-FloatArray = NDArray[np.float64]
+from .calculix_models import gauge_cells, load_lines, structure_deck, wing_deck
 
 TEST_FORCE = 10.0
 """Upward force of the static test and before the ring-down [N]."""
 _LINE = 0.5 + 0.5 * np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0])
 INTEGRATION_POINTS = np.array([(x, y, z) for z in _LINE for y in _LINE for x in _LINE])
 """Local places (27, 3) in 0..1 of the integration points of a C3D20 element, in the order of its output."""
-# Rows and columns in which CalculiX prints a strain tensor.
-_PRINTED = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-_VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
-
-
-class _Printed(NamedTuple):
-    """What CalculiX printed of a static step: nodes (nodes, 3) and probes (m,), strains at cells (n, 6)."""
-
-    field: FloatArray
-    probes: FloatArray
-    strain: FloatArray
-
-
-def _statics(
-    deck: CalculixDeck, loads: Iterable[Iterable[str]], folder: Path, prints: Iterable[str] = ()
-) -> list[_Printed]:
-    steps = [[*load] for load in loads]
-    tables = read_tables(run_calculix(deck.static_steps(steps, [*prints]), folder, "static"))
-    nodes, probes, strains = (
-        [table.rows for table in tables if table.set_name == name] for name in ("NALL", "NPROBES", "EGAUGES")
-    )
-    if len(nodes) != len(steps):
-        raise CalculixError(f"CalculiX printed {len(nodes)} static solutions instead of {len(steps)}.")
-    nothing = [np.zeros((0, 8))] * len(steps)
-    return [
-        _Printed(field[:, 1:], probe[:, 1:].ravel(), strain[:, 2:])
-        for field, probe, strain in zip(nodes, probes or nothing, strains or nothing, strict=True)
-    ]
-
-
-def _frequencies(deck: CalculixDeck, count: int, folder: Path) -> FloatArray:
-    found = read_frequencies(run_calculix(deck.frequency_step(count), folder, "modes"))
-    if len(found) < count:
-        raise CalculixError(f"CalculiX printed {len(found)} frequencies instead of {count}.")
-    return found[:count]
+# Places of our strains in the order in which CalculiX prints a strain tensor: xx, yy, zz, xy, xz, yz.
+_PRINTED = [0, 1, 2, 5, 4, 3]
 
 
 def _relative(theirs: FloatArray, ours: FloatArray) -> float:
@@ -72,19 +34,6 @@ def _relative(theirs: FloatArray, ours: FloatArray) -> float:
 
 def _relative_each(theirs: FloatArray, ours: FloatArray) -> float:
     return float(np.abs(theirs / ours - 1.0).max())
-
-
-@dataclass(frozen=True)
-class ModalAgreement:
-    """Frequencies (m,) [Hz] of both codes."""
-
-    ours: FloatArray
-    calculix: FloatArray
-
-    @property
-    def relative(self) -> float:
-        """Largest relative difference."""
-        return float(np.abs(self.calculix / self.ours - 1.0).max())
 
 
 @dataclass(frozen=True)
@@ -112,44 +61,69 @@ class LoadAgreement:
     tensor: float | None = None
 
 
-def _agreement(
-    structure: AffineStructure,
-    deck: CalculixDeck,
-    load: str,
-    displacement: FloatArray,
-    theirs: _Printed,
-    relative: Callable[[FloatArray, FloatArray], float],
-    tensor: FloatArray | None = None,
-) -> LoadAgreement:
-    ours, gauges = deck.probes @ displacement, len(structure.gauges)
-    parts = (slice(0, gauges), slice(gauges, len(ours)))
-    strain, output = (relative(theirs.probes[own], ours[own]) if len(ours[own]) else None for own in parts)
-    return LoadAgreement(
-        load,
-        _relative(theirs.field, structure.full_displacement(displacement)),
-        strain,
-        output,
-        None if tensor is None else _relative(theirs.strain.reshape(tensor.shape), tensor),
-    )
-
-
 @dataclass(frozen=True)
-class StructureAgreement:
-    """A structure and CalculiX.
+class Agreement:
+    """A model and CalculiX.
 
     Attributes
     ----------
     loads : tuple of LoadAgreement
         One for each load.
-    modes : ModalAgreement
-        Lowest frequencies.
+    ours, calculix : (m,) Hz
+        Lowest frequencies of both codes.
     """
 
     loads: tuple[LoadAgreement, ...]
-    modes: ModalAgreement
+    ours: FloatArray
+    calculix: FloatArray
+
+    @property
+    def modal(self) -> float:
+        """Largest relative difference of the frequencies."""
+        return _relative_each(self.calculix, self.ours)
 
 
-def structure_agreement(structure: Structure, folder: Path, modes: int = 6) -> StructureAgreement:
+def _agreement(
+    deck: CalculixDeck,
+    loads: Mapping[str, tuple[FloatArray, Iterable[str]]],
+    folder: Path,
+    modes: int,
+    relative: Callable[[FloatArray, FloatArray], float],
+    tensor: Callable[[FloatArray], FloatArray] | None = None,
+) -> Agreement:
+    """Solve loads (n,) [N], given with their lines, and the lowest modes by both codes.
+
+    `relative` compares strains and outputs; `tensor` gives our strains (p, 6) in the cells EGAUGES.
+    """
+    structure, prints = (
+        deck.structure,
+        () if tensor is None else ("*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E"),
+    )
+    text = deck.static_steps((lines for _, lines in loads.values()), prints)
+    printed = read_tables(run_calculix(text, folder, "static")) if loads else {}
+    if (count := len(printed.get("NALL", ()))) != len(loads):
+        raise CalculixError(f"CalculiX printed {count} static solutions instead of {len(loads)}.")
+    frequencies = natural_frequencies(structure, modes, deck.values)[0]
+    theirs = read_frequencies(run_calculix(deck.frequency_step(modes), folder, "modes"))
+    if len(theirs) < modes:
+        raise CalculixError(f"CalculiX printed {len(theirs)} frequencies instead of {modes}.")
+    solve = Factorisation(structure.at(deck.values)[0]).solve
+    parts = (slice(0, len(structure.gauges)), slice(len(structure.gauges), len(deck.probes)))
+    found = []
+    for number, (name, (load, _)) in enumerate(loads.items()):
+        displacement = solve(load)
+        ours = deck.probes @ displacement
+        probes = printed["NPROBES"][number][:, 1:].ravel() if len(ours) else ours
+        strain, output = (relative(probes[own], ours[own]) if len(ours[own]) else None for own in parts)
+        field = _relative(printed["NALL"][number][:, 1:], structure.full_displacement(displacement))
+        strains = (
+            None if tensor is None else _relative(printed["EGAUGES"][number][:, 2:], tensor(displacement))
+        )
+        found.append(LoadAgreement(name, field, strain, output, strains))
+    return Agreement(tuple(found), frequencies, theirs[:modes])
+
+
+def structure_agreement(structure: Structure, folder: Path, modes: int = 6) -> Agreement:
     """Solve every load and the lowest modes by both codes, undamaged and with nominal values.
 
     Parameters
@@ -167,22 +141,14 @@ def structure_agreement(structure: Structure, folder: Path, modes: int = 6) -> S
         If CalculiX is not there, fails, or has no such element.
     """
     deck = structure_deck(structure)
-    printed = _statics(deck, structure_loads(structure, deck), folder) if structure.loads else []
-    loads = tuple(
-        _agreement(structure, deck, name, ours.displacement, theirs, _relative)
-        for (name, ours), theirs in zip(static_responses(structure).items(), printed, strict=True)
-    )
-    found = ModalAgreement(natural_frequencies(structure, modes)[0], _frequencies(deck, modes, folder))
-    return StructureAgreement(loads, found)
+    loads = {load.name: (structure.load(load.name), load_lines(deck, load)) for load in structure.design.load}
+    return _agreement(deck, loads, folder, modes, _relative)
 
 
-def static_agreement(
-    operators: AffineOperators,
-    folder: Path,
-    young_modulus_factor: float = 1.0,
-    stiffness_loss: Losses = (),
-) -> tuple[LoadAgreement, ...]:
-    """Compare the static test and the lift of the design in one state of health.
+def wing_agreement(
+    operators: AffineOperators, folder: Path, state: DigitalState, modes: int = 6
+) -> Agreement:
+    """Solve the static test, the lift of the design and the lowest modes in one state by both codes.
 
     Parameters
     ----------
@@ -190,88 +156,57 @@ def static_agreement(
         The model.
     folder : Path
         Where CalculiX works.
-    young_modulus_factor, stiffness_loss
-        As of `fe.runtime.state.DigitalState`.
+    state : DigitalState
+        Health and masses.
+    modes : int
+        Number of modes.
 
     Raises
     ------
     CalculixError
         If CalculiX is not there or fails.
     """
-    state = DigitalState(young_modulus_factor=young_modulus_factor, stiffness_loss=stiffness_loss)
-    deck = wing_deck(operators, state)
-    turn = operators.wing_mesh.design.lift.load_factor
-    loads = {"tip force": operators.turn(0.0, TEST_FORCE), "lift": operators.turn(turn)}
-    printed = _statics(
-        deck, map(deck.force_lines, loads.values()), folder, ("*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E")
+    deck, lift = wing_deck(operators, state), operators.wing_mesh.design.lift
+    loads = {"tip force": operators.turn(0.0, TEST_FORCE), "lift": operators.turn(lift.load_factor)}
+    return _agreement(
+        deck,
+        {name: (load, deck.force_lines(load)) for name, load in loads.items()},
+        folder,
+        modes,
+        _relative_each,
+        lambda displacement: _strain_tensors(operators, displacement),
     )
-    parameters = {"young_modulus_factor": young_modulus_factor}
-    solve = Factorisation(operators.stiffness(parameters, stiffness_loss)).solve
-    found = []
-    for (name, load), theirs in zip(loads.items(), printed, strict=True):
-        ours = solve(load)
-        tensor = _strain_tensors(operators, ours)
-        found.append(_agreement(operators, deck, name, ours, theirs, _relative_each, tensor))
-    return tuple(found)
 
 
 def _strain_tensors(operators: AffineOperators, free: FloatArray) -> FloatArray:
-    """Strain tensor (cells, 27, 6) in CalculiX's order at the integration points of the gauges' cells."""
+    """Strain tensors (27 cells, 6) in CalculiX's order at the integration points of the gauges' cells."""
     mesh, cells = operators.wing_mesh, gauge_cells(operators)
     slopes, _ = gradients(mesh.kind, mesh.nodes[cells], INTEGRATION_POINTS)
     displacement = operators.full_displacement(free).ravel()[mesh.unknowns_of(cells)]
-    voigt = np.einsum("nqij,nj->nqi", strain_matrix(slopes), displacement)
-    voigt[..., 3:] *= 0.5  # engineering to tensor shear
-    return np.asarray(voigt[..., [_VOIGT.index(place) for place in _PRINTED]])
-
-
-def modal_agreement(
-    operators: AffineOperators,
-    folder: Path,
-    state: DigitalState,
-    count: int = 6,
-) -> ModalAgreement:
-    """Compare the lowest modes in one state.
-
-    Raises
-    ------
-    CalculixError
-        If CalculiX is not there or fails.
-    """
-    ours = eigenmodes(
-        operators,
-        state.young_modulus_factor,
-        state.stiffness_loss,
-        state.servo_mass,
-        state.pitot_mass,
-        count,
-    ).frequency
-    return ModalAgreement(ours, _frequencies(wing_deck(operators, state), count, folder))
+    voigt = np.einsum("nqij,nj->nqi", strain_matrix(slopes), displacement).reshape(-1, 6)
+    voigt[:, 3:] *= 0.5  # engineering to tensor shear
+    return np.asarray(voigt[:, _PRINTED])
 
 
 @dataclass(frozen=True)
 class RingDownAgreement:
-    """Upward displacement [m] of the tip after its release, at the times (t,) [s], of both codes.
+    """Upward displacement [m] of the tip after its release, at equal steps of time, of both codes.
 
     Attributes
     ----------
-    time, ours, calculix : (t,)
+    ours, calculix : (t,)
         Modal integration, exact in time, and direct integration by CalculiX.
     same_rule : (t,)
         Modal integration by the trapezoidal rule with the increment of CalculiX, which leaves out the error
         of that rule.
     initial : float
         Displacement before the release [m].
-    period : float
-        Period of the first mode [s].
     """
 
-    time: FloatArray
     ours: FloatArray
     calculix: FloatArray
     same_rule: FloatArray
     initial: float
-    period: float
 
     @property
     def relative(self) -> float:
@@ -320,42 +255,28 @@ def ring_down_agreement(
     model = reduce_model(operators).model
     vector = model.vector(state.values, state.stiffness_loss)
     integrator = ModalIntegrator(model, vector, state.damping_alpha, state.damping_beta)
-    period = 1.0 / float(integrator.modes.frequency[0])
-    increment, steps = period / steps_per_period, round(periods * steps_per_period)
+    frequency, row = integrator.modes.frequency, integrator.modes.output[-1]
+    increment, steps = 1.0 / (steps_per_period * float(frequency[0])), round(periods * steps_per_period)
     initial = integrator.outputs(integrator.at_rest((0.0, TEST_FORCE)))[-1]
     current = integrator.released(initial, (0.0, 0.0), TIP_FORCE)
-    same_rule = integrator.modes.output[-1] @ _trapezoidal(
-        current.displacement,
-        2.0 * np.pi * integrator.modes.frequency,
-        integrator.damping_ratio,
-        increment,
-        steps,
-    )
+    same_rule = _trapezoidal(2.0 * np.pi * frequency, integrator.damping_ratio, increment, steps)
+    same_rule = row @ (same_rule * current.displacement[:, None])
     ours = np.empty(steps)
     for step in range(steps):
         current = integrator.advance(current, increment, (0.0, 0.0))
         ours[step] = integrator.outputs(current)[-1]
     text = wing_deck(operators, state).ring_down_steps(operators.turn(0.0, TEST_FORCE), increment, steps)
     tables, tip = read_tables(run_calculix(text, folder, "ring_down")), len(operators.gauges)
-    theirs = np.array([table.rows[:, 1:].ravel()[tip] for table in tables if table.set_name == "NPROBES"])
+    theirs = np.array([rows[:, 1:].ravel()[tip] for rows in tables.get("NPROBES", ())])
     if len(theirs) != steps:
         raise CalculixError(f"CalculiX printed {len(theirs)} increments of the ring-down instead of {steps}.")
-    time = np.asarray(increment * np.arange(1, steps + 1), dtype=np.float64)
-    return RingDownAgreement(time, ours, theirs, same_rule, initial, period)
+    return RingDownAgreement(ours, theirs, same_rule, initial)
 
 
-def _trapezoidal(
-    start: FloatArray, omega: FloatArray, damping_ratio: FloatArray, increment: float, steps: int
-) -> FloatArray:
-    """Free response (m, steps) of modes (m,) from rest at `start` by the trapezoidal rule of Newmark."""
-    displacement, velocity, acceleration = start, np.zeros_like(start), -(omega**2) * start
-    divisor = 1.0 + damping_ratio * omega * increment + 0.25 * (omega * increment) ** 2
-    found = np.empty((len(start), steps))
-    for step in range(steps):
-        displacement = displacement + increment * velocity + 0.25 * increment**2 * acceleration
-        velocity = velocity + 0.5 * increment * acceleration
-        acceleration = -(2.0 * damping_ratio * omega * velocity + omega**2 * displacement) / divisor
-        displacement = displacement + 0.25 * increment**2 * acceleration
-        velocity = velocity + 0.5 * increment * acceleration
-        found[:, step] = displacement
-    return found
+def _trapezoidal(omega: FloatArray, damping_ratio: FloatArray, increment: float, steps: int) -> FloatArray:
+    """Free response (m, steps) of modes (m,), released at rest at one, by the trapezoidal rule."""
+    half = np.zeros((len(omega), 2, 2))
+    half[:, 0, 1], half[:, 1, 0], half[:, 1, 1] = 1.0, -(omega**2), -2.0 * damping_ratio * omega
+    half *= 0.5 * increment
+    advance = np.linalg.solve(np.eye(2) - half, np.eye(2) + half)
+    return np.stack([np.linalg.matrix_power(advance, step)[:, 0, 0] for step in range(1, steps + 1)], axis=1)

@@ -7,30 +7,30 @@ own, and applies pressures and acceleration fields itself. What is read are node
 strain or displacement, by an equation, because printed displacements hold seven digits only.
 """
 
+import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fe.elements.cells import CellMesh
 from fe.elements.kinds import HEXAHEDRA_20
+from fe.runtime.arrays import FloatArray
+from fe.structure.affine import AffineStructure
 from fe.structure.supports import RigidSet, SupportedUnknowns
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _PER_LINE, _NODES_PER_LINE = 4, 12
 _BLOCK = 0.01  # side of the block that stands for a point mass [m]
 
 
 class PointBlock(NamedTuple):
-    """A point mass [kg], where it is drawn (3,) [m], and the shares of nodes in its displacement."""
+    """A point mass [kg], where it is drawn (3,) [m], and the shares (nodes,) in its displacement."""
 
     mass: float
     place: FloatArray
-    weights: Mapping[int, float]
+    shares: FloatArray
 
 
 @dataclass(frozen=True)
@@ -41,41 +41,58 @@ class CalculixDeck:
     ----------
     title : str
         What it is.
-    kind : str
-        CalculiX' name of its elements.
-    points : (nodes, 3) m
-        Nodes.
-    cells : (nc, k)
-        Nodes of the cells, counted from 0, in CalculiX' order.
-    materials : tuple of str
-        Lines of materials, orientations and sections.
+    structure : AffineStructure
+        The model.
+    values : mapping of str to float
+        Its state by name; what is left out is nominal, and healthy.
+    mesh : CellMesh
+        Its mesh.
     supports : SupportedUnknowns
         What is held, sprung and rigid; the n free unknowns are in its order.
+    materials : tuple of str
+        Lines of materials, orientations and sections.
     masses : tuple of PointBlock
         Point masses.
-    probes : (m, n)
-        Rows of what is read, on the free unknowns.
+    probed : tuple of (n,)
+        Rows on the free unknowns that are read behind the gauges and the displacement outputs.
     """
 
     title: str
-    kind: str
-    points: FloatArray
-    cells: IntArray
-    materials: tuple[str, ...]
+    structure: AffineStructure
+    values: Mapping[str, float]
+    mesh: CellMesh
     supports: SupportedUnknowns
+    materials: tuple[str, ...]
     masses: tuple[PointBlock, ...]
-    probes: FloatArray
+    probed: tuple[FloatArray, ...] = ()
+
+    @cached_property
+    def probes(self) -> FloatArray:
+        """Rows (m, n) of what is read, on the free unknowns."""
+        own = (self.structure.gauge_output.toarray(), self.structure.displacement_output.toarray())
+        return np.vstack((*own, *self.probed))
 
     def definition(self) -> Iterator[str]:
         """Yield the lines of the model definition, before the first step."""
         yield "*HEADING"
-        yield self.title
-        yield from cell_lines(self.kind, self.points, self.cells)
+        yield f"{self.title} {self.structure.design_hash[:12]}"
+        yield "*NODE, NSET=NALL"
+        for number, point in enumerate(self.mesh.points, start=1):
+            yield f"{number},{number_line(point)}"
+        yield f"*ELEMENT, TYPE={self.mesh.kind.calculix}, ELSET=EALL"
+        for number, nodes in enumerate(self.mesh.cells + 1, start=1):
+            yield from wrapped([str(value) for value in (number, *nodes)], _NODES_PER_LINE, end=",")
         yield from self.materials
-        yield from self._supports()
-        yield from self._masses()
+        elements = itertools.count(len(self.mesh.cells) + 1)
+        yield from self._supports(elements)
+        yield from self._masses(elements)
         first = self._node_count + 8 * len(self.masses) + 1
-        yield from probe_lines(first, map(list, map(self._terms, self.probes)))
+        if len(self.probes):
+            yield "*NODE, NSET=NPROBES"
+        for node in range(first, first + (len(self.probes) + 2) // 3):
+            yield f"{node},0.,0.,0."
+        for number, row in enumerate(self.probes):
+            yield from equation_lines([(first + number // 3, number % 3 + 1, -1.0), *self._terms(row)])
 
     def static_steps(self, loads: Iterable[Iterable[str]], prints: Iterable[str] = ()) -> str:
         """Input of one linear static step for each load, which prints all nodes, the probes, and `prints`."""
@@ -121,11 +138,11 @@ class CalculixDeck:
     @property
     def _node_count(self) -> int:
         """Nodes of the mesh, then two of each rigid set: what these move is its shift and its turn."""
-        return len(self.points) + 2 * len(self.supports.rigid)
+        return len(self.mesh.points) + 2 * len(self.supports.rigid)
 
     def _motion_places(self, number: int) -> list[tuple[int, int]]:
         """Node and direction of the six motions of a rigid set."""
-        first = len(self.points) + 1 + 2 * number
+        first = len(self.mesh.points) + 1 + 2 * number
         return [(first + motion // 3, motion % 3 + 1) for motion in range(6)]
 
     @cached_property
@@ -142,26 +159,21 @@ class CalculixDeck:
         for unknown in np.flatnonzero(values).tolist():
             yield (*self._places[unknown], float(values[unknown]))
 
-    def _supports(self) -> Iterator[str]:
+    def _supports(self, elements: Iterator[int]) -> Iterator[str]:
         held = self.supports
         yield "*BOUNDARY"
         for unknown in np.flatnonzero(held.held).tolist():
             yield f"{unknown // 3 + 1},{unknown % 3 + 1}"
-        element = len(self.cells)
-        axes = np.arange(len(held.springs)) % 3
-        for axis in range(3):
-            values = np.where(axes == axis, held.springs, 0.0)
-            for group, spring in enumerate(np.unique(values[values > 0.0])):
-                nodes = (np.flatnonzero(values == spring) // 3 + 1).tolist()
-                yield from spring_lines(f"SPRING{axis}X{group}", element + 1, nodes, axis + 1, spring)
-                element += len(nodes)
+        for unknown in np.flatnonzero(held.springs > 0.0).tolist():
+            place = (unknown // 3 + 1, unknown % 3 + 1)
+            yield from spring_lines(next(elements), place, held.springs[unknown])
         for number, body in enumerate(held.rigid):
-            yield from self._rigid_lines(number, body, element)
-            element += int((body.springs > 0.0).sum())
+            yield from self._rigid_lines(self._motion_places(number), body, elements)
 
-    def _rigid_lines(self, number: int, body: RigidSet, element: int) -> Iterator[str]:
+    def _rigid_lines(
+        self, places: list[tuple[int, int]], body: RigidSet, elements: Iterator[int]
+    ) -> Iterator[str]:
         """Yield the motions of a rigid set, what holds and springs them, and the nodes that follow them."""
-        places = self._motion_places(number)
         yield "*NODE"
         for node in (places[0][0], places[3][0]):
             yield f"{node},{number_line(body.point)}"
@@ -169,61 +181,36 @@ class CalculixDeck:
         for motion in np.flatnonzero(body.held).tolist():
             yield "{},{}".format(*places[motion])
         for motion in np.flatnonzero(body.springs > 0.0).tolist():
-            element += 1
-            node, direction = places[motion]
-            name = f"RIGID{number}X{motion}"
-            yield from spring_lines(name, element, [node], direction, body.springs[motion])
+            yield from spring_lines(next(elements), places[motion], body.springs[motion])
         for row, shares in enumerate(body.motions.tolist()):
             moved = [(*place, share) for place, share in zip(places, shares, strict=True) if share]
             yield from equation_lines([(int(body.nodes[row // 3]) + 1, row % 3 + 1, -1.0), *moved])
 
-    def _masses(self) -> Iterator[str]:
-        springs = (self.supports.springs, *(body.springs for body in self.supports.rigid))
-        element = len(self.cells) + sum(int((part > 0.0).sum()) for part in springs) + 1
+    def _masses(self, elements: Iterator[int]) -> Iterator[str]:
         yield "*ELSET, ELSET=EHEAVY"
         yield "EALL"
         for number, block in enumerate(self.masses):
-            if block.mass <= 0.0:
-                continue
-            yield from mass_block_lines(number, block, self._node_count + 1 + 8 * number, element + number)
-            yield "*ELSET, ELSET=EHEAVY"
-            yield f"MASS{number}"
+            if block.mass > 0.0:
+                yield from mass_block_lines(number, block, self._node_count + 1 + 8 * number, next(elements))
+                yield "*ELSET, ELSET=EHEAVY"
+                yield f"MASS{number}"
 
 
-def cell_lines(kind: str, points: FloatArray, cells: IntArray) -> Iterator[str]:
-    """Yield nodes (n, 3) [m] and cells (c, k), which count nodes from 0, of a kind of CalculiX."""
-    yield "*NODE, NSET=NALL"
-    for number, point in enumerate(points, start=1):
-        yield f"{number},{number_line(point)}"
-    yield f"*ELEMENT, TYPE={kind}, ELSET=EALL"
-    for number, nodes in enumerate(cells + 1, start=1):
-        text = [str(value) for value in (number, *nodes)]
-        for start in range(0, len(text), _NODES_PER_LINE):
-            rest = "," if start + _NODES_PER_LINE < len(text) else ""
-            yield ",".join(text[start : start + _NODES_PER_LINE]) + rest
+def wrapped(parts: list[str], count: int, end: str = "") -> Iterator[str]:
+    """Yield lines of `count` parts each; all but the last end in `end`."""
+    for start in range(0, len(parts), count):
+        rest = end if start + count < len(parts) else ""
+        yield ",".join(parts[start : start + count]) + rest
 
 
-def spring_lines(
-    name: str, element: int, nodes: Iterable[int], direction: int, stiffness: float
-) -> Iterator[str]:
-    """Yield springs [N/m] of nodes to the ground along a direction, their elements from `element` on."""
-    yield f"*ELEMENT, TYPE=SPRING1, ELSET={name}"
-    for number, node in enumerate(nodes, start=element):
-        yield f"{number},{node}"
-    yield f"*SPRING, ELSET={name}"
+def spring_lines(element: int, place: tuple[int, int], stiffness: float) -> Iterator[str]:
+    """Yield a spring [N/m] to the ground of a node along a direction."""
+    node, direction = place
+    yield f"*ELEMENT, TYPE=SPRING1, ELSET=SPRING{element}"
+    yield f"{element},{node}"
+    yield f"*SPRING, ELSET=SPRING{element}"
     yield str(direction)
     yield number_line([stiffness])
-
-
-def probe_lines(first: int, probes: Iterable[list[tuple[int, int, float]]]) -> Iterator[str]:
-    """Yield nodes from `first` on whose displacements are read, each of terms (node, direction, share)."""
-    found = list(probes)
-    if found:
-        yield "*NODE, NSET=NPROBES"
-    for node in range(first, first + (len(found) + 2) // 3):
-        yield f"{node},0.,0.,0."
-    for number, terms in enumerate(found):
-        yield from equation_lines([(first + number // 3, number % 3 + 1, -1.0), *terms])
 
 
 def number_line(values: Iterable[float]) -> str:
@@ -236,8 +223,7 @@ def equation_lines(terms: Iterable[tuple[int, int, float]]) -> Iterator[str]:
     text = [f"{node},{direction},{value:.13E}" for node, direction, value in terms]
     yield "*EQUATION"
     yield str(len(text))
-    for start in range(0, len(text), _PER_LINE):
-        yield ",".join(text[start : start + _PER_LINE])
+    yield from wrapped(text, _PER_LINE)
 
 
 def mass_block_lines(number: int, block: PointBlock, node: int, element: int) -> Iterator[str]:
@@ -266,8 +252,8 @@ def mass_block_lines(number: int, block: PointBlock, node: int, element: int) ->
     yield "*DENSITY"
     yield f"{block.mass / _BLOCK**3:.13E}"
     yield f"*SOLID SECTION, ELSET=MASS{number}, MATERIAL=MASS{number}"
+    shares = [(other + 1, float(block.shares[other])) for other in np.flatnonzero(block.shares).tolist()]
     for own in range(node, node + 8):
         for component in (1, 2, 3):
-            yield from equation_lines(
-                [(own, component, -1.0), *((n + 1, component, w) for n, w in block.weights.items())]
-            )
+            moved = [(other, component, share) for other, share in shares]
+            yield from equation_lines([(own, component, -1.0), *moved])

@@ -5,14 +5,11 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
-
-FloatArray = NDArray[np.float64]
 
 PROGRAM = "ccx"
 _TIME_LIMIT = 3600.0
@@ -23,44 +20,31 @@ def calculix_program() -> str | None:
     return shutil.which(PROGRAM)
 
 
-class PrintedBlock(NamedTuple):
-    """A table of a `.dat` file: what it is, of which set, at which time [s], and its rows."""
-
-    quantity: str
-    set_name: str
-    time: float
-    rows: FloatArray
+_HEADER = re.compile(r"^ *(\w[\w ]*?) \(.*\) for set (\w+) and time +\S+$", re.MULTILINE)
 
 
-_HEADER = re.compile(r"^ *(\w[\w ]*?) \(.*\) for set (\w+) and time +(\S+)$")
-
-
-def read_tables(text: str) -> list[PrintedBlock]:
-    """Read the tables of nodes and integration points of a `.dat` file.
+def read_tables(text: str) -> dict[str, list[FloatArray]]:
+    """Read the tables of nodes and integration points of a `.dat` file: rows (n, ...), by the names of sets.
 
     Raises
     ------
     CalculixError
         If a table holds something other than numbers.
     """
-    blocks: list[PrintedBlock] = []
-    rows: list[list[float]] = []
-    head: tuple[str, str, float] | None = None
-    for line in [*text.splitlines(), " end (of file) for set NONE and time 0"]:
-        match = _HEADER.match(line)
-        if match:
-            if head is not None:
-                blocks.append(PrintedBlock(*head, np.array(rows)))
-            head, rows = (match[1], match[2], float(match[3])), []
-        elif head is not None and line.strip():
+    tables: dict[str, list[FloatArray]] = {}
+    _, *found = _HEADER.split(text)
+    for what, name, body in zip(found[::3], found[1::3], found[2::3], strict=True):
+        rows = []
+        for line in filter(str.strip, body.splitlines()):
             try:
                 rows.append([float(value) for value in line.split()])
             except ValueError:
                 raise CalculixError(
-                    f"The table of {head[0]} that CalculiX printed holds the line {line.strip()!r}, which is "
+                    f"The table of {what} that CalculiX printed holds the line {line.strip()!r}, which is "
                     "not a row of numbers; its version may print another format (2.20 is known)."
                 ) from None
-    return blocks
+        tables.setdefault(name, []).append(np.array(rows))
+    return tables
 
 
 def read_frequencies(text: str) -> FloatArray:
@@ -71,17 +55,11 @@ def read_frequencies(text: str) -> FloatArray:
     CalculixError
         If there is no such table.
     """
-    _, found, table = text.partition("E I G E N V A L U E   O U T P U T")
-    frequencies = []
-    for line in table.splitlines():
-        parts = line.split()
-        if len(parts) == 5 and parts[0].isdigit():
-            frequencies.append(float(parts[3]))
-        elif frequencies:
-            break
-    if not found or not frequencies:
+    table = text.partition("E I G E N V A L U E   O U T P U T")[2].partition("P A R T I C I P A T I O N")[0]
+    found = re.findall(r"^ *\d+ +\S+ +\S+ +(\S+) +\S+ *$", table, re.MULTILINE)
+    if not found:
         raise CalculixError("CalculiX printed no eigenvalues; see its messages in the folder of the job.")
-    return np.array(frequencies)
+    return np.array(found, dtype=np.float64)
 
 
 def run_calculix(text: str, folder: Path, name: str) -> str:

@@ -1,19 +1,17 @@
 """A structure, and the wing, as input for CalculiX."""
 
-import itertools
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fe.elements.cells import CellMesh, rotate_elasticity
+from fe.elements.cells import rotate_elasticity
 from fe.elements.kinds import WEDGES_6
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
-from fe.structure.affine import AffineStructure
 from fe.structure.design import Load
+from fe.structure.location import point_shares
 from fe.structure.operators import Structure
-from fe.structure.supports import SupportedUnknowns
 from fe.wing.operators import (
     AffineOperators,
     cell_axes,
@@ -22,11 +20,9 @@ from fe.wing.operators import (
     point_mass_weights,
     root_support,
 )
+from fe.wing.responses import wing_values
 
 from .calculix_deck import CalculixDeck, PointBlock, number_line
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 NOT_COMPARABLE = (WEDGES_6,)
 """Kinds that CalculiX integrates otherwise (C3D6 at two points)."""
@@ -49,67 +45,33 @@ def structure_deck(structure: Structure) -> CalculixDeck:
             "can be compared; tetrahedra and hexahedra can."
         )
     masses = (
-        _point_block(part.mass, mesh.unit * np.asarray(part.point), structure.point_weights[part.name])
+        PointBlock(part.mass, mesh.unit * np.asarray(part.point), point_shares(mesh, part.point, part.name))
         for part in design.mass
     )
-    return _deck(
-        "structure", structure, mesh, structure.unknowns_held, _structure_materials(structure), masses
-    )
-
-
-def _deck(
-    title: str,
-    structure: AffineStructure,
-    mesh: CellMesh,
-    supports: SupportedUnknowns,
-    materials: Iterable[str],
-    masses: Iterable[PointBlock],
-    *probes: FloatArray,
-) -> CalculixDeck:
-    """Return the deck; it probes the gauges, the displacement outputs and further rows (n,)."""
-    rows = (structure.gauge_output.toarray(), structure.displacement_output.toarray())
     return CalculixDeck(
-        title=f"{title} {structure.design_hash[:12]}",
-        kind=mesh.kind.calculix,
-        points=mesh.points,
-        cells=mesh.cells,
-        materials=tuple(materials),
-        supports=supports,
-        masses=tuple(masses),
-        probes=np.vstack((*rows, *probes)),
+        "structure",
+        structure,
+        {},
+        mesh,
+        structure.unknowns_held,
+        tuple(_structure_materials(structure)),
+        tuple(masses),
     )
-
-
-def _point_block(mass: float, place: FloatArray, shares: FloatArray) -> PointBlock:
-    return PointBlock(mass, place, {int(node): float(shares[node]) for node in np.flatnonzero(shares)})
 
 
 def _structure_materials(structure: Structure) -> Iterator[str]:
     for number, part in enumerate(structure.design.material):
         factor = structure.parameters.get(part.scaled_by or "", 1.0)
-        yield f"*MATERIAL, NAME=M{number}"
-        yield "*ELASTIC, TYPE=ORTHO"
         local = factor * np.linalg.inv(part.compliance)
-        yield from _constant_lines(np.array([local[place] for place in ORTHOTROPIC]))
-        yield "*DENSITY"
-        yield number_line([part.density])
-        orientation = ""
-        if part.axes is not None:
-            yield f"*ORIENTATION, NAME=O{number}, SYSTEM=RECTANGULAR"
-            yield number_line([*part.axes[0], *part.axes[1]])
-            orientation = f", ORIENTATION=O{number}"
-        yield f"*ELSET, ELSET=E{number}"
-        yield from (str(cell + 1) for cell in np.flatnonzero(structure.material_of == number))
-        yield f"*SOLID SECTION, ELSET=E{number}, MATERIAL=M{number}{orientation}"
+        yield from material_lines(number, [(0.0, np.array([local[p] for p in ORTHOTROPIC]))], part.density)
+        axes = np.array(part.axes or np.eye(3)[:2])
+        yield from section_lines(number, axes, np.flatnonzero(structure.material_of == number))
 
 
-def structure_loads(structure: Structure, deck: CalculixDeck) -> Iterator[list[str]]:
-    """Yield the lines of each load of a structure, its control at the nominal value."""
-    for load in structure.design.load:
-        yield [*_load_lines(structure, deck, load)]
-
-
-def _load_lines(structure: Structure, deck: CalculixDeck, load: Load) -> Iterator[str]:
+def load_lines(deck: CalculixDeck, load: Load) -> Iterator[str]:
+    """Yield the lines of a load of a structure, its control at the nominal value."""
+    structure = deck.structure
+    assert isinstance(structure, Structure)
     factor = 1.0 if load.control is None else structure.controls[load.control]
     force = structure.load(load.name)
     yield from deck.force_lines(0.0 * force if load.force is None else force)
@@ -133,15 +95,23 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
     """
     mesh = operators.wing_mesh
     masses = (
-        _point_block(
+        PointBlock(
             state.servo_mass if place.kind == "servo" else state.pitot_mass,
             np.array([0.0, place.station * mesh.design.planform.semi_span, 0.0]),  # where it is drawn
             point_mass_weights(mesh, place),
         )
         for place in mesh.design.point_masses
     )
-    materials = itertools.chain(_wing_materials(operators, state), _gauge_set(operators))
-    return _deck("wing, design", operators, mesh, root_support(mesh), materials, masses, operators.load_tip)
+    return CalculixDeck(
+        "wing, design",
+        operators,
+        wing_values(operators, stiffness_loss=state.stiffness_loss, **state.values),
+        mesh,
+        root_support(mesh),
+        (*_wing_materials(operators, state), *cell_set("EGAUGES", gauge_cells(operators))),
+        tuple(masses),
+        (operators.load_tip,),
+    )
 
 
 def gauge_cells(operators: AffineOperators) -> IntArray:
@@ -153,11 +123,6 @@ def gauge_cells(operators: AffineOperators) -> IntArray:
         for distance, chord in mesh.design.gauges.positions
     ]
     return np.unique(cells)
-
-
-def _gauge_set(operators: AffineOperators) -> Iterator[str]:
-    yield "*ELSET, ELSET=EGAUGES"
-    yield from (str(cell + 1) for cell in gauge_cells(operators))
 
 
 def _wing_materials(operators: AffineOperators, state: DigitalState) -> Iterator[str]:
@@ -175,38 +140,43 @@ def _wing_materials(operators: AffineOperators, state: DigitalState) -> Iterator
     if graded.any():
         centre = mesh.design.skin.young_modulus(mesh.centres[graded, 1] / mesh.design.planform.semi_span)
         constants[graded] /= centre[:, None]
-    stations = mesh.design.skin.stations
-    rounded = [
-        (bool(varies), *(f"{value:.10E}" for value in (*row, mass)))
-        for varies, row, mass in zip(graded, constants, density, strict=True)
-    ]
-    materials = {key: number for number, key in enumerate(dict.fromkeys(rounded))}
-    for key, number in materials.items():
-        first = rounded.index(key)
-        courses = [(place.station, place.young_modulus) for place in stations] if key[0] else [(0.0, 1.0)]
-        yield f"*MATERIAL, NAME=M{number}"
-        yield "*ELASTIC, TYPE=ORTHO"
-        for temperature, modulus in courses:
-            yield from _constant_lines(modulus * constants[first], temperature)
-        yield "*DENSITY"
-        yield number_line(density[first : first + 1])
+    damping = f"*DAMPING, ALPHA={state.damping_alpha:.12E}, BETA={state.damping_beta:.12E}"
+    course = [(place.station, place.young_modulus) for place in mesh.design.skin.stations]
+    for cell, own in enumerate(constants):
+        moduli = course if graded[cell] else [(0.0, 1.0)]
+        rows = [(temperature, modulus * own) for temperature, modulus in moduli]
+        yield from material_lines(cell, rows, float(density[cell]))
         if state.damping_alpha or state.damping_beta:
-            yield f"*DAMPING, ALPHA={state.damping_alpha:.12E}, BETA={state.damping_beta:.12E}"
+            yield damping
+        yield from section_lines(cell, axes[cell, :2], [cell])
     if graded.any():
         # The station of a node stands as its temperature, on which the skin's constants depend.
         yield "*INITIAL CONDITIONS, TYPE=TEMPERATURE"
         span = mesh.design.planform.semi_span
         for node, place in enumerate(mesh.points[:, 1] / span, start=1):
             yield f"{node},{place:.13E}"
-    for cell, key in enumerate(rounded):
-        yield f"*ORIENTATION, NAME=O{cell}, SYSTEM=RECTANGULAR"
-        yield number_line(axes[cell, :2].ravel())
-        yield f"*ELSET, ELSET=E{cell}"
-        yield str(cell + 1)
-        yield f"*SOLID SECTION, ELSET=E{cell}, MATERIAL=M{materials[key]}, ORIENTATION=O{cell}"
 
 
-def _constant_lines(constants: FloatArray, temperature: float = 0.0) -> Iterator[str]:
-    """Yield nine orthotropic constants [Pa] at a temperature."""
-    yield number_line(constants[:8])
-    yield number_line((constants[8], temperature))
+def material_lines(number: int, courses: Iterable[tuple[float, FloatArray]], density: float) -> Iterator[str]:
+    """Yield a material: nine orthotropic constants [Pa] at each of some temperatures, density [kg/m^3]."""
+    yield f"*MATERIAL, NAME=M{number}"
+    yield "*ELASTIC, TYPE=ORTHO"
+    for temperature, constants in courses:
+        yield number_line(constants[:8])
+        yield number_line((constants[8], temperature))
+    yield "*DENSITY"
+    yield number_line([density])
+
+
+def section_lines(number: int, axes: FloatArray, cells: Iterable[int]) -> Iterator[str]:
+    """Yield which cells are of the material of a number, in axes by two vectors (2, 3)."""
+    yield f"*ORIENTATION, NAME=O{number}, SYSTEM=RECTANGULAR"
+    yield number_line(axes.ravel())
+    yield from cell_set(f"E{number}", cells)
+    yield f"*SOLID SECTION, ELSET=E{number}, MATERIAL=M{number}, ORIENTATION=O{number}"
+
+
+def cell_set(name: str, cells: Iterable[int]) -> Iterator[str]:
+    """Yield a set of cells, which count from 0."""
+    yield f"*ELSET, ELSET={name}"
+    yield from (str(cell + 1) for cell in cells)

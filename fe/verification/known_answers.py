@@ -5,24 +5,23 @@ their own; the balance and the mesh convergence check the wing itself.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import brentq
 
-from fe.elements.cells import CellMesh, gradients, hexahedra_20, isotropic_elasticity, strain_matrix
+from fe.elements.cells import CellMesh, centre_strains, gradients, hexahedra_20, isotropic_compliance
 from fe.elements.kinds import HEXAHEDRA_20, gauss_points
+from fe.full.modes import most_moved
 from fe.full.statics import Factorisation
+from fe.runtime.arrays import FloatArray
+from fe.structure.field import natural_frequencies, static_response
 from fe.structure.location import area_shares
 from fe.structure.mesh import Surface
 from fe.structure.supports import rigid_motions
 from fe.wing.design import WingDesign
-from fe.wing.operators import AffineOperators, assemble, cell_density, root_support
-from fe.wing.responses import eigenmodes, solve_static
-
-FloatArray = NDArray[np.float64]
+from fe.wing.operators import AffineOperators, assemble, cell_density, point_masses, root_support
 
 _PATCH_GRADIENT = np.array([[1.0, -0.4, 0.3], [0.2, -0.7, 0.5], [-0.6, 0.1, 0.8]]) * 1e-3
 
@@ -43,40 +42,32 @@ def brick(
     seed : int
         Of the distortion.
     """
-    grid = np.stack(
-        np.meshgrid(*(np.linspace(0.0, 1.0, n + 1) for n in cells), indexing="ij"), axis=-1
-    ).reshape(-1, 3)
-    corner = np.array(HEXAHEDRA_20.corners)
-    first = np.stack(np.meshgrid(*(np.arange(n) for n in cells), indexing="ij"), axis=-1).reshape(-1, 1, 3)
-    numbers = np.ravel_multi_index(tuple(np.moveaxis(first + corner, 2, 0)), tuple(n + 1 for n in cells))
+    grid = np.indices([n + 1 for n in cells]).reshape(3, -1).T / np.array(cells)
+    corner = np.indices(cells).reshape(3, -1).T[:, None] + np.array(HEXAHEDRA_20.corners)
+    numbers = np.ravel_multi_index(tuple(np.moveaxis(corner, 2, 0)), tuple(n + 1 for n in cells))
     inside = np.all((grid > 1e-9) & (grid < 1.0 - 1e-9), axis=1)
     shift = np.random.default_rng(seed).uniform(-distortion, distortion, grid.shape) / np.array(cells)
     points = (grid + shift * inside[:, None]) * np.array(lengths)
     return hexahedra_20(points, numbers)
 
 
-def _uniform_stiffness(body: CellMesh, elasticity: FloatArray) -> sparse.csr_array:
+def _uniform_stiffness(body: CellMesh, young_modulus: float, poisson_ratio: float) -> sparse.csr_array:
+    elasticity = np.asarray(
+        np.linalg.inv(isotropic_compliance(young_modulus, poisson_ratio)), dtype=np.float64
+    )
     return body.stiffness(np.arange(len(body.cells)), elasticity)
 
 
-@dataclass(frozen=True)
-class PatchTest:
-    """Errors of a state of constant strain on distorted cells, relative to its largest value.
+def patch_test() -> tuple[float, float]:
+    """Impose a linear displacement on the surface of a distorted brick; it must hold inside.
 
-    Attributes
-    ----------
-    displacement_error, strain_error : float
-        Largest errors over the interior nodes and over the centres of the cells.
+    Returns
+    -------
+    displacement, strain : float
+        Largest errors over the interior nodes and over the centres of the cells, relative.
     """
-
-    displacement_error: float
-    strain_error: float
-
-
-def patch_test(distortion: float = 0.25) -> PatchTest:
-    """Impose a linear displacement on the surface of a distorted brick; it must hold inside."""
-    body = brick((1.0, 0.8, 1.2), (3, 3, 3), distortion)
-    stiffness = _uniform_stiffness(body, isotropic_elasticity(1.0, 0.3))
+    body = brick((1.0, 0.8, 1.2), (3, 3, 3), 0.25)
+    stiffness = _uniform_stiffness(body, 1.0, 0.3)
     points = body.points
     exact = (points @ _PATCH_GRADIENT.T).ravel()
     edge = np.isclose(points, 0.0) | np.isclose(points, [1.0, 0.8, 1.2])
@@ -84,40 +75,18 @@ def patch_test(distortion: float = 0.25) -> PatchTest:
     fixed = np.setdiff1d(np.arange(body.unknowns), free)
     found = exact.copy()
     found[free] = Factorisation(stiffness[free][:, free]).solve(-stiffness[free][:, fixed] @ exact[fixed])
-    slopes, _ = gradients(body.kind, body.nodes, np.array([[0.5, 0.5, 0.5]]))
-    moved = found[body.unknowns_of(np.arange(len(body.cells)))]
-    strain = np.einsum("nij,nj->ni", strain_matrix(slopes[:, 0]), moved)
+    strain = centre_strains(body, found.reshape(-1, 3))
     symmetric = _PATCH_GRADIENT + _PATCH_GRADIENT.T
     expected = np.array([*(0.5 * np.diag(symmetric)), symmetric[1, 2], symmetric[0, 2], symmetric[0, 1]])
-    return PatchTest(
-        float(np.abs(found - exact).max() / np.abs(exact).max()),
-        float(np.abs(strain - expected).max() / np.abs(expected).max()),
-    )
+    moved, strained = np.abs(found - exact).max(), np.abs(strain - expected).max()
+    return float(moved / np.abs(exact).max()), float(strained / np.abs(expected).max())
 
 
-@dataclass(frozen=True)
-class RigidBodyCheck:
-    """Eigenvalues of an unsupported body, relative to the largest.
-
-    Attributes
-    ----------
-    count : int
-        Number of eigenvalues below 1e-12 of the largest; six for a sound element.
-    largest_zero, smallest_elastic : float
-        The sixth and the seventh eigenvalue over the largest.
-    """
-
-    count: int
-    largest_zero: float
-    smallest_elastic: float
-
-
-def rigid_body_check() -> RigidBodyCheck:
-    """Eigenvalues of the stiffness of an unsupported distorted brick."""
+def rigid_body_values() -> FloatArray:
+    """Eigenvalues (n,) of the stiffness of an unsupported distorted brick over the largest, rising."""
     body = brick((1.0, 0.8, 1.2), (2, 2, 2), 0.25)
-    stiffness = _uniform_stiffness(body, isotropic_elasticity(1.0, 0.3)).toarray()
-    values = np.linalg.eigvalsh(stiffness) / np.linalg.norm(stiffness, 2)
-    return RigidBodyCheck(int((values < 1e-12).sum()), float(values[5]), float(values[6]))
+    values = np.linalg.eigvalsh(_uniform_stiffness(body, 1.0, 0.3).toarray())
+    return np.asarray(values / values[-1])
 
 
 def _rigid_motions(operators: AffineOperators) -> FloatArray:
@@ -142,21 +111,8 @@ def rigid_body_residual(operators: AffineOperators) -> float:
     return float(np.abs(force).max() / bound.max())
 
 
-@dataclass(frozen=True)
-class CantileverCheck:
-    """Tip deflection of a cantilever of 20-node hexahedra against Timoshenko's beam [m]."""
-
-    deflection: float
-    timoshenko: float
-
-    @property
-    def relative_error(self) -> float:
-        """Deflection over Timoshenko's, less one."""
-        return self.deflection / self.timoshenko - 1.0
-
-
-def cantilever_check(cells_along: int = 10) -> CantileverCheck:
-    """Bend a clamped beam of square section by a shear force at its end.
+def cantilever_check(cells_along: int = 10) -> float:
+    """Bend a clamped beam of square section by a shear force: deflection over Timoshenko's, less one.
 
     Poisson's ratio is zero, so that the clamp does not hold back the section and the beam theory with the
     shear coefficient 5/6 is the solution to compare with.
@@ -166,25 +122,23 @@ def cantilever_check(cells_along: int = 10) -> CantileverCheck:
     second_moment = side**4 / 12.0
     bending = force * length**3 / (3.0 * modulus * second_moment)
     shear = force * length / (5.0 / 6.0 * 0.5 * modulus * side**2)
-    bent = force * _end_deflection(body, isotropic_elasticity(modulus, 0.0), length, 2)
-    return CantileverCheck(bent, bending + shear)
+    bent = force * _end_deflection(body, modulus, 0.0, length, 2)
+    return bent / (bending + shear) - 1.0
 
 
-def _end_deflection(body: CellMesh, elasticity: FloatArray, length: float, component: int) -> float:
+def _end_deflection(
+    body: CellMesh, young_modulus: float, poisson_ratio: float, length: float, component: int
+) -> float:
     """Mean displacement of the end y = `length` along a unit force there; the other end is clamped."""
-    stiffness, shares = _uniform_stiffness(body, elasticity), face_shares(body, length)
+    stiffness = _uniform_stiffness(body, young_modulus, poisson_ratio)
+    on_end = np.flatnonzero(np.isclose(body.corners[:, :, 1].max(axis=1), length))
+    shares = area_shares(body, Surface(on_end, np.full(len(on_end), _END_FACE)))
+    shares /= shares.sum()
     free = np.flatnonzero(np.repeat(body.points[:, 1] > 1e-9, 3))
     load, found = np.zeros(body.unknowns), np.zeros(body.unknowns)
     load[component::3] = shares
     found[free] = Factorisation(stiffness[free][:, free]).solve(load[free])
     return float(found[component::3] @ shares)
-
-
-def face_shares(body: CellMesh, place: float) -> FloatArray:
-    """Consistent shares (nodes,) of a uniform traction on the end face y = `place`; they sum to one."""
-    on_end = np.flatnonzero(np.isclose(body.corners[:, :, 1].max(axis=1), place))
-    shares = area_shares(body, Surface(on_end, np.full(len(on_end), _END_FACE)))
-    return np.asarray(shares / shares.sum())
 
 
 _END_FACE = 4  # of a hexahedron, where its second coordinate is one
@@ -214,67 +168,36 @@ def macneal_harder_beam(shape: str, *, across_depth: bool) -> float:
     points[:, 1] += np.where(inside, lean * (points[:, 0] - 0.5 * depth), 0.0)
     body = hexahedra_20(points, regular.cells[:, :8])
     component, exact = (0, 0.1081) if across_depth else (2, 0.4321)
-    return _end_deflection(body, isotropic_elasticity(1e7, 0.3), length, component) / exact
+    return _end_deflection(body, 1e7, 0.3, length, component) / exact
 
 
-@dataclass(frozen=True)
-class WingBalance:
-    """Sums that must agree for the wing in a turn.
+def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[str, tuple[float, float, str]]:
+    """Return sums that must agree for the wing at a load factor, each with the other and their unit.
 
-    Attributes
-    ----------
-    structural_mass : float
-        From the mass matrix and a rigid heave [kg].
-    volume_mass : float
-        From the volumes of the cells [kg].
-    lift, spring_force : float
-        Total net load and the force in the transverse root spring [N].
-    lift_moment, spring_moment : float
-        Moment of the load about the root and the moment in the flap spring [N m].
-    work, strain_energy : float
-        Half the work of the load and the elastic energy [J].
+    The mass of the matrix and of the volumes; the force of the root spring and the net load; the moment of
+    the flap spring and that of the load about the root; the elastic energy and half the work of the load.
     """
-
-    structural_mass: float
-    volume_mass: float
-    lift: float
-    spring_force: float
-    lift_moment: float
-    spring_moment: float
-    work: float
-    strain_energy: float
-
-
-def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> WingBalance:
-    """Mass, reaction and energy sums of the wing at a load factor."""
-    mesh = operators.wing_mesh
-    design = mesh.design
+    mesh, design = operators.wing_mesh, operators.wing_mesh.design
     heave, flap, _ = _rigid_motions(operators).T
     local, weight = gauss_points(2)
     volume = gradients(mesh.kind, mesh.nodes, local)[1] @ weight
-    solution = solve_static(operators, load_factor=load_factor)
-    u = solution.displacement
+    u = static_response(operators, {"load_factor": load_factor}).displacement
     load = operators.turn(load_factor)
-    return WingBalance(
-        structural_mass=float(heave @ (operators.mass_terms[0] @ heave)),
-        volume_mass=float(volume @ cell_density(mesh)),
-        lift=design.lift.force * load_factor / design.lift.load_factor,
-        spring_force=float(design.root.transverse_spring * u[-3]),
-        lift_moment=float(flap @ load),
-        spring_moment=float(design.root.flap_spring * u[-2]),
-        work=float(0.5 * load @ u),
-        strain_energy=float(0.5 * u @ (operators.stiffness() @ u)),
-    )
+    lift = design.lift.force * load_factor / design.lift.load_factor
+    energy = 0.5 * u @ (operators.stiffness() @ u)
+    return {
+        "mass": (float(heave @ (operators.mass_terms[0] @ heave)), float(volume @ cell_density(mesh)), "kg"),
+        "reaction": (float(design.root.transverse_spring * u[-3]), lift, "N"),
+        "root moment": (float(design.root.flap_spring * u[-2]), float(flap @ load), "N m"),
+        "energy and work": (float(energy), float(0.5 * load @ u), "J"),
+    }
 
 
-@dataclass(frozen=True)
-class ConvergenceRow:
-    """Results of the wing on one mesh.
+class ConvergenceRow(NamedTuple):
+    """Results of the healthy wing at e = 1 on one mesh.
 
     Attributes
     ----------
-    refinement : float
-        `mesh.refinement` of the design.
     unknowns : int
         Free unknowns.
     tip_stiffness : float
@@ -285,30 +208,11 @@ class ConvergenceRow:
         Gauge strains at the load factor of the design's lift.
     """
 
-    refinement: float
     unknowns: int
     tip_stiffness: float
     first_bending: float
     second_bending: float
     strain: FloatArray
-
-
-def convergence_row(operators: AffineOperators) -> ConvergenceRow:
-    """Results of the healthy wing at e = 1 on the mesh of `operators`."""
-    design = operators.wing_mesh.design
-    factors = Factorisation(operators.stiffness())
-    turn = factors.solve(operators.turn(design.lift.load_factor))
-    bent = factors.solve(operators.load_tip)
-    modes = eigenmodes(operators, 1.0, (), design.masses.servo, design.masses.pitot, count=4)
-    first, second = modes.flapwise_bending
-    return ConvergenceRow(
-        refinement=design.mesh.refinement,
-        unknowns=operators.unknowns,
-        tip_stiffness=1.0 / float(operators.load_tip @ bent),
-        first_bending=float(modes.frequency[first]),
-        second_bending=float(modes.frequency[second]),
-        strain=np.asarray(operators.gauge_output @ turn),
-    )
 
 
 def mesh_convergence(
@@ -321,10 +225,19 @@ def mesh_convergence(
     InvalidDesignError
         If a refinement lies outside the range of the design.
     """
-    return tuple(
-        convergence_row(assemble(design.changed(mesh={"refinement": refinement})))
-        for refinement in refinements
-    )
+    rows = []
+    for refinement in refinements:
+        operators = assemble(design.changed(mesh={"refinement": refinement}))
+        loads = np.column_stack((operators.turn(design.lift.load_factor), operators.load_tip))
+        turn, bent = Factorisation(operators.stiffness()).solve(loads).T
+        masses = point_masses(design.masses.servo, design.masses.pitot)
+        frequency, shapes = natural_frequencies(operators, 4, masses)
+        first, second = frequency[most_moved(operators.load_tip, frequency**2, shapes)].tolist()
+        stiffness = 1.0 / float(operators.load_tip @ bent)
+        rows.append(
+            ConvergenceRow(operators.unknowns, stiffness, first, second, operators.gauge_output @ turn)
+        )
+    return tuple(rows)
 
 
 def observed_order(refinements: Sequence[float], values: Sequence[float]) -> float:

@@ -5,14 +5,11 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
 
 from .design import WingDesign, rib_interval
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 SMALLEST_GAP = 2e-4
 """Two mesh lines that the design asks for may not lie closer than this [m]."""

@@ -11,18 +11,15 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.elements.cells import CellMesh, hexahedra_20
 from fe.elements.kinds import HEXAHEDRA_20
+from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import MeshError
 
 from .design import WingDesign
 from .grid import MeshLine, cells_within, chord_lines, rib_cells, span_lines, web_cells
 from .parts import four_digit_half_thickness, four_digit_slope
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 SKIN = 0
 """Index of the skin in `WingMesh.region_names`; the damage regions follow, then webs and ribs."""
@@ -70,7 +67,7 @@ class WingMesh(CellMesh):
     region: IntArray
     web: IntArray
     rib: IntArray
-    leading_edge: NDArray[np.bool_]
+    leading_edge: BoolArray
     height_cells: int
 
     @property
@@ -127,19 +124,6 @@ class WingMesh(CellMesh):
             local.append((place - places[before]) / (places[before + 1] - places[before]))
         height = self.height_cells + 1 if upper else 0
         return SurfacePoint(int(self._cell_of[*index, height]), np.array([*local, float(upper)]))
-
-    def cells_of(self, name: str) -> IntArray:
-        """Numbers of the cells of a named region.
-
-        Raises
-        ------
-        MeshError
-            If there is no such region.
-        """
-        names = self.region_names
-        if name not in names:
-            raise MeshError(f"there is no region '{name}'; the regions are {', '.join(names)}.")
-        return np.flatnonzero(self.region == names.index(name))
 
     def skin_cells(self, *, upper: bool) -> IntArray:
         """Numbers of the cells of the upper or lower skin, defect regions included."""

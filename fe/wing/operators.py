@@ -12,18 +12,18 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.elements.cells import (
-    isotropic_elasticity,
+    isotropic_compliance,
     jacobians,
-    orthotropic_elasticity,
+    orthotropic_compliance,
     point_jacobians,
     rotate_elasticity,
     strain_weights,
 )
 from fe.elements.kinds import gauss_points
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.state import DigitalState
 from fe.structure.affine import AffineStructure, LoadTerm, StiffnessTerm
 from fe.structure.supports import RigidSet, SupportedUnknowns, rigid_motions
@@ -32,9 +32,6 @@ from .design import WingDesign
 from .mesh import SurfacePoint, WingMesh, build_mesh
 from .parts import PointMassPlace
 from .turn_load import STANDARD_GRAVITY, lift_load
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 def patch_pieces(middle: float, length: float, lines: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -206,20 +203,18 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
     local = np.empty((len(mesh.cells), 6, 6))
     across, along = skin.transverse_shear_ratio, skin.in_plane_shear_ratio
     unit, wall = (
-        orthotropic_elasticity(1.0, skin.poisson_ratio, *shears)
-        for shears in ((across, across, along), (along, across, across))
+        np.linalg.inv(orthotropic_compliance(1.0, skin.poisson_ratio, shears))
+        for shears in ((along, across, across), (across, across, along))
     )
     station = mesh.centres[:, 1] / design.planform.semi_span
     modulus = skin.young_modulus(station)
     shell = (mesh.web < 0) & (mesh.rib < 0)
     local[shell] = np.where(mesh.leading_edge[shell, None, None], wall, unit) * modulus[shell, None, None]
     for index, web in enumerate(design.webs):
-        shear = web.shear_modulus
-        local[mesh.web == index] = orthotropic_elasticity(
-            web.young_modulus, web.poisson_ratio, shear, shear, shear
-        )
+        compliance = orthotropic_compliance(web.young_modulus, web.poisson_ratio, web.shear_modulus)
+        local[mesh.web == index] = np.linalg.inv(compliance)
     for index, rib in enumerate(design.ribs):
-        local[mesh.rib == index] = isotropic_elasticity(rib.young_modulus, rib.poisson_ratio)
+        local[mesh.rib == index] = np.linalg.inv(isotropic_compliance(rib.young_modulus, rib.poisson_ratio))
     for rod in design.rods:
         inside = (mesh.web == rod.web) & (station < rod.reach)
         second_moment = design.webs[rod.web].thickness * _web_height(mesh)[inside] ** 3 / 12.0

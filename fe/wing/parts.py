@@ -9,15 +9,16 @@ import math
 from typing import Annotated, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
+from fe.runtime.arrays import FloatArray
 from fe.structure.tables import Modulus, Part
 
 _SHAPE = (0.2969, -0.1260, -0.3516, 0.2843, -0.1015)
 
 
-def four_digit_half_thickness(chord_fraction: ArrayLike, thickness_ratio: float) -> NDArray[np.float64]:
+def four_digit_half_thickness(chord_fraction: ArrayLike, thickness_ratio: float) -> FloatArray:
     """Half thickness of a symmetric four-digit section, as a fraction of the chord.
 
     Parameters
@@ -37,7 +38,7 @@ def four_digit_half_thickness(chord_fraction: ArrayLike, thickness_ratio: float)
     return np.asarray(5.0 * thickness_ratio * polynomial)
 
 
-def four_digit_slope(chord_fraction: ArrayLike, thickness_ratio: float) -> NDArray[np.float64]:
+def four_digit_slope(chord_fraction: ArrayLike, thickness_ratio: float) -> FloatArray:
     """Slope of the upper surface, the derivative of `four_digit_half_thickness` (...,)."""
     xi = np.clip(np.asarray(chord_fraction, dtype=float), 1e-6, 1.0)
     a0, a1, a2, a3, a4 = _SHAPE
@@ -45,7 +46,7 @@ def four_digit_slope(chord_fraction: ArrayLike, thickness_ratio: float) -> NDArr
     return np.asarray(5.0 * thickness_ratio * derivative)
 
 
-_Numbers = TypeVar("_Numbers", float, NDArray[np.float64])
+_Numbers = TypeVar("_Numbers", float, FloatArray)
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Thickness = Annotated[float, Field(gt=0.0, lt=0.1, description="m")]
 PoissonRatio = Annotated[float, Field(ge=0.0, lt=0.5)]
@@ -121,7 +122,7 @@ class Skin(Part):
             raise ValueError(f"the ends of the bands must rise from above 0 to 1, but are {ends}")
         return self
 
-    def young_modulus(self, station: NDArray[np.float64]) -> NDArray[np.float64]:
+    def young_modulus(self, station: FloatArray) -> FloatArray:
         """Young's modulus (...,) [Pa] at fractions of the span (...,)."""
         if self.stations:
             places = [place.station for place in self.stations]

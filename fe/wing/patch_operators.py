@@ -11,8 +11,9 @@ around the section takes it.
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
+
+from fe.runtime.arrays import FloatArray
 
 from .design import WingDesign
 from .operators import (
@@ -24,9 +25,6 @@ from .operators import (
     turn_load,
     upward,
 )
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 LEAST_LINE_DISTANCE = 0.1
 """Least distance between lines of a section, as a fraction of the chord."""

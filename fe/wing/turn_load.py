@@ -12,15 +12,14 @@ H. Glauert, "The Elements of Aerofoil and Airscrew Theory" (1926), chapter XI.
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fe.elements.cells import jacobians
 from fe.elements.kinds import gauss_points
+from fe.runtime.arrays import FloatArray
 
 from .mesh import WingMesh
 from .parts import Planform
-
-FloatArray = NDArray[np.float64]
 
 Distribution = Callable[[ArrayLike], FloatArray]
 

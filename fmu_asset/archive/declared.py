@@ -2,14 +2,17 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
 from fmu_asset.errors import FmuInputError, FmuUnsupportedError, visible
-from fmu_asset.instances.plan import Interface
+from fmu_asset.instances.plan import FmuIdentity, Interface
 
 NUMERIC_KINDS = frozenset(
     {"Real", "Integer", "Enumeration", "Boolean", "Float32", "Float64"}
@@ -77,6 +80,32 @@ class VariableInfo:
         """Number of values."""
         return math.prod(self.shape)
 
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """Names of the elements of an array, row by row and from 1; the name itself of a scalar."""
+        if not self.shape:
+            return (self.name,)
+        ranges = [range(1, length + 1) for length in self.shape]
+        return tuple(f"{self.name}[{','.join(map(str, index))}]" for index in product(*ranges))
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Declared range, within that of the type: C would wrap what does not fit."""
+        low, high = (0.0, 1.0) if self.kind == "Boolean" else (-math.inf, math.inf)
+        if self.base_type in ("Integer", "Enumeration"):
+            sized = self.kind not in ("Integer", "Enumeration")
+            limits = np.iinfo(self.kind.lower() if sized else "int32")
+            low, high = float(limits.min), float(limits.max)
+        return (
+            low if self.minimum is None else max(low, self.minimum),
+            high if self.maximum is None else min(high, self.maximum),
+        )
+
+    @property
+    def in_unit(self) -> str:
+        """Unit with a blank before it, for a sentence; nothing if it has none."""
+        return "" if self.unit in (None, "1") else f" {self.unit}"
+
     def resized(self, lengths: Mapping[str | None, int]) -> "VariableInfo":
         """Return the variable with other values of structural parameters; one start value stands for all.
 
@@ -131,7 +160,7 @@ class UnitInfo:
 
 
 @dataclass(frozen=True)
-class FmuDescription:
+class FmuDescription(FmuIdentity):
     """What an FMU file is and declares; plain values only, so that it can be listed or sent.
 
     Attributes
@@ -142,8 +171,8 @@ class FmuDescription:
         Hash of the file.
     file_size : int
         Bytes.
-    fmi_version, model_name, model_identifier, guid, description, generation_tool : str
-        As declared; the identifier is that of `interface`.
+    model_name, description, generation_tool : str
+        As declared.
     platforms : tuple of str
         Folders of binaries, such as linux64.
     can_get_and_set_state, can_serialise_state, can_vary_step : bool
@@ -152,8 +181,6 @@ class FmuDescription:
         In the order of the model description.
     units : tuple of UnitInfo
         The unit definitions.
-    interface : {"co-simulation", "model-exchange"}
-        How it is run.
     interfaces : tuple of str
         All that it offers.
     needs_tool : bool
@@ -164,10 +191,6 @@ class FmuDescription:
         Of the default experiment.
     fixed_step : float or None
         Internal step size that FMI 3 declares [s].
-    states, event_indicators : int
-        Numbers of continuous states and event indicators.
-    completed_step : bool
-        Whether model exchange wants to hear of completed integrator steps.
     can_interpolate_inputs : bool
         Whether inputs can move in straight lines between communication points: in model exchange, and where
         co-simulation declares `canInterpolateInputs` (FMI 1 and 2).
@@ -176,10 +199,7 @@ class FmuDescription:
     path: Path
     sha256: str = ""
     file_size: int = 0
-    fmi_version: str = "2.0"
     model_name: str = ""
-    model_identifier: str = ""
-    guid: str = ""
     description: str = ""
     generation_tool: str = ""
     platforms: tuple[str, ...] = ()
@@ -188,7 +208,6 @@ class FmuDescription:
     can_vary_step: bool = True
     variables: tuple[VariableInfo, ...] = ()
     units: tuple[UnitInfo, ...] = ()
-    interface: Interface = "co-simulation"
     interfaces: tuple[str, ...] = ("co-simulation",)
     needs_tool: bool = False
     once_per_process: bool = False
@@ -197,15 +216,12 @@ class FmuDescription:
     tolerance: float | None = None
     stop_time: float | None = None
     fixed_step: float | None = None
-    states: int = 0
-    event_indicators: int = 0
-    completed_step: bool = False
     can_interpolate_inputs: bool = False
 
     @property
-    def major_version(self) -> int:
-        """1, 2 or 3."""
-        return int(self.fmi_version[0])
+    def identity(self) -> FmuIdentity:
+        """What of it an instance has to know."""
+        return FmuIdentity(**{item.name: getattr(self, item.name) for item in fields(FmuIdentity)})
 
     @cached_property
     def _by_name(self) -> dict[str, VariableInfo]:
@@ -260,9 +276,9 @@ def read_declared(
     FmuUnsupportedError
         If it does not offer that.
     """
-    there = _offered(declared, archive["path"], wanted)
-    interface = wanted or there[0]
-    chosen = declared.coSimulation if interface == "co-simulation" else declared.modelExchange
+    offered = _offered(declared, archive["path"], wanted)
+    interface = next(iter(offered)) if wanted is None else wanted
+    chosen = offered[interface]
     experiment = declared.defaultExperiment
     # fmpy does not read the capabilities of FMI 1.
     capabilities = root.find("Implementation//Capabilities")
@@ -296,12 +312,10 @@ def read_declared(
         can_serialise_state=bool(chosen.canSerializeFMUstate),
         can_vary_step=bool(vary),
         can_interpolate_inputs=bool(lines),
-        variables=tuple(
-            _variable(variable, known.get(variable.name)) for variable in declared.modelVariables
-        ),
+        variables=tuple(_variable(each, known.get(each.name)) for each in declared.modelVariables),
         units=tuple(_unit(unit) for unit in declared.unitDefinitions),
         interface=interface,
-        interfaces=tuple(there),
+        interfaces=tuple(offered),
         needs_tool=bool(chosen.needsExecutionTool)
         or root.find("Implementation/CoSimulation_Tool") is not None,
         once_per_process=bool(getattr(chosen, "canBeInstantiatedOnlyOncePerProcess", False)),
@@ -324,12 +338,12 @@ def _checked(name: str, shape: Sequence[int]) -> tuple[int, ...]:
     return tuple(shape)
 
 
-def _offered(declared: Any, file: Path, wanted: Interface | None) -> list[Interface]:
-    """Return the interfaces that an FMU offers, the one that is wanted among them."""
-    offered: dict[Interface, Any] = {
+def _offered(declared: Any, file: Path, wanted: Interface | None) -> dict[Interface, Any]:
+    """Return what an FMU says of the interfaces that it offers, the one that is wanted among them."""
+    there: dict[Interface, Any] = {
         "co-simulation": declared.coSimulation, "model-exchange": declared.modelExchange
     }  # fmt: skip
-    there: list[Interface] = [name for name, given in offered.items() if given is not None]
+    there = {name: given for name, given in there.items() if given is not None}
     if not there:
         raise FmuUnsupportedError(
             f"{file} offers neither co-simulation nor model exchange (scheduled execution is not supported); "
@@ -337,7 +351,7 @@ def _offered(declared: Any, file: Path, wanted: Interface | None) -> list[Interf
         )
     if wanted is not None and wanted not in there:
         raise FmuUnsupportedError(
-            f"{file} offers {there[0]} only, but the binding asks for {wanted}; change `interface` "
+            f"{file} offers {next(iter(there))} only, but the binding asks for {wanted}; change `interface` "
             "there, or export the FMU anew."
         )
     return there

@@ -142,10 +142,9 @@ def extract_fmu(description: FmuDescription) -> Path:
     try:
         with zipfile.ZipFile(description.path) as archive:
             needed = sum(entry.file_size for entry in archive.infolist())
-        free = shutil.disk_usage(folder).free
-        if needed > free:
-            raise OSError(f"it needs {needed // 1024**2} MiB, and {free // 1024**2} MiB are free")
-        with zipfile.ZipFile(description.path) as archive:
+            free = shutil.disk_usage(folder).free
+            if needed > free:
+                raise OSError(f"it needs {needed // 1024**2} MiB, and {free // 1024**2} MiB are free")
             archive.extractall(folder)
     except _UNREADABLE as error:
         remove_folder(folder)
@@ -222,16 +221,8 @@ def _refuse_unequal_twins(file: Path, archive: zipfile.ZipFile) -> None:
 def _check_entry(file: Path, entry: zipfile.ZipInfo) -> None:
     name = entry.orig_filename
     parts = PurePosixPath(name).parts
-    mode = entry.external_attr >> 16
-    if (
-        not name
-        or "\\" in name
-        or ":" in name
-        or "\0" in name
-        or name.startswith("/")
-        or ".." in parts
-        or stat.S_ISLNK(mode)
-    ):
+    outside = not name or name.startswith("/") or ".." in parts or not {*name}.isdisjoint("\\:\0")
+    if outside or stat.S_ISLNK(entry.external_attr >> 16):
         raise FmuFileError(
             f"{file} holds the entry {name!r}, which would be extracted outside its folder; it was refused."
         )
@@ -242,15 +233,14 @@ def _check_entry(file: Path, entry: zipfile.ZipInfo) -> None:
         )
 
 
-class _DocumentTypeError(Exception):
-    pass
-
-
 class _WithoutDocumentType(TreeBuilder):
     """Elements of a file in any encoding, up to a document type, before its entities are defined."""
 
     def doctype(self, name: str, public: str | None, system: str | None) -> None:
-        raise _DocumentTypeError
+        raise FmuFileError(
+            "defines a document type or entities, which FMI does not provide for and which can be made to "
+            "fill the memory; it was refused"
+        )
 
 
 def _model_description(file: Path) -> Element:
@@ -258,25 +248,15 @@ def _model_description(file: Path) -> Element:
     try:
         with zipfile.ZipFile(file) as archive:
             if archive.getinfo("modelDescription.xml").file_size > _LARGEST_DESCRIPTION:
-                raise FmuFileError(
-                    f"The model description of {file} is larger than {_LARGEST_DESCRIPTION // 1024**2} MiB; "
-                    "it was refused."
-                )
-            text = archive.read("modelDescription.xml")
-        parser = XMLParser(target=_WithoutDocumentType())
-        parser.feed(text)
+                raise FmuFileError(f"is larger than {_LARGEST_DESCRIPTION // 1024**2} MiB; it was refused")
+            parser = XMLParser(target=_WithoutDocumentType())
+            parser.feed(archive.read("modelDescription.xml"))
         root: Element = parser.close()
-    except _DocumentTypeError:
-        raise FmuFileError(
-            f"The model description of {file} defines a document type or entities, which FMI does not "
-            "provide for and which can be made to fill the memory; it was refused."
-        ) from None
+        if root.tag != "fmiModelDescription":
+            raise FmuFileError(f"begins with <{root.tag}>; it is damaged")
     except (ParseError, ValueError, LookupError, zipfile.BadZipFile, OSError) as error:
-        if isinstance(error, FmuFileError):
-            raise
-        raise FmuFileError(f"The model description of {file} cannot be read ({error}).") from error
-    if root.tag != "fmiModelDescription":
-        raise FmuFileError(f"The model description of {file} begins with <{root.tag}>; it is damaged.")
+        why = error.sentence if isinstance(error, FmuFileError) else f"cannot be read ({error})"
+        raise FmuFileError(f"The model description of {file} {why}.") from error
     return root
 
 

@@ -36,10 +36,6 @@ class Finding:
     verdict: Verdict
     text: str
 
-    def __post_init__(self) -> None:
-        """Make control characters, which names of an FMU may hold, visible."""
-        object.__setattr__(self, "text", visible(self.text))
-
 
 @dataclass(frozen=True)
 class FmuCheck:
@@ -56,18 +52,10 @@ class FmuCheck:
     path: Path
     findings: tuple[Finding, ...]
 
-    def _texts(self, verdict: Verdict) -> tuple[str, ...]:
-        return tuple(finding.text for finding in self.findings if finding.verdict == verdict)
-
     @property
     def problems(self) -> tuple[str, ...]:
         """One sentence each; empty if nothing is wrong."""
-        return self._texts("problem")
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """What is allowed but makes the FMU harder to use."""
-        return self._texts("warning")
+        return tuple(finding.text for finding in self.findings if finding.verdict == "problem")
 
     @property
     def passed(self) -> bool:
@@ -116,92 +104,83 @@ def check_fmu(
         used = given or whole_binding(description, step_size=step_size)
         flights = Flights(description, used, step_timeout, memory_limit)
     except FmuError as error:
-        if isinstance(error, BindingError) and given is None:
-            error = BindingError(f"No binding can be drafted for it: {error.sentence}")
-        found.append(("binding", "problem", error.sentence))
+        undrafted = isinstance(error, BindingError) and given is None
+        why = "No binding can be drafted for it: " if undrafted else ""
+        found.append(("binding", "problem", f"{why}{error.sentence}"))
     else:
         origin = f"{used.name} fits" if given else "Drafted; give --binding to check your own"
         found.append(("binding", "ok", f"{origin}."))
         found += flights.checks(cycles, progress or SilentProgress())
-    return FmuCheck(description.path, tuple(Finding(*told) for told in found))
+    # Names of an FMU may hold control characters.
+    findings = tuple(Finding(check, verdict, visible(text)) for check, verdict, text in found)
+    return FmuCheck(description.path, findings)
 
 
 def check_file(description: FmuDescription) -> Iterator[tuple[str, *Told]]:
     """Yield what the file of an FMU tells without running it: name of the check, verdict, sentence."""
-    kinds = " and ".join(description.interfaces)
-    yield (
-        "archive",
-        "ok",
-        (
-            f"FMI {description.fmi_version}, {kinds}, {len(description.variables)} variables, binaries for "
-            f"{', '.join(description.platforms)}."
-        ),
-    )
-    yield from _schema(description)
-    yield from _content(description)
-    yield from _units(description)
-    yield from _ranges(description)
+    checks = {
+        "archive": _archive, "fmpy validate": _schema, "content": _content, "units": _units, "ranges": _ranges
+    }  # fmt: skip
+    for name, check in checks.items():
+        for told in check(description):
+            yield name, *told
 
 
-def _schema(description: FmuDescription) -> Iterator[tuple[str, *Told]]:
+def _archive(description: FmuDescription) -> list[Told]:
+    kinds, platforms = " and ".join(description.interfaces), ", ".join(description.platforms)
+    count = len(description.variables)
+    text = f"FMI {description.fmi_version}, {kinds}, {count} variables, binaries for {platforms}."
+    return [("ok", text)]
+
+
+def _schema(description: FmuDescription) -> list[Told]:
     # It needs a grammar parser and an XML schema; those who only fly an FMU shall not pay for it.
     from fmpy.validation import validate_fmu
 
     problems = [" ".join(str(problem).split()) for problem in validate_fmu(str(description.path))]
-    for problem in problems:
-        yield "fmpy validate", "problem", problem
-    if not problems:
-        yield "fmpy validate", "ok", "The model description keeps the schema and the standard's rules."
+    fine: Told = "ok", "The model description keeps the schema and the standard's rules."
+    return [("problem", problem) for problem in problems] or [fine]
 
 
-def _content(description: FmuDescription) -> Iterator[tuple[str, *Told]]:
+def _content(description: FmuDescription) -> list[Told]:
     """Compare the GUID of a wing or structure FMU of ours with its content."""
     with zipfile.ZipFile(description.path) as archive:
         names = set(archive.namelist())
     python = {"resources/start.json", "resources/reduced_model.npz"}
     compiled = {"resources/reduced_model.bin", "sources/structure_variables.h"}
     if not (python <= names or compiled <= names):
-        return
+        return []
     changed = "the file was changed after its build."
     try:
         declared, actual = recorded_content_hash(description.path)
     except (KeyError, IndexError, UnicodeDecodeError):
-        yield "content", "problem", f"Its parts are not those of an FMU as we build it: {changed}"
-        return
+        return [("problem", f"Its parts are not those of an FMU as we build it: {changed}")]
     if declared == actual:
-        yield "content", "ok", "The GUID is the hash of the content."
-    else:
-        yield "content", "problem", f"The GUID {declared} does not fit the content ({actual}): {changed}"
+        return [("ok", "The GUID is the hash of the content.")]
+    return [("problem", f"The GUID {declared} does not fit the content ({actual}): {changed}")]
 
 
-def _units(description: FmuDescription) -> Iterator[tuple[str, *Told]]:
+def _units(description: FmuDescription) -> list[Told]:
     reals = [v for v in description.variables if v.kind in FLOAT_KINDS and v.causality != "independent"]
-    bare = [v.name for v in reals if v.unit is None]
     found = contradictions(description.units)
-    if bare:
+    if bare := [v.name for v in reals if v.unit is None]:
         found.append(f"{len(bare)} real variables have no unit: {', '.join(bare[:5])}.")
     defined = {unit.name for unit in description.units if unit.exponents is not None}
-    unknown = {v.unit for v in reals if v.unit and v.unit not in defined and meaning_of(v.unit) is None}
-    if unknown:
+    if unknown := {v.unit for v in reals if v.unit and v.unit not in defined and meaning_of(v.unit) is None}:
         listed = ", ".join(sorted(unknown)[:5])
         found.append(f"Nothing can be converted to {listed}: the FMU does not define it in SI.")
-    for sentence in found:
-        yield "units", "warning", sentence
-    if not found:
-        yield "units", "ok", "All real variables have units, and these mean what is usual."
+    fine: Told = "ok", "All real variables have units, and these mean what is usual."
+    return [("warning", sentence) for sentence in found] or [fine]
 
 
-def _ranges(description: FmuDescription) -> Iterator[tuple[str, *Told]]:
+def _ranges(description: FmuDescription) -> list[Told]:
     inputs = [v for v in description.variables if v.kind in FLOAT_KINDS and v.causality == "input"]
-    unlimited = [v.name for v in inputs if v.minimum is None or v.maximum is None]
-    empty = [
-        v.name
-        for v in description.variables
-        if v.minimum is not None and v.maximum is not None and v.minimum > v.maximum
-    ]
-    if empty:
-        yield "ranges", "problem", f"The range of {', '.join(empty[:5])} is empty."
-    if unlimited:
-        yield "ranges", "warning", f"{len(unlimited)} inputs have no range: {', '.join(unlimited[:5])}."
-    if inputs and not (unlimited or empty):
-        yield "ranges", "ok", "All real inputs have ranges."
+    found: list[Told] = []
+    ends = ((v.name, v.minimum, v.maximum) for v in description.variables)
+    if empty := [name for name, low, high in ends if low is not None and high is not None and low > high]:
+        found.append(("problem", f"The range of {', '.join(empty[:5])} is empty."))
+    if unlimited := [v.name for v in inputs if v.minimum is None or v.maximum is None]:
+        found.append(("warning", f"{len(unlimited)} inputs have no range: {', '.join(unlimited[:5])}."))
+    if inputs and not found:
+        found.append(("ok", "All real inputs have ranges."))
+    return found

@@ -1,18 +1,18 @@
 """What an FMU does when it is flown: the same twice, finite, resumable, at other steps, again and again."""
 
-import math
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from fmu_asset.archive.declared import FmuDescription, VariableInfo
+from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.door.binding import INPUT_ROLES, Binding, Input
-from fmu_asset.door.layout import find
+from fmu_asset.door.layout import Place, find
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
+from fmu_asset.errors import FmuCallError, FmuError
 from reporting.progress import Progress
 
 _STEPS = 6
@@ -51,8 +51,8 @@ class Flights:
         step_timeout: float | None,
         memory_limit: float | None,
     ) -> None:
-        self._description, self._binding = description, binding
-        self._step_timeout, self._memory_limit = step_timeout, memory_limit
+        self._binding = binding
+        self._open = partial(FmiAsset, description.path, step_timeout=step_timeout, memory_limit=memory_limit)
         # Whether it fits is found here, before anything is started.
         self._description = self._asset().description
         self._base = self._base_inputs()
@@ -96,28 +96,20 @@ class Flights:
 
     def _asset(self, **header: Any) -> FmiAsset:
         changed = self._binding.binding.model_copy(update=header)
-        binding = self._binding.model_copy(update={"binding": changed})
-        return FmiAsset(
-            self._description.path,
-            binding,
-            step_timeout=self._step_timeout,
-            memory_limit=self._memory_limit,
-        )
+        return self._open(self._binding.model_copy(update={"binding": changed}))
 
     def _base_inputs(self) -> Inputs:
         """Return zeros for arrays whose start values a new size took; all else begins at its own."""
         base: Inputs = {role: {} for role in INPUT_ROLES}
         for role in INPUT_ROLES if self._binding.binding.structural_parameters else ():
             for name, item in self._binding.inputs(role).items():
-                variable, size = self._place(role, name, item)
-                if len((variable.start or "0").split()) not in (1, variable.size):
-                    base[role][name] = [0.0] * size
+                place = self._place(role, name, item)
+                if len((place.variable.start or "0").split()) not in (1, place.variable.size):
+                    base[role][name] = [0.0] * len(place.elements)
         return base
 
-    def _place(self, role: str, name: str, item: Input) -> tuple[VariableInfo, int]:
-        """Return the variable of an input, and how many values the input has."""
-        place = find(self._description, item.variable, f"{role}.{name}", "input")
-        return place.variable, place.size
+    def _place(self, role: str, name: str, item: Input) -> Place:
+        return find(self._description, item.variable, f"{role}.{name}", "input")
 
     def _fly(self, asset: FmiAsset | None = None) -> Series:
         """Return the outputs (N, n) of a flight at the start values, from the start."""
@@ -125,7 +117,7 @@ class Flights:
             with closing(self._asset()) as own:
                 return self._fly(own)
         asset.reset(**self._base)
-        return np.array([_row(asset, self._base) for _ in range(_STEPS)])
+        return _outputs(asset, _STEPS)
 
     # ------------------------------------------------------------------ the checks
 
@@ -141,13 +133,12 @@ class Flights:
     def _state(self) -> Told:
         with closing(self._asset()) as asset:
             asset.reset(**self._base)
-            for _ in range(2):
-                asset.step(**self._base)
+            _outputs(asset, 2)
             saved, method = asset.save_state(), asset.state_method
-            expected = np.array([_row(asset, self._base) for _ in range(_STEPS - 2)])
+            expected = _outputs(asset, _STEPS - 2)
         with closing(self._asset()) as other:
             other.restore_state(saved)
-            found = np.array([_row(other, self._base) for _ in range(_STEPS - 2)])
+            found = _outputs(other, _STEPS - 2)
         if found.tobytes() != expected.tobytes():
             hint = "its outputs are not a function of its inputs"
             if method == "serialised":
@@ -176,10 +167,8 @@ class Flights:
                 if self._description.can_vary_step:
                     text = f"It declares that it takes any step size, but not {half:g} s: {_sentence(error)}"
                     return "problem", text
-                return (
-                    "warning",
-                    f"It takes {header.step_size:g} s only; `decimation` observes every n-th step.",
-                )
+                text = f"It takes {header.step_size:g} s only; `decimation` observes every n-th step."
+                return "warning", text
         scale = max(float(np.abs(self._series).max(initial=0.0)), 1e-300)
         error_size = float(np.abs(halved - self._series).max(initial=0.0)) / scale
         if error_size <= _SAME:
@@ -196,7 +185,9 @@ class Flights:
         with closing(self._asset()) as asset:
             for role in INPUT_ROLES:
                 for name, item in self._binding.inputs(role).items():
-                    for value in self._ends(asset, role, name):
+                    single = len(self._place(role, name, item).elements) == 1
+                    ends = asset.input_range(role, name) if single else ()
+                    for value in (end for end in ends if abs(end) < 1e9):
                         tried += 1
                         inputs = self._base | {role: self._base[role] | {name: value}}
                         try:
@@ -209,12 +200,6 @@ class Flights:
         if tried:
             return "ok", f"{tried} ends of ranges give finite outputs."
         return "skipped", "No input has a range."
-
-    def _ends(self, asset: FmiAsset, role: str, name: str) -> list[float]:
-        if self._place(role, name, self._binding.inputs(role)[name])[1] != 1:
-            return []
-        ends = asset.input_range(role, name)
-        return [end for end in ends if math.isfinite(end) and abs(end) < 1e9]
 
     def _reset(self) -> Told:
         with closing(self._asset()) as asset:
@@ -237,7 +222,7 @@ class Flights:
                     if done == cycles // 2:
                         half = asset.worker_memory or 0
                     asset.renew(**self._base)
-                    asset.step(**self._base)
+                    asset.step()
                     stage.advance()
                 end = asset.worker_memory or 0
         except FmuError as error:
@@ -251,9 +236,10 @@ class Flights:
         return "warning", f"{text}: it leaks a little."
 
 
-def _row(asset: FmiAsset, inputs: Inputs) -> list[float]:
-    seen = asset.step(**inputs)
-    return [*seen.values.tolist(), *seen.extra.values()]
+def _outputs(asset: FmiAsset, steps: int) -> Series:
+    """Return the outputs (N, n) of steps with the inputs as they are."""
+    seen = (asset.step() for _ in range(steps))
+    return np.array([[*one.values.tolist(), *one.extra.values()] for one in seen])
 
 
 def _difference(one: Series, two: Series) -> str:
@@ -262,7 +248,7 @@ def _difference(one: Series, two: Series) -> str:
     return f"first {one.flat[at[0]]!r}, then {two.flat[at[0]]!r}".replace("np.float64", "")
 
 
-def _sentence(error: FmuError | FmuInputError) -> str:
+def _sentence(error: FmuError) -> str:
     """Return the error in one line."""
     more = f" The FMU says: {error.messages[-1]}" if error.messages else ""
     return " ".join(f"{error.sentence}{more}".split())

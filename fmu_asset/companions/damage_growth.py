@@ -1,6 +1,6 @@
 """Damage that grows: the stiffness losses of two regions, by script, by load and by chance.
 
-This file is copied into the FMU: standard library and relative imports only.
+This file is copied into the FMU: standard library only.
 
 The loss of a region is the sum of three parts, kept below a ceiling:
 
@@ -20,65 +20,11 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Mapping, Sequence
-from typing import Any
 
-from ..slaves.base import Behaviour
-from ..slaves.variables import FmuVariable, Table
-
-NAME = "damage_growth"
-DESCRIPTION = "Growth of the stiffness losses of two regions: by script, with the load factor, and by chance."
 REGIONS = ("z1", "z2")
 SCRIPT_LENGTH = 8
-LARGEST_SEED = 2**31 - 1
 _DECIMALS = 12
 """Losses are given rounded to this many digits, so that ten times 2 % and 40 % are 60 %."""
-
-
-def variable_table(setting: Mapping[str, Any]) -> tuple[FmuVariable, ...]:
-    """Return the table of variables; `setting` holds `start`, start values by name."""
-    table = Table(setting.get("start", {}))
-    loss: dict[str, Any] = {"unit": "1", "display": "%", "box": (0.0, 1.0)}
-    per_region = [(region, f"region {region[1]}") for region in REGIONS]
-    text = "Load factor that is held over the step"
-    table.add("load_factor", "input", text, unit="1", box=(-10.0, 10.0), default=1.0)
-    for region, name in per_region:
-        table.add(f"initial.{region}", "parameter", f"Loss of {name} at the start", **loss)
-    table.add("ceiling", "parameter", "Largest loss", default=0.8, **loss)
-    text = "Time from one mark to the next"
-    table.add("period", "parameter", text, unit="s", box=(1e-6, None), default=1.0)
-    text = "Load factor n_ref at which rates and probabilities hold"
-    table.add("reference_load_factor", "parameter", text, unit="1", box=(1e-3, 10.0), default=3.0)
-    text = "Exponent of the load factor in rates and probabilities"
-    table.add("exponent", "parameter", text, unit="1", box=(0.0, 20.0))
-    for region, name in per_region:
-        text = f"Growth of {name} at the reference load factor"
-        table.add(f"rate.{region}", "parameter", text, unit="1/s", box=(0.0, None))
-    table.add("level", "parameter", "By how much chance worsens a region", default=0.2, **loss)
-    for region, name in per_region:
-        text = f"Probability that {name} worsens at a mark, at the reference load factor"
-        table.add(f"probability.{region}", "parameter", text, **loss)
-    table.add("seed", "parameter", "Seed of chance", kind="Integer", box=(0, LARGEST_SEED))
-    for entry in range(1, SCRIPT_LENGTH + 1):
-        table.add(f"script[{entry}].first", "parameter", f"First mark of entry {entry}", unit="s")
-        table.add(f"script[{entry}].last", "parameter", f"Last mark of entry {entry}", unit="s")
-        for region, name in per_region:
-            text = f"What {name} loses at each mark of entry {entry}"
-            table.add(f"script[{entry}].{region}", "parameter", text, **(loss | {"box": (-1.0, 1.0)}))
-    for region, name in per_region:
-        text = f"Stiffness that {name} has lost, as a fraction"
-        table.add(region, "output", text, unit="1", display="%")
-    table.add_status()
-    return table.rows()
-
-
-def dependencies(setting: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return the direct dependencies: the losses are states, so there are none."""
-    return {name: [] for name in (*REGIONS, "status")}
-
-
-def behaviour(setting: Mapping[str, Any]) -> Behaviour:
-    """Return a fresh behaviour."""
-    return DamageGrowth()
 
 
 class DamageGrowth:

@@ -1,6 +1,6 @@
 """Strain gauges: true strains in; gain, offset, drift, noise and dropout; readings out.
 
-This file is copied into the FMU: standard library and relative imports only.
+This file is copied into the FMU: standard library only.
 
 At time t, a gauge reads gain * strain + offset + drift_rate * max(0, t - drift_start) + noise. It is lost
 where dropout_start < t <= dropout_end, where blackout.start < t <= blackout.end (all gauges), and by chance
@@ -14,89 +14,16 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Mapping, Sequence
-from typing import Any
-
-from ..slaves.base import Behaviour
-from ..slaves.variables import FmuVariable, Table
-
-NAME = "strain_gauges"
-DESCRIPTION = "Strain gauges with gain, offset, drift, Gaussian noise and dropout."
-GAUGE_COUNT = 24
-LARGEST_STRAIN = 0.1
-LARGEST_SEED = 2**31 - 1
-
-
-def gauge_count(setting: Mapping[str, Any]) -> int:
-    """Return the number of gauges of a setting."""
-    return int(setting.get("gauge_count", GAUGE_COUNT))
-
-
-def variable_table(setting: Mapping[str, Any]) -> tuple[FmuVariable, ...]:
-    """Return the table of variables; `setting` holds `gauge_count` and `start`, start values by name."""
-    table = Table(setting.get("start", {}))
-    gauges = range(1, gauge_count(setting) + 1)
-    strain: dict[str, Any] = {"unit": "1", "display": "microstrain"}
-    limited = strain | {"box": (-LARGEST_STRAIN, LARGEST_STRAIN)}
-    for gauge in gauges:
-        table.add(f"strain[{gauge}]", "input", f"True strain at gauge {gauge}", **limited)
-    text = "Standard deviation of the noise of every gauge"
-    table.add("noise", "parameter", text, box=(0.0, LARGEST_STRAIN), **strain)
-    table.add("seed", "parameter", "Seed of noise and chance", kind="Integer", box=(0, LARGEST_SEED))
-    text = "Probability that a reading of a gauge is lost"
-    table.add("dropout_probability", "parameter", text, unit="1", display="%", box=(0.0, 1.0))
-    table.add("blackout.start", "parameter", "All gauges are lost after this time", unit="s")
-    table.add("blackout.end", "parameter", "All gauges are back after this time", unit="s")
-    for gauge in gauges:
-        text = f"Gain of gauge {gauge}"
-        table.add(f"gain[{gauge}]", "parameter", text, unit="1", box=(-10.0, 10.0), default=1.0)
-        table.add(f"offset[{gauge}]", "parameter", f"Offset of gauge {gauge}", **limited)
-        text = f"Drift of gauge {gauge}"
-        table.add(f"drift_rate[{gauge}]", "parameter", text, unit="1/s", display="microstrain/s")
-        for name, text in (
-            ("drift_start", f"Time at which gauge {gauge} begins to drift"),
-            ("dropout_start", f"Gauge {gauge} is lost after this time"),
-            ("dropout_end", f"Gauge {gauge} is back after this time"),
-        ):
-            table.add(f"{name}[{gauge}]", "parameter", text, unit="s")
-    for gauge in gauges:
-        table.add(f"reading[{gauge}]", "output", f"What gauge {gauge} says; 0 where it is lost", **strain)
-    for gauge in gauges:
-        table.add(f"received[{gauge}]", "output", f"Whether gauge {gauge} is received", kind="Boolean")
-    table.add_status()
-    return table.rows()
-
-
-def dependencies(setting: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return the direct dependencies: each reading on its strain."""
-    gauges = range(1, gauge_count(setting) + 1)
-    return (
-        {f"reading[{gauge}]": [f"strain[{gauge}]"] for gauge in gauges}
-        | {f"received[{gauge}]": [] for gauge in gauges}
-        | {"status": []}
-    )
-
-
-def behaviour(setting: Mapping[str, Any]) -> Behaviour:
-    """Return a fresh behaviour."""
-    return StrainGauges(gauge_count(setting))
 
 
 class StrainGauges:
-    """The gauges; see the module.
+    """The gauges, as many as there are gains; see the module."""
 
-    Parameters
-    ----------
-    count : int
-        Number of gauges.
-    """
-
-    def __init__(self, count: int) -> None:
-        self._count = count
-        self._samples = 0
+    _samples = 0
 
     def _take(self, parameters: Mapping[str, float]) -> None:
         """Keep the parameters in the form in which a reading needs them."""
-        gauges = range(1, self._count + 1)
+        gauges = range(1, sum(name.startswith("gain[") for name in parameters) + 1)
 
         def each(name: str) -> list[float]:
             return [parameters[f"{name}[{gauge}]"] for gauge in gauges]
@@ -132,7 +59,7 @@ class StrainGauges:
         ]
         for index, rate, begin in self._drift:
             readings[index] += rate * max(0.0, time - begin)
-        received = [1.0] * self._count
+        received = [1.0] * len(strains)
         if self._noise or self._chance:
             generator = random.Random(f"{self._seed}:{sample}")
             readings = [value + self._noise * normal(generator) for value in readings]
@@ -142,7 +69,7 @@ class StrainGauges:
             if begin < time <= end:
                 received[index] = 0.0
         if self._blackout[0] < time <= self._blackout[1]:
-            received = [0.0] * self._count
+            received = [0.0] * len(strains)
         return [v if there else 0.0 for v, there in zip(readings, received, strict=True)] + received
 
     def state(self) -> list[float]:

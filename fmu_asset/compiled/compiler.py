@@ -5,7 +5,7 @@ import shlex
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -25,16 +25,10 @@ PLATFORM: Platform = "linux64"
 CROSS_COMPILER = "x86_64-w64-mingw32-gcc"
 """Makes binaries for 64-bit Windows on Linux."""
 
+# Fused multiplications would make the last bit depend on the processor that is compiled for.
 _COMMON_FLAGS = (
-    "-std=c11",
-    "-O3",
-    "-shared",
-    "-fvisibility=hidden",
-    # Fused multiplications would make the last bit depend on the processor that is compiled for.
-    "-ffp-contract=off",
-    "-fno-math-errno",
-    "-Wl,-s",
-)
+    "-std=c11", "-O3", "-shared", "-fvisibility=hidden", "-ffp-contract=off", "-fno-math-errno", "-Wl,-s",
+)  # fmt: skip
 
 # Nothing that depends on the place or the time of the build, or that is not there where the FMU runs.
 FLAGS: Mapping[Platform, tuple[str, ...]] = {
@@ -42,14 +36,17 @@ FLAGS: Mapping[Platform, tuple[str, ...]] = {
     "win64": (*_COMMON_FLAGS, "-static-libgcc", "-Wl,--no-insert-timestamp"),
 }
 
-LIBRARIES = ("-lm",)
-
 _LONGEST_BUILD = 300.0
 _SHOWN_ERROR_LINES = 12
 
 
-def find_compiler() -> list[str]:
+def find_compiler(platform: Platform = PLATFORM) -> list[str]:
     """Return the command of a C compiler: `$CC` if it is set, else the first of `COMPILERS` that is there.
+
+    Parameters
+    ----------
+    platform : {"linux64", "win64"}
+        What it compiles for; for the latter there is one only.
 
     Returns
     -------
@@ -61,6 +58,13 @@ def find_compiler() -> list[str]:
     FmuBuildError
         If there is none.
     """
+    if platform != PLATFORM:
+        if program := shutil.which(CROSS_COMPILER):
+            return [program]
+        raise FmuBuildError(
+            f"A binary for 64-bit Windows needs {CROSS_COMPILER}, which was not found; install it (such as "
+            "the package gcc-mingw-w64-x86-64), or build without --windows."
+        )
     given = shlex.split(os.environ.get("CC", ""))
     for command in [given] if given else [[name] for name in COMPILERS]:
         program = shutil.which(command[0])
@@ -73,36 +77,13 @@ def find_compiler() -> list[str]:
     )
 
 
-def compiler_for(platform: Platform) -> list[str]:
-    """Return the command of the compiler for a platform.
-
-    Raises
-    ------
-    FmuBuildError
-        If there is none.
-    """
-    if platform == PLATFORM:
-        return find_compiler()
-    program = shutil.which(CROSS_COMPILER)
-    if program is None:
-        raise FmuBuildError(
-            f"A binary for 64-bit Windows needs {CROSS_COMPILER}, which was not found; install it (such as "
-            "the package gcc-mingw-w64-x86-64), or build without --windows."
-        )
-    return [program]
-
-
-def compile_library(
-    sources: Mapping[str, bytes], *, extra_flags: Sequence[str] = (), platform: Platform = PLATFORM
-) -> bytes:
+def compile_library(sources: Mapping[str, bytes], *, platform: Platform = PLATFORM) -> bytes:
     """Return the shared library of C sources; the same sources and compiler give the same bytes.
 
     Parameters
     ----------
     sources : mapping of str to bytes
         Content of the sources and headers by file name, all in one folder.
-    extra_flags : sequence of str
-        Flags after the usual ones.
     platform : {"linux64", "win64"}
         What it is to run on.
 
@@ -121,13 +102,13 @@ def compile_library(
             f"Compiled FMUs are built on {PLATFORM} only, but this is {fmi_platform}; build with --kind "
             "source and compile the FMU with `fmpy compile`."
         )
-    compiler = compiler_for(platform)
+    compiler = find_compiler(platform)
     with tempfile.TemporaryDirectory(prefix="uav-twin-cc-") as folder:
         for name, content in sources.items():
             (Path(folder) / name).write_bytes(content)
         units = sorted(name for name in sources if name.endswith(".c"))
         # Names relative to the working folder, so that no path gets into the library.
-        command = [*compiler, *FLAGS[platform], *extra_flags, "-o", "library.so", *units, *LIBRARIES]
+        command = [*compiler, *FLAGS[platform], "-o", "library.so", *units, "-lm"]
         try:
             done = subprocess.run(
                 command, cwd=folder, capture_output=True, text=True, timeout=_LONGEST_BUILD, check=False

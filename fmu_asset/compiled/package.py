@@ -13,15 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fe.runtime.reduced_arrays import ReducedArrays
-from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
 from fmu_asset.description import (
     LOG_CATEGORIES,
     PLACEHOLDER,
     ArrayVariable,
     Declaration,
     arrays_of,
-    documentation_page,
-    model_description,
+    description_members,
     rendered,
 )
 from fmu_asset.errors import FmuBuildError
@@ -129,16 +127,8 @@ def exchange_table(
     for name in (*states, *(rates if arrays else (f"der({state})" for state in states))):
         what = "Coordinate" if "displacement" in name else "Rate of the coordinate"
         text = f"{what} of mode {name.partition('[')[2].partition(']')[0]}, mass-normalised"
-        rows.append(
-            FmuVariable(
-                name=name,
-                reference=len(rows),
-                kind="Real",
-                causality="local",
-                variability="continuous",
-                description=f"Derivative of: {text}" if name.startswith("der(") else text,
-            )
-        )
+        text = f"Derivative of: {text}" if name.startswith("der(") else text
+        rows.append(FmuVariable(name, len(rows), "Real", "local", "continuous", text))
     return tuple(rows)
 
 
@@ -147,12 +137,6 @@ DATA_FILE = "resources/reduced_model.bin"
 FmiVersion = Literal[2, 3]
 """Versions of FMI that a compiled FMU can be of."""
 
-FMI_HEADERS: Mapping[FmiVersion, tuple[str, ...]] = {
-    2: ("fmi2Functions.h", "fmi2FunctionTypes.h", "fmi2TypesPlatform.h"),
-    3: ("fmi3Functions.h", "fmi3FunctionTypes.h", "fmi3PlatformTypes.h"),
-}
-"""The headers of FMI as fmpy ships them, with their licence (2-clause BSD) in them."""
-
 _BINARIES: Mapping[tuple[FmiVersion, Platform], str] = {
     (2, "linux64"): "binaries/linux64/{}.so",
     (2, "win64"): "binaries/win64/{}.dll",
@@ -160,15 +144,7 @@ _BINARIES: Mapping[tuple[FmiVersion, Platform], str] = {
     (3, "win64"): "binaries/x86_64-windows/{}.dll",
 }
 
-_TIME = FmuVariable(
-    name="time",
-    reference=0,
-    kind="Real",
-    causality="independent",
-    variability="continuous",
-    description="Time",
-    unit="s",
-)
+_TIME = FmuVariable("time", 0, "Real", "independent", "continuous", "Time", unit="s")
 
 HOST = "It is compiled C and needs nothing but the C library; its sources are inside."
 
@@ -219,12 +195,10 @@ def compiled_members(
     for name in ("CMakeLists.txt", "buildDescription.xml")[: fmi - 1]:
         sources[name] = rendered(name, identifier=declared.identifier, sources=listed, fmi=fmi)
     return {
-        "modelDescription.xml": model_description(
-            declared, generation_tool="uav-twin", source_files=listed, fmi=fmi, arrays=arrays
+        **description_members(
+            declared, generation_tool="uav-twin", host=HOST, source_files=listed, fmi=fmi, arrays=arrays
         ),
-        "documentation/index.html": documentation_page(declared, HOST, fmi=fmi, interface=interface),
         DATA_FILE: data_file_bytes(model),
-        f"resources/{DESIGN_RECORD}": design_record(model.design_hash),
         **{f"sources/{name}": content for name, content in sources.items()},
         **{f"sources/{name}": content for name, content in fmi_headers(fmi).items()},
     }
@@ -249,31 +223,21 @@ def variable_sources(
     dict of str to bytes
         File name to content: `structure_variables.h` and `structure_variables.c`.
     """
-    outputs = [row for row in table if row.causality == "output"]
-    local = [row.reference for row in table if row.causality == "local"]
-    counts = {
-        "VARIABLE_COUNT": len(table),
-        "INPUT_COUNT": sum(row.causality == "input" for row in table),
-        "FIRST_OUTPUT": outputs[0].reference,
-        "OUTPUT_COUNT": roles.outputs,
-        "OUTPUT_MODES": sum(row.name.startswith("frequency[") for row in outputs),
-        "CHOSEN_COUNT": len(roles.chosen),
-        "POINT_LOAD": roles.point_load,
-        "LOG_CATEGORIES": len(LOG_CATEGORIES),
-        # Of model exchange: states, and then as many rates.
-        "FIRST_STATE": min(local, default=len(table)),
-        "STATE_COUNT": len(local) // 2,
-    }
     elements = {
         row.reference: (f"{array.name}[{index + 1}]", 0 if index else len(array.rows))
         for array in arrays
         for index, row in enumerate(array.rows)
     }
-    values = {"table": table, "roles": roles, "counts": counts, "shown": elements, "token": PLACEHOLDER}
-    values |= {"categories": LOG_CATEGORIES, "enumerations": ENUMERATIONS}
-    place = {row.name: row.reference for row in table}
-    names = ("structure_variables.h", "structure_variables.c")
-    return {name: rendered(name, place=place, **values) for name in names}
+    values = {
+        "table": table,
+        "place": {row.name: row.reference for row in table},
+        "roles": roles,
+        "shown": elements,
+        "token": PLACEHOLDER,
+        "categories": LOG_CATEGORIES,
+        "enumerations": ENUMERATIONS,
+    }
+    return {name: rendered(name, **values) for name in ("structure_variables.h", "structure_variables.c")}
 
 
 def _sources(fmi: FmiVersion) -> dict[str, bytes]:
@@ -288,18 +252,20 @@ def _sources(fmi: FmiVersion) -> dict[str, bytes]:
 def fmi_headers(fmi: FmiVersion = 2) -> dict[str, bytes]:
     """Return the headers of a version of FMI by name, from the installed fmpy.
 
+    Their licence (2-clause BSD) is in them.
+
     Raises
     ------
     FmuBuildError
         If they are missing from the installation.
     """
     folder = Path(str(distribution("fmpy").locate_file("fmpy"))) / "c-code"
-    try:
-        return {name: (folder / name).read_bytes() for name in FMI_HEADERS[fmi]}
-    except OSError as error:
+    found = {path.name: path.read_bytes() for path in folder.glob(f"fmi{fmi}*.h")}
+    if not found:
         raise FmuBuildError(
-            f"The FMI header {error.filename} is missing from the installation of fmpy; install it again."
-        ) from error
+            f"The headers of FMI {fmi} are missing from the installation of fmpy; install it again."
+        )
+    return found
 
 
 def binaries_of(

@@ -8,7 +8,7 @@ from fmu_asset.door.exchange import Exchange, Values
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import AlgebraicLoopError, BindingError, CouplingError
 
-from .instance import CoupledFmus, Coupling, naming
+from .instance import CoupledFmus, naming
 from .schedule import Schedule, loop_sentence
 from .structure import SystemStructure, listed
 from .system import parts_of, system_description, wiring_hash
@@ -87,41 +87,35 @@ class CoupledAsset(FmiAsset):
                 f"The binding {binding.name} of several FMUs has a decimation, which only a binding of one "
                 "FMU can have; leave it out."
             )
-        jacobi, loops = algorithm == "jacobi", wiring.schedule.loops
-        if loops and iterations == 1 and not jacobi:  # Jacobi delays every connection
-            raise AlgebraicLoopError(loop_sentence(loops))
+        jacobi, plan = algorithm == "jacobi", wiring.schedule
+        if plan.loops and iterations == 1 and not jacobi:  # Jacobi delays every connection
+            raise AlgebraicLoopError(loop_sentence(plan.loops))
         system = system_description(wiring, wiring_hash(wiring, binding, algorithm, iterations, tolerance))
         # Lines are drawn at the components.
-        exchange = Exchange(system, binding.with_interpolation("zero-order"))
+        exchange = Exchange(system, binding.with_header(interpolation="zero-order"))
         parts = parts_of(wiring, exchange, linear=binding.binding.interpolation == "linear")
         tuned = system.of_components(exchange.settings(parameters or {}))
         assets = {}
         for name, part in parts.items():
             with naming(name):
                 assets[name] = FmiAsset(
-                    wiring.structure.component(name).fmu,
+                    wiring.declared[name].path,
                     part.binding,
                     isolated=isolated,
                     step_timeout=step_timeout,
                     parameters=part.settings | tuned.get(name, {}),
                 )
-        for group, circular in zip(self.schedule.groups, self.schedule.circular, strict=True):
-            for name in group if circular and iterations > 1 else ():
-                if assets[name].state_method != "serialised":
-                    raise CouplingError(
-                        f"The component {name!r} cannot save and restore its state, which iterations need; "
-                        "allow one iteration only, or delay a connection."
-                    )
-        coupling = Coupling(
-            system, exchange.sent, exchange.read, wiring.schedule, parts, jacobi, iterations, tolerance
+        for name in (name for group in plan.circles if iterations > 1 for name in group):
+            if assets[name].state_method != "serialised":
+                raise CouplingError(
+                    f"The component {name!r} cannot save and restore its state, which iterations need; "
+                    "allow one iteration only, or delay a connection."
+                )
+        housing = CoupledFmus(
+            exchange, plan, parts, assets, jacobi=jacobi, iterations=iterations, tolerance=tolerance
         )
         self._parts = parts
-        self._settle(exchange, CoupledFmus(coupling, assets), parameters or {})
-
-    @property
-    def wiring(self) -> Wiring:
-        """The system, checked."""
-        return self._wiring
+        self._settle(exchange, housing, parameters or {})
 
     @property
     def schedule(self) -> Schedule:
@@ -147,6 +141,6 @@ class CoupledAsset(FmiAsset):
             "linear": [name for name, part in self._parts.items() if part.linear],
             "held": [f"{link.source} -> {link.target}" for link in plan.held],
             "loops": [" -> ".join(str(end) for end in loop) for loop in plan.loops],
-            "binding": self._binding.name,
+            "binding": self.binding.name,
             "step_size": self._interval,
         }

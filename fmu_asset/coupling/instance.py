@@ -2,15 +2,16 @@
 
 import ctypes
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from copy import copy
 from itertools import accumulate, pairwise
-from typing import Self
+from typing import Self, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from fmu_asset.archive.declared import VariableInfo
+from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.placement import Housing, ResetTrial, Start
 from fmu_asset.door.saved_state import PackedState
 from fmu_asset.door.session import FmiAsset
@@ -74,36 +75,31 @@ class Taps:
         return values
 
 
-class naming:  # noqa: N801 - cheaper than one made of a generator
-    """A block in which an error of an FMU gets the name of its component."""
-
-    def __init__(self, component: str) -> None:
-        self._component = component
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, FmuError):
-            # Where one of them ended is no moment of the system.
-            time = None if isinstance(error, FmuEndedError) else error.time
-            sentence = f"component {self._component}: {error.sentence}"
-            raise type(error)(sentence, error.messages, time) from error
+@contextmanager
+def naming(component: str) -> Iterator[None]:
+    """Give an error of an FMU the name of its component."""
+    try:
+        yield
+    except FmuError as error:
+        # Where one of them ended is no moment of the system.
+        time = None if isinstance(error, FmuEndedError) else error.time
+        sentence = f"component {component}: {error.sentence}"
+        raise type(error)(sentence, error.messages, time) from error
 
 
-@dataclass(frozen=True)
-class Coupling:
-    """How FMUs are coupled.
+class CoupledFmus(Housing):
+    """Several FMUs as one instance, and where it lives: what `FmiAsset` asks of an instance and its housing.
 
-    Attributes
+    Parameters
     ----------
-    system : SystemDescription
-        The system as one FMU.
-    sent, read : sequence of VariableInfo
-        What a request and a reply hold of it, in their order.
-    schedule : Schedule
+    exchange : Exchange
+        What a request and a reply hold of the system as one FMU.
+    order : Schedule
         The order of the components.
     parts : dict of str to Part
         The components, by name.
+    assets : dict of str to FmiAsset
+        Their FMUs.
     jacobi : bool
         Whether all components take the outputs of the beginning of the step.
     iterations : int
@@ -112,45 +108,34 @@ class Coupling:
         When the values in a circle have settled.
     """
 
-    system: SystemDescription
-    sent: Sequence[VariableInfo]
-    read: Sequence[VariableInfo]
-    schedule: Schedule
-    parts: dict[str, Part]
-    jacobi: bool
-    iterations: int
-    tolerance: float
-
-
-class CoupledFmus(Housing):
-    """Several FMUs as one instance, and where it lives: what `FmiAsset` asks of an instance and its housing.
-
-    Parameters
-    ----------
-    coupling : Coupling
-        How they are coupled.
-    assets : dict of str to FmiAsset
-        The FMUs, by the names of the components.
-    """
-
     lost = False
 
-    def __init__(self, coupling: Coupling, assets: dict[str, FmiAsset]) -> None:
-        self._coupling, self.assets = coupling, assets
-        self._schedule, self._parts, ends = coupling.schedule, coupling.parts, coupling.system.ends
-        self.instance: Instance | None = self
+    def __init__(
+        self, exchange: Exchange, order: Schedule, parts: dict[str, Part], assets: dict[str, FmiAsset],
+        *, jacobi: bool, iterations: int, tolerance: float,
+    ) -> None:  # fmt: skip
+        self._exchange, self._schedule, self._parts = exchange, order, parts
+        self._jacobi, self._iterations, self._tolerance = jacobi, iterations, tolerance
+        self._system = cast("SystemDescription", exchange.description)
+        ends = self._system.ends
         self.reset_trial = ResetTrial(comparable=False)
-        self.request = (ctypes.c_double * (2 + len(coupling.sent)))()
-        self.reply = (ctypes.c_double * len(coupling.read))()
-        self._answer = np.frombuffer(memoryview(self.reply).cast("B"))
-        self._inputs = [(n, port) for n, sent in enumerate(coupling.sent, 2) for port in ends[sent.name]]
-        self._ends = [end for part in self._parts.values() for end in part.ends]
+        self._inputs = [(n, port) for n, sent in enumerate(exchange.sent, 2) for port in ends[sent.name]]
+        self._ends = [end for part in parts.values() for end in part.ends]
         place = {end: index for index, end in enumerate(self._ends)}
         self._spans = {
-            name: slice(place[part.ends[0]], place[part.ends[-1]] + 1) for name, part in self._parts.items()
+            name: slice(place[part.ends[0]], place[part.ends[-1]] + 1) for name, part in parts.items()
         }
-        self._taps = {name: Taps(part.fed.values(), place) for name, part in self._parts.items()}
-        self._shown = Taps((ends[read.name][0] for read in coupling.read), place)
+        self._taps = {name: Taps(part.fed.values(), place) for name, part in parts.items()}
+        self._shown = Taps((ends[read.name][0] for read in exchange.read), place)
+        self._begin(assets)
+
+    def _begin(self, assets: dict[str, FmiAsset]) -> None:
+        """Take the FMUs, which have exchanged nothing."""
+        self.instance: Instance | None = self
+        self.assets = assets
+        self.request = (ctypes.c_double * (2 + len(self._exchange.sent)))()
+        self.reply = (ctypes.c_double * len(self._exchange.read))()
+        self._answer = np.frombuffer(memoryview(self.reply).cast("B"))
         self._held: dict[str, dict[str, float]] = {}
         self._now = np.zeros(len(self._ends))
         self._before = self._earlier = self._now.copy()
@@ -177,7 +162,9 @@ class CoupledFmus(Housing):
 
     def sibling(self) -> "CoupledFmus":
         """Return the same system with FMUs of its own."""
-        return CoupledFmus(self._coupling, {name: asset.sibling() for name, asset in self.assets.items()})
+        other = copy(self)
+        other._begin({name: asset.sibling() for name, asset in self.assets.items()})
+        return other
 
     def close(self) -> None:
         """End all workers; the next start has new ones."""
@@ -191,7 +178,7 @@ class CoupledFmus(Housing):
 
         An input whose source comes later starts at the FMU's own start value.
         """
-        tuned = self._coupling.system.of_components(parameters)
+        tuned = self._system.of_components(parameters)
         self._held = {name: dict(part.constants) for name, part in self._parts.items()}
         if with_inputs:
             self._take()
@@ -219,11 +206,11 @@ class CoupledFmus(Housing):
         self._earlier, self._before = self._before, self._now.copy()
         self._stepped.clear()
         self._broken = True
-        for group, circular in zip(self._schedule.groups, self._schedule.circular, strict=True):
-            if circular and self._coupling.iterations > 1:
+        for group in self._schedule.groups:
+            if self._iterations > 1 and group in self._schedule.circles:
                 self._iterate(group)
             else:
-                self._pass(group, self._before if self._coupling.jacobi else self._now)
+                self._pass(group, self._before if self._jacobi else self._now)
         self._broken = False
         self.read()
 
@@ -312,22 +299,19 @@ class CoupledFmus(Housing):
         states = {name: self.assets[name].save_state() for name in group}
         exchanged = {port.end for name in group for port in self._parts[name].fed.values()}
         watched = [i for i, end in enumerate(self._ends) if end in exchanged and end.component in group]
-        for iteration in range(self._coupling.iterations):
+        for iteration in range(self._iterations):
             last = self._now.copy()
             if iteration:
                 for name, state in states.items():
                     with naming(name):
                         self.assets[name].restore_state(state)
-            self._pass(group, last if self._coupling.jacobi else self._now)
+            self._pass(group, last if self._jacobi else self._now)
             change = np.abs(self._now - last)[watched]
-            if (
-                iteration
-                and (change <= self._coupling.tolerance * np.maximum(1.0, np.abs(last[watched]))).all()
-            ):
+            if iteration and (change <= self._tolerance * np.maximum(1.0, np.abs(last[watched]))).all():
                 return
         worst = int(np.argmax(change))
         raise IterationError(
-            f"The components {listed(group)} did not settle in {self._coupling.iterations} iterations of the "
+            f"The components {listed(group)} did not settle in {self._iterations} iterations of the "
             f"step from t = {self.request[0]:g} s ({self._ends[watched[worst]]} still changes by "
             f"{change[worst]:.3g}); allow more iterations or a larger tolerance, make the step smaller, or "
             "delay one of their connections."

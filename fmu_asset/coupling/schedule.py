@@ -6,8 +6,9 @@ of the same FMU; a circle in it is an algebraic loop. A circle of components alo
 stands a state, whose value at the beginning of the step can be used.
 """
 
-from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from heapq import heappop, heappush
 from typing import NamedTuple, TypeVar
 
@@ -35,24 +36,27 @@ class Schedule:
 
     Attributes
     ----------
-    order : tuple of str
-        The components: each one after those that it depends on directly, as far as that is possible.
     groups : tuple of tuple of str
-        The same order, cut into what depends on itself in a circle (more than one name, or one that is
-        connected to itself) and what does not.
-    circular : tuple of bool
-        For each group, whether it is such a circle.
+        The components: each one after those that it depends on directly, as far as that is possible; cut into
+        what depends on itself in a circle (more than one name, or one that is connected to itself) and what
+        does not.
+    circles : frozenset of tuple of str
+        Those of the groups that are such a circle.
     held : tuple of Link
         Connections that, in one pass in this order, carry the value of the beginning of the step.
     loops : tuple of tuple of Endpoint
         Algebraic loops, each as a shortest circle of variables.
     """
 
-    order: tuple[str, ...]
     groups: tuple[tuple[str, ...], ...]
-    circular: tuple[bool, ...]
+    circles: frozenset[tuple[str, ...]]
     held: tuple[Link, ...]
     loops: tuple[tuple[Endpoint, ...], ...]
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """The components in their order."""
+        return tuple(name for group in self.groups for name in group)
 
 
 def schedule(names: Sequence[str], links: Sequence[Link], feedthrough: Feedthrough) -> Schedule:
@@ -81,34 +85,27 @@ def schedule(names: Sequence[str], links: Sequence[Link], feedthrough: Feedthrou
         inside = {name: [other for other in directly[name] if other in group] for name in group}
         # What even direct feedthrough joins in a circle stays in the order of the names.
         groups.append(tuple(name for part in strong_components(inside) for name in part))
-    order = tuple(name for group in groups for name in group)
-    place = {name: index for index, name in enumerate(order)}
+    place = {name: index for index, name in enumerate(name for group in groups for name in group)}
     return Schedule(
-        order=order,
         groups=tuple(groups),
-        circular=tuple(len(group) > 1 or group[0] in follows[group[0]] for group in groups),
+        circles=frozenset(group for group in groups if len(group) > 1 or group[0] in follows[group[0]]),
         held=tuple(link for link in links if place[link.source.component] >= place[link.target.component]),
         loops=algebraic_loops(links, feedthrough),
     )
 
 
-def algebraic_loops(links: Iterable[Link], feedthrough: Feedthrough) -> tuple[tuple[Endpoint, ...], ...]:
+def algebraic_loops(links: Sequence[Link], feedthrough: Feedthrough) -> tuple[tuple[Endpoint, ...], ...]:
     """Return one shortest circle of variables for each set of variables that depend on each other."""
-    graph: dict[Endpoint, set[Endpoint]] = {}
+    graph: dict[Endpoint, set[Endpoint]] = {end: set() for link in links for end in link}
     for link in links:
-        graph.setdefault(link.source, set()).add(link.target)
-        graph.setdefault(link.target, set())
+        graph[link.source].add(link.target)
     for name, outputs in feedthrough.items():
         for output, inputs in outputs.items():
-            for variable in inputs:
-                begin, end = Endpoint(name, variable), Endpoint(name, output)
-                if begin in graph and end in graph:
+            end = Endpoint(name, output)
+            for begin in (Endpoint(name, variable) for variable in inputs) if end in graph else ():
+                if begin in graph:
                     graph[begin].add(end)
-    found = []
-    for part in strong_components(graph):
-        if len(part) > 1 or part[0] in graph[part[0]]:
-            found.append(shortest_circle(graph, part))
-    return tuple(found)
+    return tuple(filter(None, (shortest_circle(graph, part) for part in strong_components(graph))))
 
 
 def strong_components(graph: Mapping[Node, Collection[Node]]) -> list[tuple[Node, ...]]:
@@ -121,55 +118,49 @@ def strong_components(graph: Mapping[Node, Collection[Node]]) -> list[tuple[Node
     graph : mapping
         Successors by node; every successor is a node of the mapping.
     """
-    nodes = list(graph)
-    number = {node: index for index, node in enumerate(nodes)}
-    edges = [(number[node], number[successor]) for node in nodes for successor in graph[node]]
+    number = {node: index for index, node in enumerate(graph)}
+    edges = [(number[node], number[successor]) for node, others in graph.items() for successor in others]
     begins, ends = zip(*edges, strict=True) if edges else ((), ())
-    matrix = coo_array((np.ones(len(edges)), (begins, ends)), shape=(len(nodes), len(nodes)))
-    part_of = connected_components(matrix, connection="strong")[1].tolist()
+    matrix = coo_array((np.ones(len(edges)), (begins, ends)), shape=(len(number), len(number)))
     parts: dict[int, list[Node]] = {}
-    first: dict[int, int] = {}  # place of a part's first node
-    for index, (node, part) in enumerate(zip(nodes, part_of, strict=True)):
-        parts.setdefault(part, []).append(node)
-        first.setdefault(part, index)
-    behind: dict[int, set[int]] = {part: set() for part in parts}
+    labels = connected_components(matrix, connection="strong")[1].tolist()
+    for node, label in zip(graph, labels, strict=True):
+        parts.setdefault(label, []).append(node)
+    place = {label: index for index, label in enumerate(parts)}  # by their first nodes
+    sorter = TopologicalSorter[int](dict.fromkeys(place.values(), ()))
     for begin, end in edges:
-        behind[part_of[begin]].add(part_of[end])
-    before = dict.fromkeys(parts, 0)
-    for part, others in behind.items():
-        others.discard(part)
-        for other in others:
-            before[other] += 1
-    ready = [(first[part], part) for part, count in before.items() if not count]
-    order = []
-    while ready:  # in the order of the mapping, and so a heap
-        _, part = heappop(ready)
-        order.append(tuple(parts[part]))
-        for other in behind[part]:
-            before[other] -= 1
-            if not before[other]:
-                heappush(ready, (first[other], other))
+        if labels[begin] != labels[end]:
+            sorter.add(place[labels[end]], place[labels[begin]])
+    sorter.prepare()
+    found, ready, order = list(parts.values()), list[int](), []
+    while sorter.is_active():  # in the order of the mapping, and so a heap
+        for index in sorter.get_ready():
+            heappush(ready, index)
+        index = heappop(ready)
+        order.append(tuple(found[index]))
+        sorter.done(index)
     return order
 
 
 def shortest_circle(graph: Mapping[Node, Collection[Node]], part: Sequence[Node]) -> tuple[Node, ...]:
-    """Return a shortest circle inside a strongly connected component, its first node repeated at the end."""
+    """Return a shortest circle inside a strongly connected component, its first node repeated at the end.
+
+    Empty for a node alone that has no connection to itself.
+    """
     inside = set(part)
     position = {node: index for index, node in enumerate(graph)}
     best: tuple[Node, ...] = ()
     for start in part:
         trails: list[tuple[Node, ...]] = [(start,)]
         seen: set[Node] = set()
-        while trails and not (best and len(trails[0]) + 1 >= len(best)):
-            trail = trails.pop(0)
-            for successor in sorted(graph[trail[-1]], key=position.__getitem__):
-                if successor == start:
-                    best = (*trail, start)
-                    trails = []
-                    break
-                if successor in inside and successor not in seen:
-                    seen.add(successor)
-                    trails.append((*trail, successor))
+        for trail in trails:  # to which longer ones are added on the way
+            if best and len(trail) + 1 >= len(best):
+                break
+            if start in graph[trail[-1]]:
+                best = (*trail, start)
+            following = sorted(inside.intersection(graph[trail[-1]]) - seen, key=position.__getitem__)
+            seen.update(following)
+            trails += [(*trail, node) for node in following]
     return best
 
 

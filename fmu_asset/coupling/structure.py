@@ -3,10 +3,11 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from fmu_asset.archive.declared import UnitInfo
 from fmu_asset.door.binding import expand
+from fmu_asset.door.units import IDENTITY, Conversion
 from fmu_asset.errors import CouplingError
 from fmu_asset.instances.plan import Interface
 
@@ -35,16 +36,15 @@ class Setting:
         The value.
     unit : str or None
         Its unit; that of the variable if None.
-    factor, offset : float
-        The variable is factor * value + offset, the value converted to its unit.
+    scale : Conversion
+        What the value, converted to the variable's unit, is scaled by.
     units : tuple of UnitInfo
         Definitions that go before those of the system: a parameter set brings its own.
     """
 
     value: SettingValue
     unit: str | None = None
-    factor: float = 1.0
-    offset: float = 0.0
+    scale: Conversion = IDENTITY
     units: tuple[UnitInfo, ...] = field(default=(), compare=False)
 
 
@@ -116,6 +116,11 @@ class Connection:
     offset: float = 0.0
     convert_units: bool = True
     delayed: bool = False
+
+    @property
+    def scale(self) -> Conversion:
+        """The linear transformation."""
+        return Conversion(self.factor, self.offset)
 
 
 @dataclass(frozen=True)
@@ -214,15 +219,18 @@ def parse_endpoint(text: str, components: Sequence[str]) -> Endpoint:
 
 
 def expand_connection(
-    source: str,
-    target: str,
-    components: Sequence[str],
-    *,
-    factor: float = 1.0,
-    offset: float = 0.0,
-    delayed: bool = False,
+    source: str, target: str, components: Sequence[str], **options: Any
 ) -> tuple[Connection, ...]:
     """Return the connections that two patterns stand for, such as `wing.strain[{1..24}]`, pair by pair.
+
+    Parameters
+    ----------
+    source, target : str
+        The patterns.
+    components : sequence of str
+        Names of the components.
+    **options
+        What `Connection` has beside its ends.
 
     Raises
     ------
@@ -239,8 +247,6 @@ def expand_connection(
             "two patterns must stand for equally many."
         )
     return tuple(
-        Connection(
-            parse_endpoint(a, components), parse_endpoint(b, components), factor, offset, delayed=delayed
-        )
+        Connection(parse_endpoint(a, components), parse_endpoint(b, components), **options)
         for a, b in zip(sources, targets, strict=True)
     )

@@ -1,10 +1,10 @@
 """A system of FMUs as the description of one, and as its components see it."""
 
 import hashlib
-import json
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector
@@ -13,7 +13,7 @@ from fmu_asset.door.units import IDENTITY
 from fmu_asset.errors import BindingError, CouplingError
 from fmu_asset.instances.plan import Settings
 
-from .structure import Component, Connector, Endpoint
+from .structure import Component, Endpoint
 from .wiring import ConnectedVariable, Wiring
 
 
@@ -46,9 +46,7 @@ class SystemDescription(FmuDescription):
         return found
 
 
-def system_description(
-    wiring: Wiring, sha256: str = "", span: tuple[float | None, float | None] = (None, None)
-) -> SystemDescription:
+def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
     """Return a system as the description of one FMU, all of whose variables are real numbers.
 
     Outputs of components that a connector shows are local variables; the ranges and types of inputs are
@@ -60,81 +58,62 @@ def system_description(
         The system.
     sha256 : str
         Stands for all that the meaning of a state depends on.
-    span : (float or None, float or None)
-        Start and end of the default experiment [s].
     """
-    shown = {port.end for port in wiring.outward.values()}
-    found = [_of_connector(wiring, connector) for connector in wiring.structure.connectors]
+    structure = wiring.structure
+    variables = list[VariableInfo]()
+    ends: dict[str, tuple[ConnectedVariable, ...]] = {}
+    definitions: dict[str, tuple[UnitInfo, ...]] = {}
+
+    def offer(name: str, causality: str, unit: str | None, **said: Any) -> None:
+        # An input that nobody gives keeps the start value of its FMU.
+        start = "nan" if causality == "input" else None
+        variable = VariableInfo(name, len(variables), causality=causality, unit=unit, start=start, **said)
+        variables.append(variable)
+
+    for connector in structure.connectors:
+        name, own = connector.name, wiring.ends[connector.name]
+        causalities = {wiring.variable(port.end).causality for port in own} or {"connected to nothing"}
+        causality = "output" if own and connector.kind == "output" else " and ".join(sorted(causalities))
+        offer(name, causality, wiring.units[name])
+        units = (unit for port in own for unit in wiring.declared[port.end.component].units)
+        ends[name], definitions[name] = own, (*structure.units, *units)
+    shown = {port.end for item in structure.connectors if item.kind == "output" for port in ends[item.name]}
     for component, declared in wiring.declared.items():
-        for variable in declared.variables:
-            end = Endpoint(component, variable.name)
-            causality = variable.causality
+        for variable in filter(lambda variable: variable.single, declared.variables):
+            end, causality = Endpoint(component, variable.name), variable.causality
             if end in wiring.feeds:
                 causality = "an input that is fed by a connection already"
             elif end in shown:
                 causality = "local"
-            if variable.single:
-                own = replace(variable, name=str(end), causality=causality)
-                found.append((own, (ConnectedVariable(end, IDENTITY, False),), declared.units))
+            said = {"variability": variable.variability, "description": variable.description}
+            offer(str(end), causality, variable.unit, **said)
+            ends[str(end)] = (ConnectedVariable(end, IDENTITY, False),)
+            definitions[str(end)] = declared.units
     steps = [declared.fixed_step or declared.step_size for declared in wiring.declared.values()]
     return SystemDescription(
-        path=Path(f"the system {wiring.structure.name}"),
+        path=Path(f"the system {structure.name}"),
         sha256=sha256,
-        model_name=wiring.structure.name,
+        model_name=structure.name,
         can_get_and_set_state=True,
         can_serialise_state=True,
-        # An input that nobody gives keeps the start value of its FMU.
-        variables=tuple(
-            replace(
-                variable,
-                reference=number,
-                kind="Real",
-                minimum=None,
-                maximum=None,
-                start="nan" if variable.causality == "input" else None,
-            )
-            for number, (variable, _, _) in enumerate(found)
-        ),
-        start_time=span[0],
-        stop_time=span[1],
+        variables=tuple(variables),
+        start_time=structure.span[0],
+        stop_time=structure.span[1],
         step_size=min((size for size in steps if size is not None), default=None),
-        ends={variable.name: ends for variable, ends, _ in found},
-        definitions={variable.name: units for variable, _, units in found},
+        ends=ends,
+        definitions=definitions,
     )
-
-
-def _of_connector(
-    wiring: Wiring, connector: Connector
-) -> tuple[VariableInfo, tuple[ConnectedVariable, ...], tuple[UnitInfo, ...]]:
-    there = wiring.outward.get(connector.name)
-    ends = wiring.inward.get(connector.name, ()) if there is None else (there,)
-    causality = "output"
-    if there is None:
-        causalities = {wiring.variable(port.end).causality for port in ends} or {"connected to nothing"}
-        causality = " and ".join(sorted(causalities))
-    units = tuple(unit for port in ends for unit in wiring.declared[port.end.component].units)
-    variable = VariableInfo(connector.name, 0, causality=causality, unit=wiring.units[connector.name])
-    return variable, ends, (*wiring.structure.units, *units)
 
 
 def wiring_hash(wiring: Wiring, binding: Binding, *algorithm: str | float) -> str:
     """Return the SHA-256 of all that the meaning of a state depends on; places of files do not count."""
-
-    def told(ports: tuple[ConnectedVariable, ...]) -> Iterator[list[str | float | bool]]:
-        return ([str(port.end), *port.conversion, port.delayed] for port in ports)
-
-    record = {
-        "components": [
-            [c.name, wiring.declared[c.name].sha256, wiring.settings[c.name], c.substeps, c.interface]
-            for c in wiring.structure.components
-        ],
-        "feeds": [[str(target), *told((port,))] for target, port in wiring.feeds.items()],
-        "inward": {name: [*told(ports)] for name, ports in wiring.inward.items()},
-        "outward": {name: [*told((port,))] for name, port in wiring.outward.items()},
-        "binding": binding.model_dump(mode="json", exclude={"limits"}),
-        "algorithm": algorithm,
-    }
-    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+    components = [
+        (c.name, wiring.declared[c.name].sha256, wiring.settings[c.name], c.substeps, c.interface)
+        for c in wiring.structure.components
+    ]
+    bound = binding.model_dump(mode="json", exclude={"limits"})
+    record = (components, wiring.feeds, wiring.ends, bound, algorithm)
+    return hashlib.sha256(repr(record).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -212,29 +191,32 @@ def _part(wiring: Wiring, exchange: Exchange, component: Component, *, linear: b
     fed = {target.variable: port for target, port in wiring.feeds.items() if target.component == name}
     sources = [port.end for port in wiring.feeds.values() if port.end.component == name]
     ends = tuple(dict.fromkeys([*sources, *bound(variable.name for variable in exchange.read)]))
-    ends = ends or (_any_output(wiring, name),)
-    given = bound(variable.name for variable in exchange.sent)
+    variables = {v.name: v for v in wiring.declared[name].variables}
+    # Of a component of which nothing is asked, any output is looked at.
+    outputs = (v.name for v in variables.values() if v.causality == "output" and v.single)
+    ends = ends or tuple(Endpoint(name, output) for output in outputs)[:1]
+    if not ends:
+        raise CouplingError(
+            f"The component {name!r} has no output of a single number, so it takes no part; leave it out."
+        )
+    given = [end.variable for end in bound(variable.name for variable in exchange.sent)]
+    tuned = [end.variable for end in bound(item.variable for item in binding.parameter.values())]
     moving = frozenset(
-        variable
-        for variable, port in fed.items()
-        if wiring.variable(port.end).continuous and wiring.variable(Endpoint(name, variable)).continuous
+        key for key, port in fed.items() if wiring.variable(port.end).continuous and variables[key].continuous
     )
     linear = (
         linear
         and wiring.declared[name].can_interpolate_inputs
-        and (bool(moving) or any(wiring.variable(end).continuous for end in given))
+        and (bool(moving) or any(variables[key].continuous for key in given))
     )
-    starts: dict[str, dict[str, float]] = {"input": {}, "parameter": {}}
-    for variable, number in wiring.settings[name].items():
-        is_input = wiring.variable(Endpoint(name, variable)).causality == "input"
-        starts["input" if is_input else "parameter"][variable] = number
-    tuned = bound(item.variable for item in binding.parameter.values())
+    constants, settings = dict[str, float](), dict[str, float]()
+    for key, number in wiring.settings[name].items():
+        (constants if variables[key].causality == "input" else settings)[key] = number
 
-    def unit(variable: str) -> str:
-        return wiring.variable(Endpoint(name, variable)).unit or "1"
+    def units(*groups: Iterable[str]) -> dict[str, str]:
+        """Return the units of variables, each once."""
+        return {key: variables[key].unit or "1" for group in groups for key in group}
 
-    inputs = dict.fromkeys([*fed, *(end.variable for end in given), *starts["input"]])
-    parameters = dict.fromkeys([*starts["parameter"], *(end.variable for end in tuned)])
     own = Binding(
         binding=Header(
             name=name,
@@ -246,19 +228,12 @@ def _part(wiring: Wiring, exchange: Exchange, component: Component, *, linear: b
             tolerance=binding.binding.tolerance,
         ),
         limits=binding.limits,
-        load={key: Input(variable=key, unit=unit(key)) for key in inputs},
-        parameter={key: Parameter(variable=key, unit=unit(key)) for key in parameters},
-        observation={key: Vector(variables=(key,), unit=unit(key)) for _, key in ends},
+        load={key: Input(variable=key, unit=unit) for key, unit in units(fed, given, constants).items()},
+        parameter={key: Parameter(variable=key, unit=unit) for key, unit in units(settings, tuned).items()},
+        observation={
+            key: Vector(variables=(key,), unit=unit)
+            for key, unit in units(end.variable for end in ends).items()
+        },
     )
     substeps = 1 if linear else component.substeps
-    return Part(name, ends, fed, moving, linear, substeps, starts["parameter"], starts["input"], own)
-
-
-def _any_output(wiring: Wiring, name: str) -> Endpoint:
-    """Return an output to look at for a component of which nothing is asked."""
-    for variable in wiring.declared[name].variables:
-        if variable.causality == "output" and variable.single:
-            return Endpoint(name, variable.name)
-    raise CouplingError(
-        f"The component {name!r} has no output of a single number, so it takes no part; leave it out."
-    )
+    return Part(name, ends, fed, moving, linear, substeps, settings, constants, own)

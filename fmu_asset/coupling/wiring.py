@@ -2,16 +2,15 @@
 
 import difflib
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 from fmu_asset.archive.declared import READABLE, FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.units import Conversion, between
+from fmu_asset.door.units import IDENTITY, Conversion, between
 from fmu_asset.errors import CouplingError
 
 from .schedule import Link, Schedule, schedule
-from .structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure, listed
+from .structure import Component, Connection, Endpoint, Setting, SystemStructure, listed
 
 _FITS = {
     "Real": {"Real"},
@@ -47,17 +46,15 @@ class Wiring:
     Attributes
     ----------
     structure : SystemStructure
-        As given, without what was left out.
+        As given.
     left_out : list of str
         The names of these settings.
     declared : dict of str to FmuDescription
         The FMUs by component.
     feeds : dict of Endpoint to ConnectedVariable
         Connections between components.
-    inward : dict of str to tuple of ConnectedVariable
-        For each input and parameter of the system, where it goes.
-    outward : dict of str to ConnectedVariable
-        For each output of the system, where it comes from.
+    ends : dict of str to tuple of ConnectedVariable
+        For each input and parameter of the system where it goes, for each output where it comes from.
     units : dict of str to (str or None)
         Unit of each connector: its own, or that of what it is connected to.
     settings : dict of str to (dict of str to float)
@@ -87,17 +84,12 @@ class Wiring:
             c.name: read_fmu(c.fmu, c.interface) for c in structure.components
         }
         self.left_out: list[str] = []
-        if leave_out_unknown:
-            structure = replace(structure, components=tuple(map(self._known, structure.components)))
         self.structure = structure
-        self.settings = {c.name: self._settings(c) for c in structure.components}
-        self._connectors = {connector.name: connector for connector in structure.connectors}
+        self.settings = {c.name: self._settings(c, leave_out_unknown) for c in structure.components}
+        self._kinds = {connector.name: connector.kind for connector in structure.connectors}
         self.units: dict[str, str | None] = {c.name: c.unit for c in structure.connectors}
         self.feeds: dict[Endpoint, ConnectedVariable] = {}
-        self.inward: dict[str, tuple[ConnectedVariable, ...]] = {
-            c.name: () for c in structure.connectors if c.kind != "output"
-        }
-        self.outward: dict[str, ConnectedVariable] = {}
+        self.ends: dict[str, tuple[ConnectedVariable, ...]] = dict.fromkeys(self._kinds, ())
         taken: dict[Endpoint, Endpoint] = {}
         for connection in structure.connections:
             self._connect(connection, taken)
@@ -138,19 +130,20 @@ class Wiring:
             )
         return variable
 
-    def _connector(self, end: Endpoint, kinds: tuple[str, ...], verb: str) -> Connector:
-        connector = self._connectors.get(end.variable)
-        if connector is None:
+    def _connector(self, end: Endpoint, kinds: tuple[str, ...], verb: str) -> VariableInfo:
+        """Return a connector of the system, which has one of these kinds and fits any type."""
+        kind = self._kinds.get(end.variable)
+        if kind is None:
             raise CouplingError(
                 f"The system {self.structure.name} has no connector {end.variable!r}; it has "
-                f"{listed(self._connectors)}."
+                f"{listed(self._kinds)}."
             )
-        if connector.kind not in kinds:
+        if kind not in kinds:
             raise CouplingError(
-                f"The connector {end.variable!r} of the system is of the kind {connector.kind} and cannot "
-                f"be {verb} of a connection."
+                f"The connector {end.variable!r} of the system is of the kind {kind} and cannot be {verb} of "
+                "a connection."
             )
-        return connector
+        return VariableInfo(end.variable, 0, kind="", causality=kind, unit=self.units[end.variable])
 
     def _connect(self, connection: Connection, taken: dict[Endpoint, Endpoint]) -> None:
         source, target = connection.source, connection.target
@@ -166,38 +159,28 @@ class Wiring:
                 f"The connection from {source} to {target} joins two connectors of the system; one end must "
                 "be a component."
             )
-        outer = gives = takes = None
+        causalities: tuple[str, ...] = ("input",)
         if source.component:
-            gives = self._single(
-                source, READABLE, "the source of a connection", "an output of a single number is needed"
-            )
+            needed = "an output of a single number is needed"
+            gives = self._single(source, READABLE, "the source of a connection", needed)
         else:
-            outer = self._connector(source, ("input", "parameter"), "the source")
+            gives = self._connector(source, ("input", "parameter"), "the source")
+            causalities = tuple(dict.fromkeys([gives.causality, "input"]))
             if connection.delayed:
                 raise CouplingError(f"The connection from the input {source} cannot be delayed.")
         if target.component:
-            causalities = ("input",) if outer is None or outer.kind == "input" else ("parameter", "input")
             needed = f"a single number is needed as {' or '.join(causalities)}"
             takes = self._single(target, causalities, "the target of this connection", needed)
         else:
-            outer = self._connector(target, ("output",), "the target")
-        if outer is None:
-            assert gives is not None
-            assert takes is not None
-            self._fit(connection, gives, takes)
-        elif self.units[outer.name] is None:
-            self.units[outer.name] = (gives or takes).unit  # type: ignore[union-attr]
-        own = None if outer is None else self.units[outer.name]
-        conversion = self._converted(
-            connection, own if gives is None else gives.unit, own if takes is None else takes.unit
-        )
-        joined = ConnectedVariable(source if gives else target, conversion, connection.delayed)
-        if outer is None:
-            self.feeds[target] = joined
-        elif gives is None:
-            self.inward[outer.name] += (joined,)
-        else:
-            self.outward[outer.name] = joined
+            takes = self._connector(target, ("output",), "the target")
+        own, other = (source, target) if source.component else (target, source)
+        port = ConnectedVariable(own, self._converted(connection, gives, takes), connection.delayed)
+        if other.component:
+            self.feeds[target] = port
+            return
+        self.ends[other.variable] += (port,)
+        if self.units[other.variable] is None:
+            self.units[other.variable] = takes.unit if gives.unit is None else gives.unit
 
     def _single(self, end: Endpoint, causalities: tuple[str, ...], what: str, needed: str) -> VariableInfo:
         """Return the variable at an end, which must be a single number of one of these causalities."""
@@ -209,31 +192,27 @@ class Wiring:
             )
         return variable
 
-    def _fit(self, connection: Connection, source: VariableInfo, target: VariableInfo) -> None:
-        if target.base_type not in _FITS[source.base_type]:
-            raise CouplingError(
-                f"{connection.source} is of the type {source.kind} and cannot feed {connection.target}, "
-                f"which is of the type {target.kind}."
-            )
-        scaled = (connection.factor, connection.offset) != (1.0, 0.0)
-        if scaled and target.base_type != "Real":
-            raise CouplingError(
-                f"The connection from {connection.source} to {connection.target} has a linear "
-                "transformation, but "
-                f"{connection.target} is of the type {target.kind}; only real numbers can be scaled."
-            )
-
-    def _converted(self, connection: Connection, source: str | None, target: str | None) -> Conversion:
-        own = Conversion(connection.factor, connection.offset)
+    def _converted(self, connection: Connection, gives: VariableInfo, takes: VariableInfo) -> Conversion:
+        """Return what becomes of a value on its way, if the types of both ends fit."""
+        source, target, own = connection.source, connection.target, connection.scale
+        if gives.kind and takes.kind:
+            if takes.base_type not in _FITS[gives.base_type]:
+                raise CouplingError(
+                    f"{source} is of the type {gives.kind} and cannot feed {target}, which is of the type "
+                    f"{takes.kind}."
+                )
+            if own != IDENTITY and takes.base_type != "Real":
+                raise CouplingError(
+                    f"The connection from {source} to {target} has a linear transformation, but {target} is "
+                    f"of the type {takes.kind}; only real numbers can be scaled."
+                )
         if not connection.convert_units:
             return own
-        unit = between(
-            source, self._definitions(connection.source), target, self._definitions(connection.target)
-        )
+        unit = between(gives.unit, self._definitions(source), takes.unit, self._definitions(target))
         if unit is None:
             raise CouplingError(
-                f"{connection.source} is in {source!r} and {connection.target} in {target!r}, and there is "
-                "no conversion between the two; correct the connection, or suppress the conversion of units."
+                f"{source} is in {gives.unit!r} and {target} in {takes.unit!r}, and there is no conversion "
+                "between the two; correct the connection, or suppress the conversion of units."
             )
         return unit.then(own)
 
@@ -242,21 +221,18 @@ class Wiring:
 
     # ------------------------------------------------------------------ parameters
 
-    def _known(self, component: Component) -> Component:
-        known = self.declared[component.name].variable
-        settings = {name: setting for name, setting in component.settings.items() if known(name)}
-        self.left_out += [f"{component.name}.{name}" for name in component.settings if name not in settings]
-        return replace(component, settings=settings)
-
-    def _settings(self, component: Component) -> dict[str, float]:
+    def _settings(self, component: Component, leave_out_unknown: bool) -> dict[str, float]:
         if component.substeps < 1:
             raise CouplingError(
                 f"The component {component.name!r} needs at least one step in a step of the system."
             )
-        return {
-            name: self.number(Endpoint(component.name, name), setting)
-            for name, setting in component.settings.items()
-        }
+        settings = {}
+        for name, setting in component.settings.items():
+            if leave_out_unknown and self.declared[component.name].variable(name) is None:
+                self.left_out.append(f"{component.name}.{name}")
+            else:
+                settings[name] = self.number(Endpoint(component.name, name), setting)
+        return settings
 
     def number(self, end: Endpoint, setting: Setting) -> float:
         """Return a parameter or start value as a number in the FMU's unit.
@@ -273,16 +249,16 @@ class Wiring:
             text = f"is of the type {variable.kind}"
             what = "is an array" if variable.shape else "changes with a clock" if variable.clocked else text
             raise CouplingError(f"{end} cannot be set: it {what}; only single numbers are set in a system.")
-        value = setting.value
+        value, own = setting.value, self.declared[end.component].units
         if isinstance(value, str):
-            items = variable.items
-            if variable.kind == "Enumeration" and value in items:
-                return float(items[value])
-            raise CouplingError(
-                f"{end} cannot be set to {value!r}: it is of the type {variable.kind}"
-                + (f" with the items {listed(items)}." if items else ", and a number is needed.")
+            if value in variable.items:
+                return float(variable.items[value])
+            items = (
+                f" with the items {listed(variable.items)}" if variable.items else ", and a number is needed"
             )
-        own = self.declared[end.component].units
+            raise CouplingError(
+                f"{end} cannot be set to {value!r}: it is of the type {variable.kind}{items}."
+            )
         units = (*setting.units, *self.structure.units, *own)
         conversion = between(setting.unit, units, variable.unit, own)
         if conversion is None:
@@ -290,13 +266,12 @@ class Wiring:
                 f"{end} is given in {setting.unit!r}, but it is in {variable.unit!r}, and there is no "
                 "conversion between the two."
             )
-        number = conversion.then(Conversion(setting.factor, setting.offset)).to_fmu(float(value))
-        wrong = (
-            (isinstance(value, bool) and variable.kind != "Boolean")
-            or (not isinstance(value, bool) and variable.kind == "Boolean" and value not in (0, 1))
-            or (variable.base_type in ("Integer", "Enumeration") and not number.is_integer())
-            or not math.isfinite(number)
-        )
-        if wrong:
+        number = conversion.then(setting.scale).to_fmu(float(value))
+        if variable.kind == "Boolean":
+            fits = value in (0, 1)
+        else:
+            whole = variable.base_type == "Real" or number.is_integer()
+            fits = whole and math.isfinite(number) and not isinstance(value, bool)
+        if not fits:
             raise CouplingError(f"{end} cannot be set to {value!r}: it is of the type {variable.kind}.")
         return number

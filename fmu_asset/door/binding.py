@@ -317,13 +317,13 @@ class Binding(Section):
                 return slice(begin, begin + len(vector.variables))
             begin += len(vector.variables)
         raise BindingError(
-            f"The binding {self.name} has no observation {name!r}; it has {_listed(self.observation)}."
+            f"The binding {self.name} has no observation {name!r}; it has "
+            f"{', '.join(self.observation) or 'none'}."
         )
 
-    def with_interpolation(self, interpolation: Interpolation) -> "Binding":
-        """Return the binding with inputs that go on so between communication points."""
-        header = self.binding.model_copy(update={"interpolation": interpolation})
-        return self.model_copy(update={"binding": header})
+    def with_header(self, **changes: Any) -> "Binding":
+        """Return the binding with other values in its table `[binding]`, which are not checked."""
+        return self.model_copy(update={"binding": self.binding.model_copy(update=changes)})
 
     def with_regions(self, regions: Sequence[str]) -> "Binding":
         """Return the binding for a wing with these damage regions: their health inputs, and no others.
@@ -331,10 +331,8 @@ class Binding(Section):
         An input that the binding has for a region stays as it is; the others have the names of their regions.
         """
         bound = {entry.variable: (name, entry) for name, entry in self.health.items()}
-        health = dict(
-            bound.get(variable, (region, Input(variable=variable, unit="1")))
-            for region, variable in ((region, f"health.{region}") for region in regions)
-        )
+        own = {region: Input(variable=f"health.{region}", unit="1") for region in regions}
+        health = dict(bound.get(entry.variable, (region, entry)) for region, entry in own.items())
         return self.model_copy(update={"health": health})
 
     def with_arrays(self, elements: Callable[[str], Sequence[str]]) -> "Binding":
@@ -391,7 +389,3 @@ def parse_binding(content: Mapping[str, Any], *, where: str = "the binding") -> 
                 )
             taken[scalar.variable] = here
     return parsed
-
-
-def _listed(names: Mapping[str, object]) -> str:
-    return ", ".join(names) or "none"

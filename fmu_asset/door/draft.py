@@ -23,7 +23,7 @@ _AUXILIARY = re.compile(r"status|error|bound|count|iteration|frequency|ratio", r
 _PORT = re.compile(
     r"(?P<stem>.*?)[._ ]?(?P<quantity>force|displacement|velocity)(?P<rest>\[\d+\])?", re.IGNORECASE
 )
-_NUMBERED = re.compile(r"(?P<stem>.*\D|)(?P<number>\d+)(?P<rest>\D*)", re.DOTALL)
+_NUMBERED = re.compile(r"(?P<stem>.*\D|)(?P<number>\d{1,9})(?P<rest>\D*)", re.DOTALL)
 _INNER = ("local", "calculatedParameter", "none")
 _PATTERN = re.compile(r"\{\d+\.\.\d+\}")
 
@@ -58,33 +58,23 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
     in_port = {variable.name for port in ports.values() for variable in port.values()}
     known, shown = {v.name for v in usable}, {v.name for v in observed}
     keys = _Keys()
-    inputs = [
-        (role, keys.of(role, v.name), v)
-        for v in usable
-        if v.causality == "input" and v.name not in in_port
-        for role in (_role(v),)
-    ]
+    inputs = [(_role(v), v) for v in usable if v.causality == "input" and v.name not in in_port]
+    chosen = [v for v in usable if v.causality == "parameter" and v.variability != "constant"]
     text = rendered(
         "draft.toml",
         fmu=description,
         name=keys.of("binding", description.model_name),
         step_size=step_size or description.fixed_step or description.step_size,
-        inputs=inputs,
+        inputs=[(role, keys.of(role, v.name), v) for role, v in inputs],
         observed=[(keys.of("observation", _stem(group)), group) for group in _groups(observed)],
-        parameters=[
-            (keys.of("parameter", v.name), v)
-            for v in usable
-            if v.causality == "parameter" and v.variability != "constant"
-        ],
+        parameters=[(keys.of("parameter", v.name), v) for v in chosen],
         ports=[(keys.of("port", stem or "port"), port) for stem, port in ports.items()],
         recorded=_groups(v for v in usable if v.causality == "output" and v.name not in shown),
         others=[v.name for v in usable if v.causality in _INNER],
         left_out=[v.name for v in description.variables if v.name not in known and v.causality != "local"],
         float_kinds=FLOAT_KINDS,
-        about=_about,
         pattern=_pattern,
         comment=_comment,
-        listed=_listed,
     ).decode()
     text = text.rstrip() + "\n"
     Exchange(description, parse_binding(tomllib.loads(text), where="the draft"))
@@ -93,9 +83,8 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
 
 def bindable(variable: VariableInfo) -> bool:
     """Return whether a variable can be bound; a pattern of ours in somebody's name would be expanded."""
-    return bool(
-        variable.numeric and not variable.clocked and variable.size and not _PATTERN.search(variable.name)
-    )
+    numbers = variable.numeric and not variable.clocked and variable.size > 0
+    return numbers and not _PATTERN.search(variable.name)
 
 
 def observable(description: FmuDescription, usable: Sequence[VariableInfo]) -> list[VariableInfo]:
@@ -117,19 +106,16 @@ class _Keys:
     """Names of tables, unique within their role."""
 
     def __init__(self) -> None:
-        self._taken: set[tuple[str, str]] = set()
         self._wished: Counter[tuple[str, str]] = Counter()
 
     def of(self, role: str, name: str) -> str:
-        """Return a name for a table."""
-        wish = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_").lower() or "x"
-        while True:
+        """Return a name for a table: what is wished or, where that is taken, its first free number."""
+        key = wish = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_").lower() or "x"
+        while self._wished[role, key]:
             self._wished[role, wish] += 1
-            number = self._wished[role, wish]
-            key = wish if number == 1 else f"{wish}_{number}"
-            if (role, key) not in self._taken:
-                self._taken.add((role, key))
-                return key
+            key = f"{wish}_{self._wished[role, wish]}"
+        self._wished[role, key] += 1
+        return key
 
 
 def _role(variable: VariableInfo) -> str:
@@ -146,43 +132,33 @@ def _ports(variables: Sequence[VariableInfo]) -> dict[str, dict[str, VariableInf
     found: dict[str, dict[str, VariableInfo]] = {}
     for variable in sorted(variables, key=lambda variable: variable.causality):
         match = _PORT.fullmatch(variable.name)
-        units = PORT_QUANTITIES[match["quantity"].lower()] if match else ()
+        quantity = match["quantity"].lower() if match else ""
+        units = PORT_QUANTITIES.get(quantity, ())
         if match and any(same_dimension(variable.unit or "", unit) for unit in units):
-            own = found.setdefault(match["stem"] + (match["rest"] or ""), {})
-            own[match["quantity"].lower()] = variable
-    ordered = {
-        stem: {quantity: port[quantity] for quantity in PORT_QUANTITIES if quantity in port}
-        for stem, port in found.items()
-    }
-    return {
-        stem: port
-        for stem, port in ordered.items()
-        if "force" in port
-        and len(port) > 1
+            found.setdefault(match["stem"] + (match["rest"] or ""), {})[quantity] = variable
+    ports = {}
+    for stem, port in found.items():
         # The force stands alone on its side.
-        and [v.causality for v in port.values()].count(port["force"].causality) == 1
-    }
+        sides = [variable.causality for variable in port.values()]
+        if len(port) > 1 and "force" in port and sides.count(port["force"].causality) == 1:
+            ports[stem] = {quantity: port[quantity] for quantity in PORT_QUANTITIES if quantity in port}
+    return ports
 
 
 def _groups(variables: Iterable[VariableInfo]) -> list[list[VariableInfo]]:
     """Put variables together that are numbered one after the other and have one unit."""
     groups: list[list[VariableInfo]] = []
+    following: object = None  # what the next one of the last group is called
     for variable in variables:
-        now = _NUMBERED.fullmatch(variable.name)
-        before = _NUMBERED.fullmatch(groups[-1][-1].name) if groups else None
-        follows = (
-            now is not None
-            and before is not None
-            and (now["stem"], now["rest"]) == (before["stem"], before["rest"])
-            and now["number"] == str(int(before["number"]) + 1)
-            and before["number"] == str(int(before["number"]))
-            and not (variable.shape or groups[-1][-1].shape)
-            and variable.unit == groups[-1][-1].unit
-        )
-        if follows:
+        now = None if variable.shape else _NUMBERED.fullmatch(variable.name)
+        own = now and (now["stem"], now["number"], now["rest"], variable.unit)
+        if now and own == following:
             groups[-1].append(variable)
         else:
             groups.append([variable])
+        following = None
+        if now and str(int(now["number"])) == now["number"]:
+            following = (now["stem"], str(int(now["number"]) + 1), now["rest"], variable.unit)
     return groups
 
 
@@ -199,25 +175,5 @@ def _stem(group: Sequence[VariableInfo]) -> str:
     return numbered["stem"].rstrip("[._ ") or "values" if numbered else group[0].name
 
 
-def _about(variable: VariableInfo) -> str:
-    """Return a comment with what the FMU says of a variable."""
-    parts = [_comment(variable.description)] if variable.description else []
-    if variable.shape:
-        parts.append(f"array {' x '.join(map(str, variable.shape))}")
-    if variable.minimum is not None or variable.maximum is not None:
-        low = "-inf" if variable.minimum is None else f"{variable.minimum:g}"
-        high = "inf" if variable.maximum is None else f"{variable.maximum:g}"
-        parts.append(f"{low} to {high}")
-    if variable.start is not None and variable.causality in ("input", "parameter"):
-        parts.append(f"start {_comment(variable.start)}")
-    return f" # {'; '.join(parts)}" if parts else ""
-
-
 def _comment(text: str) -> str:
     return " ".join(re.sub(r"[\x00-\x1f\x7f]", " ", text).split())[:120]
-
-
-def _listed(names: Iterable[str]) -> str:
-    given = [_comment(name) for name in names]
-    more = f" and {len(given) - 20} more" if len(given) > 20 else ""
-    return ", ".join(given[:20]) + more

@@ -1,5 +1,6 @@
 """A binding resolved against an FMU: what is sent and read, where it stands in the blocks, in which units."""
 
+import operator
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, TypedDict
@@ -8,22 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.archive.declared import FmuDescription, VariableInfo
-from fmu_asset.errors import BindingError
+from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
 
 from .binding import INPUT_ROLES, Binding, Input, Vector
-from .layout import (
-    BlockLayout,
-    Place,
-    Slot,
-    configured,
-    element_names,
-    find,
-    in_unit,
-    start_values,
-    value_range,
-)
-from .reading import OutputTable
+from .layout import BlockLayout, OutputTable, Place, Slot, configured, find, start_values
 from .units import IDENTITY, conversion
 
 _LARGEST = sys.float_info.max
@@ -31,6 +21,9 @@ _NOWHERE = (0, 1.0, 0.0)
 
 Values = Mapping[str, float | Sequence[float]]
 """Values by the binding's names: a number, or as many as the bound array or port has."""
+
+Histories = Mapping[str, npt.ArrayLike]
+"""Inputs by the binding's names: a number for all steps, or one for each; (n,) or (N, n) for an array."""
 
 
 class Inputs(TypedDict, total=False):
@@ -70,6 +63,10 @@ class Exchange:
         For the instance; its folder is still empty.
     outputs : OutputTable
         What is read of the reply block.
+    recorded_units : dict of str to str
+        Units of what is read beside the observations, by name.
+    output_names : list of str
+        Names of all values of the reply block.
     sent, read : tuple of VariableInfo
         What stands in the request and in the reply block, in order.
 
@@ -88,8 +85,8 @@ class Exchange:
                 f"{description.fmi_version}; correct `fmi_version`, or leave it out."
             )
         description, configuration = configured(description, binding)
-        self.description = self._description = description
-        self.binding = self._binding = binding.with_arrays(self._elements)
+        self.description = description
+        self.binding = binding.with_arrays(self._elements)
         self._whose = f"of the binding {binding.name}"
         self._ports = self._port_vectors()
         self._make_outputs()
@@ -97,35 +94,29 @@ class Exchange:
         self.sent, self.read = self._inputs.variables, self._outputs.variables
         self.plan = Plan(
             folder="",
-            fmi_version=description.major_version,
-            interface=description.interface,
-            guid=description.guid,
-            model_identifier=description.model_identifier,
+            fmu=description.identity,
             instance_name=binding.name,
             inputs=self._inputs.groups,
             outputs=self._outputs.groups,
             substeps=binding.binding.decimation,
             tolerance=binding.binding.tolerance or description.tolerance,
             solver_tolerance=binding.binding.tolerance or min(description.tolerance or 1.0, SOLVER_TOLERANCE),
-            states=description.states,
-            event_indicators=description.event_indicators,
-            completed_step=description.completed_step,
             configuration=configuration,
         )
 
     # ------------------------------------------------------------------ resolving
 
     def _elements(self, name: str) -> tuple[str, ...]:
-        variable = self._description.variable(name)
-        return (name,) if variable is None else element_names(variable)
+        variable = self.description.variable(name)
+        return (name,) if variable is None else variable.elements
 
     def _find(self, name: str, label: str, causality: str) -> Place:
-        return find(self._description, name, f"{label} {self._whose}", causality)
+        return find(self.description, name, f"{label} {self._whose}", causality)
 
     def _port_vectors(self) -> list[tuple[str, Vector, bool]]:
         """Return what ports have: name, vector, and whether it is read, which is so of force or of motion."""
         found = []
-        for name, port in self._binding.port.items():
+        for name, port in self.binding.port.items():
             reads: dict[str, bool] = {}
             for quantity, vector in port.quantities.items():
                 label = f"port.{name}.{quantity}"
@@ -134,10 +125,10 @@ class Exchange:
                         f"{label} {self._whose} has {len(vector.variables)} values and the force "
                         f"{len(port.force.variables)}; give as many."
                     )
-                causalities = {self._causality(variable) == "input" for variable in vector.variables}
-                if len(causalities) > 1:
+                read = {not self._is_input(variable) for variable in vector.variables}
+                if len(read) > 1:
                     raise BindingError(f"{label} {self._whose} mixes inputs and outputs of the FMU.")
-                reads[quantity] = not causalities.pop()
+                reads[quantity] = read.pop()
                 found.append((f"{name}.{quantity}", vector, reads[quantity]))
             force = reads.pop("force")
             if force in reads.values():
@@ -147,16 +138,16 @@ class Exchange:
                 )
         return found
 
-    def _causality(self, name: str) -> str:
-        variable = self._description.variable(name) or self._description.variable(name.rpartition("[")[0])
-        return "" if variable is None else variable.causality
+    def _is_input(self, name: str) -> bool:
+        variable = self.description.variable(name) or self.description.variable(name.rpartition("[")[0])
+        return variable is not None and variable.causality == "input"
 
     def _make_inputs(self) -> None:
         """Lay out the request block: time, step size, all inputs."""
         wanted: list[tuple[str, str, Input, tuple[str, ...]]] = [
             (role, name, item, (item.variable,))
             for role in INPUT_ROLES
-            for name, item in self._binding.inputs(role).items()
+            for name, item in self.binding.inputs(role).items()
         ]
         wanted += [
             ("port", name, Input(variable=vector.variables[0], unit=vector.units[0]), vector.variables)
@@ -167,12 +158,9 @@ class Exchange:
             [self._find(variable, f"{role}.{name}", "input") for variable in variables]
             for role, name, _, variables in wanted
         ]
-        self._inputs = BlockLayout(
-            self._description,
-            [place.variable for found in places for place in found],
-            begin=2,
-            linear=self._binding.binding.interpolation == "linear",
-        )
+        sent = [place.variable for found in places for place in found]
+        linear = self.binding.binding.interpolation == "linear"
+        self._inputs = BlockLayout(self.description, sent, begin=2, linear=linear)
         self._check_lines()
         self._slots: dict[str, dict[str, Slot]] = {role: {} for role in (*INPUT_ROLES, "port")}
         taken: dict[int, str] = {}
@@ -187,7 +175,7 @@ class Exchange:
             for position in positions:
                 if position in taken:
                     raise BindingError(
-                        f"In the binding {self._binding.name}, {label} and {taken[position]} set the same "
+                        f"In the binding {self.binding.name}, {label} and {taken[position]} set the same "
                         f"value of {found[0].variable.name!r}; keep one."
                     )
                 taken[position] = label
@@ -201,27 +189,25 @@ class Exchange:
             }
             for role, slots in self._slots.items()
         }
-        self._parameter_slots = {
-            name: self._parameter_slot(name, item) for name, item in self._binding.parameter.items()
-        }
+        named = self.binding.parameter.items()
+        self._parameter_slots = {name: self._parameter_slot(name, item) for name, item in named}
 
     def _parameter_slot(self, name: str, item: Input) -> Slot:
         """Return the slot of a parameter, whose positions count from the variable's own values."""
         label = f"parameter.{name}"
         place = self._find(item.variable, label, "parameter")
-        positions = [place.element] if place.element is not None else [*range(place.size)]
-        return self._slot(label, item, place.variable, positions)
+        return self._slot(label, item, place.variable, place.elements)
 
     def _check_lines(self) -> None:
         """Refuse straight lines of inputs where the FMU or none of its inputs can follow them."""
-        if self._binding.binding.interpolation == "zero-order":
+        if self.binding.binding.interpolation == "zero-order":
             return
-        asked = f"The binding {self._binding.name} asks for linear interpolation of inputs, but"
-        path = self._description.path
-        if not self._description.can_interpolate_inputs:
+        asked = f"The binding {self.binding.name} asks for linear interpolation of inputs, but"
+        path = self.description.path
+        if not self.description.can_interpolate_inputs:
             why = (
                 "FMI 3.0 has no derivatives of inputs in co-simulation"
-                if self._description.major_version == 3
+                if self.description.major_version == 3
                 else "it does not declare `canInterpolateInputs`"
             )
             raise BindingError(
@@ -233,39 +219,36 @@ class Exchange:
 
     def _own_slot(self, name: str) -> Slot:
         """Return the slot of a parameter by its name in the FMU, which the binding does not name."""
-        variable = self._description.variable(name)
+        variable = self.description.variable(name)
         bound = {slot.variable.name for slot in self._parameter_slots.values()}
         if variable is None or variable.causality != "parameter" or name in bound:
             raise BindingError(
-                f"The binding {self._binding.name} has no parameter {name!r}; "
+                f"The binding {self.binding.name} has no parameter {name!r}; "
                 f"it has {', '.join(self._parameter_slots) or 'none'}."
             )
         return self._parameter_slot(name, Input(variable=name, unit=variable.unit or "1"))
 
     def _slot(self, label: str, item: Input, variable: VariableInfo, positions: Sequence[int]) -> Slot:
-        scale = conversion(item.unit, variable, self._description.units_of(variable), where=label)
-        low, high = value_range(variable)
+        scale = conversion(item.unit, variable, self.description.units_of(variable), where=label)
+        low, high = variable.bounds
         least, most = sorted(scale.to_fmu(end) for end in item.ends)
         if least > high or most < low:
             raise BindingError(
                 f"The range of {label} {self._whose} lies outside that of {variable.name!r}, {low:g} to "
-                f"{high:g}{in_unit(variable)}; correct minimum or maximum."
+                f"{high:g}{variable.in_unit}; correct minimum or maximum."
             )
         return Slot(label, positions, max(low, least), min(high, most), scale, variable)
 
     def _make_outputs(self) -> None:
         """Lay out the reply block: observations, monitors, records, outputs of ports."""
-        binding = self._binding
+        binding = self.binding
         wanted = [
             (name, name, unit, f"observation.{key}")
             for key, vector in binding.observation.items()
             for name, unit in zip(vector.variables, vector.units, strict=True)
         ]
         count = len(wanted)
-        wanted += [
-            (name, scalar.variable, scalar.unit, f"monitor.{name}")
-            for name, scalar in binding.monitor.items()
-        ]
+        wanted += [(name, one.variable, one.unit, f"monitor.{name}") for name, one in binding.monitor.items()]
         wanted += [(name, name, "", "record.variables") for name in binding.record.variables]
         for label, vector, read in self._ports:
             several = len(vector.variables) > 1
@@ -274,28 +257,19 @@ class Exchange:
                 for number, name in enumerate(vector.variables if read else (), 1)
             ]
         places = [self._find(name, where, "output") for _, name, _, where in wanted]
-        self._outputs = BlockLayout(self._description, [place.variable for place in places], begin=0)
-        self._output_names = self._outputs.names()
-        conversions = [
-            conversion(
-                unit or place.variable.unit or "1",
-                place.variable,
-                self._description.units_of(place.variable),
-                where=where,
-            )
-            for (_, _, unit, where), place in zip(wanted, places, strict=True)
-        ]
-        positions = [self._outputs.positions(place)[0] for place in places]
+        self._outputs = BlockLayout(self.description, [place.variable for place in places], begin=0)
+        self.output_names = self._outputs.names()
+        units, scales = [], []
+        for (_, _, unit, where), (variable, _) in zip(wanted, places, strict=True):
+            units.append(unit or variable.unit or "1")
+            known = self.description.units_of(variable)
+            scales.append(conversion(units[-1], variable, known, where=where))
         # A name that stands there twice is that of its last value.
         extra = {name: which for which, (name, *_) in enumerate(wanted[count:], count)}
         chosen = [*range(count), *extra.values()]
-        self.outputs = OutputTable(
-            count, [*extra], [positions[which] for which in chosen], [conversions[which] for which in chosen]
-        )
-        self.recorded_units = {
-            name: unit or place.variable.unit or "1"
-            for (name, _, unit, _), place in zip(wanted[count:], places[count:], strict=True)
-        }
+        positions = [self._outputs.positions(places[which])[0] for which in chosen]
+        self.outputs = OutputTable(count, [*extra], positions, [scales[which] for which in chosen])
+        self.recorded_units = {name: units[which] for name, which in extra.items()}
 
     # ------------------------------------------------------------------ sending
 
@@ -316,7 +290,7 @@ class Exchange:
         slots = [self.slot(role, name) for role, part in given.items() for name in part or ()]
         whole = {slot.variable.name for slot in slots if len(slot.positions) == slot.variable.size}
         for variable in self._inputs.variables:
-            values += start_values(self._description, variable, given=variable.name in whole)
+            values += start_values(self.description, variable, given=variable.name in whole)
         return values + values[2 : 2 + self.plan.linear_count]
 
     def settings(self, parameters: Values) -> Settings:
@@ -340,24 +314,17 @@ class Exchange:
         FmuInputError
             If a value is not finite or outside its range.
         """
-        slots = self._parameter_slots | {
-            name: self._own_slot(name) for name in parameters if name not in self._parameter_slots
-        }
-        fixed = {
-            name: parameter.value
-            for name, parameter in self._binding.parameter.items()
-            if parameter.value is not None
-        }
+        fixed = {n: entry.value for n, entry in self.binding.parameter.items() if entry.value is not None}
         set_values: dict[str, tuple[str, int, list[float]]] = {}
         for name, value in {**fixed, **parameters}.items():
-            variable = slots[name].variable
+            slot = self._parameter_slots.get(name) or self._own_slot(name)
+            variable = slot.variable
             if variable.name not in set_values:
-                kind = self._description.exchange_kind(variable)
-                whole = len(slots[name].positions) == variable.size
-                start = start_values(self._description, variable, given=whole)
+                kind = self.description.exchange_kind(variable)
+                whole = len(slot.positions) == variable.size
+                start = start_values(self.description, variable, given=whole)
                 set_values[variable.name] = (kind, variable.reference, start)
-            numbers = slots[name].numbers(value).tolist()
-            for position, number in zip(slots[name].positions, numbers, strict=True):
+            for position, number in zip(slot.positions, slot.numbers(value).tolist(), strict=True):
                 set_values[variable.name][2][position] = number
         return list(set_values.values())
 
@@ -393,6 +360,57 @@ class Exchange:
                     target[position] = number
         return there
 
+    def rows(
+        self, held: npt.NDArray[np.float64], roles: Mapping[str, Histories | None], steps: int | None
+    ) -> npt.NDArray[np.float64]:
+        """Return the request blocks of many steps, without their times; histories are checked as a whole.
+
+        Parameters
+        ----------
+        held : (2 + n_inputs,) ndarray
+            The last request: what is not given keeps its value.
+        roles : mapping of str to mapping
+            Inputs by role, then by name.
+        steps : int, optional
+            Number of steps N; that of the histories if absent.
+
+        Returns
+        -------
+        (N, 2 + n_inputs) ndarray
+            In the FMU's units.
+
+        Raises
+        ------
+        BindingError
+            If a name is not in the binding.
+        FmuInputError
+            If a value is no number, not finite or out of range, or the histories have different lengths.
+        """
+        given = [
+            (self.slot(role, name), v) for role, part in roles.items() for name, v in (part or {}).items()
+        ]
+        arrays = [(slot, slot.numbers(values, history=True)) for slot, values in given]
+        count, source = steps, "`steps`"
+        if count is not None and (count := operator.index(count)) < 1:
+            raise FmuInputError(f"steps must be at least 1, but is {count}.")
+        for slot, array in arrays:
+            if array.ndim == 2:
+                if count is None:
+                    count, source = len(array), slot.label
+                elif len(array) != count:
+                    raise FmuInputError(
+                        f"{slot.label} has {len(array)} steps, but {source} says {count}; give as many of "
+                        "each."
+                    )
+        if not count:
+            raise FmuInputError(
+                "Nothing says how many steps to make: give `steps`, or a history of an input."
+            )
+        rows = np.tile(held, (count, 1))
+        for slot, array in arrays:
+            rows[:, list(slot.positions)] = array
+        return rows
+
     def slot(self, role: str, name: str) -> Slot:
         """Return where an input goes.
 
@@ -404,20 +422,5 @@ class Exchange:
         slot = self._slots.get(role, {}).get(name)
         if slot is None:
             known = ", ".join(self._slots.get(role, {})) or "none"
-            raise BindingError(f"The binding {self._binding.name} has no {role} {name!r}; it has {known}.")
+            raise BindingError(f"The binding {self.binding.name} has no {role} {name!r}; it has {known}.")
         return slot
-
-    def input_range(self, role: str, name: str) -> tuple[float, float]:
-        """Return the range of an input in the binding's unit; see `FmiAsset.input_range`."""
-        slot = self.slot(role, name)
-        low, high = sorted(slot.conversion.from_fmu(end) for end in (slot.low, slot.high))
-        return low, high
-
-    def output_name(self, position: int) -> str:
-        """Return the name of an output by its position in the reply block."""
-        return self._output_names[position]
-
-    def not_finite(self, block: npt.NDArray[np.float64]) -> list[str]:
-        """Return the names of outputs that are NaN or infinite."""
-        count = len(self._output_names)
-        return [self._output_names[index] for index in np.flatnonzero(~np.isfinite(block[:count]))]

@@ -12,8 +12,8 @@ from reporting.progress import Progress
 
 from .binding import Binding, Header, Input, Parameter, Vector
 from .draft import bindable, observable
-from .history_file import InputHistories
-from .reading import Observation, ObservationHistory
+from .history_file import InputHistories, Roles
+from .layout import ObservationHistory
 from .session import FmiAsset
 
 _STEPS = 500
@@ -76,23 +76,21 @@ def default_experiment(
     steps, size = _steps_to(description.start_time or 0.0, end, size)
     binding = whole_binding(description, step_size=size)
     structural = [v.name for v in description.variables if v.causality == "structuralParameter"]
-    given: dict[str, dict[str, Value]] = {"parameter": {}, "load": {}, "structural": {}}
-    places = {
-        **dict.fromkeys(binding.parameter, "parameter"),
-        **dict.fromkeys(binding.load, "load"),
-        **dict.fromkeys(structural, "structural"),
-    }
-    for name, value in (values or {}).items():
-        if name not in places:
-            some = ", ".join(list(places)[:20]) or "none"
+    values = values or {}
+    known = [*binding.parameter, *binding.load, *structural]
+    for name in values:
+        if name not in known:
+            some = ", ".join(known[:20]) or "none"
             raise BindingError(
                 f"{description.path} has no parameter or input {name!r} that takes numbers; it has {some}"
-                f"{', ...' if len(places) > 20 else ''}."
+                f"{', ...' if len(known) > 20 else ''}."
             )
-        given[places[name]][name] = value
-    header = binding.binding.model_copy(update={"structural_parameters": given["structural"]})
-    binding = binding.model_copy(update={"binding": header})
-    return Experiment(binding, steps, given["parameter"], {"load": given["load"]})
+    parameters, load, sizes = (
+        {name: value for name, value in values.items() if name in names}
+        for names in (binding.parameter, binding.load, structural)
+    )
+    binding = binding.with_header(structural_parameters=sizes)
+    return Experiment(binding, steps, parameters, {"load": load})
 
 
 def whole_binding(description: FmuDescription, *, step_size: float | None = None) -> Binding:
@@ -176,12 +174,12 @@ def fly_histories(asset: FmiAsset, given: InputHistories, progress: Progress) ->
     first = {role: {name: v[0] for name, v in table.items()} for role, table in given.roles.items()}
     rest = {role: {name: v[1:] for name, v in table.items()} for role, table in given.roles.items()}
     asset.reset(**first)
-    start = asset.observe()
-    return _from_start(start, asset.simulate(**rest, steps=given.steps - 1, progress=progress))
+    return _from_here(asset, given.steps - 1, progress, rest)
 
 
-def _from_start(first: Observation, then: ObservationHistory) -> ObservationHistory:
-    """Return a history with the moment before it."""
+def _from_here(asset: FmiAsset, steps: int, progress: Progress, roles: Roles) -> ObservationHistory:
+    """Return this moment and what comes out of the steps after it."""
+    first, then = asset.observe(), asset.simulate(**roles, steps=steps, progress=progress)
     return ObservationHistory(
         np.concatenate(([first.time], then.time)),
         np.vstack((first.values, then.values)),
@@ -213,5 +211,4 @@ def fly(asset: FmiAsset, experiment: Experiment, progress: Progress) -> Observat
         As `FmiAsset.simulate`.
     """
     asset.reset(experiment.parameters, **experiment.inputs)
-    first = asset.observe()
-    return _from_start(first, asset.simulate(steps=experiment.steps, progress=progress))
+    return _from_here(asset, experiment.steps, progress, {})

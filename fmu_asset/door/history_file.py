@@ -3,6 +3,7 @@
 import csv
 import io
 import re
+from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.table_file import TableErrors, read_table
 
 from .binding import INPUT_ROLES, Binding
-from .reading import ObservationHistory
+from .layout import ObservationHistory
 from .session import FmiAsset
 
 Roles = dict[str, dict[str, npt.NDArray[np.float64]]]
@@ -83,15 +84,11 @@ def read_histories(path: Path, binding: Binding) -> InputHistories:
         taken[element] = table.numbers(column, "a simulation")
     roles: Roles = {}
     for (role, name), elements in columns.items():
-        if 0 in elements:
-            roles.setdefault(role, {})[name] = elements[0]
-            continue
-        lost = [number for number in range(1, max(elements) + 1) if number not in elements]
-        if lost or min(elements) < 1:
-            raise FmuInputError(
-                f"{path} lacks the column {role}.{name}[{lost[0] if lost else 1}]; count from 1."
-            )
-        roles.setdefault(role, {})[name] = np.column_stack([elements[i] for i in sorted(elements)])
+        lost = {*range(1, len(elements) + 1)} - elements.keys()
+        if lost and 0 not in elements:
+            raise FmuInputError(f"{path} lacks the column {role}.{name}[{min(lost)}]; count from 1.")
+        array = np.column_stack([elements[number] for number in sorted(elements)])
+        roles.setdefault(role, {})[name] = elements.get(0, array)
     return InputHistories(len(time), roles)
 
 
@@ -142,18 +139,15 @@ def _input_names(binding: Binding) -> dict[str, tuple[str, str]]:
     """Return role and name by what a column may be called."""
     keys = [(role, name) for role in INPUT_ROLES for name in binding.inputs(role)]
     keys += [("port", f"{name}.{item}") for name, port in binding.port.items() for item in port.quantities]
-    plain = [name for _, name in keys]
-    return {name: key for key, name in zip(keys, plain, strict=True) if plain.count(name) == 1} | {
-        ".".join(key): key for key in keys
-    }
+    times = Counter(name for _, name in keys)
+    return {key[1]: key for key in keys if times[key[1]] == 1} | {".".join(key): key for key in keys}
 
 
 def _netcdf(asset: FmiAsset, source: tuple[str, str], history: ObservationHistory) -> bytes:
     import xarray as xr
 
     binding, units = asset.binding, asset.recorded_units
-    observed_units = [vector.unit for vector in binding.observation.values() for _ in vector.variables]
-
+    observed_units = [unit for vector in binding.observation.values() for unit in vector.units]
     extra_units = [units[name] for name in history.extra]
     extra = np.column_stack([*history.extra.values()]) if history.extra else np.empty((len(history.time), 0))
     data = xr.Dataset(
@@ -168,10 +162,6 @@ def _netcdf(asset: FmiAsset, source: tuple[str, str], history: ObservationHistor
             "observation_name": ("observation_name", np.array(binding.observation_variables, dtype=str)),
             "extra_name": ("extra_name", np.array([*history.extra], dtype=str)),
         },
-        attrs={
-            "fmu": source[0],
-            "fmu_sha256": source[1],
-            "binding": binding.name,
-        },
+        attrs={"fmu": source[0], "fmu_sha256": source[1], "binding": binding.name},
     )
     return bytes(data.to_netcdf(engine="h5netcdf"))

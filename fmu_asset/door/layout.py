@@ -1,19 +1,18 @@
-"""Names of a binding found in an FMU: where their values stand in a block, and which of them are refused."""
+"""Names of a binding found in an FMU: where their values stand in a block, what is refused, what is read."""
 
 import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from itertools import accumulate, groupby, product
+from dataclasses import dataclass, replace
+from itertools import accumulate, groupby
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
-from fmu_asset.instances.plan import Group, Settings
+from fmu_asset.instances.plan import Floats, Group, Settings
 
 from .binding import Binding
 from .units import IDENTITY, Conversion
@@ -30,23 +29,10 @@ _KIND_ORDER = ("Real", "Float64", "Integer", "Boolean")
 
 
 class Place(NamedTuple):
-    """A variable, and which of its values is meant: one, or all (None)."""
+    """A variable, and which of its values are meant: one, or all."""
 
     variable: VariableInfo
-    element: int | None
-
-    @property
-    def size(self) -> int:
-        """Number of values."""
-        return self.variable.size if self.element is None else 1
-
-
-def element_names(variable: VariableInfo) -> tuple[str, ...]:
-    """Return the names of the elements of an array, row by row and from 1; the name itself for a scalar."""
-    if not variable.shape:
-        return (variable.name,)
-    ranges = [range(1, length + 1) for length in variable.shape]
-    return tuple(f"{variable.name}[{','.join(map(str, index))}]" for index in product(*ranges))
+    elements: range
 
 
 def find(description: FmuDescription, name: str, label: str, causality: str) -> Place:
@@ -69,13 +55,13 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
     BindingError
         If there is none, or one of another causality or type.
     """
-    variable, element = description.variable(name), None
-    if variable is None:
-        variable, element = _element(description, name, label)
-    if variable is None:
+    variable = description.variable(name)
+    place = _element(description, name, label) if variable is None else Place(variable, range(variable.size))
+    if place is None:
         near = difflib.get_close_matches(name, [v.name for v in description.variables], 1, 0.6)
         hint = f"; did you mean {near[0]!r}?" if near else "."
         raise BindingError(f"{label} names {name!r}, which is not a variable of {description.path}{hint}")
+    variable = place.variable
     sent = (
         causality == "input"
         and (variable.causality, variable.variability) == ("parameter", "tunable")
@@ -93,24 +79,23 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
         )
     if variable.clocked:
         raise BindingError(f"{label} names {name!r}, which changes with a clock; clocks are not supported.")
-    return Place(variable, element)
+    return place
 
 
-def _element(description: FmuDescription, name: str, label: str) -> tuple[VariableInfo | None, int | None]:
+def _element(description: FmuDescription, name: str, label: str) -> Place | None:
     found = _ELEMENT.fullmatch(name)
     variable = description.variable(found.group(1)) if found else None
     if found is None or variable is None or not variable.shape:
-        return None, None
-    index = [int(number) for number in found.group(2).split(",")]
-    fits = len(index) == len(variable.shape) and all(
-        1 <= i <= length for i, length in zip(index, variable.shape, strict=True)
-    )
-    if not fits:
+        return None
+    index = [int(number) - 1 for number in found.group(2).split(",")]
+    try:
+        element = int(np.ravel_multi_index(index, variable.shape))
+    except (TypeError, ValueError):
         raise BindingError(
             f"{label} names {name!r}, but {variable.name!r} has {' x '.join(map(str, variable.shape))} "
             "elements, counted from 1."
-        )
-    return variable, int(np.ravel_multi_index([i - 1 for i in index], variable.shape))
+        ) from None
+    return Place(variable, range(element, element + 1))
 
 
 class BlockLayout:
@@ -146,25 +131,21 @@ class BlockLayout:
 
         unique = {variable.name: variable for variable in variables if variable.size}
         self.variables = tuple(sorted(unique.values(), key=kind))
-        sizes = [variable.size for variable in self.variables]
-        begins = accumulate(sizes[:-1], initial=begin)
-        self._positions = dict(zip([v.name for v in self.variables], begins, strict=False))
+        begins = accumulate((variable.size for variable in self.variables), initial=begin)
+        self._begins = dict(zip((variable.name for variable in self.variables), begins, strict=False))
         groups = [(key, list(members)) for key, members in groupby(self.variables, kind)]
         self.groups = tuple(
             Group(name, tuple(v.reference for v in members), sum(v.size for v in members), not held)
             for (held, _, name), members in groups
         )
 
-    def positions(self, place: Place) -> range:
+    def positions(self, place: Place) -> list[int]:
         """Return where the values of a place stand."""
-        if not place.size:
-            return range(0)
-        first = self._positions[place.variable.name] + (place.element or 0)
-        return range(first, first + place.size)
+        return [self._begins[place.variable.name] + element for element in place.elements]
 
     def names(self) -> list[str]:
         """Return the names of all values in the order of the block."""
-        return [name for variable in self.variables for name in element_names(variable)]
+        return [name for variable in self.variables for name in variable.elements]
 
 
 def start_values(description: FmuDescription, variable: VariableInfo, *, given: bool = False) -> list[float]:
@@ -216,7 +197,7 @@ class Slot(NamedTuple):
         """Whether it takes whole numbers only."""
         return self.variable.kind not in FLOAT_KINDS
 
-    def numbers(self, given: Any, *, history: bool = False) -> npt.NDArray[np.float64]:
+    def numbers(self, given: Any, *, history: bool = False) -> Floats:
         """Return values in the FMU's unit, all of them checked.
 
         Parameters
@@ -279,26 +260,8 @@ class Slot(NamedTuple):
             return f"{self.label} must be a whole number, but is {given!r}; nothing was sent to the FMU."
         return (
             f"{self.label} = {given!r} lies outside the range of {self.variable.name!r}, {self.low:g} to "
-            f"{self.high:g}{in_unit(self.variable)}; nothing was sent to the FMU."
+            f"{self.high:g}{self.variable.in_unit}; nothing was sent to the FMU."
         )
-
-
-def value_range(variable: VariableInfo) -> tuple[float, float]:
-    """Return the declared range, within that of the type: C would wrap what does not fit."""
-    low, high = (0.0, 1.0) if variable.kind == "Boolean" else (-math.inf, math.inf)
-    if variable.base_type in ("Integer", "Enumeration"):
-        sized = variable.kind not in ("Integer", "Enumeration")
-        limits = np.iinfo(variable.kind.lower() if sized else "int32")
-        low, high = float(limits.min), float(limits.max)
-    return (
-        low if variable.minimum is None else max(low, variable.minimum),
-        high if variable.maximum is None else min(high, variable.maximum),
-    )
-
-
-def in_unit(variable: VariableInfo) -> str:
-    """Return the unit of a variable with a blank before it, for a sentence; nothing if it has none."""
-    return "" if variable.unit in (None, "1") else f" {variable.unit}"
 
 
 def configured(description: FmuDescription, binding: Binding) -> tuple[FmuDescription, Settings]:
@@ -317,7 +280,7 @@ def configured(description: FmuDescription, binding: Binding) -> tuple[FmuDescri
         label = f"structural_parameters.{name}"
         where = f"{label} of the binding {binding.name}"
         variable = find(description, name, where, "structuralParameter").variable
-        numbers = Slot(label, (0,), *value_range(variable), IDENTITY, variable).numbers(value).tolist()
+        numbers = Slot(label, (0,), *variable.bounds, IDENTITY, variable).numbers(value).tolist()
         found.append((variable.kind, variable.reference, numbers))
         lengths[name] = int(numbers[0])
     if not lengths:
@@ -328,3 +291,92 @@ def configured(description: FmuDescription, binding: Binding) -> tuple[FmuDescri
             "only."
         )
     return replace(description, variables=tuple(v.resized(lengths) for v in description.variables)), found
+
+
+class Observation(NamedTuple):
+    """What came out of one communication step.
+
+    Attributes
+    ----------
+    values : (n_obs,) ndarray
+        The observations of the binding in their order and units.
+    time : float
+        Time at the end of the step [s]: start + i * interval.
+    extra : dict of str to float
+        Monitors, recorded variables and outputs of ports.
+    """
+
+    values: Floats
+    time: float
+    extra: dict[str, float]
+
+
+@dataclass(frozen=True)
+class ObservationHistory:
+    """What came out of N steps.
+
+    Attributes
+    ----------
+    time : (N,) ndarray
+        Time at the end of each step [s].
+    values : (N, n_obs) ndarray
+        The observations of the binding in their order and units.
+    extra : dict of str to (N,) ndarray
+        Monitors, recorded variables and outputs of ports.
+    ended : str
+        What the FMU did if it ended the simulation by itself: fewer steps were made then than were asked
+        for, and the last time is where it ended, within a step perhaps.
+    """
+
+    time: Floats
+    values: Floats
+    extra: dict[str, Floats]
+    ended: str = ""
+
+
+class OutputTable:
+    """What is read of a block of outputs: first what is observed, then the extras.
+
+    Parameters
+    ----------
+    observed : int
+        How many are observed.
+    extra : sequence of str
+        Names of the extras.
+    positions : sequence of int
+        Where all of them stand in the block.
+    conversions : sequence of Conversion
+        From the binding's units to the FMU's, one for each.
+    """
+
+    def __init__(
+        self, observed: int, extra: Sequence[str], positions: Sequence[int], conversions: Sequence[Conversion]
+    ) -> None:
+        self._observed, self._extra = observed, tuple(extra)
+        index = np.array(positions, dtype=np.intp)
+        first = int(index[0]) if len(index) else 0
+        together = np.array_equal(index, np.arange(first, first + len(index)))
+        self._index = slice(first, first + len(index)) if together else index
+        scales = np.array(conversions).reshape(-1, 2).T
+        self._scale = None if all(item == IDENTITY for item in conversions) else scales
+
+    def _converted(self, values: Floats) -> Floats:
+        """Return values in the binding's units; never a view."""
+        if self._scale is None:
+            return values.copy()
+        converted: Floats = (values - self._scale[1]) / self._scale[0]
+        return converted
+
+    def observation(self, block: Floats, time: float) -> Observation:
+        """Return what a block (n_outputs,) of a moment [s] holds."""
+        values = self._converted(block[self._index])
+        # Both are of one table; to compare their lengths would take as long as the rest of the line.
+        extra = dict(zip(self._extra, values[self._observed :].tolist()))  # noqa: B905
+        return Observation(values[: self._observed], time, extra)
+
+    def history(self, time: Floats, blocks: Floats, ended: str = "") -> ObservationHistory:
+        """Return what the blocks (N, n_outputs) of moments (N,) [s] hold; `ended` as in the history."""
+        values = self._converted(blocks[:, self._index])
+        extra = np.ascontiguousarray(values[:, self._observed :].T)
+        observed = np.ascontiguousarray(values[:, : self._observed])
+        return ObservationHistory(time, observed, dict(zip(self._extra, extra, strict=True)), ended)

@@ -4,30 +4,22 @@ import math
 import os
 from collections import deque
 from collections.abc import Mapping
-from types import TracebackType
+from copy import copy
 from typing import Any, Literal, NoReturn, Self, Unpack
 
 import numpy as np
 import numpy.typing as npt
 
-from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.errors import (
-    FmuCallError,
-    FmuError,
-    FmuMemoryError,
-    FmuOutputError,
-    FmuStateError,
-    FmuWorkerError,
-)
-from fmu_asset.instances.base import STATUS_NAMES
+from fmu_asset.errors import FmuError, FmuOutputError, FmuStateError
+from fmu_asset.instances.base import status_name
 from fmu_asset.instances.plan import Instance
 from fmu_asset.worker.client import WorkerInstance
 
 from .binding import Binding, load_binding
 from .exchange import Exchange, Inputs, Values, check_roles, plain_values
-from .placement import Housing, ResetTrial, Start, limits_of
-from .reading import Observation
+from .layout import Observation
+from .placement import Housing, Start, limits_of
 from .saved_state import StateMethod
 
 _LOG_LENGTH = 200
@@ -36,7 +28,7 @@ _LOG_LENGTH = 200
 class OpenedFmu:
     """An FMU with a binding and the instance that stands for it; `FmiAsset` adds steps and states.
 
-    Parameters and errors are those of `FmiAsset`.
+    Parameters, attributes and errors are those of `FmiAsset`.
     """
 
     def __init__(
@@ -59,15 +51,21 @@ class OpenedFmu:
     def _settle(self, exchange: Exchange, housing: Housing, parameters: Values) -> None:
         """Begin with what is exchanged, and with where the instance lives."""
         self._exchange, self._housing = exchange, housing
-        self._description, self._binding = exchange.description, exchange.binding
-        self._start_time, self._interval = self._binding.binding.start_time, self._binding.interval
+        self.description, self.binding = exchange.description, exchange.binding
+        self.recorded_units, self.reset_trial = exchange.recorded_units, housing.reset_trial
+        able = self.description.can_get_and_set_state and self.description.can_serialise_state
+        # A state in model exchange would have to hold our solver as well.
+        serialised = able and self.description.interface == "co-simulation"
+        wanted = self.binding.binding.state
+        self.state_method: StateMethod = (
+            wanted if wanted != "auto" else "serialised" if serialised else "replay"
+        )
+        self._start_time, self._interval = self.binding.binding.start_time, self.binding.interval
         self._phase: Literal["new", "ready", "broken", "closed"] = "new"
-        self._index = 0
-        self._settings = self._exchange.settings(parameters)
-        self._parameters = plain_values(parameters)
-        self._step_size = self._binding.step_size
-        self._lines = self._exchange.plan.linear_count
-        self._recording = self.state_method == "replay"
+        self.step_index = 0
+        self._set_parameters(parameters)
+        self._step_size = self.binding.step_size
+        self._lines = exchange.plan.linear_count
         self._record: list[bytes] = []
         self._start_inputs = b""
         self._log: deque[tuple[str, str]] = deque(maxlen=_LOG_LENGTH)
@@ -75,45 +73,15 @@ class OpenedFmu:
     # ------------------------------------------------------------------ what it is
 
     @property
-    def binding(self) -> Binding:
-        """The binding, with arrays that are observed or recorded as their elements."""
-        return self._binding
-
-    @property
     def time(self) -> float:
         """Time of the asset [s]: start + i * interval, never accumulated."""
-        return self._start_time + self._index * self._interval
-
-    @property
-    def step_index(self) -> int:
-        """Number of steps since the last reset."""
-        return self._index
-
-    @property
-    def description(self) -> FmuDescription:
-        """What the FMU declares."""
-        return self._description
-
-    @property
-    def state_method(self) -> StateMethod:
-        """How `save_state` keeps the state: serialised by the FMU, or by replaying the recorded inputs."""
-        wanted = self._binding.binding.state
-        if wanted != "auto":
-            return wanted
-        able = self._description.can_get_and_set_state and self._description.can_serialise_state
-        # A state in model exchange would have to hold our solver as well.
-        return "serialised" if able and self._description.interface == "co-simulation" else "replay"
+        return self._start_time + self.step_index * self._interval
 
     @property
     def log(self) -> tuple[tuple[str, str], ...]:
         """The last messages of the FMU, oldest first: status and text."""
         self._collect_log()
         return tuple(self._log)
-
-    @property
-    def reset_trial(self) -> ResetTrial:
-        """Whether the FMU's own reset works, which is seen at the first reset after a flight."""
-        return self._housing.reset_trial
 
     @property
     def worker_process_id(self) -> int | None:
@@ -127,11 +95,6 @@ class OpenedFmu:
         instance = self._housing.instance
         return instance.memory if isinstance(instance, WorkerInstance) and not instance.lost else None
 
-    @property
-    def recorded_units(self) -> dict[str, str]:
-        """Units of `Observation.extra` by name."""
-        return dict(self._exchange.recorded_units)
-
     def input_range(self, role: str, name: str) -> tuple[float, float]:
         """Return the range of an input in the binding's unit: that of the FMU and of the binding together.
 
@@ -140,7 +103,9 @@ class OpenedFmu:
         BindingError
             If the binding has no such input.
         """
-        return self._exchange.input_range(role, name)
+        slot = self._exchange.slot(role, name)
+        low, high = sorted(slot.conversion.from_fmu(end) for end in (slot.low, slot.high))
+        return low, high
 
     def check_parameters(self, parameters: Values) -> None:
         """See whether parameters could be set, without setting them.
@@ -161,9 +126,7 @@ class OpenedFmu:
             self.reset()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -193,8 +156,7 @@ class OpenedFmu:
         """
         check_roles(inputs)
         if parameters is not None:
-            self._settings = self._exchange.settings(parameters)
-            self._parameters = plain_values(parameters)
+            self._set_parameters(parameters)
         self._start_anew(inputs)
 
     def renew(self, **inputs: Unpack[Inputs]) -> None:
@@ -234,18 +196,19 @@ class OpenedFmu:
         BindingError, FmuInputError
             If a parameter is unknown or lies outside its range.
         """
-        other = type(self).__new__(type(self))
-        other.__dict__.update(self.__dict__)
+        other = copy(self)
         other._housing = self._housing.sibling()
-        other._phase, other._index = "new", 0
+        other._phase, other.step_index = "new", 0
         other._record, other._start_inputs = [], b""
         other._log = deque(maxlen=_LOG_LENGTH)
         if parameters is not None:
-            other._settings = other._exchange.settings(parameters)
-            other._parameters = plain_values(parameters)
+            other._set_parameters(parameters)
         return other
 
     # ------------------------------------------------------------------ inside
+
+    def _set_parameters(self, parameters: Values) -> None:
+        self._settings, self._parameters = self._exchange.settings(parameters), plain_values(parameters)
 
     def _start_anew(self, inputs: Mapping[str, Any], *, renewed: bool = False) -> None:
         start = self._exchange.start_values(inputs)
@@ -255,19 +218,20 @@ class OpenedFmu:
     def _begin(self, request: list[float], *, with_inputs: bool, renewed: bool = False) -> None:
         if self._lines:
             request[-self._lines :] = request[2 : 2 + self._lines]
-        start = Start(self._start_time, self._step_size, self._settings, request, with_inputs)
+        start = Start(self._start_time, self._settings, request, with_inputs)
         try:
             instance = self._housing.start(start, renewed=renewed)
             self._adopt(instance)
         except FmuError as error:
             self.close()
             self._fail(error, "the start")
-        self._index = 0
+        self.step_index = 0
         self._record = []
         self._start_inputs = bytes(instance.request)[16:] if with_inputs else b""
         self._phase = "ready"
 
     def _adopt(self, instance: Instance) -> None:
+        self._instance = instance
         self._request = memoryview(instance.request).cast("B").cast("d")
         self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
 
@@ -284,19 +248,15 @@ class OpenedFmu:
 
         Where a step gives a whole array that was resized, its start values need not fit.
         """
-        if self._phase == "ready" and self._housing.instance is not None:
-            return self._housing.instance
         if self._phase == "broken":
             raise FmuStateError("A state could not be restored; reset the asset to go on.")
         if self._phase == "closed":
             raise FmuStateError("The asset is closed; reset it to start anew.")
         if self._phase == "new":
             # Without them: what keeps its start values, and lines, which begin at them.
-            known = given if self._binding.binding.structural_parameters and not self._lines else None
+            known = given if self.binding.binding.structural_parameters and not self._lines else None
             self._begin(self._exchange.start_values(known or {}), with_inputs=False)
-        instance = self._housing.instance
-        assert instance is not None
-        return instance
+        return self._instance
 
     def _observation(self) -> Observation:
         self._refuse_not_finite()
@@ -304,12 +264,14 @@ class OpenedFmu:
 
     def _refuse_not_finite(self, which: str = "") -> None:
         # The sum of squares is as fast as can be, and can be infinite for large values too.
-        if not math.isfinite(self._reply.dot(self._reply)) and (
-            bad := self._exchange.not_finite(self._reply)
-        ):
+        if math.isfinite(self._reply.dot(self._reply)):
+            return
+        finite = np.isfinite(self._reply).tolist()
+        bad = [name for name, good in zip(self._exchange.output_names, finite, strict=False) if not good]
+        if bad:
             more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
             raise FmuOutputError(
-                f"The FMU {self._description.path} gave values that are not finite at t = {self.time:g} s: "
+                f"The FMU {self.description.path} gave values that are not finite at t = {self.time:g} s: "
                 f"{', '.join(bad[:5])}{more}. Its inputs or its step size are probably beyond what it can "
                 f"compute; reset the asset or restore a state to go on.{which}",
                 [text for _, text in self.log[-5:]],
@@ -319,16 +281,15 @@ class OpenedFmu:
         instance = self._housing.instance
         if instance is not None and not instance.lost:
             for status, text in instance.take_log():
-                name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
-                self._log.append((name, text))
+                self._log.append((status_name(status), text))
 
     def _fail(self, error: FmuError, what: str) -> NoReturn:
         """Raise the error with the FMU's file and the moment, and keep its messages."""
         self._log.extend(("Error", message) for message in error.messages)
-        if isinstance(error, FmuCallError | FmuWorkerError | FmuStateError | FmuMemoryError | TimeoutError):
-            tool = what == "the start" and self._description.needs_tool
+        if isinstance(error, RuntimeError | TimeoutError):  # the others are about what was asked
+            tool = what == "the start" and self.description.needs_tool
             hint = " It declares that it needs its authoring tool on this machine." if tool else ""
             raise type(error)(
-                f"{self._description.path}, {what}: {error.sentence}{hint}", error.messages, error.time
+                f"{self.description.path}, {what}: {error.sentence}{hint}", error.messages, error.time
             ) from error
         raise error

@@ -12,12 +12,11 @@ import weakref
 from array import array
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.archive.fmu_file import extract_fmu
@@ -25,7 +24,7 @@ from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances import open_instance
 from fmu_asset.instances.base import FmuInstance, forget_modules
-from fmu_asset.instances.plan import Instance, Plan, Settings
+from fmu_asset.instances.plan import Floats, Instance, Plan, Settings
 from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 
@@ -38,8 +37,8 @@ class Start:
 
     Attributes
     ----------
-    time, step_size : float
-        Start time, and size of a communication step [s].
+    time : float
+        Start time [s].
     settings : Settings
         What is set before initialisation.
     request : list of float
@@ -49,7 +48,6 @@ class Start:
     """
 
     time: float
-    step_size: float
     settings: Settings
     request: list[float]
     with_inputs: bool
@@ -74,37 +72,14 @@ class Way(IntEnum):
     LOADING = 2
 
 
-@dataclass(frozen=True)
-class FirstStep:
-    """The first step of a flight.
-
-    Attributes
-    ----------
-    start : Start
-        How the instance was started.
-    request : bytes
-        The request block of the step.
-    reply : (n,) ndarray
-        The outputs after it.
-    """
-
-    start: Start
-    request: bytes
-    reply: npt.NDArray[np.float64]
-
-    def again(self, instance: Instance) -> npt.NDArray[np.float64]:
-        """Return the outputs (n,) of an instance that is started and asked alike."""
-        self.start.make(instance)
-        memoryview(instance.request).cast("B")[:] = self.request
-        instance.step()
-        return np.array(instance.reply)
-
-
+@dataclass
 class ResetTrial:
     """Whether the reset of an FMU can be believed; shared by all assets of one opening.
 
     Attributes
     ----------
+    comparable : bool
+        Whether there are other instances to compare one with, and they begin alike.
     works : bool or None
         None as long as nothing has shown it.
     fault : str
@@ -113,25 +88,35 @@ class ResetTrial:
         Whether it returns OK and does nothing of use.
     way : Way
         The fastest way to start again that has shown no difference.
-    first : FirstStep or None
-        Of the first instance; None as long as it has made none.
-    comparable : bool
-        Whether there are other instances to compare one with, and they begin alike.
+    first : (Start, bytes), optional
+        How the first instance was started, and the request block of its first step.
+    reply : (n,) ndarray
+        The outputs after that step.
     """
 
-    def __init__(self, *, comparable: bool = True) -> None:
-        self.works: bool | None = None
-        self.fault = ""
-        self.lies, self.comparable = False, comparable
-        self.way = Way.RESET
-        self.first: FirstStep | None = None
+    comparable: bool = True
+    works: bool | None = None
+    fault: str = ""
+    lies: bool = False
+    way: Way = Way.RESET
+    first: tuple[Start, bytes] | None = None
+    reply: Floats = field(default_factory=lambda: np.empty(0))
+
+    def first_step(self, instance: Instance) -> Floats:
+        """Return the outputs (n,) of an instance that is started and asked as the first one."""
+        assert self.first is not None
+        start, request = self.first
+        start.make(instance)
+        memoryview(instance.request).cast("B")[:] = request
+        instance.step()
+        return np.array(instance.reply)
 
     def refused(self) -> None:
         """Remember that the FMU has no reset."""
         self.works, self.way = False, Way.RENEWAL
         self.fault = "It cannot be reset; every start takes a new instance."
 
-    def agrees(self, path: Path, way: Way, reply: npt.NDArray[np.float64]) -> bool:
+    def agrees(self, path: Path, way: Way, reply: Floats) -> bool:
         """Return whether a start can be believed; if not, say it once and turn to the next way for good.
 
         Parameters
@@ -143,8 +128,7 @@ class ResetTrial:
         reply : (n,) ndarray
             Outputs after the first step, which was asked as that of `first`.
         """
-        assert self.first is not None
-        true = self.first.reply
+        true = self.reply
         different = ~((reply == true) | (np.isnan(reply) & np.isnan(true)))
         if not different.any():
             if way == Way.RESET:
@@ -161,13 +145,12 @@ class ResetTrial:
             f"{what} (an output is {reply[at]:.9g} where that of a new instance is {true[at]:.9g}); "
             f"every start takes a new {instead} instead.{doubted}"
         )
-        if (path, way) not in _doubted:
+        if (path, way) not in _said:
             _logger.warning("%s: %s", path, self.fault)
-            _doubted.add((path, way))
+            _said.add((path, way))
         return False
 
 
-_doubted: set[tuple[Path, Way]] = set()
 _FAULTS = {
     Way.RESET: ("Its reset returns OK and does not bring it back to its start", "instance"),
     Way.RENEWAL: ("Another instance in the same process does not begin as the first one did", "process"),
@@ -175,7 +158,8 @@ _FAULTS = {
 
 
 _logger = logging.getLogger(__name__)
-_said: set[str] = set()
+_said: set[object] = set()
+"""What was warned of once already."""
 
 
 class Extraction:
@@ -261,7 +245,7 @@ class Housing:
         start.make(instance)
         return instance
 
-    def contradicted(self, request: bytes, reply: npt.NDArray[np.float64]) -> Instance | None:
+    def contradicted(self, request: bytes, reply: Floats) -> Instance | None:
         """Return another instance at its start if a flight's first step is not that of a new instance.
 
         Parameters
@@ -280,12 +264,10 @@ class Housing:
         if start is None or not trial.comparable:
             return None
         if trial.first is None:
-            trial.first = FirstStep(start, request, np.array(reply))
-        elif (start, request) == (trial.first.start, trial.first.request) and not trial.agrees(
-            self._description.path, self._way, reply
-        ):
-            return self.start(start)
-        return None
+            trial.first, trial.reply = (start, request), np.array(reply)
+            return None
+        same = (start, request) != trial.first or trial.agrees(self._description.path, self._way, reply)
+        return None if same else self.start(start)
 
     def renew(self) -> Instance:
         """Free the instance and return another one, in the same process.
@@ -314,7 +296,7 @@ class Housing:
                 instance = again()
                 if trial.first is None:
                     return instance
-                if trial.agrees(self._description.path, self._way, trial.first.again(instance)):
+                if trial.agrees(self._description.path, self._way, trial.first_step(instance)):
                     return again()
         self._way = Way.LOADING
         return self._another()

@@ -1,7 +1,7 @@
 """The state of an asset as bytes: what a mission's checkpoint keeps of an FMU, or of several."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -92,15 +92,15 @@ class SavedState(PackedState):
     inputs: bytes
     outputs: bytes
 
-    def refuse_other_outputs(self, outputs: bytes, name_of: Callable[[int], str]) -> None:
+    def refuse_other_outputs(self, outputs: bytes, names: Sequence[str]) -> None:
         """Refuse a restored FMU that does not give the outputs that it gave when it was saved.
 
         Parameters
         ----------
         outputs : bytes
             What it gives now, as doubles.
-        name_of : callable
-            Name of an output by its position.
+        names : sequence of str
+            Names of the outputs.
 
         Raises
         ------
@@ -121,6 +121,6 @@ class SavedState(PackedState):
                 '`state = "replay"` into the table [binding] of its binding'
             )
         raise FmuStateError(
-            f"After the state was restored the FMU gives {name_of(which)} = {float(now[which])!r} instead of "
+            f"After the state was restored the FMU gives {names[which]} = {float(now[which])!r} instead of "
             f"{float(then[which])!r}: {cause}."
         )

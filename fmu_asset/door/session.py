@@ -8,11 +8,10 @@ from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateErro
 from fmu_asset.instances.plan import Floats, Instance
 from reporting.progress import Progress, SilentProgress, Stage
 
-from .exchange import Values, plain_values
+from .exchange import Histories, Values, plain_values
+from .layout import Observation, ObservationHistory
 from .life import OpenedFmu
-from .reading import Observation, ObservationHistory
 from .saved_state import SavedState
-from .simulation import Histories, request_rows
 
 _BLOCK_BYTES = 2**20
 """Of the requests or replies that are sent in one message."""
@@ -39,6 +38,21 @@ class FmiAsset(OpenedFmu):
         Limit of the worker's resident memory [MiB]; that of the binding, or 4096.
     parameters : mapping of str to float, optional
         Parameters by the binding's names and in its units; they are set at every reset that gives no others.
+
+    Attributes
+    ----------
+    description : FmuDescription
+        What the FMU declares.
+    binding : Binding
+        The binding, with arrays that are observed or recorded as their elements.
+    step_index : int
+        Number of steps since the last reset.
+    state_method : {"serialised", "replay"}
+        How `save_state` keeps the state: serialised by the FMU, or by replaying the recorded inputs.
+    reset_trial : ResetTrial
+        Whether the FMU's own reset works, which is seen at the first reset after a flight.
+    recorded_units : dict of str to str
+        Units of `Observation.extra` by name.
 
     Raises
     ------
@@ -86,7 +100,7 @@ class FmiAsset(OpenedFmu):
         instance = self._opened(inputs)
         request = self._request
         before = request.tobytes()
-        begin = self._start_time + self._index * self._interval
+        begin = self._start_time + self.step_index * self._interval
         if self._lines:
             request[-self._lines :] = request[2 : 2 + self._lines]
         try:
@@ -94,13 +108,13 @@ class FmiAsset(OpenedFmu):
             request[0] = begin
             request[1] = self._step_size
             instance.step()
-            while not self._index and (other := self._stand_in(request.tobytes(), self._reply)) is not None:
+            while not self.step_index and (other := self._stand_in(request.tobytes(), self._reply)):
                 other.step()
         except FmuError as error:
             self._request.cast("B")[:] = before
-            self._fail(error, f"step {self._index} from t = {begin:g} s")
-        self._index += 1
-        if self._recording:
+            self._fail(error, f"step {self.step_index} from t = {begin:g} s")
+        self.step_index += 1
+        if self.state_method == "replay":
             self._record.append(request.tobytes()[16:])
         return self._observation()
 
@@ -166,8 +180,8 @@ class FmiAsset(OpenedFmu):
         """
         roles = {"control": control, "health": health, "load": load, "port": port}
         self._opened(roles)
-        rows = request_rows(self._exchange, np.array(self._request), roles, steps)
-        index = np.arange(self._index, self._index + len(rows) + 1)
+        rows = self._exchange.rows(np.array(self._request), roles, steps)
+        index = np.arange(self.step_index, self.step_index + len(rows) + 1)
         moments = np.asarray(self._start_time + index * self._interval, dtype=np.float64)
         rows[:, 0], rows[:, 1] = moments[:-1], self._step_size
         if self._lines:
@@ -176,12 +190,12 @@ class FmiAsset(OpenedFmu):
             rows[1:, -self._lines :] = rows[:-1, moving]
         replies = np.full((len(rows), len(self._reply)), np.nan)
         with (progress or SilentProgress()).stage("Simulating", total=len(rows), unit="steps") as stage:
-            begin = self._index
+            begin = self.step_index
             length = max(1, _BLOCK_BYTES // max(rows[0].nbytes, replies[0].nbytes))
             for first in range(0, len(rows), length):
                 ended = self._run(rows[first : first + length], replies[first : first + length], stage)
                 if ended is not None:
-                    made = self._index - begin
+                    made = self.step_index - begin
                     if ended.time is not None and ended.time > moments[made]:
                         # A part of the step was made, or all of it.
                         moments[made + 1], made = ended.time, made + 1
@@ -196,7 +210,7 @@ class FmiAsset(OpenedFmu):
 
         Return how the FMU has ended its simulation, if it has.
         """
-        before, begin, made = np.array(self._request), self._index, 0
+        before, begin, made = np.array(self._request), self.step_index, 0
 
         def report(done: int) -> None:
             nonlocal made
@@ -216,14 +230,14 @@ class FmiAsset(OpenedFmu):
                 if made and not begin and (instance := self._stand_in(rows[0].tobytes(), replies[0])):
                     report(0)
         finally:
-            self._index += made
+            self.step_index += made
             self._request[:] = (rows[made - 1] if made else before).data
-            if self._recording:
+            if self.state_method == "replay":
                 self._record += [row[2:].tobytes() for row in rows[:made]]
         if isinstance(failure, FmuEndedError):
             return failure
         if failure is not None:
-            self._fail(failure, f"step {self._index} from t = {self.time:g} s")
+            self._fail(failure, f"step {self.step_index} from t = {self.time:g} s")
         self._reply[:] = replies[made - 1]
         self._refuse_not_finite(f" It was step {begin + made - 1}.")
         return None
@@ -252,11 +266,11 @@ class FmiAsset(OpenedFmu):
         FmuCallError
             If the FMU fails to save.
         """
-        if self._phase != "ready" or self._housing.instance is None:
+        if self._phase != "ready":
             raise FmuStateError("There is no state to save before the first reset or step.")
         if self.state_method == "serialised":
             try:
-                body = self._housing.instance.save()
+                body = self._instance.save()
             except FmuCallError as error:
                 hint = 'If it cannot save its state, write `state = "replay"` into [binding] of its binding.'
                 self._fail(FmuCallError(f"{error.sentence} {hint}", error.messages), "saving the state")
@@ -266,13 +280,13 @@ class FmiAsset(OpenedFmu):
             body = b"".join(self._record)
         return SavedState(
             method=self.state_method,
-            fmu=self._description.sha256,
-            index=self._index,
+            fmu=self.description.sha256,
+            index=self.step_index,
             step_size=self._interval,
             start_time=self._start_time,
             parameters=self._parameters,
             start_inputs=self._start_inputs,
-            inputs=bytes(self._housing.instance.request)[16:],
+            inputs=bytes(self._instance.request)[16:],
             outputs=self._outputs_now(),
             body=body,
         ).to_bytes()
@@ -292,30 +306,26 @@ class FmiAsset(OpenedFmu):
         width = 8 * self._exchange.plan.input_count
         self._refuse_foreign(saved, width)
         replayed = saved.method == "replay"
-        ready = (
-            self._phase == "ready" and self._housing.instance is not None and not self._housing.instance.lost
-        )
+        ready = self._phase == "ready" and not self._instance.lost
         same = (plain_values(saved.parameters), saved.start_inputs) == (self._parameters, self._start_inputs)
         # An instance that was initialised in the same way takes the state as it is: what an ensemble needs.
         if replayed or not (ready and same):
-            self._settings = self._exchange.settings(saved.parameters)
-            self._parameters = plain_values(saved.parameters)
+            self._set_parameters(saved.parameters)
             # Arrays that were resized may have no start values: zeros keep their place, and are not sent.
-            empty = bytes(width) if self._binding.binding.structural_parameters else b""
+            empty = bytes(width) if self.binding.binding.structural_parameters else b""
             held = np.frombuffer(saved.start_inputs or empty).tolist()
             start = [0.0, 0.0, *held] if held else self._exchange.start_values({})
             self._begin(start, with_inputs=bool(saved.start_inputs))
-        instance = self._housing.instance
-        assert instance is not None
+        instance = self._instance
         try:
             if replayed:
                 for index in range(saved.index):
                     self._replay(saved.body[index * width : (index + 1) * width])
             else:
                 instance.restore(saved.body)
-                self._index = saved.index
-            memoryview(instance.request).cast("B")[16:] = saved.inputs
-            saved.refuse_other_outputs(self._outputs_now(), self._exchange.output_name)
+                self.step_index = saved.index
+            self._request.cast("B")[16:] = saved.inputs
+            saved.refuse_other_outputs(self._outputs_now(), self._exchange.output_names)
         except FmuError as error:
             self._phase = "broken"
             self._fail(error, "restoring the state")
@@ -343,9 +353,9 @@ class FmiAsset(OpenedFmu):
 
     def _refuse_foreign(self, saved: SavedState, width: int) -> None:
         """Refuse a state of another FMU or binding; the inputs of one step have `width` bytes."""
-        if saved.fmu != self._description.sha256:
+        if saved.fmu != self.description.sha256:
             raise FmuStateError(
-                f"The state was saved with another FMU than {self._description.path} (its hash differs); use "
+                f"The state was saved with another FMU than {self.description.path} (its hash differs); use "
                 "that one."
             )
         if (saved.step_size, saved.start_time) != (self._interval, self._start_time):
@@ -361,17 +371,13 @@ class FmiAsset(OpenedFmu):
             )
 
     def _replay(self, inputs: bytes) -> None:
-        instance = self._housing.instance
-        assert instance is not None
-        instance.request[0], instance.request[1] = self.time, self._step_size
-        memoryview(instance.request).cast("B")[16:] = inputs
-        instance.step()
-        self._index += 1
+        self._request[0], self._request[1] = self.time, self._step_size
+        self._request.cast("B")[16:] = inputs
+        self._instance.step()
+        self.step_index += 1
         self._record.append(inputs)
 
     def _outputs_now(self) -> bytes:
         """Return the outputs of this moment as the FMU gives them."""
-        instance = self._housing.instance
-        assert instance is not None
-        instance.read()
-        return bytes(instance.reply)
+        self._instance.read()
+        return self._reply.tobytes()

@@ -16,7 +16,7 @@ def open_instance(plan: Plan) -> "FmuInstance":
     FmuCallError
         If the binary cannot be loaded or the instance cannot be made.
     """
-    if plan.interface == "model-exchange":
+    if plan.fmu.interface == "model-exchange":
         # Its solver is a library of its own; those who do not need it shall not load it.
         from .model_exchange import ModelExchange
 

@@ -4,21 +4,22 @@ The worker process runs this; `FmiAsset` runs it directly when it is told not to
 """
 
 import ctypes
+import itertools
 import os
 import sys
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from contextlib import chdir, contextmanager
 from typing import Any, ClassVar
 
+from fmpy import calloc, fmi1, fmi2, free
 from fmpy.fmi1 import FMICallException
+from fmpy.logging import addLoggerProxy
 
-from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, FmuWorkerError
+from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, FmuWorkerError, visible
 
-from .block import Lines, exchanged, prepared
-from .messages import Mailbox, callbacks
-from .plan import Group, Instance, Plan, Settings
+from .plan import Group, Instance, Lines, Plan, Settings, exchanged, prepared
 
 STATUS_NAMES = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 OK, WARNING, DISCARD, ERROR, FATAL, PENDING = range(6)
@@ -29,6 +30,39 @@ Calls = list[tuple[str, Callable[[], int], Callable[[], object] | None]]
 """Name of the function, the prepared call, and what converts the values before or after it, if needed."""
 
 
+# ---------------------------------------------------------------------- what FMUs log
+
+_LONGEST_LOG = 1000
+
+# fmpy's native proxy, which formats the messages of C FMUs, knows one logger in a process.
+_logging: "dict[bytes, FmuInstance]" = {}
+_instance_numbers = itertools.count(1)
+
+
+def _log(_: object, instance_name: bytes, status: int, category: bytes, message: bytes) -> None:
+    instance = _logging.get(instance_name or b"")
+    if instance is not None:
+        instance.log(None, status, category, message)
+
+
+_MODULES = {1: fmi1, 2: fmi2}
+_LOGGERS = {1: fmi1.fmi1CallbackLoggerTYPE(_log), 2: fmi2.fmi2CallbackLoggerTYPE(_log)}
+
+
+def callbacks(fmi_version: int) -> Any:
+    """Return new callbacks for FMI 1 or 2, whose logger knows all instances."""
+    module, name = _MODULES[fmi_version], f"fmi{fmi_version}Callback"
+    given = getattr(module, f"{name}Functions")()  # what is not said, such as `stepFinished`, is none
+    given.logger = _LOGGERS[fmi_version]
+    given.allocateMemory = getattr(module, f"{name}AllocateMemoryTYPE")(calloc)
+    given.freeMemory = getattr(module, f"{name}FreeMemoryTYPE")(free)
+    addLoggerProxy(ctypes.byref(given))
+    return given
+
+
+# ---------------------------------------------------------------------- an instance
+
+
 class FmuInstance(Instance):
     """One instance in this process; subclasses speak the interfaces, and the table of classes the versions.
 
@@ -37,11 +71,18 @@ class FmuInstance(Instance):
     plan : Plan
         What is exchanged.
 
+    Attributes
+    ----------
+    messages : deque of (int, str)
+        The last ones that the FMU has logged and nobody has taken yet: status and text.
+
     Raises
     ------
     FmuCallError
         If the binary cannot be loaded or the instance cannot be made.
     """
+
+    # Wherever the FMU or fmpy goes, `chdir(".")` comes back to the working directory.
 
     classes: ClassVar[dict[int, type[Any]]]
     """fmpy's class for each FMI version: that of FMI 2, or one with its methods."""
@@ -51,19 +92,21 @@ class FmuInstance(Instance):
         # Communication point and step size of a step, where they stand in the request.
         self._begin = ctypes.c_double.from_buffer(self.request, 0)
         self._size = ctypes.c_double.from_buffer(self.request, 8)
-        self._plan, self._version = plan, plan.fmi_version
+        self._plan, self._version = plan, plan.fmu.major_version
         self._prefix = "fmi" if self._version == 1 else f"fmi{self._version}"
         self._lines = Lines(self.request, plan) if plan.linear_count else None
-        self._mailbox = Mailbox(plan.instance_name)
+        self._name = f"{plan.instance_name}-{os.getpid()}-{next(_instance_numbers)}"
+        self.messages: deque[tuple[int, str]] = deque(maxlen=_LONGEST_LOG)
+        self._errors = 0
+        _logging[self._name.encode()] = self
         self._ended: float | None = None
         self._phase = "instantiated"
-        with _guarded_directory():
+        with chdir("."):
             try:
                 self._fmu = self._instantiated()
             except Exception as error:
-                messages = self._texts()
-                self._mailbox.close()
-                raise FmuCallError(_why_not_instantiated(error), messages) from error
+                _logging.pop(self._name.encode())
+                raise FmuCallError(_why_not_instantiated(error), self._texts()) from error
         for function in vars(self._fmu.dll).values():
             # fmpy lets negative statuses pass.
             if getattr(function, "restype", None) is ctypes.c_int:
@@ -75,15 +118,15 @@ class FmuInstance(Instance):
 
     def _instantiated(self) -> Any:
         """Return fmpy's object, instantiated."""
-        plan, mailbox = self._plan, self._mailbox
+        plan = self._plan
         fmu = self.classes[self._version](
-            guid=plan.guid,
-            modelIdentifier=plan.model_identifier,
+            guid=plan.fmu.guid,
+            modelIdentifier=plan.fmu.model_identifier,
             unzipDirectory=plan.folder,
-            instanceName=mailbox.name,
+            instanceName=self._name,
         )
         if self._version == 3:
-            fmu.instantiate(loggingOn=True, logMessage=mailbox.log)
+            fmu.instantiate(loggingOn=True, logMessage=self.log)
         else:
             given = {"functions" if self._version == 1 else "callbacks": callbacks(self._version)}
             fmu.instantiate(loggingOn=True, **given)
@@ -141,13 +184,13 @@ class FmuInstance(Instance):
 
     def initialise(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
         """Set parameters, and inputs if wanted, and go to the first communication point."""
-        errors = self._mailbox.errors
+        errors = self._errors
         if self._lines is not None:
             self._lines.stand()
         with self._calls("initialisation"):
             self._start(start_time, parameters, with_inputs=with_inputs)
             self._phase = "stepping"
-        if self._mailbox.errors > errors:
+        if self._errors > errors:
             raise FmuCallError("The FMU refused its initialisation.", self._texts())
 
     def step(self) -> None:
@@ -202,7 +245,7 @@ class FmuInstance(Instance):
 
     def restore(self, content: bytes) -> None:
         """Restore a serialised FMU state."""
-        fmu, errors = self._fmu, self._mailbox.errors
+        fmu, errors = self._fmu, self._errors
         with self._calls("restoring the state"):
             state = fmu.deserializeFMUState(content)
             try:
@@ -210,7 +253,7 @@ class FmuInstance(Instance):
             finally:
                 fmu.freeFMUState(state)
         self._ended = None
-        if self._mailbox.errors > errors:
+        if self._errors > errors:
             raise FmuStateError("The FMU refused the state.", self._texts())
 
     def reset(self) -> None:
@@ -221,29 +264,32 @@ class FmuInstance(Instance):
             self._fmu.reset()
             self._phase, self._ended = "instantiated", None
 
-    @property
-    def has_log(self) -> bool:
-        """Whether the FMU has logged messages."""
-        return bool(self._mailbox.messages)
+    def log(self, _: object, status: int, category: bytes, message: bytes) -> None:
+        """Take a message of the FMU."""
+        self._errors += status in (ERROR, FATAL)
+        text = (message or b"").decode("utf-8", "replace").rstrip()
+        self.messages.append((int(status), visible(text)))
 
     def take_log(self) -> list[tuple[int, str]]:
         """Return and forget the messages that the FMU has logged: status and text."""
-        return self._mailbox.take()
+        messages = list(self.messages)
+        self.messages.clear()
+        return messages
 
     def close(self) -> None:
         """Free the instance; one that was lost to a fatal error is left alone, since freeing it can crash."""
-        self._mailbox.close()
+        _logging.pop(self._name.encode(), None)
         if self.lost:
             return
         self.lost = True
-        with _guarded_directory():
+        with chdir("."):
             self._free()
 
     # ------------------------------------------------------------------ inside
 
     def _prepared(self, name: str, *arguments: Any) -> Callable[[], int]:
         """Return a call of a C function of the instance such as SetReal, with C values."""
-        before = f"{self._plan.model_identifier}_" if self._version == 1 else ""
+        before = f"{self._plan.fmu.model_identifier}_" if self._version == 1 else ""
         function = getattr(self._fmu.dll, before + self._prefix + name)
         return prepared(function, ctypes.c_void_p.from_param(self._fmu.component), *arguments)
 
@@ -288,14 +334,13 @@ class FmuInstance(Instance):
     def _calls(self, what: str) -> Iterator[None]:
         if self.lost:
             raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
-        with _guarded_directory():
+        with chdir("."):
             try:
                 yield
             except FMICallException as error:
                 raise self._call_error(str(error.function), int(error.status), what) from error
 
     def _call_error(self, function: str, status: int, what: str) -> FmuCallError:
-        name = STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
         # What the standard still allows after an error is not worth the trouble: another instance is made.
         self.lost = self.lost or status != DISCARD
         after = {
@@ -303,10 +348,15 @@ class FmuInstance(Instance):
             ERROR: "its values are no longer to be trusted; reset the asset or restore a state",
             PENDING: "asynchronous steps are not supported; export it to step synchronously",
         }.get(status, "the instance is lost; reset the asset or restore a state")
-        return FmuCallError(f"{function} returned {name} in {what}: {after}.", self._texts())
+        return FmuCallError(f"{function} returned {status_name(status)} in {what}: {after}.", self._texts())
 
     def _texts(self) -> list[str]:
         return [text for _, text in self.take_log()][-_MESSAGES_IN_ERROR:]
+
+
+def status_name(status: int) -> str:
+    """Return what FMI calls a status."""
+    return STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
 
 
 def _refuse_negative(status: int, function: Any, arguments: tuple[Any, ...]) -> int:
@@ -341,13 +391,3 @@ def forget_modules(folder: str) -> None:
     for name, module in sys.modules.copy().items():
         if str(getattr(module, "__file__", None) or "").startswith(inside):
             sys.modules.pop(name, None)
-
-
-@contextmanager
-def _guarded_directory() -> Iterator[None]:
-    """Come back to the working directory, wherever the FMU or fmpy goes."""
-    here = Path.cwd()
-    try:
-        yield
-    finally:
-        os.chdir(here)

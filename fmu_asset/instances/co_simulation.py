@@ -10,8 +10,7 @@ from fmpy.fmi3 import FMU3Slave
 from fmu_asset.errors import FmuCallError
 
 from .base import ACCEPTED, DISCARD, OK, Calls, FmuInstance
-from .block import Lines
-from .plan import Plan
+from .plan import Lines, Plan
 
 _LAST_SUCCESSFUL_TIME, _TERMINATED = 2, 3
 """Of the enumeration `fmi2StatusKind`."""

@@ -1,10 +1,11 @@
-"""What an instance is asked, and what it exchanges with its FMU: plain values, sent to a worker."""
+"""What an instance is asked, and what it exchanges with its FMU: a plan, sent to a worker, and C calls."""
 
 import ctypes
 import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -45,6 +46,36 @@ class Group:
     linear: bool = False
 
 
+@dataclass(frozen=True, kw_only=True)
+class FmuIdentity:
+    """What an FMU declares that an instance of it has to know.
+
+    Attributes
+    ----------
+    fmi_version, guid, model_identifier : str
+        As declared; the identifier is that of `interface`.
+    interface : {"co-simulation", "model-exchange"}
+        How it is run.
+    states, event_indicators : int
+        Numbers of continuous states and event indicators (model exchange).
+    completed_step : bool
+        Whether it wants to hear of completed integrator steps (model exchange).
+    """
+
+    fmi_version: str = "2.0"
+    guid: str = ""
+    model_identifier: str = ""
+    interface: Interface = "co-simulation"
+    states: int = 0
+    event_indicators: int = 0
+    completed_step: bool = False
+
+    @property
+    def major_version(self) -> int:
+        """1, 2 or 3."""
+        return int(self.fmi_version[0])
+
+
 @dataclass(frozen=True)
 class Plan:
     """What an instance is and what it exchanges.
@@ -53,12 +84,10 @@ class Plan:
     ----------
     folder : str
         Where the FMU is extracted.
-    fmi_version : int
-        1, 2 or 3.
-    interface : {"co-simulation", "model-exchange"}
-        How the FMU is run.
-    guid, model_identifier, instance_name : str
-        As FMI wants them.
+    fmu : FmuIdentity
+        Which FMU it is.
+    instance_name : str
+        As FMI wants it.
     inputs, outputs : tuple of Group
         What is set and read at every step, in the order of the request and of the reply block.
     substeps : int
@@ -67,28 +96,18 @@ class Plan:
         Relative tolerance that the FMU is told.
     solver_tolerance : float
         Relative tolerance of our solver (model exchange).
-    states, event_indicators : int
-        Numbers of continuous states and event indicators (model exchange).
-    completed_step : bool
-        Whether the FMU wants to hear of completed integrator steps (model exchange).
     configuration : Settings
         Structural parameters (FMI 3), set before everything else.
     """
 
     folder: str
-    fmi_version: int
-    interface: Interface
-    guid: str
-    model_identifier: str
+    fmu: FmuIdentity
     instance_name: str
     inputs: tuple[Group, ...]
     outputs: tuple[Group, ...]
     substeps: int = 1
     tolerance: float | None = None
     solver_tolerance: float = SOLVER_TOLERANCE
-    states: int = 0
-    event_indicators: int = 0
-    completed_step: bool = False
     configuration: Settings = field(default_factory=list)
 
     @property
@@ -105,6 +124,134 @@ class Plan:
     def output_count(self) -> int:
         """Number of output values."""
         return sum(group.count for group in self.outputs)
+
+
+_C_TYPES: dict[str, Any] = {
+    "Real": ctypes.c_double, "Float64": ctypes.c_double, "Float32": ctypes.c_float, "Integer": ctypes.c_int,
+    **{name: getattr(ctypes, f"c_{name.lower()}") for bits in (8, 16, 32, 64)
+       for name in (f"Int{bits}", f"UInt{bits}")},
+}  # fmt: skip
+_BOOLEANS: dict[int, Any] = {1: ctypes.c_ubyte, 2: ctypes.c_int, 3: ctypes.c_bool}
+
+
+def values_of(block: Any) -> Floats:
+    """Return a ctypes array of doubles as an array that shares its memory."""
+    return np.frombuffer(memoryview(block).cast("B"))
+
+
+def exchanged(
+    fmi_version: int, group: Group, doubles: Any, begin: int, *, sent: bool
+) -> tuple[tuple[Any, ...], Callable[[], object] | None]:
+    """Return what a C function that sets or reads variables takes after the instance, and a conversion.
+
+    Parameters
+    ----------
+    fmi_version : int
+        1, 2 or 3.
+    group : Group
+        The variables, of one base type; enumerations are integers, see `FmuDescription.exchange_kind`.
+    doubles : ctypes array of double
+        The block of their values.
+    begin : int
+        Where the group begins in it.
+    sent : bool
+        Whether the values are set.
+
+    Returns
+    -------
+    tuple of (tuple, callable or None)
+        C values; what converts the numbers of the block before they are set, or into the block after they
+        are read: None where the FMU reads and writes the block itself.
+    """
+    kind = _BOOLEANS[fmi_version] if group.kind == "Boolean" else _C_TYPES[group.kind]
+    convert = None
+    if kind is ctypes.c_double and group.count:
+        values = (kind * group.count).from_buffer(doubles, 8 * begin)
+    else:
+        values = (kind * group.count)()
+        pair = [np.ctypeslib.as_array(values), values_of(doubles)[begin : begin + group.count]]
+        target, source = pair if sent else reversed(pair)
+        convert = partial(np.copyto, target, source, casting="unsafe")
+    length = len(group.references)
+    counts = [length, group.count] if fmi_version == 3 else [length]
+    first, *further = [ctypes.c_size_t.from_param(count) for count in counts]
+    references = ctypes.byref((ctypes.c_uint * length)(*group.references))
+    return (references, first, ctypes.byref(values), *further), convert
+
+
+# Without declared types ctypes passes C values as they are: a third of the time of a call that converts.
+_Function = ctypes.CFUNCTYPE(ctypes.c_int)
+
+
+def prepared(function: Any, *arguments: Any) -> Callable[[], int]:
+    """Return a call without arguments.
+
+    Parameters
+    ----------
+    function : C function
+        One that returns an FMI status.
+    *arguments
+        C values: results of `from_param` and `byref`, or objects such as `c_double`, whose value at the
+        moment of the call is passed. A Python number would not be of the right type.
+
+    Returns
+    -------
+    callable
+        Makes the call and returns its status.
+    """
+    address = ctypes.cast(function, ctypes.c_void_p).value
+    assert address is not None  # ctypes finds no function at 0
+    return partial(_Function(address), *arguments)
+
+
+_ROUNDING = 1e-12
+"""Of the step: what the moment of its end may lack."""
+
+
+class Lines:
+    """What the FMU is given within a step, of a request that says where each line begins and ends.
+
+    Parameters
+    ----------
+    request : ctypes array of double
+        The request block: time, step size, the inputs at the end of the step (those that move first), and
+        where they begin.
+    plan : Plan
+        What is exchanged.
+
+    Attributes
+    ----------
+    values : ctypes array of double
+        Time, step size, and the inputs of the moment.
+    slopes : ctypes array of double
+        Derivatives in time of the inputs that move.
+    """
+
+    def __init__(self, request: Any, plan: Plan) -> None:
+        count = plan.linear_count
+        self.values = (ctypes.c_double * (len(request) - count))()
+        self.slopes = (ctypes.c_double * count)()
+        self._request, self._all = values_of(request), values_of(self.values)
+        self._moving, self._slopes = self._all[2 : 2 + count], values_of(self.slopes)
+        self._end, self._begin = self._request[2 : 2 + count], self._request[-count:]
+        self._substeps, self._start, self._span = plan.substeps, 0.0, 1.0
+
+    def stand(self) -> None:
+        """Give the inputs of the request as they are, as in an initialisation."""
+        self._all[:] = self._request[: len(self._all)]
+
+    def aim(self) -> None:
+        """Take the lines of a new request, and give the inputs of its begin."""
+        self._start, self._span = self._request[0], self._request[1] * self._substeps
+        self._slopes[:] = (self._end - self._begin) / self._span
+        self.stand()
+        self._moving[:] = self._begin
+
+    def move(self, time: float) -> None:
+        """Give the inputs of a moment [s]; one that stays keeps its value to the bit, and so does the end."""
+        share = (time - self._start) / self._span
+        there = share >= 1.0 - _ROUNDING
+        self._moving[:] = self._end if there else self._begin + share * (self._end - self._begin)
 
 
 class Instance(Protocol):

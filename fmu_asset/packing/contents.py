@@ -13,8 +13,11 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distribution, version
 from importlib.resources import files
 from pathlib import Path
+from uuid import UUID
 
-from fmu_asset.description import PLACEHOLDER, Declaration, documentation_page, model_description, rendered
+from fmu_asset.archive.declared import BASE_UNITS
+from fmu_asset.description import PLACEHOLDER, Declaration, description_members, rendered
+from fmu_asset.door.units import meaning_of
 from fmu_asset.errors import FmuBuildError, FmuError
 from fmu_asset.slaves.variables import FmuVariable
 from reporting.files import atomic_write_bytes
@@ -43,8 +46,8 @@ class FmuInfo:
     ----------
     path : Path
         The file.
-    guid, content_hash, model_identifier : str
-        GUID (from the content hash), SHA-256 of the content, stem of the binary.
+    guid : str
+        GUID, from the content hash.
     design_hash : str
         Hash of the design that made the reduced model; empty where there is none.
     size : int
@@ -53,8 +56,6 @@ class FmuInfo:
 
     path: Path
     guid: str
-    content_hash: str
-    model_identifier: str
     design_hash: str
     size: int
 
@@ -84,29 +85,44 @@ def checked_target(
     return target
 
 
-def write_fmu(target: Path, content: bytes, content_hash: str, stem: str, design_hash: str = "") -> FmuInfo:
-    """Write the archive of an FMU, whole or not at all, and say what it is; `stem` is that of its binary."""
+def write_fmu(target: Path, packed: tuple[bytes, str], design_hash: str = "") -> FmuInfo:
+    """Write what `sealed` returned, whole or not at all, and say what it is."""
+    content, guid = packed
     atomic_write_bytes(target, content)
-    identifier = f"{stem}_{tag_of(content_hash)}"
-    return FmuInfo(target, guid_of(content_hash), content_hash, identifier, design_hash, len(content))
+    return FmuInfo(target, guid, design_hash, len(content))
 
 
 def check_start(table: Iterable[FmuVariable]) -> None:
     """Refuse start values outside their ranges; raises `FmuBuildError`."""
     for row in table:
-        if row.start is None:
-            continue
         low = -float("inf") if row.minimum is None else row.minimum
         high = float("inf") if row.maximum is None else row.maximum
-        if not low <= row.start <= high:
+        if row.start is not None and not low <= row.start <= high:
+            advice = "the reduced model; give another state or build a model with a wider range"
+            if row.variability == "tunable":
+                advice = "that number of an effect; correct the patch"
             raise FmuBuildError(
                 f"The start value {row.start:g} of {row.name} lies outside {low:g} to {high:g}, the range of "
-                + (
-                    "that number of an effect; correct the patch."
-                    if row.variability == "tunable"
-                    else "the reduced model; give another state or build a model with a wider range."
-                )
+                f"{advice}."
             )
+
+
+def units_of(table: Iterable[FmuVariable]) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
+    """Return the units of a table with their display units; see `Declaration`.
+
+    What a text does not say is left out: of a unit that is not understood no more than its name is told.
+    """
+    units: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
+    for row in table:
+        meaning, shown = meaning_of(row.unit or ""), meaning_of(row.display_unit or "")
+        base, displays = units.setdefault(row.unit, ({}, {})) if row.unit else ({}, {})
+        if meaning is not None:
+            base |= {symbol: n for symbol, n in zip(BASE_UNITS, meaning.exponents, strict=True) if n}
+            if meaning[1:] != (1.0, 0.0):
+                base |= {"factor": meaning.factor, "offset": meaning.offset}
+            if shown is not None and row.display_unit:
+                displays[row.display_unit] = meaning.factor / shown.factor
+    return units
 
 
 # ---------------------------------------------------------------- pythonfmu
@@ -122,11 +138,12 @@ def pythonfmu_version() -> str:
     """
     try:
         installed = version("pythonfmu")
-    except PackageNotFoundError as error:
-        raise FmuBuildError("Building an FMU needs pythonfmu; install the project's requirements.") from error
+    except PackageNotFoundError:
+        installed = "none"
     if installed != PYTHONFMU_VERSION:
         raise FmuBuildError(
-            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed} is installed."
+            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed} is installed; install the "
+            "project's requirements."
         )
     return installed
 
@@ -215,8 +232,7 @@ def python_members(
     names = {"module": module, "class_name": f"{class_name}{PLACEHOLDER}", "tag": PLACEHOLDER}
     tool = f"uav-twin with PythonFMU {pythonfmu_version()}"
     return {
-        "modelDescription.xml": model_description(declared, generation_tool=tool),
-        "documentation/index.html": documentation_page(declared, host),
+        **description_members(declared, generation_tool=tool, host=host),
         **{f"resources/{file}": content for file, content in resources.items()},
         f"resources/{module}.py": rendered("slave.py", **names),
         f"{runtime}/__init__.py": b'"""An FMU of uav-twin."""\n',
@@ -239,22 +255,15 @@ def content_hash_of(template: Mapping[str, bytes]) -> str:
     return digest.hexdigest()
 
 
-def tag_of(content_hash: str) -> str:
-    """Return what stands in names: the first characters of a content hash, as many as the placeholder has."""
-    return content_hash[: len(PLACEHOLDER)]
-
-
 def guid_of(content_hash: str) -> str:
     """Return the GUID that a content hash gives."""
-    h = content_hash
-    return f"{{{h[:8]}-{h[8:12]}-{h[12:16]}-{h[16:20]}-{h[20:32]}}}"
+    return f"{{{UUID(content_hash[:32])}}}"
 
 
 def sealed(
-    template: Mapping[str, bytes],
-    binaries: Callable[[dict[str, bytes], str], dict[str, bytes]] | None = None,
+    template: Mapping[str, bytes], binaries: Callable[[dict[str, bytes], str], dict[str, bytes]] | None = None
 ) -> tuple[bytes, str]:
-    """Return the archive of the files, tag and GUID in the place of the placeholder, and their content hash.
+    """Return the archive of the files, tag and GUID in the place of the placeholder, and the GUID.
 
     Parameters
     ----------
@@ -264,10 +273,10 @@ def sealed(
         Makes further files of these and of the tag; they are not part of the hash.
     """
     content_hash = content_hash_of(template)
-    tag = tag_of(content_hash)
-    members = exchanged(template, (PLACEHOLDER, PLACEHOLDER), (tag, guid_of(content_hash)))
+    tag, guid = content_hash[: len(PLACEHOLDER)], guid_of(content_hash)
+    members = exchanged(template, (PLACEHOLDER, PLACEHOLDER), (tag, guid))
     further = {} if binaries is None else binaries(members, tag)
-    return archive_bytes(members | further), content_hash
+    return archive_bytes(members | further), guid
 
 
 def exchanged(members: Mapping[str, bytes], old: tuple[str, str], new: tuple[str, str]) -> dict[str, bytes]:

@@ -33,8 +33,9 @@ from fe.runtime.patch import (
     Primitive,
     RunOffset,
 )
-from fe.runtime.sensors import check_channels, needs_structure
+from fe.runtime.sensors import check_channels
 from fmu_asset.errors import PatchFileError
+from fmu_asset.slaves.effects import output_channels
 from reporting.json_file import parse_json, read_json
 
 SCHEMA = "uav-twin patch 2"
@@ -91,17 +92,17 @@ class PatchFile:
         return PatchFile(tuple(effect for effect in rest if len(effect.patch)), self.channels)
 
     @property
-    def needs_arrays(self) -> bool:
-        """Whether an effect changes more than what sensors show, so that the FMU needs arrays for it."""
-        return needs_structure(self.patch)
+    def plain(self) -> list[dict[str, Any]]:
+        """`id` and `primitives` of each effect, as `fmu_asset.slaves.effects` takes them."""
+        return [{"id": name, "primitives": patch.to_list()} for name, patch in self.effects]
 
-    def for_outputs(self, outputs: Sequence[tuple[str, str]], where: str = "The patch") -> tuple[Effect, ...]:
-        """Return the effects with channels replaced by the outputs that they are.
+    def for_gauges(self, count: int, where: str = "The patch") -> PatchFile:
+        """Return the same with channels replaced by the outputs that they are.
 
         Parameters
         ----------
-        outputs : sequence of (str, str)
-            Name and quantity of the outputs that sensors may change.
+        count : int
+            Number of gauges of the wing.
         where : str
             What was read, for the error.
 
@@ -110,12 +111,12 @@ class PatchFile:
         PatchFileError
             If a channel is no such output, or a primitive has no meaning in an FMU.
         """
-        found = []
+        outputs, found = output_channels(count), []
         for name, patch in self.effects:
             label = f"{where}: the effect {name!r}"
             items = tuple(self._with_output(item, outputs, label) for item in patch)
             found.append(Effect(name, ModelPatch(items)))
-        return tuple(found)
+        return PatchFile(tuple(found), {})
 
     def _with_output(self, item: Primitive, outputs: Sequence[tuple[str, str]], where: str) -> Primitive:
         label = f"{where} has the primitive {item.kind!r}"

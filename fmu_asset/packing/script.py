@@ -11,12 +11,10 @@ two class attributes, both optional:
 The script runs once in this process, to be asked for its variables.
 """
 
-import importlib.util
 import os
-import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
+from runpy import run_path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
@@ -55,13 +53,11 @@ def build_script_fmu(
     FmuBuildError
         The file exists, the suffix is wrong, or the script cannot be packed; the sentence says why.
     """
-    target = checked_target(path, replace=replace)
-    content, content_hash = script_fmu(script)
-    return write_fmu(target, content, content_hash, Path(script).stem)
+    return write_fmu(checked_target(path, replace=replace), script_fmu(script))
 
 
 def script_fmu(script: str | os.PathLike[str]) -> tuple[bytes, str]:
-    """Return the archive of a script and its content hash; see `build_script_fmu`."""
+    """Return the archive of a script and its GUID; see `build_script_fmu`."""
     file = Path(script)
     if not file.stem.isidentifier() or file.suffix != ".py":
         raise FmuBuildError(
@@ -73,11 +69,6 @@ def script_fmu(script: str | os.PathLike[str]) -> tuple[bytes, str]:
     except OSError as error:
         raise FmuBuildError(f"The model script {file} cannot be read ({error.strerror or error}).") from error
     pythonfmu_version()
-    template = _members(file, source)
-    return sealed(template)
-
-
-def _members(file: Path, source: bytes) -> dict[str, bytes]:
     model = _model_class(file)
     module, name = f"{file.stem}_{PLACEHOLDER}", model.__name__
     runtime = f"resources/{module}_runtime"
@@ -87,9 +78,8 @@ def _members(file: Path, source: bytes) -> dict[str, bytes]:
         f"{runtime}/__init__.py": rendered("script_runtime.py"),
         f"{runtime}/model.py": source,
     }
-    return members | pythonfmu_members(
-        module, "resources/pythonfmu", ("__init__.py", "builder.py", "osutil.py", *BASE_CLASS_FILES)
-    )
+    names = ("__init__.py", "builder.py", "osutil.py", *BASE_CLASS_FILES)
+    return sealed(members | pythonfmu_members(module, "resources/pythonfmu", names))
 
 
 def _model_class(file: Path) -> type[Any]:
@@ -97,21 +87,13 @@ def _model_class(file: Path) -> type[Any]:
     from pythonfmu import Fmi2Slave
 
     name = f"_uav_twin_script_{file.stem}"
-    specification = importlib.util.spec_from_file_location(name, file)
-    assert specification is not None
-    assert specification.loader is not None
-    module: ModuleType = importlib.util.module_from_spec(specification)
-    kept = sys.dont_write_bytecode
-    sys.dont_write_bytecode = True  # nothing is left beside the user's script
     try:
-        specification.loader.exec_module(module)
+        content = run_path(str(file), run_name=name)  # which leaves nothing beside the user's script
     except Exception as error:
         raise FmuBuildError(f"The model script {file} cannot be run: {error!r}.") from error
-    finally:
-        sys.dont_write_bytecode = kept
     found = [
         item
-        for item in vars(module).values()
+        for item in content.values()
         if isinstance(item, type) and issubclass(item, Fmi2Slave) and item.__module__ == name
     ]
     if len(found) != 1:
@@ -125,27 +107,19 @@ def _model_class(file: Path) -> type[Any]:
 def _description(file: Path, model: type[Any], identifier: str) -> bytes:
     """Return pythonfmu's model description with units, ranges and initial unknowns, and without the time."""
     try:
-        instance = model(instance_name="description", resources=str(file.parent))
-        root: Element = instance.to_xml()
+        root: Any = model(instance_name="description", resources=str(file.parent)).to_xml()
     except Exception as error:
         raise FmuBuildError(f"{model.__name__} of {file} cannot be instantiated: {error!r}.") from error
-    root.set("modelName", file.stem)
-    root.set("guid", PLACEHOLDER)
-    root.set("generationTool", f"uav-twin with {root.get('generationTool')}")
+    tool = f"uav-twin with {root.get('generationTool')}"
+    root.attrib.update(modelName=file.stem, guid=PLACEHOLDER, generationTool=tool)
     root.attrib.pop("generationDateAndTime", None)
-    interface = root.find("CoSimulation")
-    assert interface is not None
+    interface, variables = root.find("CoSimulation"), root.find("ModelVariables")
     interface.set("modelIdentifier", identifier)
     units: Mapping[str, Mapping[str, Any]] = getattr(model, "unit_table", {})
-    table: Mapping[str, tuple[Any, ...]] = getattr(model, "variable_table", {})
     if units:
         root.insert(list(root).index(interface) + 1, _unit_definitions(file, units))
-    variables = root.find("ModelVariables")
-    assert variables is not None
-    _add_ranges(file, variables, table, units)
-    structure = root.find("ModelStructure")
-    assert structure is not None
-    unknowns = SubElement(structure, "InitialUnknowns")
+    _add_ranges(file, variables, getattr(model, "variable_table", {}), units)
+    unknowns = SubElement(root.find("ModelStructure"), "InitialUnknowns")
     for index, variable in enumerate(variables, 1):
         if variable.get("causality") == "output":
             SubElement(unknowns, "Unknown", index=str(index))
@@ -172,22 +146,16 @@ def _unit_definitions(file: Path, units: Mapping[str, Mapping[str, Any]]) -> Ele
 
 
 def _add_ranges(
-    file: Path, variables: Iterable[Element], table: Mapping[str, tuple[Any, ...]], units: Mapping[str, Any]
+    file: Path, variables: Any, table: Mapping[str, tuple[Any, ...]], units: Mapping[str, Any]
 ) -> None:
-    remaining = dict(table)
-    for variable in variables:
-        name = str(variable.get("name"))
-        row = remaining.pop(name, None)
-        if row is None:
-            continue
-        _, unit, low, high, _, _ = row
+    inner = {str(variable.get("name")): variable[0] for variable in variables}
+    for name, (_, unit, low, high, _, _) in table.items():
+        if name not in inner:
+            raise FmuBuildError(
+                f"The variable_table of {file} has {name}, which the model does not register."
+            )
         if unit is not None and unit not in units:
             raise FmuBuildError(f"{file} gives {name} in {unit}, which its unit_table does not have.")
-        inner = variable[0]
         for key, value in (("unit", unit), ("min", low), ("max", high)):
             if value is not None:
-                inner.set(key, value if isinstance(value, str) else repr(float(value)))
-    if remaining:
-        raise FmuBuildError(
-            f"The variable_table of {file} has {', '.join(remaining)}, which the model does not register."
-        )
+                inner[name].set(key, value if isinstance(value, str) else repr(float(value)))

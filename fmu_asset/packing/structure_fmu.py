@@ -10,20 +10,25 @@ import os
 import re
 import zipfile
 from collections.abc import Mapping, Sequence
-from typing import Literal, TypedDict, Unpack
+from dataclasses import replace as changed
+from typing import Any, Literal, TypedDict, Unpack
 
+from fe.runtime.errors import FiniteElementError
+from fe.runtime.patch import LocalStiffnessLoss, ModelPatch
 from fe.runtime.patch_arrays import PatchArrays
+from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
+from fe.runtime.sensors import needs_structure
 from fe.runtime.state import DigitalState
+from fe.runtime.transient import ModalIntegrator
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
-from fmu_asset.compiled.compiler import PLATFORM, Platform, compiler_for
+from fmu_asset.compiled.compiler import PLATFORM, Platform, find_compiler
 from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binaries_of, compiled_members
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.instances.plan import Interface
-from fmu_asset.slaves.effects import effect_rows, switch_of, units_of
+from fmu_asset.slaves.effects import effect_rows, switch_of
 from fmu_asset.slaves.table import is_wing, structure_table
-from fmu_asset.slaves.variables import UNITS, FmuVariable, Unit
 
 from .contents import (
     FmuInfo,
@@ -35,10 +40,10 @@ from .contents import (
     python_members,
     room_members,
     sealed,
+    units_of,
     write_fmu,
 )
 from .patch_file import PatchFile
-from .patched_runtime import output_channels, patched_members, plain_effects
 
 FmuKind = Literal["python", "compiled", "source"]
 """Run by Python, compiled for this machine, or the sources of the compiled one alone."""
@@ -51,7 +56,6 @@ _OF_A_STRUCTURE = (
     "Structure {}: strains, displacements, accelerations and modes from a reduced finite element model under "
     "its loads, with regions that can lose stiffness."
 )
-_ACCELERATION = Unit("m/s2", (("m", 1), ("s", -2)))
 
 
 class FmuOptions(TypedDict, total=False):
@@ -119,83 +123,96 @@ def build_fmu(
         If the FMU cannot carry an effect of the patch.
     """
     target = checked_target(path, replace=replace)
-    content, content_hash = fmu_bytes(model, **options)
-    return write_fmu(target, content, content_hash, stem_of(model), model.design_hash)
-
-
-def fmu_bytes(
-    model: ReducedModel,
-    state: DigitalState | None = None,
-    kind: FmuKind = "python",
-    *,
-    start: Mapping[str, float] | None = None,
-    note: str = "",
-    resources: Mapping[str, bytes] | None = None,
-    patch: PatchFile | None = None,
-    activate: bool = False,
-    arrays: PatchArrays | None = None,
-    fmi: FmiVersion = 2,
-    interface: Interface = "co-simulation",
-    platforms: Sequence[Platform] = (PLATFORM,),
-) -> tuple[bytes, str]:
-    """Return the archive and its content hash; see `build_fmu`."""
+    kind, fmi = options.get("kind", "python"), options.get("fmi", 2)
+    interface, platforms = options.get("interface", "co-simulation"), options.get("platforms", (PLATFORM,))
+    patch, state = options.get("patch"), options.get("state")
     check_form(kind, fmi, interface, patched=patch is not None, platforms=platforms)
-    values = start_values(model, state) if state is not None else {}
-    values |= {name: float(value) for name, value in (start or {}).items()}
+    values = {} if state is None else start_values(model, state)
+    values |= {name: float(value) for name, value in (options.get("start") or {}).items()}
     try:
         table, roles = structure_table(model, values)
     except ValueError as error:
         raise FmuBuildError(f"The FMU of the structure {model.name} cannot be built: {error}.") from error
-    effects = []
+    name, kept = stem_of(model), {}
     if patch is not None:
-        effects = plain_effects(patch.for_outputs(output_channels(model.gauge_count)))
-        values |= {switch_of(effect): float(activate) for effect in effects}
+        effects = patch.for_gauges(model.gauge_count).plain
+        values |= {switch_of(effect): float(options.get("activate", False)) for effect in effects}
         table += effect_rows(effects, len(table), values)
+        kept = _patched_members(model, effects, options.get("arrays"))
     check_start(table)
-    name, kept = stem_of(model), {} if not effects else patched_members(model, effects, arrays)
     description = _OF_THE_WING if is_wing(model) else _OF_A_STRUCTURE.format(model.name)
-    declared = Declaration(name, f"{description} {note}".strip(), table, _units(table))
+    declared = Declaration(name, f"{description} {options.get('note', '')}".strip(), table, units_of(table))
     if kind == "python":
-        template = kept | _python_members(model, declared, values)
+        resources = {
+            "reduced_model.npz": model.to_bytes(),
+            "start.json": (json.dumps(values, sort_keys=True, indent=1) + "\n").encode(),
+        }
+        imports = "from .slaves.behaviour import load_contents\n"
+        template = kept | python_members(declared, "Structure_", imports=imports, resources=resources)
+        template |= room_members("fe.runtime", f"resources/{declared.identifier}_runtime/fe")
     else:
         template = compiled_members(model, declared, roles, fmi=fmi, interface=interface)
-    for file, content in (resources or {}).items():
+    template[f"resources/{DESIGN_RECORD}"] = design_record(model.design_hash)
+    for file, content in (options.get("resources") or {}).items():
         if f"resources/{file}" in template or "/" in file or not file:
             raise FmuBuildError(f"A resource of an FMU cannot have the name {file!r}; choose another one.")
         template[f"resources/{file}"] = content
-    if kind != "compiled":
-        return sealed(template)
-    return sealed(template, lambda members, tag: binaries_of(members, f"{name}_{tag}", fmi, platforms))
+
+    def binaries(members: dict[str, bytes], tag: str) -> dict[str, bytes]:
+        return binaries_of(members, f"{name}_{tag}", fmi, platforms)
+
+    return write_fmu(target, sealed(template, binaries if kind == "compiled" else None), model.design_hash)
 
 
-def _python_members(
-    model: ReducedModel, declared: Declaration, values: Mapping[str, float]
+def _patched_members(
+    model: ReducedModel, effects: Sequence[dict[str, Any]], arrays: PatchArrays | None
 ) -> dict[str, bytes]:
-    return python_members(
-        declared,
-        "Structure_",
-        imports="from .slaves.behaviour import load_contents\n",
-        resources={
-            "reduced_model.npz": model.to_bytes(),
-            "start.json": (json.dumps(values, sort_keys=True, indent=1) + "\n").encode(),
-            DESIGN_RECORD: design_record(model.design_hash),
-        },
-    ) | room_members("fe.runtime", f"resources/{declared.identifier}_runtime/fe")
+    """Return the further files of an FMU that carries effects, by their names in the archive.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The wing.
+    effects : sequence of dict
+        As `PatchFile.plain` has them.
+    arrays : PatchArrays or None
+        The same wing in the basis for patches; needed where an effect is of more than sensors.
+
+    Raises
+    ------
+    PatchFileError
+        If the arrays are missing or are those of another wing, or the wing cannot carry an effect.
+    """
+    # The order of keys is that of the variables.
+    text = json.dumps(effects, indent=1, allow_nan=False)
+    members = {"resources/effects.json": f"{text}\n".encode()}
+    patch = ModelPatch.from_list([primitive for effect in effects for primitive in effect["primitives"]])
+    if not needs_structure(patch):
+        return members
+    if arrays is None:
+        raise PatchFileError(
+            "The patch changes structure or loads, for which the FMU needs the wing in the basis for "
+            "patches: give `arrays`, as `fe.reduction.model_cache.patch_arrays` returns them."
+        )
+    if arrays.design_hash != model.design_hash:
+        raise PatchFileError(
+            f"The wing for patches is of the design {arrays.design_hash[:12]}, and the reduced model of "
+            f"{model.design_hash[:12]}; make both of one design."
+        )
+    try:
+        ModalIntegrator(PatchedWing(arrays), model.nominal, *model.damping.tolist(), patch).modes  # noqa: B018
+    except FiniteElementError as cause:
+        raise PatchFileError(f"The wing cannot carry the patch: {cause}") from cause
+    if not len(patch.of(LocalStiffnessLoss)):  # strips, which only that needs, are most of the bytes
+        strips = ("strip_stiffness", "strip_of", "term_of")
+        arrays = changed(arrays, **{name: getattr(arrays, name)[:0] for name in strips})
+    return {**members, "resources/patch_arrays.npz": arrays.to_bytes()}
 
 
 def stem_of(model: ReducedModel) -> str:
     """Return the name of a structure as an identifier of C."""
     plain = re.sub(r"[^A-Za-z0-9]+", "_", model.name).strip("_")[:40]
     return plain if plain[:1].isalpha() else f"structure_{plain}".rstrip("_")
-
-
-def _units(table: tuple[FmuVariable, ...]) -> tuple[Unit, ...]:
-    """Return the units of the table; of a control's unit that is not known no more than its name is told."""
-    moving = any(row.unit == _ACCELERATION.name for row in table)
-    known = (*UNITS, *((_ACCELERATION,) if moving else ()), *units_of(table))
-    names = {unit.name for unit in known}
-    others = sorted({row.unit for row in table if row.unit is not None} - names)
-    return (*known, *(Unit(name) for name in others))
 
 
 def check_form(
@@ -233,7 +250,7 @@ def check_form(
             "patch."
         )
     for platform in platforms if kind == "compiled" else ():
-        compiler_for(platform)
+        find_compiler(platform)
 
 
 def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:

@@ -1,41 +1,23 @@
 """The one way from a wing design to its FMU: reduced, tailored to a calibration, with missing effects."""
 
 import os
-from collections.abc import Mapping
-from typing import Protocol, Unpack
+from typing import Unpack
 
 from fe.reduction.model_cache import patch_arrays, reduced_model
 from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.state import DigitalState
+from fe.runtime.sensors import needs_structure
 from fe.wing.design import WingDesign
-from reporting.progress import Progress, SilentProgress
+from reporting.progress import Progress
 
 from .contents import FmuInfo
 from .patch_file import PatchFile
 from .structure_fmu import FmuOptions, build_fmu
 
 
-class Tailoring(Protocol):
-    """What an FMU takes of the calibration of a wing; `calibration.result.plain` makes it."""
-
-    @property
-    def state(self) -> DigitalState:
-        """Start values of parameters and health."""
-
-    @property
-    def note(self) -> str:
-        """A sentence for the description."""
-
-    @property
-    def resources(self) -> Mapping[str, bytes]:
-        """Files that say what the wing was calibrated with, by name."""
-
-
 def pack_wing(
     design: WingDesign,
     path: str | os.PathLike[str],
     *,
-    tailoring: Tailoring | None = None,
     replace: bool = False,
     progress: Progress | None = None,
     **options: Unpack[FmuOptions],
@@ -45,11 +27,10 @@ def pack_wing(
     Parameters
     ----------
     design : WingDesign
-        The wing; of a calibrated one its tailored design.
+        The wing; of a calibrated one its tailored design, with what `calibration.result.plain.tailoring`
+        gives among the options.
     path : path-like
         Where to write, with the suffix .fmu.
-    tailoring : Tailoring, optional
-        The calibration: the FMU starts at its means and carries its record.
     replace, **options
         See `fmu_asset.packing.structure_fmu.build_fmu`.
     progress : Progress, optional
@@ -62,11 +43,8 @@ def pack_wing(
     FmuBuildError, PatchFileError
         See `fmu_asset.packing.structure_fmu.build_fmu`.
     """
-    progress = progress or SilentProgress()
     model = reduced_model(design, progress=progress)
     options["arrays"] = arrays_for(design, options.get("patch"), progress)
-    if tailoring is not None:
-        options |= {"state": tailoring.state, "note": tailoring.note, "resources": tailoring.resources}
     return build_fmu(model, path, replace=replace, **options)
 
 
@@ -80,6 +58,6 @@ def arrays_for(
     FiniteElementError
         The design cannot be modelled.
     """
-    if patch is None or not patch.needs_arrays:
+    if patch is None or not needs_structure(patch.patch):
         return None
-    return patch_arrays(design, progress or SilentProgress())
+    return patch_arrays(design, progress)

@@ -327,13 +327,8 @@ class Slave:
             raise ValueError("it was saved by an FMU with other content")
         return struct.unpack_from(f"<{count}d", state, _HEADER.size)
 
-    @staticmethod
-    def _fmu_state_to_bytes(state: bytes) -> bytes:
-        return state
-
-    @staticmethod
-    def _fmu_state_from_bytes(state: bytes) -> bytes:
-        return bytes(state)
+    # A state is bytes already.
+    _fmu_state_to_bytes = _fmu_state_from_bytes = staticmethod(bytes)
 
     # ------------------------------------------------------------------ refusals
 
@@ -361,6 +356,3 @@ class Slave:
         category = "logStatusDiscard" if level == _DISCARD else "logStatusError"
         self.log_queue.append(LogMessage(level, category, sentence))
         return False
-
-    def _get_log_queue(self) -> list[LogMessage]:
-        return self.log_queue

@@ -8,10 +8,10 @@ same for a structure without effects.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -62,15 +62,10 @@ class StructureBehaviour:
     """
 
     def __init__(
-        self,
-        model: ReducedModel,
-        table: Sequence[FmuVariable],
-        roles: Roles,
-        effects: Effects | None = None,
+        self, model: ReducedModel, table: Sequence[FmuVariable], roles: Roles, effects: Effects | None = None
     ) -> None:
         self._model, self._roles, self._effects = model, roles, effects
-        inputs = [row.name for row in table if row.causality == "input"]
-        self._sources = [(name, inputs.index(name) if name in inputs else None) for name in roles.chosen]
+        self._inputs = [row.name for row in table if row.causality == "input"]
         self._resting = [0.0] * len(model.accelerations)
         self._own = len(model.chosen) - len(model.controls)  # what modes depend on
         self._parameters: Mapping[str, float] = {}
@@ -96,20 +91,13 @@ class StructureBehaviour:
         UnacceptableValuesError
             If the structure cannot have the effects that are on.
         """
-
-        def begin() -> list[float]:
-            self._keep(parameters)
-            self._begun = self._tuned[1]
-            self._vector = self._state = self._integrator = self._filters = None
-            return self._go(time, 0.0, inputs)
-
-        return self._whole(begin)
+        return self._whole(time, 0.0, inputs, parameters)
 
     def advance(self, time: float, duration: float, inputs: Sequence[float]) -> Sequence[float]:
         """Advance by one step of `duration` [s] with inputs and effects held; raises as `start`."""
         if self._vector is None:
             raise RuntimeError("the structure was not initialised")
-        return self._whole(lambda: self._go(time, duration, inputs))
+        return self._whole(time, duration, inputs)
 
     def later(self, group: int) -> list[float]:
         """Return the outputs of a group: the bound, the other bound or the load point, the modes."""
@@ -170,13 +158,20 @@ class StructureBehaviour:
 
     def _keep(self, parameters: Mapping[str, float]) -> None:
         self._parameters = dict(parameters)
+        self._damping = parameters["damping.alpha"], parameters["damping.beta"]
         self._moves = int(parameters["response"]) == TRANSIENT
 
-    def _whole(self, act: Callable[[], list[float]]) -> list[float]:
-        """Do something completely, or leave everything as it was."""
+    def _whole(
+        self, time: float, duration: float, inputs: Sequence[float], start: Mapping[str, float] | None = None
+    ) -> list[float]:
+        """Make a step, or a start with parameters, completely, or leave everything as it was."""
         before = dict(self.__dict__)
         try:
-            return act()
+            if start is not None:
+                self._keep(start)
+                self._begun = self._tuned[1]
+                self._vector = self._state = self._integrator = self._filters = None
+            return self._go(time, duration, inputs)
         except Exception as error:
             self.__dict__.update(before)
             if not isinstance(error, FiniteElementError):
@@ -188,12 +183,13 @@ class StructureBehaviour:
         """Begin, where there is no state yet, or advance; return the outputs."""
         changed = self._effects is not None and self._take_effects(self._effects)
         before, parameters, own = self._vector, self._parameters, self._own
-        vector = np.array([parameters[name] if n is None else inputs[n] for name, n in self._sources])
+        values = {**parameters, **dict(zip(self._inputs, inputs, strict=True))}
+        vector = np.array([values[name] for name in self._roles.chosen])
         integrator, state, static = self._integrator, self._state, None
         if not (self._moves or (self._acting is not None and self._acting.changes_structure)):
             integrator = state = None
             static = self._model.static_response(vector)
-            values = [*static.strain.tolist(), *static.displacement.tolist(), *self._resting]
+            outputs = [*static.strain.tolist(), *static.displacement.tolist(), *self._resting]
         else:
             same = before is not None and vector[:own].tobytes() == before[:own].tobytes()
             if integrator is None or changed or not same:
@@ -209,9 +205,9 @@ class StructureBehaviour:
                 state = integrator.at_rest(load)
             else:
                 state = integrator.released(parameters[self._roles.release], load, self._held(integrator))
-            values = integrator.outputs(state).tolist()
+            outputs = integrator.outputs(state).tolist()
         self._vector, self._integrator, self._state, self._static = vector, integrator, state, static
-        return values if self._acting is None else self._show(values, duration, time + duration)
+        return outputs if self._acting is None else self._show(outputs, duration, time + duration)
 
     def _held(self, integrator: ModalIntegrator) -> int:
         """Return the number of the load that holds the structure aside."""
@@ -249,10 +245,6 @@ class StructureBehaviour:
         )  # fmt: skip
         return self._shown[:-1]
 
-    @property
-    def _damping(self) -> tuple[float, float]:
-        return self._parameters["damping.alpha"], self._parameters["damping.beta"]
-
     def _made(self, vector: FloatArray) -> ModalIntegrator:
         """Return the structure in time; that of a wing with effects in its basis for patches."""
         if self._effects is None or self._effects.wing is None:
@@ -263,7 +255,8 @@ class StructureBehaviour:
 
 def load_contents(resources: Path) -> Contents:
     """Return what the files that `fmu_asset.packing.structure_fmu` packed describe."""
-    model, start = ReducedModel.load(resources / "reduced_model.npz"), _read(resources / "start.json")
+    model = ReducedModel.load(resources / "reduced_model.npz")
+    start = json.loads((resources / "start.json").read_text(encoding="utf-8"))
     own = {name: value for name, value in start.items() if not name.startswith("effect.")}
     table, roles = structure_table(model, own)
     later, behaviour = later_outputs(table, roles), partial(StructureBehaviour, model, table, roles)
@@ -271,17 +264,11 @@ def load_contents(resources: Path) -> Contents:
         return Contents(table, behaviour, later)
     # a plain structure needs nothing of these
     from fe.runtime.patch_arrays import PatchArrays
-    from fe.runtime.patched_wing import PatchedWing
 
     from .effects import Effects, effect_rows
 
-    record, arrays = _read(resources / "effects.json"), resources / "patch_arrays.npz"
-    effects, channels = record["effects"], tuple((name, quantity) for name, quantity in record["channels"])
-    wing = PatchedWing(PatchArrays.load(arrays)) if arrays.is_file() else None
+    effects = json.loads((resources / "effects.json").read_text(encoding="utf-8"))
+    file = resources / "patch_arrays.npz"
+    arrays = PatchArrays.load(file) if file.is_file() else None
     rows = effect_rows(effects, len(table), start)
-    return Contents(table + rows, lambda: behaviour(Effects(effects, channels, wing)), later)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return record
+    return Contents(table + rows, lambda: behaviour(Effects(effects, len(model.gauges), arrays)), later)

@@ -16,12 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from fe.runtime.patch import CHANNEL_UNIT, PER_RELEASE, PRIMITIVES, HighPass, ModelPatch
+from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, needs_structure
 from fe.runtime.transient import ModalIntegrator
 
 from .base import UnacceptableValuesError
-from .variables import FmuVariable, Table, Unit
+from .variables import FmuVariable, Table
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -34,31 +35,15 @@ ROTATING_PORT = "root"
 RANGES: Mapping[str, tuple[float, float]] = {"side": (-1.0, 1.0), "element_count": (1.0, 1000.0)}
 """Ranges of the whole numbers of primitives; of the others the wing says itself what cannot be."""
 
-UNITS = (
-    Unit("K", (("K", 1),)),
-    Unit("1/K", (("K", -1),), (("microstrain/K", 1e6),)),
-    Unit("rad", (("rad", 1),), (("deg", 57.29577951308232),)),
-    Unit("1/m", (("m", -1),)),
-    Unit("m/s", (("m", 1), ("s", -1))),
-    Unit("rad/s", (("rad", 1), ("s", -1))),
-    Unit("N.m", (("kg", 1), ("m", 2), ("s", -2))),
-    Unit("N/m", (("kg", 1), ("s", -2))),
-    Unit("N.m/rad", (("kg", 1), ("m", 2), ("s", -2), ("rad", -1))),
-    Unit("rad/(N.m)", (("rad", 1), ("kg", -1), ("m", -2), ("s", 2))),
-)
-"""Units of effects beside those of `variables`."""
+
+def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
+    """Return names and quantities of the outputs that sensors show, in the behaviour's order."""
+    strains = tuple((f"strain[{gauge}]", "strain") for gauge in range(1, gauge_count + 1))
+    return (*strains, ("tip_displacement", "displacement"), ("load_point_displacement", "displacement"))
 
 
-class Number(NamedTuple):
-    """One number of an effect: its variable, and where it stands in the effect's primitives."""
-
-    name: str
-    primitive: int
-    key: str
-
-
-def numbers_of(effect: Mapping[str, Any]) -> list[Number]:
-    """Return the numbers of an effect in the order of its primitives.
+def numbers_of(effect: Mapping[str, Any]) -> dict[str, tuple[int, str]]:
+    """Return the numbers of an effect by their variables: which primitive has them under which key.
 
     A number is called `effect.<id>.<key>`; where several primitives of the effect have one of that name,
     `effect.<id>.<key>[n]`, n the number of the primitive from 1.
@@ -75,10 +60,10 @@ def numbers_of(effect: Mapping[str, Any]) -> list[Number]:
         if isinstance(value, int | float)
     ]
     often = Counter(key for _, key in found)
-    return [
-        Number(f"effect.{effect['id']}.{key}" + (f"[{number + 1}]" if often[key] > 1 else ""), number, key)
+    return {
+        f"effect.{effect['id']}.{key}" + (f"[{number + 1}]" if often[key] > 1 else ""): (number, key)
         for number, key in found
-    ]
+    }
 
 
 def _unit(primitive: Mapping[str, Any], key: str) -> str:
@@ -115,14 +100,14 @@ def effect_rows(
     """
     table = Table({}, first)
     for effect in effects:
-        kinds = " and ".join(dict.fromkeys(str(item["kind"]) for item in effect["primitives"]))
+        words = " and ".join(dict.fromkeys(str(item["kind"]) for item in effect["primitives"]))
         switch = switch_of(effect)
         table.add(
             switch, "parameter",
-            f"Whether the effect {effect['id']} ({kinds.replace('_', ' ')}) acts: 0 off, 1 on",
+            f"Whether the effect {effect['id']} ({words.replace('_', ' ')}) acts: 0 off, 1 on",
             unit="1", box=(0.0, 1.0), default=start.get(switch, 0.0), tunable=True,
         )  # fmt: skip
-        for name, number, key in numbers_of(effect):
+        for name, (number, key) in numbers_of(effect).items():
             primitive = effect["primitives"][number]
             value, place = primitive[key], primitive.get("port") or primitive.get("channel") or ""
             where = f" at {place}" if place not in ("", "*") else ""
@@ -133,20 +118,13 @@ def effect_rows(
                 kind="Integer" if whole else "Real", unit=None if whole else _unit(primitive, key),
                 box=RANGES[key] if whole else (None, None), default=start.get(name, value), tunable=True,
             )  # fmt: skip
-    if {"thermal_strain", "modulus_temperature"} & {
-        item["kind"] for effect in effects for item in effect["primitives"]
-    }:
+    kinds = {item["kind"] for effect in effects for item in effect["primitives"]}
+    if kinds & {"thermal_strain", "modulus_temperature"}:
         table.add(
             TEMPERATURE, "input", "Temperature of the wing less the reference temperature",
             unit="K", box=(-100.0, 100.0), default=start.get(TEMPERATURE, 0.0),
         )  # fmt: skip
     return table.rows()
-
-
-def units_of(rows: Sequence[FmuVariable]) -> tuple[Unit, ...]:
-    """Return the units of effects that rows use beside those of `variables`."""
-    used = {row.unit for row in rows}
-    return tuple(unit for unit in UNITS if unit.name in used)
 
 
 def active_primitives(
@@ -166,7 +144,7 @@ def active_primitives(
         if value[switch_of(effect)] <= 0.5:
             continue
         own = [dict(primitive) for primitive in effect["primitives"]]
-        for name, number, key in numbers_of(effect):
+        for name, (number, key) in numbers_of(effect).items():
             own[number][key] = type(own[number][key])(value[name])
         rows += own
     return rows
@@ -203,19 +181,17 @@ class Effects:
     ----------
     effects : sequence of mapping
         `id` and `primitives` of each effect.
-    channels : tuple of (str, str)
-        Outputs that sensors show, with their quantities: strains, tip displacement, load point displacement.
-    wing : PatchedWing, optional
+    gauge_count : int
+        Number of gauges of the wing.
+    arrays : PatchArrays, optional
         The wing for patches; None where the effects are of sensors alone.
     """
 
     def __init__(
-        self,
-        effects: Sequence[Mapping[str, Any]],
-        channels: tuple[tuple[str, str], ...],
-        wing: PatchedWing | None = None,
+        self, effects: Sequence[Mapping[str, Any]], gauge_count: int, arrays: PatchArrays | None = None
     ) -> None:
-        self._effects, self._channels, self.wing = effects, channels, wing
+        self._effects, self._channels = effects, output_channels(gauge_count)
+        self.wing = None if arrays is None else PatchedWing(arrays)
         self._names = tuple(row.name for row in effect_rows(effects, 0, {}))
         self._last: tuple[object, ModalIntegrator] | None = None  # it never changes
 

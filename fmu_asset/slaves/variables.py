@@ -1,4 +1,4 @@
-"""Rows of a table of variables, which model description, slave and documentation follow; units; enumerations.
+"""Rows of a table of variables, which model description, slave and documentation follow; enumerations.
 
 Standard library only: the file is copied into the FMU.
 """
@@ -18,13 +18,11 @@ QUASI_STATIC = 1
 TRANSIENT = 2
 """Value of `response`: the modes are integrated in time."""
 
-STATUS_OK = 0
-STATUS_OUTSIDE_RANGE = 1
-STATUS_NOT_FINITE = 2
-STATUS_BAD_STEP = 3
-STATUS_BAD_CALL = 4
-STATUS_BAD_STATE = 5
-STATUS_INTERNAL = 6
+(
+    STATUS_OK, STATUS_OUTSIDE_RANGE, STATUS_NOT_FINITE, STATUS_BAD_STEP, STATUS_BAD_CALL, STATUS_BAD_STATE,
+    STATUS_INTERNAL,
+) = range(7)  # fmt: skip
+"""Values of `status`."""
 
 
 @dataclass(frozen=True)
@@ -62,36 +60,6 @@ ENUMERATIONS = (
 
 
 @dataclass(frozen=True)
-class Unit:
-    """A unit, its SI exponents and its display units.
-
-    Attributes
-    ----------
-    name : str
-        As in the model description.
-    exponents : tuple of (str, int)
-        Exponents of SI base units; the factor to them is one.
-    displays : tuple of (str, float)
-        Display units with the factor f of display = f * value.
-    """
-
-    name: str
-    exponents: tuple[tuple[str, int], ...] = ()
-    displays: tuple[tuple[str, float], ...] = ()
-
-
-UNITS = (
-    Unit("1", (), (("microstrain", 1e6), ("%", 100.0))),
-    Unit("m", (("m", 1),), (("mm", 1000.0),)),
-    Unit("kg", (("kg", 1),), (("g", 1000.0),)),
-    Unit("N", (("kg", 1), ("m", 1), ("s", -2))),
-    Unit("s", (("s", 1),)),
-    Unit("1/s", (("s", -1),)),
-    Unit("Hz", (("s", -1),)),
-)
-
-
-@dataclass(frozen=True)
 class FmuVariable:
     """One row of the table.
 
@@ -108,7 +76,7 @@ class FmuVariable:
     description : str
         One line for people.
     unit, display_unit : str or None
-        Of `UNITS`.
+        In the spelling of FMI.
     minimum, maximum : float or None
         The range that is enforced for inputs and parameters; None where there is none.
     start : float or None

@@ -75,19 +75,15 @@ def join_ssp(structure: SystemStructure, delayed: Iterable[str] = ()) -> Wiring:
         same_unit = between(declared.unit, (*structure.units, *units), variable.unit, units) == IDENTITY
         # SSP 1.0 has no local variables.
         own_kind = "output" if variable.causality == "local" else variable.causality
-        for fits, said, has in (
-            (declared.kind == own_kind, f"as {declared.kind}", f"as {variable.causality}"),
-            (
-                declared.type in (None, variable.base_type),
-                f"of the type {declared.type}",
-                f"as {variable.kind}",
-            ),
-            (same_unit, f"in {declared.unit!r}", f"in {variable.unit!r}"),
-        ):
-            if not fits:
-                raise SspError(
-                    f"The connector {end} is declared {said}, but its FMU has it {has}; correct the file."
-                )
+        if declared.kind != own_kind:
+            differs = f"as {declared.kind}, but its FMU has it as {variable.causality}"
+        elif declared.type not in (None, variable.base_type):
+            differs = f"of the type {declared.type}, but its FMU has it as {variable.kind}"
+        elif not same_unit:
+            differs = f"in {declared.unit!r}, but its FMU has it in {variable.unit!r}"
+        else:
+            continue
+        raise SspError(f"The connector {end} is declared {differs}; correct the file.")
     return wiring
 
 
@@ -95,7 +91,7 @@ def left_out_sentence(wiring: Wiring, file: Path) -> str:
     """Return what of a file's parameters goes nowhere, with the nearest names; empty if all are used."""
     if not wiring.left_out:
         return ""
-    known = [*wiring.inward]
+    known = [item.name for item in wiring.structure.connectors if item.kind != "output"]
     for component, declared in wiring.declared.items():
         settable = (v for v in declared.variables if v.causality in ("parameter", "input"))
         known += [f"{component}.{variable.name}" for variable in settable]
@@ -139,7 +135,7 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
         problems=problems,
         components=tuple((name, wiring.declared[name].model_name) for name in plan.order),
         connections=len(wiring.structure.connections),
-        parameters=sum(len(component.settings) for component in wiring.structure.components),
+        parameters=sum(map(len, wiring.settings.values())),
         loops=(loop_sentence(plan.loops),) if plan.loops else (),
         unused=tuple(wiring.left_out),
         left_out=left_out_sentence(wiring, file),

@@ -33,6 +33,17 @@ from .package import INTERFACES, NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage
 
 _INWARD = ("input", "parameter")
 """Kinds of connectors through which values come in; inside a system, they are where values come from."""
+_OUTSIDE = ("sourceBase", "SSD", "it lies inside a component, which is not supported; move it out")
+_ONLY = {
+    "Component": [("type", "application/x-fmu-sharedlibrary", "only FMUs are supported")],
+    "ParameterBinding": [
+        ("type", "application/x-ssp-parameter-set", "only parameter sets are read"), _OUTSIDE
+    ],
+    "ParameterMapping": [
+        ("type", "application/x-ssp-parameter-mapping", "only parameter mappings are read"), _OUTSIDE
+    ],
+}  # fmt: skip
+"""By element its attributes of which one value is read, and what is said of others."""
 
 
 def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> SystemStructure:
@@ -74,7 +85,7 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Sy
     return SystemStructure(
         str(root.get("name")),
         tuple(components),
-        tree.outer_connectors(),
+        tuple(connector for node, connector in tree.connectors.items() if not node.component),
         connections,
         _units(root, "ssd"),
         declared={node: own for node, own in tree.connectors.items() if node.component in tree.components},
@@ -104,10 +115,11 @@ class _Tree:
         """Return the error that says what is wrong with the system structure."""
         return SspError(f"{SSD_NAME} in {self.package.path}: {sentence}")
 
-    def _refuse_other(self, element: Any, attribute: str, usual: str, where: str, instead: str) -> None:
-        """Refuse an attribute that has another value than the one that is read."""
-        if (given := element.get(attribute, usual)) != usual:
-            raise self._error(f"{where} has the {attribute} {given!r}: {instead}.")
+    def _refuse_other(self, element: Any, where: str) -> None:
+        """Refuse attributes that have other values than those that are read."""
+        for attribute, usual, instead in _ONLY[etree.QName(element).localname]:
+            if (given := element.get(attribute, usual)) != usual:
+                raise self._error(f"{where} has the {attribute} {given!r}: {instead}.")
 
     # ------------------------------------------------------------------ as it is written
 
@@ -128,21 +140,15 @@ class _Tree:
 
     def _read_component(self, element: Any, path: str) -> None:
         where = f"the component {path!r}"
-        self._refuse_other(
-            element, "type", "application/x-fmu-sharedlibrary", where, "only FMUs are supported"
-        )
-        implementation = element.get("implementation", "any")
-        if implementation not in INTERFACES:
-            raise self._error(f"{where} asks for {implementation!r}, which is not supported.")
+        self._refuse_other(element, where)
         source = self.package.resolve(str(element.get("source")), where)
         substeps = _annotation(element).get("substeps", "1")
         if not (substeps.isascii() and substeps.isdigit() and int(substeps) > 0):
             raise self._error(
                 f"{where} has the number of steps {substeps!r}, which must be a positive whole number."
             )
-        self.components[path] = Component(
-            path, Path(source), substeps=int(substeps), interface=INTERFACES[implementation]
-        )
+        interface = INTERFACES[element.get("implementation", "any")]
+        self.components[path] = Component(path, Path(source), substeps=int(substeps), interface=interface)
         self._read_connectors(element, path)
         self._bind(element, path)
 
@@ -151,9 +157,15 @@ class _Tree:
             node = Endpoint(path, str(connector.get("name")))
             if node in self.connectors:
                 raise self._error(f"the connector {str(node)!r} is there twice.")
-            item = connector.find("ssc:*", NAMESPACES)
-            kind, unit = (None, None) if item is None else (etree.QName(item).localname, item.get("unit"))
-            self.connectors[node] = Connector(node.variable, connector.get("kind"), unit or None, kind)
+            kind, item = connector.get("kind"), connector.find("ssc:*", NAMESPACES)
+            if not path and kind not in CONNECTOR_KINDS:
+                raise self._error(
+                    f"the connector {node.variable!r} of the system is of the kind {kind}, not supported."
+                )
+            of_type = (
+                (None, None) if item is None else (item.get("unit") or None, etree.QName(item).localname)
+            )
+            self.connectors[node] = Connector(node.variable, kind, *of_type)
 
     def _read_connection(self, element: Any, path: str) -> None:
         ends: list[Endpoint] = []
@@ -230,13 +242,7 @@ class _Tree:
 
     def _content(self, element: Any, inline: str, kind: str, where: str) -> Any:
         """Return the set or mapping that an element refers to or holds."""
-        self._refuse_other(
-            element,
-            "sourceBase",
-            "SSD",
-            where,
-            "it lies inside a component, which is not supported; move it out",
-        )
+        self._refuse_other(element, where)
         if source := element.get("source"):
             return self.package.parse(kind, self.package.resolve(source, where))
         root = element.find(inline, NAMESPACES)
@@ -246,9 +252,6 @@ class _Tree:
 
     def _values(self, element: Any, where: str) -> dict[str, Setting]:
         """Return the values of a parameter set under the names that it gives them."""
-        self._refuse_other(
-            element, "type", "application/x-ssp-parameter-set", where, "only parameter sets are read"
-        )
         root = self._content(element, "ssd:ParameterValues/ssv:ParameterSet", "ssv", where)
         units, found = _units(root, "ssv"), dict[str, Setting]()
         for parameter in root.iterfind("ssv:Parameters/ssv:Parameter", NAMESPACES):
@@ -269,14 +272,11 @@ class _Tree:
     ) -> dict[str, Setting]:
         """Return the values under the names that a mapping gives them; what it does not name is not used."""
         where = f"the mapping of {where}"
-        self._refuse_other(
-            element, "type", "application/x-ssp-parameter-mapping", where, "only parameter mappings are read"
-        )
         root = self._content(element, "ssm:ParameterMapping", "ssm", where)
         found: dict[str, Setting] = {}
         for entry in root.iterfind("ssm:MappingEntry", NAMESPACES):
             source, target = entry.get("source"), entry.get("target")
-            factor, offset = scale = self._transformation(entry, f"{source!r} in {where}")
+            scale = self._transformation(entry, f"{source!r} in {where}")
             if source not in values:  # one mapping may serve several sets
                 missed.append(target)
                 continue
@@ -286,23 +286,12 @@ class _Tree:
             if scale != IDENTITY:
                 if isinstance(setting.value, bool | str):
                     raise self._error(f"{where} scales {source!r}, which is no number.")
-                setting = replace(setting, factor=factor, offset=offset)
+                setting = replace(setting, scale=scale)
             suppressed = _flag(entry, "suppressUnitConversion")
             found[target] = replace(setting, unit=None if suppressed else setting.unit)
         return found
 
     # ------------------------------------------------------------------ flat
-
-    def outer_connectors(self) -> tuple[Connector, ...]:
-        """Return the connectors of the outermost system."""
-        found = [connector for node, connector in self.connectors.items() if not node.component]
-        for connector in found:
-            if connector.kind not in CONNECTOR_KINDS:
-                raise self._error(
-                    f"the connector {connector.name!r} of the system is of the kind {connector.kind}, not "
-                    "supported."
-                )
-        return tuple(found)
 
     def _is_end(self, node: Endpoint) -> bool:
         return node.component in self.components or node.component == ""
@@ -327,7 +316,7 @@ class _Tree:
             nodes = [edge.source for edge in edges if edge.source.component not in self.components]
             for node in (node for node in nodes if node in self.settings):
                 rest = edges[[edge.source for edge in edges].index(node) :]
-                if any((edge.factor, edge.offset, edge.convert_units) != (*IDENTITY, True) for edge in rest):
+                if any((edge.scale, edge.convert_units) != (IDENTITY, True) for edge in rest):
                     raise self._error(
                         f"{str(node)!r} is set and transformed on its way to {str(target)!r}; set that "
                         "instead."
@@ -340,7 +329,7 @@ class _Tree:
     def _joined(self, edges: list[Connection]) -> Connection:
         """Return one connection for those that follow one another through nested systems."""
         source, target = edges[0].source, edges[-1].target
-        scale = reduce(Conversion.then, (Conversion(edge.factor, edge.offset) for edge in edges))
+        scale = reduce(Conversion.then, (edge.scale for edge in edges))
         with_units = any(self.connectors[edge.source].unit for edge in edges[1:])
         converted = {edge.convert_units for edge in edges}
         if len(converted) > 1 or (scale != IDENTITY and with_units):

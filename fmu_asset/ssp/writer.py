@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from fmu_asset.archive.declared import BASE_UNITS, VariableInfo
+from fmu_asset.archive.declared import BASE_UNITS
 from fmu_asset.coupling.structure import Endpoint
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.description import rendered
@@ -17,7 +17,6 @@ from reporting.files import atomic_write_bytes
 from .package import INTERFACES, NAMESPACES, OWN_NAMESPACE, SSD_NAME, parse_xml, validate
 
 _DOCUMENTS = (SSD_NAME, "resources/parameters.ssv", "resources/parameters.ssm")
-_IMPLEMENTATIONS = {interface: name for name, interface in INTERFACES.items()}
 _CONNECTOR_KINDS = ("input", "output", "parameter", "calculatedParameter")
 
 
@@ -29,85 +28,48 @@ def write_ssp(
     stop_time: float | None = None,
     replace: bool = False,
 ) -> Path:
-    """Write a system as an SSP 1.0 file; see `ssp_bytes`.
-
-    Raises
-    ------
-    SspError
-        If the system cannot be written, the path has another suffix, or something is there and `replace` is
-        False.
-    reporting.errors.FileNotWrittenError
-        If the file cannot be written.
-    """
-    target = checked_target(path, replace=replace, what="An SSP file", suffix=".ssp", error=SspError)
-    content = ssp_bytes(wiring, parameter_names=parameter_names, stop_time=stop_time)
-    return atomic_write_bytes(target, content)
-
-
-def ssp_bytes(
-    wiring: Wiring, *, parameter_names: Mapping[Endpoint, str] | None = None, stop_time: float | None = None
-) -> bytes:
-    """Return the archive, its XML checked by the published schemas.
+    """Write a system as an SSP 1.0 file, its XML checked by the published schemas.
 
     Parameters
     ----------
     wiring : Wiring
         The system.
+    path : path-like
+        Where to write, with the suffix .ssp.
     parameter_names : mapping of Endpoint to str, optional
         What parameters are called in the parameter set; by default `component.variable`.
     stop_time : float, optional
         End of the default experiment [s].
+    replace : bool
+        Whether an existing file may be replaced.
 
     Raises
     ------
     SspError
-        If a name cannot be written, or is there twice.
+        If a name cannot be written or is there twice, the path has another suffix, or something is there and
+        `replace` is False.
+    reporting.errors.FileNotWrittenError
+        If the file cannot be written.
     """
-    structure, units, names = wiring.structure, _known_units(wiring), parameter_names or {}
-    enumerations: dict[str, Mapping[str, int]] = {}
-
-    def connector(name: str, kind: str, end: Endpoint | None, unit: str | None) -> dict[str, Any]:
-        """Return what is said of a connector with the type of the variable at an end."""
-        variable = VariableInfo(name, 0, kind="") if end is None else wiring.variable(end)
-        said = {"name": name, "kind": kind, "type": variable.base_type}
-        if variable.base_type == "Real" and unit in units:
-            said["unit"] = unit
-        if variable.base_type == "Enumeration":
-            said["enumeration"] = str(end)
-            enumerations[str(end)] = variable.items
-        return said
-
-    outer = []
-    for item in structure.connectors:
-        ports = (*wiring.inward.get(item.name, ()), *filter(None, [wiring.outward.get(item.name)]))
-        end = ports[0].end if ports else None
-        outer.append(connector(item.name, item.kind, end, wiring.units[item.name]))
-    ends = dict.fromkeys(end for link in structure.connections for end in (link.source, link.target))
-    components = []
-    for component in structure.components:
-        variables = {end: wiring.variable(end) for end in ends if end.component == component.name}
-        if other := [v for v in variables.values() if v.causality not in _CONNECTOR_KINDS]:
+    target = checked_target(path, replace=replace, what="An SSP file", suffix=".ssp", error=SspError)
+    structure, units = wiring.structure, _known_units(wiring)
+    ends = (end for link in structure.connections for end in (link.source, link.target))
+    used = {end: wiring.variable(end) for end in ends if end.component}
+    for variable in used.values():
+        if variable.causality not in _CONNECTOR_KINDS:
             raise SspError(
-                f"The variable {other[0].name!r} is declared as {other[0].causality}, which SSP 1.0 has no "
+                f"The variable {variable.name!r} is declared as {variable.causality}, which SSP 1.0 has no "
                 "connector for."
             )
-        components.append(
-            {
-                "name": component.name,
-                "source": _resource(component.name),
-                "implementation": _IMPLEMENTATIONS[wiring.declared[component.name].interface],
-                "substeps": component.substeps,
-                "connectors": [connector(v.name, v.causality, end, v.unit) for end, v in variables.items()],
-            }
-        )
     values = {
         "structure": structure,
-        "connectors": outer,
-        "components": components,
-        "parameters": _parameters(wiring, names, units),
-        "enumerations": enumerations,
+        "wiring": wiring,
+        "used": used,
+        "parameters": _parameters(wiring, parameter_names or {}, units),
         "units": units,
         "stop_time": None if stop_time is None else float(stop_time),
+        "implementations": {interface: name for name, interface in INTERFACES.items()},
+        "resource": _resource,
         "namespaces": NAMESPACES,
         "own_namespace": OWN_NAMESPACE,
         "tool": f"uav-twin {version('uav-twin')}",
@@ -116,7 +78,7 @@ def ssp_bytes(
     for name, content in members.items():
         validate(parse_xml(content, name), name[-3:], name)
     members |= {_resource(component.name): component.fmu.read_bytes() for component in structure.components}
-    return archive_bytes(members, SSD_NAME)
+    return atomic_write_bytes(target, archive_bytes(members, SSD_NAME))
 
 
 def _resource(component: str) -> str:

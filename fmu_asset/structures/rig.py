@@ -40,13 +40,7 @@ def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
         for output in design.displacement
         if load.control in forces and _meet(load, output)
     ]
-    parameters = [
-        *((part, part.name, "1") for part in design.parameter),
-        *((part, f"mass.{part.name}", "kg") for part in design.mass if part.free),
-    ]
-    text = rendered(
-        "rig.toml", design=design, fmu=fmu, forces=forces, flies=flies, ports=ports, parameters=parameters
-    )
+    text = rendered("rig.toml", design=design, fmu=fmu, forces=forces, flies=flies, ports=ports)
     return text.decode().rstrip() + "\n"
 
 

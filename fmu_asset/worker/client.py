@@ -24,20 +24,19 @@ from .sandbox import Grants
 _MEBIBYTE = 1024**2
 _GLANCE = 0.05
 """Seconds between two looks at the memory of a worker that is at work."""
-_WHAT = {
-    "open": "loading and instantiation",
-    "initialise": "initialisation",
-    "reset": "reset",
-    "step": "the step",
-    "run": "a step",
-    "read": "reading the outputs",
-    "save": "saving the state",
-    "restore": "restoring the state",
-    "take_log": "reading the log",
-    "close": "the end",
+_CALLS = {
+    "open": ("load_time", "loading and instantiation"),
+    "initialise": ("load_time", "initialisation"),
+    "reset": ("load_time", "reset"),
+    "step": ("step_time", "the step"),
+    "run": ("step_time", "a step"),
+    "read": ("step_time", "reading the outputs"),
+    "save": ("step_time", "saving the state"),
+    "restore": ("step_time", "restoring the state"),
+    "take_log": ("step_time", "reading the log"),
+    "close": ("step_time", "the end"),
 }
-_LOADING = ("open", "initialise", "reset")
-
+"""Which limit holds for a call, and what it is in a sentence."""
 
 _Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 _Paths = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(strict=False)]
@@ -89,6 +88,8 @@ class WorkerInstance(Instance):
 
     Attributes
     ----------
+    process_id : int
+        Process number of the worker.
     lost : bool
         Also from a question until its answer: an exception between the two, such as an interruption, leaves
         them out of step.
@@ -107,8 +108,9 @@ class WorkerInstance(Instance):
         self._request = memoryview(self.request).cast("B")
         self._reply = memoryview(self.reply).cast("B")
         self._header = memoryview(bytearray(HEADER.size))
-        self._number, self._name, self._logged = 0, "open", False
+        self._number, self._logged = 0, False
         self._process = WorkerProcess(scratch, plan.folder, limits.grants)
+        self.process_id = self._process.number
         self._out, self._in = self._process.outgoing, self._process.incoming
         # The worker may leave it at half an answer.
         os.set_blocking(self._in, False)
@@ -132,8 +134,6 @@ class WorkerInstance(Instance):
         if length != len(self._reply):
             raise self._died()
         self._fill(self._reply)
-        if time.monotonic() > self._next_glance:
-            self._check_memory()
         self.lost = False
 
     def run(self, requests: Floats, replies: Floats, report: Callable[[int], object]) -> None:
@@ -146,8 +146,6 @@ class WorkerInstance(Instance):
                 raise self._died()
             self._fill(target[filled : filled + length])
             filled += length
-            if time.monotonic() > self._next_glance:
-                self._check_memory()
             self.lost = kind == PART
             report(filled // size)
 
@@ -187,11 +185,6 @@ class WorkerInstance(Instance):
             raise self._died() from None
 
     @property
-    def process_id(self) -> int:
-        """Process number of the worker."""
-        return self._process.number
-
-    @property
     def memory(self) -> int:
         """Resident memory of the worker [bytes]; 0 if it is gone, or if the system does not say.
 
@@ -201,7 +194,7 @@ class WorkerInstance(Instance):
         allocation fails inside the FMU, which then crashes, and nobody could say why.
         """
         try:
-            with open(f"/proc/{self._process.number}/statm", "rb") as file:  # noqa: PTH123 - half the time
+            with open(f"/proc/{self.process_id}/statm", "rb") as file:  # noqa: PTH123 - half the time
                 return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
         except (OSError, IndexError, ValueError):
             return 0
@@ -215,7 +208,6 @@ class WorkerInstance(Instance):
             with contextlib.suppress(FmuWorkerError):
                 self._ask(CALL, "close", self._pickled("close"))
         self.lost = True
-        self._process.close_pipes()
         self._process.end(CLOSE_LIMIT if kindly else 0.0)
         remove_folder(self._folder)
 
@@ -227,7 +219,7 @@ class WorkerInstance(Instance):
     def _ask(self, kind: int, name: str, content: bytes | memoryview) -> None:
         if self.lost:
             raise FmuWorkerError("The FMU's worker is gone or was interrupted; reset the asset to go on.")
-        self.lost, self._name = True, name
+        self.lost, (self._limit, self._what) = True, _CALLS[name]
         self._number = (self._number + 1) % 2**32
         try:
             send(self._out, HEADER.pack(kind, 0, self._number, len(content)), content)
@@ -239,8 +231,8 @@ class WorkerInstance(Instance):
         self._ask(CALL, name, self._pickled(name, *arguments))
         largest = int(self._limits.memory * _MEBIBYTE) if name == "save" else LARGEST_MESSAGE
         answer = bytearray(self._await(largest)[1])
+        self._next_glance = 0.0
         self._fill(memoryview(answer))
-        self._check_memory()
         self.lost = False
         return bytes(answer)
 
@@ -278,16 +270,14 @@ class WorkerInstance(Instance):
             try:
                 count = os.readv(self._in, [target[filled:]])
             except BlockingIOError:
-                deadline = deadline or time.monotonic() + self._limit + grace
+                deadline = deadline or time.monotonic() + getattr(self._limits, self._limit) + grace
                 self._wait(deadline)
                 continue
             if count == 0:
                 raise self._died()
             filled += count
-
-    @property
-    def _limit(self) -> float:
-        return self._limits.load_time if self._name in _LOADING else self._limits.step_time
+        if time.monotonic() > self._next_glance:
+            self._check_memory()
 
     def _wait(self, deadline: float) -> None:
         """Wait a moment for something to read."""
@@ -297,11 +287,10 @@ class WorkerInstance(Instance):
         self._check_memory()
         if left <= 0.0:
             self._process.kill()
-            key = "load_time" if self._name in _LOADING else "step_time"
             raise FmuTimeoutError(
-                f"The FMU took longer than {self._limit:g} s for {_WHAT[self._name]}; its worker was "
-                f"stopped. If it is only slow, give it more `{key}` in the table [limits] of its binding; "
-                "otherwise it hangs."
+                f"The FMU took longer than {getattr(self._limits, self._limit):g} s for {self._what}; its "
+                f"worker was stopped. If it is only slow, give it more `{self._limit}` in the table [limits] "
+                "of its binding; otherwise it hangs."
             )
 
     def _check_memory(self) -> None:
@@ -310,11 +299,11 @@ class WorkerInstance(Instance):
         if used > limit:
             self._process.kill()
             raise FmuMemoryError(
-                f"The FMU took {used / _MEBIBYTE:.0f} MiB of memory during {_WHAT[self._name]}, more than "
+                f"The FMU took {used / _MEBIBYTE:.0f} MiB of memory during {self._what}, more than "
                 f"the limit of {self._limits.memory:g} MiB; its worker was stopped. If it needs that much, "
                 "give it more `memory` in the table [limits] of its binding; otherwise it leaks."
             )
 
     def _died(self) -> FmuWorkerError:
         self.lost = True
-        return self._process.death(_WHAT[self._name])
+        return self._process.death(self._what)

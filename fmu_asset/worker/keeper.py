@@ -18,6 +18,7 @@ from typing import NoReturn
 from fmu_asset.folders import remove_folder
 
 from .protocol import OWN_FAILURE, WORKER_NUMBER
+from .protocol import ended as has_ended
 
 _GRACE = 2.0
 """Seconds in which a worker without a twin ends by itself."""
@@ -85,7 +86,8 @@ def keep(scratch: str, shared: str, grants: str) -> NoReturn:
     reap()
     status = reaped[worker]
     _end_descendants()
-    if deserted and not asked and status != 0 and _ended(gone):
+    # The twin's pipes are closed a moment before it is dead.
+    if deserted and not asked and status != 0 and has_ended(gone, 1.0):
         remove_folder(scratch)
         remove_folder(shared)
     if os.WIFSIGNALED(status):
@@ -165,10 +167,3 @@ def _children() -> list[int]:
                     parent = file.read().rpartition(b")")[2].split()[1]
                 found += [int(name)] * (int(parent) == os.getpid())
     return found
-
-
-def _ended(process: int) -> bool:
-    """Return whether the twin is dead; its pipes are closed a moment before it is."""
-    poll = select.poll()
-    poll.register(process, select.POLLIN)
-    return bool(poll.poll(1000))

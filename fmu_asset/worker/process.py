@@ -3,7 +3,6 @@
 import contextlib
 import json
 import os
-import select
 import signal
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from pathlib import Path
 from fmu_asset.errors import FmuWorkerError
 from fmu_asset.folders import end_processes
 
-from .protocol import OWN_FAILURE, PIPES_GONE, WORKER_NUMBER, receive
+from .protocol import OWN_FAILURE, PIPES_GONE, WORKER_NUMBER, ended, receive
 from .sandbox import Grants, landlock_version
 
 CLOSE_LIMIT = 2.0
@@ -31,10 +30,6 @@ _MEANINGS = {
 }
 _REMEDY = "Reset the asset, or resume the run, to go on; if it happens again, the FMU is at fault"
 _CONFINED = ", or needs what its sandbox does not grant ([limits] of its binding)"
-
-
-def _open_plainly(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK)
 
 
 class WorkerProcess:
@@ -94,7 +89,6 @@ class WorkerProcess:
         self._ended = os.pidfd_open(self._process.pid)
         first = bytearray(WORKER_NUMBER.size)
         if not receive(self.incoming, memoryview(first)):
-            self.close_pipes()
             self.end(CLOSE_LIMIT)
             raise FmuWorkerError("The worker process ended before it began.", self._last_words())
         self.number: int = WORKER_NUMBER.unpack(first)[0]
@@ -113,7 +107,9 @@ class WorkerProcess:
                 end_processes(self._folder)
 
     def end(self, limit: float) -> None:
-        """Wait for its end, and kill what is left then."""
+        """Close the pipes, which tells a worker that it is needed no more, wait, and kill what is left."""
+        for pipe in self._pipes:
+            pipe.close()
         self._await_end(limit)
         self.kill()
 
@@ -122,17 +118,12 @@ class WorkerProcess:
         """Whether the pipes are closed."""
         return self._pipes[0].closed
 
-    def close_pipes(self) -> None:
-        """Close the twin's ends, which is how a worker learns that it is not needed any more."""
-        for pipe in self._pipes:
-            pipe.close()
-
     def death(self, what: str) -> FmuWorkerError:
         """Return the error that says how it died."""
-        ended = self._await_end(CLOSE_LIMIT)
+        alive = not self._await_end(CLOSE_LIMIT)
         self.kill()
         code = self._process.returncode
-        if not ended:
+        if alive:
             how = "closed its pipe, or wrote something else into it"
         elif code < 0:
             name = {item.value: item.name for item in signal.Signals}.get(-code, "a real-time signal")
@@ -150,17 +141,14 @@ class WorkerProcess:
 
     def _await_end(self, limit: float) -> bool:
         """Return whether it ended in time; it is not reaped yet."""
-        if self._process.returncode is not None:
-            return True
-        poll = select.poll()
-        poll.register(self._ended, select.POLLIN)
-        return bool(poll.poll(1000.0 * limit))
+        return self._process.returncode is not None or ended(self._ended, limit)
 
     def _last_words(self) -> list[str]:
         """Return the last lines of its output; of a crash of Python's, not the trace of our own code."""
         with contextlib.suppress(OSError):
             # The FMU may have put a link or a pipe there.
-            with open(self._folder / "worker.log", "rb", opener=_open_plainly) as file:
+            log = os.open(self._folder / "worker.log", os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            with os.fdopen(log, "rb") as file:
                 file.seek(max(file.seek(0, os.SEEK_END) - 4000, 0))
                 text = file.read().decode("utf-8", "replace")
             text = text.partition("Fatal Python error")[0]

@@ -66,6 +66,13 @@ def send(descriptor: int, *parts: bytes | bytearray | memoryview) -> None:
             rest = rest[os.write(descriptor, rest) :]
 
 
+def ended(process: int, limit: float) -> bool:
+    """Return whether the process of a file descriptor has ended, or ends within a limit [s]."""
+    poll = select.poll()
+    poll.register(process, select.POLLIN)
+    return bool(poll.poll(1000.0 * limit))
+
+
 def look(poll: select.poll) -> None:
     """Return as soon as there is something to read, or after a moment without."""
     if _PROCESSORS > 1:

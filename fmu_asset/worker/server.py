@@ -120,7 +120,7 @@ def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[b
     def answer(kind: int, payload: bytes | memoryview) -> None:
         if os.getpid() != own_number:
             os._exit(0)  # a copy that the FMU has made of this process
-        logged = kind != FAILURE and instance is not None and instance.has_log
+        logged = kind != FAILURE and instance is not None and len(instance.messages) > 0
         HEADER.pack_into(reply_header, 0, kind, logged, number, len(payload))
         send(outgoing, reply_header, payload)
 

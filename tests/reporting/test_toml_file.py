@@ -22,7 +22,6 @@ def test_a_file_is_read_with_and_without_a_byte_order_mark(tmp_path: Path) -> No
         file.write_text(content, encoding=encoding)
         assert read_toml(file, WrongFileError) == read
         assert parse_toml(file.read_bytes(), "the draft", WrongFileError) == read
-    assert read_toml(file, WrongFileError, parse_float=str)["span"] == "1.50"
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pydantic import Field
 from fe.runtime.errors import InvalidDesignError
 from fe.structure.design import Gauge, MeshDesign, load_structure, parse_structure, with_rosettes
 from fe.structure.gauges import gauge_rows, spread_rosettes
-from fe.structure.location import Locator
+from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 from fe.structure.tables import Part
 from reporting.section import checked
@@ -60,15 +60,15 @@ def with_candidates(scenario: Scenario, candidates: str, folder: Path) -> Scenar
     keep_files(folder, read_files(belief.all_files()))
     file = folder / MODEL_COPY
     source = Path(belief.all_files()[MODEL_COPY]).parent / own.mesh  # this one stays
-    locator = Locator(read_mesh(source, own.unit, own.length_unit))
-    gauges = _gauges(candidates, locator)
+    mesh = read_mesh(source, own.unit, own.length_unit)
+    gauges = _gauges(candidates, mesh)
     with file.open("a", encoding="utf-8") as text:
         for gauge in gauges:
             rows = (f"{key} = {json.dumps(value)}\n" for key, value in gauge.model_dump().items())
             text.write("".join(("\n[[gauge]]\n", *rows)))
     before, names = ([part.name for part in design.gauge] for design in (own, _joined(file, candidates)))
     try:
-        gauge_rows(locator.mesh, locator, gauges)
+        gauge_rows(mesh, gauges)
     except InvalidDesignError as error:
         raise InvalidDesignError(f"--candidates {candidates}: {error}") from error
     known = dict(zip(before, observation.titles or before, strict=True))
@@ -99,9 +99,9 @@ def _joined(file: Path, candidates: str) -> MeshDesign:
     return design
 
 
-def _gauges(candidates: str, locator: Locator) -> tuple[Gauge, ...]:
+def _gauges(candidates: str, mesh: StructureMesh) -> tuple[Gauge, ...]:
     if candidates.isdecimal():
-        spread = spread_rosettes(locator, int(candidates))
+        spread = spread_rosettes(mesh, int(candidates))
         return tuple(Gauge(**gauge) for one in spread for gauge in one.gauges())
-    content = with_rosettes(read_toml(candidates, InvalidDesignError), candidates, InvalidDesignError)
+    content = with_rosettes(read_toml(candidates, InvalidDesignError), candidates)
     return checked(_Gauges, content, candidates, InvalidDesignError, what="a file of gauges").gauge

@@ -233,16 +233,16 @@ class CoupledSource(SeveralSource):
             return target
         if component.design is None:
             return _given_fmu(component, target.parent)
-        tailored = None
+        options = {}
         if component.design == CALIBRATED_DESIGN_NAME:
             from calibration.result.file import load_calibration
             from calibration.result.plain import tailoring
 
             wing = load_calibration(Path(self._scenario.calibration.file or ""))
-            design, tailored = wing.wing_design, tailoring(wing)
+            design, options = wing.wing_design, tailoring(wing)
         else:
             design = load_design(component.design_path)
-        pack_wing(design, target, tailoring=tailored, replace=True, progress=progress)
+        pack_wing(design, target, replace=True, progress=progress, **options)
         return target
 
     def wiring(self) -> "Wiring":
@@ -261,14 +261,7 @@ class CoupledSource(SeveralSource):
         connections = tuple(
             connection
             for entry in asset.connection
-            for connection in expand_connection(
-                entry.source,
-                entry.target,
-                names,
-                factor=entry.factor,
-                offset=entry.offset,
-                delayed=entry.delayed,
-            )
+            for connection in expand_connection(**entry.model_dump(), components=names)
         )
         # A connector of the system is an output where something comes to it, and an input where it gives.
         connectors = dict.fromkeys(
@@ -286,8 +279,7 @@ def _given_fmu(component: ComponentSection, folder: Path) -> Path:
     assert component.fmu is not None
     if component.fmu not in COMPANION_NAMES:
         return Path(component.fmu)
-    content, _ = companion_bytes(component.fmu)
-    return atomic_write_bytes(folder / f"{component.name}.fmu", content)
+    return atomic_write_bytes(folder / f"{component.name}.fmu", companion_bytes(component.fmu))
 
 
 def _settings(component: ComponentSection) -> "dict[str, Setting]":

@@ -189,19 +189,15 @@ class _Wing:
         """
         from fe.reduction.fields import write_wing_vtu
         from fe.reduction.model_cache import wing_fields
-        from reporting.files import write_error
 
         design = self.design() if self.name else None
         if design is None or {*state} != {*design.regions} or {*control} != {"load_factor"}:
             return False
-        try:
-            wing = wing_fields(design)
-            e = scenario.asset.true_parameters.get("young_modulus_factor", mean)
-            force = scenario.asset.constant_load.get("tip_force", 0.0)
-            values = {**control, "young_modulus_factor": e, "tip_force": force}
-            write_wing_vtu(path, wing, wing.vector(values, state))
-        except OSError as error:
-            raise write_error(error, path) from error
+        wing = wing_fields(design)
+        e = scenario.asset.true_parameters.get("young_modulus_factor", mean)
+        force = scenario.asset.constant_load.get("tip_force", 0.0)
+        values = {**control, "young_modulus_factor": e, "tip_force": force}
+        write_wing_vtu(path, wing, wing.vector(values, state))
         return True
 
 
@@ -243,16 +239,16 @@ class WingFmuSource(FmuSource):
         """Reduce the design and pack the FMU."""
         from fmu_asset.packing.wing_packing import pack_wing
 
-        self.model, tailored = self._of.reduced(progress), None
+        self.model, options = self._of.reduced(progress), {}
         calibration = self._of.calibration()
         if calibration is not None:
             from calibration.result.plain import tailoring  # takes a second to load
 
-            tailored = tailoring(calibration)
+            options = tailoring(calibration)
         with progress.stage("Packing the FMU"):
             pack_wing(
-                self._of.design(), self.fmu_path(), tailoring=tailored, kind=self._packed,
-                patch=self._of.patch(), activate=True, replace=True, progress=progress,
+                self._of.design(), self.fmu_path(), kind=self._packed, patch=self._of.patch(), activate=True,
+                replace=True, progress=progress, **options,
             )  # fmt: skip
         return {FLOWN_DESIGN_HASH: self.model.design_hash, "fmu": hash_file(self.fmu_path())}
 

@@ -11,14 +11,10 @@ from fe.runtime.patch import PortForce, SensorDrift
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import WingDesign
 from fmu_asset.packing.patch_file import PatchFile, load_patch
-from fmu_asset.packing.patched_runtime import (
-    effect_values,
-    output_channels,
-    patched_behaviour,
-    plain_effects,
-)
 from fmu_asset.packing.wing_packing import arrays_for
 from fmu_asset.slaves.base import UnacceptableValuesError
+from fmu_asset.slaves.behaviour import StructureBehaviour
+from fmu_asset.slaves.effects import Effects, effect_rows, switch_of
 from fmu_asset.slaves.table import structure_table
 from twin_master.assets.interface import asked_table
 from twin_master.assets.parameter import ParameterDraws
@@ -39,7 +35,7 @@ def check_model_patch(patch: PatchFile, gauge_count: int, where: str = "The patc
     PatchFileError
         The wing cannot carry an effect.
     """
-    for effect in patch.for_outputs(output_channels(gauge_count), where):
+    for effect in patch.for_gauges(gauge_count, where).effects:
         for item in effect.patch:
             drifts = isinstance(item, SensorDrift) and item.exponent != 0.0
             if drifts or (isinstance(item, PortForce) and item.hysteretic):
@@ -67,10 +63,12 @@ def patched_observation_table(
         The model cannot carry the patch.
     """
     check_model_patch(patch, wing.gauge_count, where)
-    effects = plain_effects(patch.for_outputs(output_channels(wing.gauge_count)))
-    behaviour = patched_behaviour(wing, effects, arrays_for(design, patch))
-    behaviour.tune(effect_values(effects, active=True), 0.0)
-    rows = structure_table(wing, {})[0]
+    effects = patch.for_gauges(wing.gauge_count).plain
+    rows, roles = structure_table(wing, {})
+    acting = Effects(effects, wing.gauge_count, arrays_for(design, patch))
+    behaviour = StructureBehaviour(wing, rows, roles, acting)
+    on = {switch_of(effect): 1.0 for effect in effects}
+    behaviour.tune({row.name: float(row.start or 0.0) for row in effect_rows(effects, 0, on)}, 0.0)
     nominal = {row.name: row.start or 0.0 for row in rows}
     names = [row.name for row in rows if row.causality == "input"]
     force = scenario.asset.constant_load.get("tip_force", 0.0)
@@ -96,5 +94,5 @@ def effect_names(patch_file: Path, gauge_count: int) -> tuple[str, ...]:
     PatchFileError
         The patch cannot be read, or the FMU cannot carry it.
     """
-    effects = plain_effects(load_patch(patch_file).for_outputs(output_channels(gauge_count), str(patch_file)))
-    return tuple(effect_values(effects, active=False))
+    effects = load_patch(patch_file).for_gauges(gauge_count, str(patch_file)).plain
+    return tuple(row.name for row in effect_rows(effects, 0, {}))

@@ -83,8 +83,7 @@ class RecordedStructure:
         assert scenario.truth.record is not None
         self._scenario, self._model = scenario, model
         self._section, self._record = scenario.observation.modes, scenario.truth.record
-        step = {"step_size": 1.0 / self._record.sampling_rate}
-        bound = binding.model_copy(update={"binding": binding.binding.model_copy(update=step)})
+        bound = binding.with_header(step_size=1.0 / self._record.sampling_rate)
         self._parameters = {**parameters, "response": 2.0}
         self._session = session(bound, self._parameters)
         chosen = bound.observation_slice("acceleration")

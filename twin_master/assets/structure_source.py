@@ -266,13 +266,8 @@ def _write_field(path: Path, file: Path, values: Mapping[str, float]) -> bool:
     from fe.structure.field import write_structure_vtu
     from fe.structure.matrix_design import MatrixDesign
     from fe.structure.operators import load_and_assemble
-    from reporting.files import write_error
 
     if isinstance(load_structure(file), MatrixDesign):
         return False
-    target = path.with_name(FIELD_NAME)
-    try:
-        write_structure_vtu(target, load_and_assemble(file), values)
-    except OSError as error:
-        raise write_error(error, target) from error
+    write_structure_vtu(path.with_name(FIELD_NAME), load_and_assemble(file), values)
     return True

@@ -92,8 +92,7 @@ class FmuTestBench:
     ) -> RingDownSignal:
         """Hold the tip aside [m], let it go, and record for `duration` [s] at `sampling_rate` [Hz]."""
         time = sampling_times(duration, sampling_rate)
-        header = self._binding.binding.model_copy(update={"step_size": 1.0 / sampling_rate})
-        binding = self._binding.model_copy(update={"binding": header})
+        binding = self._binding.with_header(step_size=1.0 / sampling_rate)
         release = {"response": float(TRANSIENT), "initial_tip_displacement": initial_tip_displacement}
         strain = np.empty_like(time)
         with self._session(binding, release) as session:

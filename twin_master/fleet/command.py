@@ -130,8 +130,6 @@ class _Console:
 
 
 def _heading(watched: "FleetWatch") -> str:
-    from reporting.words import counted
-
     assets = watched.assets.values()
     turns = sum(asset.keep.twin.turns for asset in assets)
     alarms = sum(asset.alarm_count for asset in assets)
@@ -231,7 +229,7 @@ def learn(
     json: terminal.Json = False,
 ) -> None:
     """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ."""
-    from twin_master.fleet.lessons import learn_from_fleet
+    from twin_master.fleet.lessons import learn_from_fleet, lesson_rows
 
     record = learn_from_fleet(folder, out, progress=terminal.progress())
     if not no_report:
@@ -239,33 +237,9 @@ def learn(
     if json:
         terminal.print_json({"file": str(out), **record})
         return
-    _show_lessons(record)
+    headings = ("group", "learnt", "assumed", "mean", "95 % interval")
+    terminal.print_table(headings, lesson_rows(record))
     terminal.say(f"Learnt: {out}")
-
-
-def _show_lessons(record: dict[str, Any]) -> None:
-    table: list[tuple[str, ...]] = []
-    for name, group in record["groups"].items():
-        heading = f"{name}, {counted(group['twins'], 'twin')}"
-        heading += f", {group['alarmed']} with an alarm" if group["alarmed"] else ""
-        for control, rate in group["probability"].items():
-            mean, interval = f"{rate['mean']:.4f}", f"{rate['lower_95']:.4f} to {rate['upper_95']:.4f}"
-            if not rate["flown"]:
-                mean, interval = "", "not flown"
-            learnt = f"probability to worsen, {control}"
-            table.append((heading, learnt, f"{rate['assumed']:.4f}", mean, interval))
-            heading = ""
-        rows = [("noise over the assumed", "1", group["noise_factor"])]
-        if "population" in group:
-            parameter, told = group["population"]["parameter"], group["population"]
-            rows += [(f"{parameter}, mean", "", told["mean"]), (f"{parameter}, spread", "", told["spread"])]
-        for title, assumed, line in rows:
-            interval = f"{line['lower_95']:.4g} to {line['upper_95']:.4g}"
-            table.append(("", title, assumed, f"{line['mean']:.4g}", interval))
-    for control, told in record.get("shared", {}).items():
-        mean = f"{told['mean']:.4f} ± {told['standard_deviation']:.2g}"
-        table.append(("all groups", f"mean over groups, {control}", "", mean, ""))
-    terminal.print_table(("group", "learnt", "assumed", "mean", "95 % interval"), table)
 
 
 def engine_of(workers: int | None, cluster: str | None) -> "Engine":
@@ -350,11 +324,9 @@ def _plain(figures: Figures) -> dict[str, Any]:
 
 
 def _table(figures: Figures) -> None:
-    from twin_master.fleet.reading import shown
+    from twin_master.fleet.reading import figure_rows
 
-    titles = dict.fromkeys(title for group in figures.values() for title in group)
-    rows = [[title, *(shown(group.get(title)) for group in figures.values())] for title in titles]
-    terminal.print_table(["figure", *figures], rows)
+    terminal.print_table(["figure", *figures], figure_rows(figures))
 
 
 def _show(outcome: "FleetOutcome", figures: Figures) -> None:

@@ -7,17 +7,14 @@ in any order, shard by shard. What the twins decided takes no part, for they dec
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.compilation import compiled
+from reporting.arrays import Float, Index, Unsigned
 from twin_master.errors import FleetError
 from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.network.transition import predecessor_lists
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-Unsigned = NDArray[np.uint64]
 
 
 @compiled
@@ -72,7 +69,7 @@ class Worsening:
     assumed : (K,)
         What the scenario assumes.
     start, source
-        The predecessor lists, see `SparseTransition`.
+        Of the predecessor lists of all states.
     worsens, stays : (non-zeros, K)
         How often each probability, and its complement, is a factor of an entry.
     prior : (S,)
@@ -109,11 +106,11 @@ class Worsening:
             update={"probability": dict.fromkeys(scenario.control_names, 0.5)}
         )
         model = build_graphical_model(scenario.model_copy(update={"transition": halved}))
-        sparse, shape, size = model.transition.sparse, model.states.shape, model.states.size
-        length = sparse.start[1:].astype(np.int64) - sparse.start[:-1].astype(np.int64)
-        row = np.repeat(np.arange(len(length)), length)
+        _, _, start, source, *_ = predecessor_lists([model.transition.matrix])
+        shape, size = model.states.shape, model.states.size
+        row = np.repeat(np.arange(len(start) - 1), (start[1:] - start[:-1]).astype(np.int64))
         in_force, to = np.divmod(row, size)
-        before, after = np.unravel_index(sparse.source.astype(np.int64), shape), np.unravel_index(to, shape)
+        before, after = np.unravel_index(source.astype(np.int64), shape), np.unravel_index(to, shape)
         worsens, stays = np.zeros((len(row), len(keys))), np.zeros((len(row), len(keys)))
         for factor, name in enumerate(scenario.state_names):
             for number, chosen in enumerate(scenario.control_names):
@@ -123,9 +120,7 @@ class Worsening:
                 can = before[factor] < shape[factor] - 1
                 stays[:, k] += here & can & (after[factor] == before[factor])
         names = tuple(control if name is None else f"{control}, {name}" for control, name in keys)
-        return cls(
-            names, np.array(assumed), sparse.start, sparse.source, worsens, stays, model.prior, tuple(keys)
-        )
+        return cls(names, np.array(assumed), start, source, worsens, stays, model.prior, tuple(keys))
 
     def probability(self, points: Float) -> Float:
         """Return the entries of the lists (P, non-zeros) for probabilities (P, K) between 0 and 1."""

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reporting.arrays import Float, Index
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_record
 from twin_master.assets.parameter import ParameterDraws
@@ -25,9 +25,6 @@ from twin_master.scenario.schema import Scenario
 if TYPE_CHECKING:
     import xarray as xr
 
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 NOISE_TWINS = 100
 """Twins of a group from which the noise is learnt: they know it to one part in a few hundred."""

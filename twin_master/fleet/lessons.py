@@ -1,6 +1,5 @@
 """What a fleet has learnt, for people and as `learnt.toml`, with which a scenario is flown."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,12 +7,18 @@ import numpy as np
 
 from reporting.files import atomic_write_text
 from reporting.progress import Progress
+from reporting.toml_file import toml_text
+from reporting.words import counted
 from twin_master.fleet.learn import FleetLessons, learn_fleet
 from twin_master.fleet.posterior import Line
 from twin_master.run_folder import to_json
 
 LESSONS_NAME = "learnt.json"
 """In the folder of a fleet: what was learnt from it, for its report."""
+HEADING = """\
+# Learnt by `uav-twin fleet learn`. Fly with it: `uav-twin run SCENARIO --learnt THIS_FILE`, or
+# `learnt = "THIS_FILE"` in a group of a fleet.
+"""
 
 
 def learn_from_fleet(
@@ -53,26 +58,17 @@ def write_learnt(path: Path, lessons: FleetLessons) -> Path:
     A new asset has the means that the groups share, and the population of the parameter over the largest
     group. Figures are in SI.
     """
-    lines = [
-        "# Learnt by `uav-twin fleet learn`. Fly with it: `uav-twin run SCENARIO --learnt THIS_FILE`, or",
-        '# `learnt = "THIS_FILE"` in a group of a fleet.',
-        "format = 1",
-        f"source = {_inline(lessons.source)}",
-        "",
-    ]
-    largest = max(range(len(lessons.groups)), key=lambda number: lessons.groups[number].twins)
-    means = [marginal.mean for marginal in lessons.probabilities(largest)]
-    if lessons.shared is not None:
-        means = [mean for mean, _ in lessons.shared.mean]
-    lines += _tables(lessons, largest, means, "")
-    if len(lessons.groups) > 1:
-        for number, group in enumerate(lessons.groups):
-            own = [marginal.mean for marginal in lessons.probabilities(number)]
-            lines += _tables(lessons, number, own, f"group.{group.name}.")
-    return atomic_write_text(path, "\n".join(lines))
+    own = [[marginal.mean for marginal in lessons.probabilities(n)] for n in range(len(lessons.groups))]
+    largest = max(range(len(own)), key=lambda number: lessons.groups[number].twins)
+    means = own[largest] if lessons.shared is None else [mean for mean, _ in lessons.shared.mean]
+    content = {"format": 1, "source": lessons.source} | _tables(lessons, largest, means)
+    if len(own) > 1:
+        named = zip(lessons.groups, own, strict=True)
+        content["group"] = {group.name: _tables(lessons, n, mean) for n, (group, mean) in enumerate(named)}
+    return atomic_write_text(path, HEADING + toml_text(content))
 
 
-def _tables(lessons: FleetLessons, number: int, means: list[float], prefix: str) -> list[str]:
+def _tables(lessons: FleetLessons, number: int, means: list[float]) -> dict[str, Any]:
     group = lessons.groups[number]
     probability: dict[str, Any] = {}
     assumptions = group.worsening.assumed.tolist()
@@ -83,62 +79,47 @@ def _tables(lessons: FleetLessons, number: int, means: list[float], prefix: str)
             probability[control] = mean
         else:
             probability.setdefault(control, {})[factor] = mean
-    assumed = np.asarray(lessons.scenarios[group.name].observation.standard_deviation)
-    noise = (assumed * group.noise.mean).tolist()
-    lines = [f"[{prefix}transition]", f"probability = {_inline(probability)}", ""]
-    lines += [f"[{prefix}observation]", f"standard_deviation = {json.dumps(noise)}", ""]
+    noise = np.asarray(lessons.scenarios[group.name].observation.standard_deviation) * group.noise.mean
+    tables: dict[str, Any] = {
+        "transition": {"probability": probability},
+        "observation": {"standard_deviation": noise.tolist()},
+    }
     if group.population is not None:
         middle, spread = group.population
-        total = float(np.hypot(np.hypot(spread.mean, spread.standard_deviation), middle.standard_deviation))
-        lines += [f"[{prefix}calibration]", f"parameter = {json.dumps(group.parameter)}"]
-        lines += [f"mean = {middle.mean!r}", f"standard_deviation = {total!r}", ""]
-    return lines
-
-
-def _inline(table: dict[str, Any]) -> str:
-    """Return a table as TOML in one line."""
-    entries = (
-        f"{json.dumps(key)} = {_inline(value) if isinstance(value, dict) else json.dumps(value)}"
-        for key, value in table.items()
-    )
-    return f"{{ {', '.join(entries)} }}"
+        total = np.linalg.norm([spread.mean, spread.standard_deviation, middle.standard_deviation])
+        tables["calibration"] = {
+            "parameter": group.parameter, "mean": middle.mean, "standard_deviation": float(total)
+        }  # fmt: skip
+    return tables
 
 
 def lessons_record(lessons: FleetLessons) -> dict[str, Any]:
     """Return what was learnt beside what was assumed, for JSON and the report."""
     groups = {}
     for number, group in enumerate(lessons.groups):
-        rates = {
-            name: {"assumed": float(assumed), "flown": flown, **_figures(marginal)}
-            for name, assumed, flown, marginal in zip(
-                group.worsening.names,
-                group.worsening.assumed,
-                lessons.flown(number),
-                lessons.probabilities(number),
-                strict=True,
-            )
-        }
-        counts = {"twins": group.twins, "left_out": group.unexplained, "alarmed": group.alarmed}
-        found: dict[str, Any] = {**counts, "probability": rates}
-        found["noise_factor"] = _figures(group.noise)
+        told = zip(
+            group.worsening.names, group.worsening.assumed.tolist(), lessons.flown(number),
+            lessons.probabilities(number), strict=True,
+        )  # fmt: skip
+        found: dict[str, Any] = {
+            "twins": group.twins, "left_out": group.unexplained, "alarmed": group.alarmed,
+            "probability": {
+                name: {"assumed": assumed, "flown": flown, **_figures(marginal)}
+                for name, assumed, flown, marginal in told
+            },
+            "noise_factor": _figures(group.noise),
+        }  # fmt: skip
         if group.population is not None:
-            mean, spread = group.population
-            found["population"] = {
-                "parameter": group.parameter, "mean": _figures(mean), "spread": _figures(spread)
-            }  # fmt: skip
+            mean, spread = map(_figures, group.population)
+            found["population"] = {"parameter": group.parameter, "mean": mean, "spread": spread}
         groups[group.name] = found
     record: dict[str, Any] = {"source": lessons.source, "groups": groups}
     if lessons.shared is not None:
         names = lessons.groups[0].worsening.names
         pairs = zip(names, lessons.shared.mean, lessons.shared.concentration, strict=True)
+        titles = "mean", "standard_deviation", "log10_concentration", "log10_concentration_standard_deviation"
         record["shared"] = {
-            name: {
-                "mean": mean[0],
-                "standard_deviation": mean[1],
-                "log10_concentration": size[0],
-                "log10_concentration_standard_deviation": size[1],
-            }
-            for name, mean, size in pairs
+            name: dict(zip(titles, (*mean, *size), strict=True)) for name, mean, size in pairs
         }
     return record
 
@@ -147,3 +128,30 @@ def _figures(marginal: Line) -> dict[str, float]:
     low, high = marginal.interval()
     deviation = marginal.standard_deviation
     return {"mean": marginal.mean, "standard_deviation": deviation, "lower_95": low, "upper_95": high}
+
+
+def lesson_rows(record: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return what was learnt as rows of a table: group, what, assumed, mean, 95 % interval."""
+    rows: list[tuple[str, ...]] = []
+    for name, group in record["groups"].items():
+        heading = f"{name}, {counted(group['twins'], 'twin')}"
+        heading += f", {group['alarmed']} with an alarm" if group["alarmed"] else ""
+        for control, rate in group["probability"].items():
+            mean, interval, off = "", "not flown", ""
+            if rate["flown"]:
+                low, high = rate["lower_95"], rate["upper_95"]
+                mean, interval = f"{rate['mean']:.4f}", f"{low:.4f} to {high:.4f}"
+                off = "" if low <= rate["assumed"] <= high else " (outside)"
+            title = f"probability to worsen, {control}"
+            rows.append((heading, title, f"{rate['assumed']:.4f}{off}", mean, interval))
+            heading = ""
+        lines = [("noise over the assumed", "1", group["noise_factor"])]
+        if told := group.get("population"):
+            lines += [(f"{told['parameter']}, {moment}", "", told[moment]) for moment in ("mean", "spread")]
+        for title, assumed, line in lines:
+            interval = f"{line['lower_95']:.4g} to {line['upper_95']:.4g}"
+            rows.append(("", title, assumed, f"{line['mean']:.4g}", interval))
+    for control, told in record.get("shared", {}).items():
+        mean = f"{told['mean']:.4f} ± {told['standard_deviation']:.2g}"
+        rows.append(("all groups", f"mean over groups, {control}", "", mean, ""))
+    return rows

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
+from reporting.arrays import Float
+
 Axes = tuple[Float, ...]
 
 POINTS = {1: 17, 2: 13, 3: 9, 4: 7}

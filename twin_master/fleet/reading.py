@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from twin_master.fleet.flight import GROUPS, fleet_config
 from twin_master.fleet.store import ENDED, FAILED, FLOWN, NOTICE_KINDS, has_flown, open_group
 from twin_master.mission.preparation import Knowledge, kept_knowledge
@@ -16,8 +17,6 @@ from twin_master.scenario.schema import Scenario
 if TYPE_CHECKING:
     import xarray as xr
 
-
-Float = NDArray[np.float64]
 
 WITHIN = 2
 """Turns within which the fallback is to come."""
@@ -229,7 +228,13 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
     return found
 
 
-def shown(figure: Estimated | int | None) -> str:
+def figure_rows(groups: Mapping[str, Mapping[str, Estimated | int]]) -> list[list[str]]:
+    """Return the figures of groups as rows of a table: the title, and what each group has."""
+    titles = dict.fromkeys(title for figures in groups.values() for title in figures)
+    return [[title, *(_shown(figures.get(title)) for figures in groups.values())] for title in titles]
+
+
+def _shown(figure: Estimated | int | None) -> str:
     """Return a figure for people."""
     if figure is None:
         return ""

@@ -17,13 +17,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from reporting import figures as style
+from reporting.arrays import Float
 from reporting.files import atomic_write_text
 from reporting.json_file import read_json
 from reporting.page import Column, Page, Words, numbers
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND as FLOWN_KIND
-from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.reading import WITHIN, group_figures, last_turns, leaving, noticed, shown
+from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
+from twin_master.fleet.reading import WITHIN, figure_rows, group_figures, last_turns, leaving, noticed
 from twin_master.fleet.standing import STATE_NAME, FleetRecord
 from twin_master.fleet.store import DONE_NAME, ENDED, FAILED, has_flown, open_group
 from twin_master.fleet.watching import KIND as WATCHED_KIND
@@ -34,9 +35,6 @@ from twin_master.scenario.schema import Scenario
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["REPORT_NAME", "fleet_page", "fleet_record", "write_fleet_report"]
-
-Float = NDArray[np.float64]
 
 WORDS = Words("twin_master.fleet")
 REPORT_NAME = "report.html"
@@ -109,9 +107,7 @@ def _add_flown(page: Page, folder: Path, records: list[dict[str, Any]], most: in
     groups = {record["name"]: open_group(folder, record["name"]) for record in records}
     page.add_paragraph(_opening(records, groups))
     found = {name: group_figures(group) for name, group in groups.items()}
-    titles = dict.fromkeys(title for figures in found.values() for title in figures)
-    rows = [[title, *(shown(figures.get(title)) for figures in found.values())] for title in titles]
-    WORDS.add_table(page, "fared", rows, more=list(found))
+    WORDS.add_table(page, "fared", figure_rows(found), more=list(found))
     status = np.concatenate([group["status"].values for group in groups.values()])
     failures = _failures(folder)
     if failures:
@@ -233,28 +229,8 @@ def _add_lessons(page: Page, folder: Path) -> None:
     path = folder / LESSONS_NAME
     if not path.is_file():
         return
-    rows = []
-    for name, group in json.loads(path.read_text())["groups"].items():
-        for control, rate in group["probability"].items():
-            low, high, assumed = rate["lower_95"], rate["upper_95"], rate["assumed"]
-            told = ["", "not flown"]
-            if rate["flown"]:
-                told = [f"{rate['mean']:.4f}", f"{low:.4f} to {high:.4f}"]
-            off = " (outside)" if rate["flown"] and not low <= assumed <= high else ""
-            rows.append([name, f"probability to worsen, {control}", f"{assumed:.4f}{off}", *told])
-        if group["alarmed"]:
-            rows.append([name, "twins with an alarm among them", "", str(group["alarmed"]), ""])
-        lines = [("noise over the assumed", "1", group["noise_factor"])]
-        if told_population := group.get("population"):
-            parameter = told_population["parameter"]
-            lines += [
-                (f"{parameter}, {moment}", "", told_population[moment]) for moment in ("mean", "spread")
-            ]
-        for title, given, line in lines:
-            interval = f"{line['lower_95']:.4g} to {line['upper_95']:.4g}"
-            rows.append([name, title, given, f"{line['mean']:.4g}", interval])
     page.add_section("Learnt across the fleet")
-    WORDS.add_table(page, "lessons", rows)
+    WORDS.add_table(page, "lessons", lesson_rows(json.loads(path.read_text())))
 
 
 def _add_group(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from reporting.files import write_error
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Fleet, Group, Member
@@ -24,8 +25,6 @@ from twin_master.store.summary import find_fallback
 if TYPE_CHECKING:
     import xarray as xr
     import zarr
-
-Float = NDArray[np.float64]
 
 
 NOTICE_KINDS = ("alarm", "gauge_left_out")

@@ -21,8 +21,6 @@ from twin_master.fleet.standing import STATE_NAME
 from twin_master.fleet.store import DONE_NAME
 from twin_master.viewer.server import OWN_NAMES, handlers_of, serve_application, text_of
 
-__all__ = ["fleet_view", "is_fleet", "serve_fleet"]
-
 WORST = 50
 """Assets in the table."""
 LOOK_SECONDS = 1.0

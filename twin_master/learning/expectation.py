@@ -10,16 +10,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from twin_master.learning.hypotheses import Hypotheses, quantiles_of, shown_by
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.network.estimator import Carried, Learnt
 from twin_master.network.rewards import RewardModel
-
-__all__ = ["Expected", "LearntExpectation"]
-
-Float = NDArray[np.float64]
 
 _LEVELS = np.array([0.025, 0.975])
 _NEGLIGIBLE = 1e-9

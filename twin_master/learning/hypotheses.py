@@ -3,13 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
-__all__ = ["Hypotheses", "quantiles_of", "shown_by"]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+from reporting.arrays import Float, Index
 
 _NEGLIGIBLE = 1e-9
 """Share of a belief below which a hypothesis tells nothing."""

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import gammaincinv, gammaln, logsumexp
 
+from reporting.arrays import Float, Index
 from twin_master.errors import ImpossibleObservation, InvalidModelError
 from twin_master.learning.hypotheses import Hypotheses, shown_by
 from twin_master.learning.posterior import INTERVAL, DrawsPosterior
@@ -25,11 +26,6 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import log_forecast, smooth_many
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import TransitionModel
-
-__all__ = ["LearningFilter", "LearntPriors"]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _NORMAL = 1.6448536269514722
 """Half-width of the central 90 % of a normal distribution, in standard deviations."""

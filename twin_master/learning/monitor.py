@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from twin_master.errors import InvalidModelError
 from twin_master.learning import switching
 from twin_master.learning.rivals import Shown, mix_onset, weigh_gauges, weigh_model, weigh_none
@@ -29,9 +30,6 @@ from twin_master.network.kernels import move_rows
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.tables import MOST_DRAWS, Noticing
 
-__all__ = ["WatchfulEstimator", "Words"]
-
-Float = NDArray[np.float64]
 Arrays = dict[str, NDArray[Any]]
 
 _PREFIX = "notice/"
@@ -133,7 +131,7 @@ class WatchfulEstimator:
         with np.errstate(divide="ignore"):
             rows = np.log([turn.arrays[_PREFIX + "belief"] for turn in carried])
             rows[-1] = np.log(carried[-1].arrays[_PREFIX + "rivals"])
-        others = smooth(self.model, [turn.control_index for turn in carried], rows).smoothed
+        others = smooth(self.model, [turn.control_index for turn in carried], rows)
         right = float(carried[-1].arrays[_PREFIX + "right"][0])
         return np.asarray(right * own + (1.0 - right) * others)
 
@@ -214,8 +212,8 @@ class WatchfulEstimator:
         """Return what was carried, one transition later, with the rivals that begin in this turn."""
         own = self._unpacked(before.arrays)
         for name in ("model", "gauge", "none", "mended"):
-            lists = self.model.transition.forward_lists.arrays
-            move_rows(lists, before.control_index, own[name].reshape(-1, self._shape[-1]))
+            rows = own[name].reshape(-1, self._shape[-1])
+            move_rows(self.model.transition.forward_lists, before.control_index, rows)
         turn = float(own["turns"][0])
         inflow = np.log(self._to_begin(turn - 1.0) - self._to_begin(turn))
         gauges = own["gauge"].reshape(-1, *self._shape[2:])

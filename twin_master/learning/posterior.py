@@ -1,13 +1,10 @@
 """Posterior of a static quantity from the weights of its draws, between the draws as well."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reporting.arrays import Float
 from twin_master.network.estimator import Learnt
-
-__all__ = ["DrawsPosterior"]
-
-Float = NDArray[np.float64]
 
 INTERVAL = (0.05, 0.95)
 _POINTS = 801

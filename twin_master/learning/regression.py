@@ -12,15 +12,10 @@ belief of each turn given the hypothesis.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from fe.compilation import compiled
-
-__all__ = ["GaugeRegression"]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+from reporting.arrays import Float, Index
 
 LARGE = 1e100
 """A product is taken to the logarithm above this."""

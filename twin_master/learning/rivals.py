@@ -10,11 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fe.compilation import compiled
-
-__all__ = ["Shown", "mix_onset", "weigh_gauges", "weigh_model", "weigh_none"]
-
-Float = NDArray[np.float64]
-Single = NDArray[np.float32]
+from reporting.arrays import Float, Single
 
 NEGLIGIBLE = 1e-30
 """Places of the model below this probability are left out of its evidence."""

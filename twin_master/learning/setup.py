@@ -6,14 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
-from twin_master.learning.monitor import WatchfulEstimator, Words
+from twin_master.learning.monitor import WatchfulEstimator
+from twin_master.learning.words import Words
 from twin_master.network.estimator import Estimator, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.schema import Scenario
-
-__all__ = ["learning_filter", "scenario_estimator"]
 
 
 def scenario_estimator(

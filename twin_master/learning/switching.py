@@ -10,24 +10,9 @@ stays that of its first beginning (compare Blom and Bar-Shalom 1988).
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reporting.arrays import Float, Single
 from twin_master.network.estimator import Hypothesis
-
-__all__ = [
-    "ENDS",
-    "GAUGES",
-    "MENDED",
-    "MODEL",
-    "NONE",
-    "at_first",
-    "beliefs_of",
-    "hypotheses",
-    "one_turn_later",
-]
-
-Float = NDArray[np.float64]
-Single = NDArray[np.float32]
 
 MODEL, MENDED, NONE, GAUGES = 0, 1, 2, 3
 """Places in the log shares; from the last on the sensors and their gains."""

@@ -27,7 +27,8 @@ from twin_master.mission.truth import (
 )
 from twin_master.mission.turns import History
 from twin_master.network.estimator import Notice
-from twin_master.network.step_many import decide_many, filter_step_many, rationed
+from twin_master.network.inference import filter_many
+from twin_master.network.planner import decision, rationed
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -173,9 +174,9 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
     ending = np.array([scenario.ends(index) for index in range(len(scenario.control))])
     budget, on_belief = scenario.planner.inspections_a_turn, knowledge.plan.on_belief
     inspecting = sorted({place for place, *_ in scenario.readings})
-    before: tuple[Float | None, Index | None] = None, None
+    before: tuple[Float, Index] = model.log_prior, np.array(-1)
     for step in range(scenario.mission.steps):
-        if before[1] is not None:
+        if step:
             for twin in np.flatnonzero(flying & ending[before[1]]).tolist():
                 how = decided_to_end(scenario, before[1][twin])
                 flights.ended[twin] = ended_sentence(scenario, step, how)
@@ -184,28 +185,34 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
         flying[[*plants.failure]] = False
         observed[~flying] = np.nan
         likelihood = knowledge.sensor_model.log_likelihood_sequence(observed, control)
-        filtered, log_filtered, evidence, impossible = filter_step_many(model, *before, likelihood)
+        found, failed = filter_many(model, control[:, None], likelihood[:, None], *before)
+        now, impossible = found[:, 0], failed >= 0
         for twin in np.flatnonzero(impossible & flying).tolist():
             worst = knowledge.sensor_model.worst_residuals(observed[twin], int(control[twin]))
             plants.failure[twin] = str(ImpossibleObservation(scenario.mission.name, step, worst))
         flying &= ~impossible
         # Of a failed twin: anything that can be gone on with.
-        filtered[impossible], log_filtered[impossible] = model.prior, model.log_prior
+        now.filtered[impossible], now.log_filtered[impossible] = model.prior, model.log_prior
         for array, row in (
             (flights.observed, observed[:, : scenario.observation.count]),
             (flights.control_index, control),
             (flights.state, state),
-            (flights.filtered, filtered),
-            (flights.log_evidence, evidence),
+            (flights.filtered, now.filtered),
+            (flights.log_evidence, now.log_evidence),
         ):
             array[flying, step] = row[flying]
-        before = log_filtered, control
-        control = decide_many(model, filtered, control, knowledge.plan, scenario.planner.decide_on)
+        before = now.log_filtered, control
+        asked = decision(
+            model.transition, now.filtered, control, knowledge.plan.policy, on_belief,
+            ahead=scenario.planner.decide_on == "predicted",
+        )  # fmt: skip
+        control = np.argmax(asked, axis=1)
         if budget is not None and on_belief is not None:
             some = np.flatnonzero(flying)
             control[some] = rationed(
-                model, filtered[some], before[1][some], control[some], on_belief, inspecting, budget
-            )
+                model.transition, now.filtered[some], before[1][some], control[some], on_belief, inspecting,
+                budget,
+            )  # fmt: skip
     for twin, sentence in plants.failure.items():
         flights.failure[twin] = sentence
     return flights

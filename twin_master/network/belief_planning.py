@@ -9,17 +9,12 @@ settle at all of them, as of a problem of so many states: Pineau et al. 2003; Po
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.compilation import compiled
+from reporting.arrays import Float, Index
 from twin_master.errors import PlanningError
 from twin_master.network.planner import BeliefPolicy, evaluate_policy, value_iteration
 from twin_master.network.transition import TransitionModel
-
-__all__ = ["BeliefPlan", "DecisionProblem", "plan_on_belief"]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _STEP = 1e-12
 """What a bound improves by at least."""
@@ -261,8 +256,7 @@ class _Bounds:
 
     def lower(self, rows: Float) -> Float:
         """Return the lower bound at rows (K, S) that need not sum to one: (K,)."""
-        result: Float = (rows @ self.vectors.T).max(axis=1)
-        return result
+        return np.asarray((rows @ self.vectors.T).max(axis=1))
 
     def backup(self, control: int, rows: Float) -> Float:
         """Return the vector (S,) of a control with the best that is known behind it at rows (K, S)."""

@@ -1,11 +1,10 @@
 """Probability distributions and stochastic matrices, checked once where they come in."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reporting.arrays import Float
 from twin_master.errors import InvalidDistributionError
-
-Float = NDArray[np.float64]
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of a probability distribution from one."""

@@ -12,23 +12,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reporting.arrays import Float
 from twin_master.errors import ImpossibleObservation
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import filter_step, smooth
-
-__all__ = [
-    "Carried",
-    "Estimate",
-    "Estimator",
-    "ExactFilter",
-    "Hypothesis",
-    "Learnt",
-    "Notice",
-    "SensorModel",
-    "Suspicion",
-]
-
-Float = NDArray[np.float64]
 
 
 class SensorModel(Protocol):
@@ -263,4 +250,4 @@ class ExactFilter:
         """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
         size = self.model.states.size
         rows = np.array([turn.arrays["log_filtered"] for turn in carried]).reshape(-1, size)
-        return smooth(self.model, [turn.control_index for turn in carried], rows).smoothed
+        return smooth(self.model, [turn.control_index for turn in carried], rows)

@@ -9,24 +9,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reporting.arrays import Float
 from reporting.words import brief
 from twin_master.errors import InvalidModelError
 from twin_master.network.distributions import distribution, stochastic_matrix
 from twin_master.network.transition import TransitionModel
-
-__all__ = [
-    "Factor",
-    "GraphicalModel",
-    "StateSpace",
-    "deterministic_policy",
-    "leaving_table",
-    "repaired_table",
-    "worsening_table",
-]
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -127,15 +116,13 @@ class StateSpace:
 
     def mean(self, belief: ArrayLike) -> Float:
         """Return the mean of each factor: (..., S) -> (..., factors)."""
-        result: Float = np.asarray(belief, dtype=np.float64) @ self.coordinates
-        return result
+        return np.asarray(belief, dtype=np.float64) @ self.coordinates
 
     def standard_deviation(self, belief: ArrayLike) -> Float:
         """Return the standard deviation of each factor: (..., S) -> (..., factors)."""
         belief = np.asarray(belief, dtype=np.float64)
         deviation = self.coordinates - self.mean(belief)[..., None, :]
-        result: Float = np.sqrt(np.einsum("...s,...sf->...f", belief, deviation**2))
-        return result
+        return np.asarray(np.sqrt(np.einsum("...s,...sf->...f", belief, deviation**2)))
 
     def within_interval(self, table: ArrayLike) -> Float:
         """Return what a table over the states (S, ...) changes by inside each state's interval: (S, ..., F).
@@ -171,8 +158,7 @@ class StateSpace:
         joint = belief.reshape(*belief.shape[:-1], *self.shape)
         keep = self.names.index(name)
         others = tuple(axis - len(self.shape) for axis in range(len(self.shape)) if axis != keep)
-        result: Float = joint.sum(axis=others)
-        return result
+        return np.asarray(joint.sum(axis=others))
 
 
 @dataclass(frozen=True)

@@ -5,16 +5,13 @@ they were found, row by row; NaN or left out where it is not known, which counts
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reporting.arrays import Float
 from twin_master.errors import InvalidObservationError
 from twin_master.network.sensor_kernels import LOG_ROOT_TWO_PI
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.observation import row_width
-
-__all__ = ["IdentifiedSensorModel", "packed_row"]
-
-Float = NDArray[np.float64]
 
 
 def packed_row(values: Float, covariance: Float) -> Float:

@@ -11,29 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reporting.arrays import Float, Index
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.kernels import backward_pass, forward_pass, move
 from twin_master.network.transition import TransitionModel
-
-__all__ = [
-    "Filtered",
-    "Predicted",
-    "Smoothed",
-    "filter_many",
-    "filter_sequence",
-    "filter_step",
-    "known_control",
-    "log_forecast",
-    "predict",
-    "smooth",
-    "smooth_many",
-]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -60,19 +44,6 @@ class Filtered:
     def __getitem__(self, place: Any) -> "Filtered":
         """Return the beliefs at a place of the leading axes."""
         return Filtered(*(np.asarray(values)[place] for values in vars(self).values()))
-
-
-@dataclass(frozen=True)
-class Smoothed:
-    """Smoothed beliefs of T steps (or of many twins, with a leading axis).
-
-    Attributes
-    ----------
-    smoothed : (..., T, S)
-        p(D_t | o_0..o_{T-1}).
-    """
-
-    smoothed: Float
 
 
 @dataclass(frozen=True)
@@ -125,7 +96,7 @@ def log_forecast(transition: TransitionModel, control: ArrayLike, log_filtered: 
     """Return the logarithms of beliefs (B, S) one transition later, each under its control (B,)."""
     before = np.array(log_filtered, dtype=np.float64, order="C")
     after = np.empty_like(before)
-    move(transition.forward_lists.arrays, np.array(control, dtype=np.int64), before, after)
+    move(transition.forward_lists, np.array(control, dtype=np.int64), before, after)
     return after
 
 
@@ -154,14 +125,14 @@ def filter_many(
     log_evidence, failed = np.empty(rows.shape[:2]), np.empty(len(rows), dtype=np.int64)
     found = forecast, filtered, log_filtered, log_evidence
     first = np.full((len(rows), rows.shape[2]), log_before), np.full(len(rows), control_before)
-    forward_pass(model.transition.forward_lists.arrays, control, *first, rows, *found, failed)
+    forward_pass(model.transition.forward_lists, control, *first, rows, *found, failed)
     return Filtered(*found), failed
 
 
 def smooth_many(transition: TransitionModel, control: Index, filtered: Float, log_filtered: Float) -> Float:
     """Smooth the filtered beliefs (B, T, S) of B twins under controls (B, T), without any check."""
     smoothed = np.empty_like(log_filtered)
-    lists = transition.forward_lists.arrays, transition.backward_lists.arrays
+    lists = transition.forward_lists, transition.backward_lists
     backward_pass(*lists, control, filtered, log_filtered, smoothed)
     return smoothed
 
@@ -236,8 +207,8 @@ def filter_sequence(
     return found[0]
 
 
-def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayLike) -> Smoothed:
-    """Smooth over the whole history, given the filtered beliefs.
+def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayLike) -> Float:
+    """Return p(D_t | o_0..o_{T-1}) of all steps (T, S), given the filtered beliefs.
 
     Parameters
     ----------
@@ -256,7 +227,8 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
     if control.ndim != 1:
         raise InvalidModelError(f"expected one control for each step, got an array of shape {control.shape}")
     rows = _checked_rows(model, control, log_filtered, what="log belief")
-    return Smoothed(smooth_many(model.transition, control[None], np.exp(rows)[None], rows[None])[0])
+    found = smooth_many(model.transition, control[None], np.exp(rows)[None], rows[None])
+    return np.asarray(found[0])
 
 
 def predict(
@@ -318,5 +290,4 @@ def known_control(belief: ArrayLike, control_index: ArrayLike, control_count: in
     """Return the joint (..., S, U) of a belief (..., S) and a control that is known (...)."""
     belief = np.asarray(belief, dtype=np.float64)
     chosen = np.eye(control_count)[np.asarray(control_index)]
-    result: Float = belief[..., :, None] * chosen[..., None, :]
-    return result
+    return np.asarray(belief[..., :, None] * chosen[..., None, :])

@@ -3,16 +3,12 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reporting.arrays import Float, Index
 from twin_master.errors import InvalidObservationError
 from twin_master.network.sensor_kernels import LOG_ROOT_TWO_PI
 from twin_master.network.sensor_model import GaussianSensorModel
-
-__all__ = ["InspectedSensorModel"]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class InspectedSensorModel(GaussianSensorModel):

@@ -14,14 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fe.compilation import callable_when_compiled, compiled
+from reporting.arrays import Float, Index, Unsigned
 
-__all__ = ["Lists", "backward_pass", "forward_pass", "move", "move_rows", "sweep"]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-Unsigned = NDArray[np.uint64]
 Lists = tuple[Index, Index, Unsigned, Unsigned, Float, Float]
-"""Levels, first row, start, source, probability and its logarithm of `TransitionLists`."""
+"""The predecessors of levels, block after block, which the loops never write to.
+
+Number of joint levels of each block, and where its rows begin: row `first row + control * levels + level`.
+Where each row begins (rows + 1,); the predecessor of a level within its block, the probability of the
+transition from it, and the logarithm of that, (non-zeros,) each.
+"""
 
 SAFE = 1e-280
 NEGLIGIBLE = -45.0

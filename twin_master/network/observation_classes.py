@@ -1,14 +1,10 @@
 """What sensors may show, as classes of finite number with their probabilities in each state."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import rel_entr
 
+from reporting.arrays import Float
 from twin_master.network.sensor_model import GaussianSensorModel
-
-__all__ = ["observation_classes"]
-
-Float = NDArray[np.float64]
 
 SAMPLES = 1500
 """Observations that are drawn for each control, the same number in each state."""

@@ -1,22 +1,18 @@
-"""Planning: value iteration on the Bellman equation, Kapteyn et al. 2021, eq. (36)."""
+"""Planning by value iteration on the Bellman equation, Kapteyn et al. 2021, eq. (36), and what is decided."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from reporting.arrays import Float, Index
 from twin_master.errors import PlanningError
 from twin_master.network.distributions import stochastic_matrix
 from twin_master.network.graphical_model import deterministic_policy
 from twin_master.network.kernels import sweep
 from twin_master.network.transition import TransitionModel
-
-__all__ = ["BeliefPolicy", "PlannedPolicy", "evaluate_policy", "given_policy", "value_iteration"]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -57,8 +53,7 @@ class BeliefPolicy:
 
     def value(self, belief: ArrayLike) -> Float:
         """Return the expected return from beliefs (..., S): (...)."""
-        result: Float = (np.asarray(belief) @ self.vectors.T).max(axis=-1)
-        return result
+        return np.asarray((np.asarray(belief) @ self.vectors.T).max(axis=-1))
 
     def action_value(self, belief: ArrayLike, controls: int) -> Float:
         """Return the same by the control of the first turn: (..., U), minus infinity without a vector."""
@@ -70,8 +65,7 @@ class BeliefPolicy:
 
     def decide(self, belief: ArrayLike) -> Index:
         """Return the control for beliefs (..., S): (...)."""
-        result: Index = self.control[np.argmax(np.asarray(belief) @ self.vectors.T, axis=-1)]
-        return result
+        return np.asarray(self.control[np.argmax(np.asarray(belief) @ self.vectors.T, axis=-1)])
 
 
 @dataclass(frozen=True)
@@ -102,6 +96,71 @@ class PlannedPolicy:
     on_belief: BeliefPolicy | None = None
 
 
+def decision(
+    transition: TransitionModel, filtered: Float, control: Index, policy: Float,
+    on_belief: BeliefPolicy | None = None, *, ahead: bool = False,
+) -> Float:  # fmt: skip
+    """Return the probability of each next control of B twins (B, U), of each what it would be alone.
+
+    Parameters
+    ----------
+    transition : TransitionModel
+    filtered : (B, S)
+        p(D_t | o_0..o_t).
+    control : (B,)
+        Control in force in turn t.
+    policy : (S, U)
+        p(U | D), which is averaged over the belief.
+    on_belief : BeliefPolicy, optional
+        Decides in its place by p(D_{t+1} | o_0..o_t).
+    ahead : bool
+        Average over that belief, too.
+    """
+    belief = filtered
+    if ahead or on_belief is not None:
+        pairs = zip(control.tolist(), filtered, strict=True)
+        belief = np.stack([transition.forward(in_force, row) for in_force, row in pairs])
+    if on_belief is not None:
+        return np.eye(policy.shape[1])[[on_belief.decide(row) for row in belief]]
+    # One product for each twin, so that its last bit does not depend on how many there are.
+    return np.asarray(np.matmul(belief[:, None, :], policy)[:, 0])
+
+
+def rationed(
+    transition: TransitionModel, filtered: Float, before: Index, chosen: Index, policy: BeliefPolicy,
+    scarce: Sequence[int], budget: int,
+) -> Index:  # fmt: skip
+    """Return the next controls (B,) of which so many at most are scarce: those that are worth most.
+
+    A scarce control is worth what its return is above that of the best other one, which is taken where the
+    budget is spent.
+
+    Parameters
+    ----------
+    transition, filtered
+        As of `decision`.
+    before, chosen : (B,)
+        Controls in force, and those that were decided.
+    policy : BeliefPolicy
+    scarce : sequence of int
+        Controls of which there are few, such as inspections.
+    budget : int
+        How many.
+    """
+    wanting = np.flatnonzero(np.isin(chosen, scarce))
+    if len(wanting) <= budget:
+        return chosen
+    ahead = np.array([transition.forward(int(before[twin]), filtered[twin]) for twin in wanting])
+    value = policy.action_value(ahead, transition.shape[0])
+    others = value.copy()
+    others[:, scarce] = -np.inf
+    gain = value[:, scarce].max(axis=1) - others.max(axis=1)
+    late = np.argsort(-gain, kind="stable")[budget:]
+    result = chosen.copy()
+    result[wanting[late]] = np.argmax(others[late], axis=1)
+    return result
+
+
 def _checked(
     transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: ArrayLike
 ) -> tuple[TransitionModel, Float, Float]:
@@ -130,8 +189,6 @@ def _checked(
 
 def _action_value(transition: TransitionModel, reward: Float, discount: Float, value: Float) -> Float:
     """Return the reward of each control first and the value afterwards: (S, U)."""
-    if not transition.is_product:
-        return np.asarray(reward + discount * (transition.matrix @ value).T)
     later = [transition.expected(control, value) for control in range(reward.shape[1])]
     return np.asarray(reward + discount * np.stack(later, axis=1))
 
@@ -178,8 +235,9 @@ def value_iteration(
     # |V_k - V*| <= gamma / (1 - gamma) |V_k - V_{k-1}|; below rounding nothing changes any more.
     limit = max(tolerance * scale * (1.0 - largest), 4e-16 * scale / (1.0 - largest))
     value, action_value = np.zeros(len(rewards)), np.empty_like(rewards)
-    lists = model.backward_lists.arrays
-    iterations, change = sweep(lists, rewards, factors.copy(), limit, max_iterations, value, action_value)
+    iterations, change = sweep(
+        model.backward_lists, rewards, factors.copy(), limit, max_iterations, value, action_value
+    )
     if change > limit:
         raise PlanningError(
             f"value iteration still changes by {change:.3g} after {max_iterations} sweeps with discount "
@@ -216,8 +274,7 @@ def evaluate_policy(
     expected = np.einsum("su,su->s", rows, rewards)
     if not model.is_product:
         closed_loop = np.einsum("su,ust->st", rows * factors, model.matrix)
-        result: Float = np.linalg.solve(np.eye(len(expected)) - closed_loop, expected)
-        return result
+        return np.asarray(np.linalg.solve(np.eye(len(expected)) - closed_loop, expected))
     value: Float = np.zeros_like(expected)
     # Each sweep shrinks the error by the discount at least.
     largest = float(factors.max())
@@ -239,7 +296,6 @@ def given_policy(
         p(U | D), row-stochastic; `control_index` is its mode, the first of equals.
     """
     value = evaluate_policy(transition, reward, discount, policy)
-    model, rewards, factors = _checked(transition, reward, discount)
+    action_value = _action_value(*_checked(transition, reward, discount), value)
     rows = stochastic_matrix(policy, name="policy[state]")
-    action_value = _action_value(model, rewards, factors, value)
     return PlannedPolicy(value, action_value, np.argmax(rows, axis=1).astype(np.int64), rows, 0)

@@ -8,16 +8,12 @@ quantiles are exact: Kapteyn et al. 2021, eqs. (3) and (37).
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fe.compilation import compiled
+from reporting.arrays import Float, Index
 from twin_master.errors import InvalidModelError
 from twin_master.network.distributions import distribution
-
-__all__ = ["QuantityModel"]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 TIE = 1e-12
 """A cumulative probability reaches a level when it misses it by no more than this (rounding of the sum)."""
@@ -92,14 +88,12 @@ class QuantityModel:
     @cached_property
     def mean(self) -> Float:
         """Mean over the draws (S, U, G)."""
-        result: Float = np.tensordot(self.draw_weight, self.value_per_draw, axes=1)
-        return result
+        return np.asarray(np.tensordot(self.draw_weight, self.value_per_draw, axes=1))
 
     @cached_property
     def variance(self) -> Float:
         """Variance over the draws (S, U, G)."""
-        result: Float = np.tensordot(self.draw_weight, (self.value_per_draw - self.mean) ** 2, axes=1)
-        return result
+        return np.asarray(np.tensordot(self.draw_weight, (self.value_per_draw - self.mean) ** 2, axes=1))
 
     @cached_property
     def _sorted(self) -> tuple[Index, Index, Float, Float]:

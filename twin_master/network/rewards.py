@@ -7,24 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
+from reporting.arrays import Float, Index
 from twin_master.errors import InvalidModelError
 from twin_master.network.quantity import QuantityModel
-from twin_master.scenario.schema import REWARD_NAMES
-
-__all__ = [
-    "REWARD_NAMES",
-    "RewardExpectation",
-    "RewardModel",
-    "RewardSettings",
-    "error_reward",
-    "health_reward",
-]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 def health_reward(value: ArrayLike, limit: ArrayLike) -> Float:
@@ -33,46 +21,15 @@ def health_reward(value: ArrayLike, limit: ArrayLike) -> Float:
     One without load, zero where a sensor reaches its limit, one or (G,), and negative beyond.
     """
     # As a share first: rounding is monotonic, so that for one limit the result is that of the largest value.
-    result: Float = 1.0 - (np.asarray(value, dtype=np.float64) / np.asarray(limit)).max(axis=-1)
-    return result
+    return np.asarray(1.0 - (np.asarray(value, dtype=np.float64) / np.asarray(limit)).max(axis=-1))
 
 
-def error_reward(
-    observation: ArrayLike, value: ArrayLike, scale: ArrayLike, normaliser: ArrayLike = 1.0
-) -> Float:
-    """Return the error reward: minus the mean distance of observation and model over the sensors.
+def _error_moments(observation: Float, shown: Float, variance: Float, scale: Float) -> tuple[Float, Float]:
+    """Return mean and variance of the error reward: minus the mean distance of observation and model.
 
-    Parameters
-    ----------
-    observation, value : (..., G)
-        What the sensors show and what the model says, SI; NaN for a lost sensor, which is left out.
-    scale : float or (G,)
-        The distance, after normalisation, that costs one.
-    normaliser : (...)
-        Both are divided by it first (for a structure: the load factor).
-
-    Returns
-    -------
-    (...)
-        NaN where every sensor is lost.
-    """
-    distance = np.abs(np.asarray(observation, dtype=np.float64) - np.asarray(value, dtype=np.float64))
-    if np.ndim(scale):
-        distance, scale = distance / np.asarray(scale), 1.0
-    seen = ~np.isnan(distance)
-    count = seen.sum(axis=-1)
-    total = np.where(seen, distance, 0.0).sum(axis=-1)
-    result: Float = np.where(
-        count > 0, -total / np.maximum(count, 1) / (np.asarray(scale) * np.asarray(normaliser)), np.nan
-    )
-    return result
-
-
-def _folded_error(observation: Float, shown: Float, variance: Float, scale: Float) -> tuple[Float, Float]:
-    """Return mean and variance of the error reward where the sensors are independently normal.
-
-    The distance of a normal variable from a point has a folded normal distribution. observation is (G,),
-    shown and variance are (..., G), scale is broadcast against them.
+    What the sensors show is independently normal, and the distance of such a variable from a point has a
+    folded normal distribution. observation is (G,), NaN for a lost sensor, which is left out; shown and
+    variance are (..., G), and scale is broadcast against them.
     """
     seen = ~np.isnan(observation)
     distance, squared = np.abs(observation - shown)[..., seen], variance[..., seen]
@@ -171,7 +128,7 @@ class RewardModel:
         self.quantity = quantity
         self.settings = settings
         self.true_per_draw = true_per_draw
-        self._normaliser = np.array(normaliser, dtype=np.float64)
+        self._error_scale = np.asarray(settings.error_scale) * np.array(normaliser, dtype=np.float64)[:, None]
         self._control_reward = np.array(settings.control_reward, dtype=np.float64)
 
     @cached_property
@@ -190,8 +147,7 @@ class RewardModel:
 
     def planning_reward(self, health_weight: float, control_weight: float) -> Float:
         """Return the expected reward of each state and control for planning, eq. (36): (S, U)."""
-        result: Float = health_weight * self._health_moments[0] + control_weight * self._control_reward
-        return result
+        return np.asarray(health_weight * self._health_moments[0] + control_weight * self._control_reward)
 
     def expectation(self, joint: ArrayLike, observation: ArrayLike | None = None) -> RewardExpectation:
         """Return mean and standard deviation of each reward.
@@ -236,7 +192,13 @@ class RewardModel:
                     f"got {observation.shape}"
                 )
             for row, seen in enumerate(observation.reshape(-1, quantity.sensor_count)):
-                mean[row, 2], variance[row, 2] = self._error_moments(flat[row], seen)
+                if not np.isnan(seen).all():
+                    state, chosen = np.nonzero(flat[row])
+                    shown = quantity.value_per_draw[:, state, chosen]
+                    error, _ = _error_moments(seen, shown, np.zeros_like(shown), self._error_scale[chosen])
+                    share = quantity.draw_weight[:, None] * flat[row, state, chosen]
+                    mean[row, 2] = (share * error).sum()
+                    variance[row, 2] = (share * (error - mean[row, 2]) ** 2).sum()
         return RewardExpectation(mean.reshape(*lead, 3), np.sqrt(variance).reshape(*lead, 3))
 
     def expectation_of(
@@ -267,20 +229,10 @@ class RewardModel:
         within = np.zeros_like(mean)
         mean[0], mean[1] = self.health_per_draw[draw][:, :, controls], self._control_reward[controls]
         if observation is not None and not np.isnan(observation).all():
-            scale = np.asarray(self.settings.error_scale) * self._normaliser[controls, None]
-            mean[2], within[2] = _folded_error(observation, shown, variance, scale)
+            mean[2], within[2] = _error_moments(observation, shown, variance, self._error_scale[controls])
         whole = np.einsum("bksu,rksu->br", weight, mean)
         spread = np.einsum("bksu,rksu->br", weight, within)
         for b in range(len(weight)):
             squared = (mean - whole[b, :, None, None, None]) ** 2
             spread[b] += np.einsum("ksu,rksu->r", weight[b], squared)
         return RewardExpectation(whole, np.sqrt(spread))
-
-    def _error_moments(self, weight: Float, observation: Float) -> tuple[float, float]:
-        """Return mean and variance of the error reward under one joint belief (S, U)."""
-        state, control = np.nonzero(weight)
-        value = self.quantity.value_per_draw[:, state, control]
-        reward = error_reward(observation, value, self.settings.error_scale, self._normaliser[control])
-        share = self.quantity.draw_weight[:, None] * weight[state, control]
-        mean = float((share * reward).sum())
-        return mean, float((share * (reward - mean) ** 2).sum())

@@ -11,11 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fe.compilation import callable_when_compiled, compiled
-
-__all__ = ["LOG_ROOT_TWO_PI", "log_densities", "separated"]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
+from reporting.arrays import Float, Index
 
 LOG_ROOT_TWO_PI = 0.5 * float(np.log(2.0 * np.pi))
 BLOCK = 32

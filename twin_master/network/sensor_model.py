@@ -8,18 +8,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
+from reporting.arrays import Float, Index
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network.quantity import QuantityModel
 from twin_master.network.sensor_kernels import log_densities, separated
-
-__all__ = ["GaussianSensorModel", "PredictiveCheck", "check_noise"]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _WORST_SHOWN = 3
 LARGEST = 1e140
@@ -56,8 +52,7 @@ class PredictiveCheck:
         seen = ~np.isnan(transform)
         inside = np.abs(transform - 0.5) <= 0.5 * probability
         count = seen.sum(axis=0)
-        result: Float = np.where(count > 0, inside.sum(axis=0) / np.maximum(count, 1), np.nan)
-        return result
+        return np.asarray(np.where(count > 0, inside.sum(axis=0) / np.maximum(count, 1), np.nan))
 
 
 @dataclass(frozen=True)
@@ -337,8 +332,7 @@ class GaussianSensorModel(QuantityModel):
 
     def observed_count(self, observations: ArrayLike) -> Index:
         """Return how many sensors report: (..., G) -> (...). Zero flags a step that follows the dynamics."""
-        result: Index = np.sum(~np.isnan(self.checked(observations)), axis=-1)
-        return result
+        return np.asarray(np.sum(~np.isnan(self.checked(observations)), axis=-1))
 
     def predictive_check(self, joint: ArrayLike, observation: ArrayLike) -> PredictiveCheck:
         """Compare observations with what beliefs predict for them.

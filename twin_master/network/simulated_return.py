@@ -3,14 +3,10 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reporting.arrays import Float, Index
 from twin_master.network.belief_planning import DecisionProblem
 
-__all__ = ["simulated_returns"]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 Decide = Callable[[Float, int], Index]
 """Returns the controls (B,) for the beliefs (B, S) before a turn, of that number from 0."""
 

@@ -11,18 +11,13 @@ from functools import cached_property
 from math import prod
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reporting.arrays import Float
 from twin_master.errors import InvalidModelError
 from twin_master.network.distributions import stochastic_matrix
 from twin_master.network.kernels import Lists
 from twin_master.network.memory import TRANSITION_COPIES, check_fits, transition_bytes
-
-__all__ = ["SparseTransition", "TransitionLists", "TransitionModel"]
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
-Unsigned = NDArray[np.uint64]
 
 JOINT_NON_ZEROS = 512
 """Non-zero transitions of a control up to which one table is used: it is applied in some microseconds."""
@@ -30,84 +25,22 @@ JOINT_LEVELS = 1024
 """Joint levels of neighbours up to which they may share a table: it has 8 MB for each control."""
 
 
-@dataclass(frozen=True)
-class SparseTransition:
-    """The non-zero transitions as predecessor lists.
+def predecessor_lists(blocks: Sequence[Float]) -> Lists:
+    """Return the predecessors of each level of blocks (U, L, L), one block after the other, for the loops.
 
-    Row ``control * S + state`` lists the states from which `state` is reached under `control`. The arrays
-    are for the compiled loops, which never write to them; unsigned indices spare the loops the test for
-    negative ones.
-
-    Attributes
-    ----------
-    start : (U * S + 1,)
-        Where each row begins.
-    source : (non-zeros,)
-        The predecessor.
-    probability, log_probability : (non-zeros,) dimensionless
-        Of the transition from it.
+    Unsigned indices spare the loops the test for negative ones.
     """
-
-    start: Unsigned
-    source: Unsigned
-    probability: Float
-    log_probability: Float
-
-    @classmethod
-    def from_matrix(cls, matrix: Float) -> "SparseTransition":
-        """Build the lists from a transition array (U, S, S)."""
-        rows = matrix.transpose(0, 2, 1).reshape(-1, matrix.shape[2])
-        row, source = np.nonzero(rows)
-        start = np.zeros(len(rows) + 1, dtype=np.uint64)
-        np.cumsum(np.bincount(row, minlength=len(rows)), out=start[1:])
-        probability = rows[row, source]
-        return cls(start, source.astype(np.uint64), probability, np.log(probability))
-
-
-@dataclass(frozen=True)
-class TransitionLists:
-    """Predecessor lists of several blocks, one after the other, for the compiled loops.
-
-    Attributes
-    ----------
-    levels : (B,)
-        Number of joint levels of each block.
-    first_row : (B,)
-        Where the rows of a block begin: row ``first_row[b] + control * levels[b] + level``.
-    start : (rows + 1,)
-        Where each row begins.
-    source : (non-zeros,)
-        The predecessor of a level within its block.
-    probability, log_probability : (non-zeros,)
-        Of the transition from it.
-    """
-
-    levels: Index
-    first_row: Index
-    start: Unsigned
-    source: Unsigned
-    probability: Float
-    log_probability: Float
-
-    @property
-    def arrays(self) -> Lists:
-        """All of them, as the compiled loops take them."""
-        return self.levels, self.first_row, self.start, self.source, self.probability, self.log_probability
-
-    @classmethod
-    def from_blocks(cls, blocks: Sequence[Float]) -> "TransitionLists":
-        """Build the lists from the transition arrays (U, L, L) of the blocks."""
-        lists = [SparseTransition.from_matrix(block) for block in blocks]
-        rows = [len(entry.start) - 1 for entry in lists]
-        counts = np.concatenate([np.diff(entry.start.astype(np.int64)) for entry in lists])
-        return cls(
-            levels=np.array([block.shape[1] for block in blocks], dtype=np.int64),
-            first_row=np.concatenate([[0], np.cumsum(rows)[:-1]]).astype(np.int64),
-            start=np.concatenate([[0], np.cumsum(counts)]).astype(np.uint64),
-            source=np.concatenate([entry.source for entry in lists]),
-            probability=np.concatenate([entry.probability for entry in lists]),
-            log_probability=np.concatenate([entry.log_probability for entry in lists]),
-        )
+    rows = [block.transpose(0, 2, 1).reshape(-1, block.shape[1]) for block in blocks]
+    start = np.cumsum([0, *np.concatenate([np.count_nonzero(own, axis=1) for own in rows])])
+    probability = np.concatenate([own[own != 0.0] for own in rows])
+    return (
+        np.array([block.shape[1] for block in blocks], dtype=np.int64),
+        np.cumsum([0, *map(len, rows)])[:-1],
+        start.astype(np.uint64),
+        np.concatenate([np.nonzero(own)[1] for own in rows]).astype(np.uint64),
+        probability,
+        np.log(probability),
+    )
 
 
 @dataclass(frozen=True)
@@ -203,19 +136,14 @@ class TransitionModel:
         return table
 
     @cached_property
-    def sparse(self) -> SparseTransition:
-        """The non-zero transitions of all states as lists."""
-        return SparseTransition.from_matrix(self.matrix)
-
-    @cached_property
-    def forward_lists(self) -> TransitionLists:
+    def forward_lists(self) -> Lists:
         """The predecessors of each level of each block."""
-        return TransitionLists.from_blocks(self.blocks)
+        return predecessor_lists(self.blocks)
 
     @cached_property
-    def backward_lists(self) -> TransitionLists:
+    def backward_lists(self) -> Lists:
         """The successors of each level of each block."""
-        return TransitionLists.from_blocks([block.transpose(0, 2, 1) for block in self.blocks])
+        return predecessor_lists([block.transpose(0, 2, 1) for block in self.blocks])
 
     def row(self, control: int, state: int) -> Float:
         """Return p(D_t | D_{t-1} = state, control): (S,)."""
@@ -226,15 +154,13 @@ class TransitionModel:
     def forward(self, control: int, belief: Float) -> Float:
         """Return beliefs (..., S) one step later, in the linear domain."""
         if not self.is_product:
-            moved: Float = belief @ self.blocks[0][control]
-            return moved
+            return np.asarray(belief @ self.blocks[0][control])
         return self._applied([block[control].T for block in self.blocks], belief)
 
     def expected(self, control: int, value: Float) -> Float:
         """Return the mean of a function of the state one step later, from each state: (S,) -> (S,)."""
         if not self.is_product:
-            mean: Float = self.blocks[0][control] @ value
-            return mean
+            return np.asarray(self.blocks[0][control] @ value)
         return self._applied([block[control] for block in self.blocks], value)
 
     def _applied(self, matrices: Sequence[Float], vector: Float) -> Float:

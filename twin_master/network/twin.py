@@ -1,8 +1,8 @@
 """The twin: it is shown observations and the control in force, and says what to do; it holds no truth."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import arrays_from_bytes, arrays_to_bytes
+from reporting.arrays import Float
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network import graphical_model
@@ -18,17 +19,14 @@ from twin_master.network.estimator import (
     Estimate,
     Estimator,
     ExactFilter,
-    Learnt,
     Notice,
     SensorModel,
     Suspicion,
 )
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.inference import Predicted, predict
-from twin_master.network.planner import BeliefPolicy
+from twin_master.network.planner import BeliefPolicy, decision
 from twin_master.scenario.schema import Scenario
-
-Float = NDArray[np.float64]
 
 _LARGEST = np.float64(1e150)
 """What is carried is below this, so that what follows from it are numbers, too."""
@@ -83,48 +81,31 @@ def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> Graphical
     )
 
 
-@dataclass(frozen=True)
-class TwinTurn:
+@dataclass(frozen=True, kw_only=True)
+class TwinTurn(Estimate):
     """What the twin concludes in one turn t, and its decision.
 
     Attributes
     ----------
     turn : int
         The number t, from 0.
-    control_index : int
-        Control u_t in force.
-    filtered : (S,)
-        p(D_t | o_0..o_t).
-    log_evidence : float
-        log p(o_t | o_0..o_{t-1}).
     prediction : Predicted
         Beliefs and controls of the steps t + 1 ... t + H.
     decision_probability : (U,)
         policy(U | D) averaged over the belief that the twin decides on.
     next_control : int
         Its mode, the first of equals: the control to fly in step t + 1.
-    learnt : dict of str to Learnt
-        Posterior of what the estimator learns.
-    notices : tuple of Notice
-        What the operator should know.
-    suspicion : Suspicion or None
-        How well the model explains the sensors, where that is watched.
-    expected : callable or None
-        Returns for each sensor the mean of what it shows and the standard deviation of its noise, (G,) each,
-        where the estimator knows more of the sensors than their model.
     """
 
     turn: int
-    control_index: int
-    filtered: Float
-    log_evidence: float
     prediction: Predicted
     decision_probability: Float
     next_control: int
-    learnt: Mapping[str, Learnt] = field(default_factory=dict)
-    notices: tuple[Notice, ...] = ()
-    suspicion: Suspicion | None = None
-    expected: Callable[[], tuple[Float, Float]] | None = None
+
+    @property
+    def control_index(self) -> int:
+        """Control u_t in force."""
+        return self.carried.control_index
 
 
 @dataclass(frozen=True)
@@ -415,19 +396,11 @@ class Twin:
             decision_probability = (1.0 - none) * decision_probability + none * self._safest
             prediction = prediction.mixed(none, self._safest)
         self._proposed = int(np.argmax(decision_probability))
+        own = vars(estimate) | {"suspicion": self._with_decision(estimate)}
         return TwinTurn(
-            turn=self._turns - 1,
-            control_index=control_index,
-            filtered=estimate.filtered,
-            log_evidence=estimate.log_evidence,
-            prediction=prediction,
-            decision_probability=decision_probability,
+            **own, turn=self._turns - 1, prediction=prediction, decision_probability=decision_probability,
             next_control=self._proposed,
-            learnt=estimate.learnt,
-            notices=estimate.notices,
-            suspicion=self._with_decision(estimate),
-            expected=estimate.expected,
-        )
+        )  # fmt: skip
 
     def _with_decision(self, estimate: Estimate) -> Suspicion | None:
         """Return what is suspected, with the hypothesis that adds most to the probability of the decision."""
@@ -443,8 +416,5 @@ class Twin:
 
     def _decision(self, belief: Float, control_index: int) -> Float:
         """Return the probability of each control (U,), by the belief of this turn or the next."""
-        if self.decide_on == "predicted" or self._on_belief is not None:
-            belief = self.model.transition.forward(control_index, belief)
-        if self._on_belief is not None:
-            return np.eye(len(self.model.controls))[self._on_belief.decide(belief)]
-        return np.asarray(belief @ self.policy)
+        alone = belief[None], np.array([control_index]), self.policy, self._on_belief
+        return np.asarray(decision(self.model.transition, *alone, ahead=self.decide_on == "predicted")[0])

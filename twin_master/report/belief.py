@@ -11,11 +11,10 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from reporting import figures as style
+from reporting.arrays import Float
 from reporting.words import capital
 from twin_master.report.reading import Run
 from twin_master.report.view import short_number
-
-Float = NDArray[np.float64]
 
 _PROBABILITY_COLORS = LinearSegmentedColormap.from_list(
     "probability", ["#ffffff", "#d3ece4", "#7fcbb2", style.PRESENT, "#003d2d"]
@@ -80,8 +79,7 @@ def _marginal_figure(run: Run) -> Figure:
     count = len(run.factors)
     figure, grid = style.panels(count, 1, 0.6 + 1.3 * count, 0.3, 0.45, left=0.09, right=0.9, hspace=0.5)
     for index, (factor, (axes,)) in enumerate(zip(run.factors, grid, strict=True)):
-        own, belief = run.coordinates[:, index], run["filtered/probability"]
-        marginal = np.stack([belief[:, own == level].sum(axis=1) for level in np.unique(own)])
+        marginal = run.model.states.marginal(run["filtered/probability"], run.model.states.names[index]).T
         places = np.arange(len(factor.levels))
         image = axes.pcolormesh(
             np.arange(run.steps + 1) - 0.5, np.arange(len(places) + 1) - 0.5, marginal,
@@ -166,7 +164,7 @@ def _margin_map(figure: Figure, axes: Axes, run: Run) -> None:
     largest = float(np.abs(margin).max()) or 1.0
     lowest, colors = (-largest, "PuOr") if len(run.controls) == 2 else (0.0, "Purples")
     image = _map(axes, run, margin, cmap=colors, vmin=lowest, vmax=largest)
-    for (x, y), value in zip(run.scales * run.coordinates, margin, strict=True):
+    for (x, y), value in zip(run.scales * run.model.states.coordinates, margin, strict=True):
         strong = abs(value) > 0.62 * largest
         axes.text(
             x, y, f"{value:+.3f}".replace("-", "−"), ha="center", va="center", fontsize=7.0,

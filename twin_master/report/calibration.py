@@ -5,14 +5,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from reporting import figures as style
+from reporting.arrays import Float
 from reporting.words import number, parameter_title
 from twin_master.report.reading import Run
-
-Float = NDArray[np.float64]
 
 
 def true_value(run: Run) -> float | None:

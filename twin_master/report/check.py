@@ -12,10 +12,9 @@ from scipy.special import ndtr
 from scipy.stats import binom
 
 from reporting import figures as style
+from reporting.arrays import Float
 from twin_master.report.reading import Run
 from twin_master.report.view import NORMAL_95
-
-Float = NDArray[np.float64]
 
 _PIT_BINS = 10
 _MOST_CELLS = 6000  # as vectors; more would make the page too large

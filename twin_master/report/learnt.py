@@ -7,14 +7,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from reporting import figures as style
+from reporting.arrays import Float
 from reporting.words import between, number, rounded
 from twin_master.report.reading import Run
 from twin_master.store.mission_result import LearntQuantity
-
-Float = NDArray[np.float64]
 
 _ROW_HEIGHT = 1.55
 

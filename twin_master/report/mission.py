@@ -8,15 +8,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from reporting import figures as style
+from reporting.arrays import Float
 from reporting.words import capital
 from twin_master.report.reading import Run
 from twin_master.report.view import NORMAL_95, short_number
 from twin_master.scenario.schema import REWARD_NAMES
-
-Float = NDArray[np.float64]
 
 _ROW_HEIGHT = 1.22
 _NARROW = 0.19
@@ -180,7 +178,8 @@ def _state_panel(axes: Axes, run: Run, index: int, now: int) -> str:
     if now == run.steps - 1:
         mean, deviation = run["smoothed/mean"], run["smoothed/standard_deviation"]
     else:
-        mean, deviation = run.moments(run.smoothed_until(now))
+        past, states = run.smoothed_until(now), run.model.states
+        mean, deviation = states.mean(past), states.standard_deviation(past)
     coming = run["predicted/mean"][now], run["predicted/standard_deviation"][now]
     found = []
     for first, (center, spread) in ((0, (mean, deviation)), (now + 1, coming)):

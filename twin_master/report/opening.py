@@ -5,7 +5,6 @@ from scipy.stats import binom
 
 from reporting.page import Words
 from reporting.words import counted, listing, parameter_title
-from twin_master.network.graphical_model import Factor, StateSpace
 from twin_master.report.check import PredictiveCheck, predictive_check
 from twin_master.report.reading import Run
 from twin_master.store.summary import Fallback, control_changes, find_fallback
@@ -58,9 +57,8 @@ def _fallback(run: Run) -> Fallback | None:
     """Return how the control fell back; None where the truth is unknown."""
     if run.truth is None:
         return None
-    states = StateSpace(tuple(Factor(factor.name, factor.levels) for factor in run.scenario.state))
     policy = run["policy/control_index"].astype(np.int64)
-    return find_fallback(states, policy, int(run.control_index[0]), run.control_index, run.truth)
+    return find_fallback(run.model.states, policy, int(run.control_index[0]), run.control_index, run.truth)
 
 
 def _belief(run: Run) -> str:

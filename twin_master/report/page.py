@@ -298,7 +298,7 @@ def _add_run(page: Page, run: Run) -> None:
     rows: list[Sequence[str]] = [
         (f"{run.step}s flown", str(run.steps)),
         (f"{run.step}s predicted", str(run.horizon)),
-        ("states", f"{len(run.coordinates)} ({' × '.join(map(str, levels))})"),
+        ("states", f"{run.model.states.size} ({' × '.join(map(str, levels))})"),
         ("controls", ", ".join(run.controls)),
         (f"{sensors.word}s", f"{len(sensors.titles)}{named}"),
         ("seed", _seed(run)),

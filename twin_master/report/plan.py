@@ -8,13 +8,11 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.tri import Triangulation
-from numpy.typing import NDArray
 
 from reporting import figures as style
+from reporting.arrays import Float
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.planner import BeliefPolicy
-
-Float = NDArray[np.float64]
 
 _COLORS = ("#56B4E9", "#E69F00", style.PRESENT, style.DECISION, style.PREDICTION, "#F0E442", style.PAST)
 _ROWS = 60

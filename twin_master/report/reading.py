@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.folders import restore_folder
 from reporting.json_file import read_json
 from reporting.words import capital, parameter_title
 from twin_master.errors import RunFolderError, TwinMasterError
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.inference import smooth
 from twin_master.network.twin import build_graphical_model
 from twin_master.report.view import PrintedFactor, PrintedSensors, printed_factors, printed_sensors
 from twin_master.run_folder import CONFIG_NAME
@@ -26,7 +29,6 @@ from twin_master.store.writing import read_run as read_tree
 if TYPE_CHECKING:
     import xarray as xr
 
-Float = NDArray[np.float64]
 
 _OF_A_BELIEF = {
     "probability": "state", "mean": "region", "standard_deviation": "region", "quantity_mean": "sensor",
@@ -136,9 +138,9 @@ class Run:
         return np.array([factor.scale for factor in self.factors])
 
     @cached_property
-    def coordinates(self) -> Float:
-        """Levels of each joint state, SI: (S, K)."""
-        return np.stack([self[f"policy/{name}"] for name in self.scenario.state_names], axis=-1)
+    def model(self) -> GraphicalModel:
+        """States and transitions that the twin believes."""
+        return build_graphical_model(self.scenario)
 
     @cached_property
     def learnt(self) -> tuple[LearntQuantity, ...]:
@@ -164,27 +166,10 @@ class Run:
         return tuple(found)
 
     def smoothed_until(self, now: int) -> Float:
-        """Return p(D_t | o_0..o_now) for t = 0..now, (now + 1, S), from the filtered beliefs.
-
-        The backward recursion of the smoother needs nothing but the transitions: with f the filtered belief
-        and T the transition under u_t, s_t = f_t * T (s_{t+1} / (f_t T)).
-        """
-        transition = build_graphical_model(self.scenario).transition
-        filtered = self["filtered/probability"]
-        smoothed = filtered[: now + 1].copy()
-        for step in range(now - 1, -1, -1):
-            control = int(self.control_index[step])
-            forecast = transition.forward(control, filtered[step])
-            ratio = np.divide(smoothed[step + 1], forecast, out=np.zeros_like(forecast), where=forecast > 0.0)
-            smoothed[step] = filtered[step] * transition.expected(control, ratio)
-            smoothed[step] /= smoothed[step].sum()
-        return smoothed
-
-    def moments(self, probability: Float) -> tuple[Float, Float]:
-        """Return mean and standard deviation of each factor under beliefs: (..., S) -> two of (..., K)."""
-        mean = probability @ self.coordinates
-        square = (self.coordinates - mean[..., None, :]) ** 2
-        return mean, np.sqrt(np.einsum("...s,...sk->...k", probability, square))
+        """Return p(D_t | o_0..o_now) for t = 0..now, (now + 1, S), from the filtered beliefs."""
+        with np.errstate(divide="ignore"):
+            rows = np.log(self["filtered/probability"][: now + 1])
+        return smooth(self.model, self.control_index[: now + 1], rows)
 
 
 def read_run(folder: Path) -> Run:
@@ -265,8 +250,6 @@ def _check(run: Run) -> None:
         for name in ("mean", "standard_deviation"):
             if not np.all(np.isfinite(run[f"{group}/{name}"])):
                 raise ValueError(f"a moment of {group} is not finite")
-    if not np.all(np.isfinite(run.coordinates)):
-        raise ValueError("a level of the state is not finite")
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -13,12 +13,11 @@ from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.structure.design import MeshDesign, load_structure
 from fe.wing.design import WingDesign, load_design
 from reporting import figures as style
+from reporting.arrays import Float
 from twin_master.assets.design_source import DESIGN_COPY, FLOWN_DESIGN_COPY
 from twin_master.assets.structure_source import FIELD_NAME, FLOWN_COPY, MODEL_COPY
 from twin_master.report.reading import Run
 from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
-
-Float = NDArray[np.float64]
 
 LOSS = "YlOrRd"
 """Colour map of what regions have lost."""

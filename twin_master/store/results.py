@@ -14,7 +14,7 @@ from reporting.groups import Group, Variable
 from twin_master.learning.expectation import Expected
 from twin_master.mission.truth import SensorStatus, Truth
 from twin_master.network.inference import known_control
-from twin_master.network.rewards import REWARD_NAMES
+from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.store.mission_result import MOMENTS, SEVERAL_UNITS, MissionResult
 
 Float = NDArray[np.float64]

@@ -10,8 +10,13 @@ from numpy.typing import NDArray
 from reporting.words import parameter_title
 from twin_master.assets.mismatch import Misfit
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
-from twin_master.network.rewards import REWARD_NAMES
-from twin_master.scenario.schema import FALLBACK_FIGURES, MISFIT_FIGURES, NOTICE_FIGURES, Scenario
+from twin_master.scenario.schema import (
+    FALLBACK_FIGURES,
+    MISFIT_FIGURES,
+    NOTICE_FIGURES,
+    REWARD_NAMES,
+    Scenario,
+)
 from twin_master.store.mission_result import MissionResult, printed_learnt
 
 Float = NDArray[np.float64]

@@ -27,12 +27,10 @@ NumPy and relative imports only: this file is copied into the FMU.
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
+from ..arrays import FloatArray as FloatArray
 from ..errors import InvalidPatchError
 from ..primitive import Primitive
-
-FloatArray = npt.NDArray[np.float64]
 
 PARAMETERS = 5
 """Most parameters of a law."""

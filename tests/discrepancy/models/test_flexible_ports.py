@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from discrepancy.campaign.records import Quantity, Release
-from discrepancy.models.acting import Acting, Course
+from discrepancy.campaign.records import Release
+from discrepancy.models.acting import Acting, Course, Shown
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.laws.micro_slip import slip_displacements
@@ -50,6 +50,10 @@ def ringdown(beta: float, *items: Primitive, refinement: int = 1) -> Motion:
     return system.motion(
         Acting(TIME, np.zeros(len(TIP)), initial=np.zeros((0, 2)), release=(TIP, RELEASE)), laws, refinement
     )
+
+
+def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
+    return motion.seen([Shown(row) for row in rows]).values
 
 
 LAWS = {
@@ -204,7 +208,7 @@ def test_a_ring_down_is_that_of_the_whole_structure(name: str) -> None:
     count = 250
     true = integrated(LAWS[name], TIME[:count])
     effect, usual, fine = (
-        np.abs(motion.values(rows)[:count] - true).max(axis=0)
+        np.abs(values(motion, rows)[:count] - true).max(axis=0)
         for motion in (ringdown(BETA), ringdown(BETA, *LAWS[name]), ringdown(BETA, *LAWS[name], refinement=8))
     )
     assert np.all(fine < 0.01 * effect + 1e-3 * np.array([0.02, A]))
@@ -216,11 +220,9 @@ def test_a_ring_down_is_that_of_the_whole_structure(name: str) -> None:
 def test_without_lag_the_order_is_two(name: str) -> None:
     smooth = {"play": LAWS["crack"]}.get(name, LAWS[name])
     errors = []
-    fine = ringdown(0.0, *smooth, refinement=16).values(TIP[None])
+    fine = values(ringdown(0.0, *smooth, refinement=16))
     for refinement in (1, 2):
-        errors.append(
-            np.sqrt(np.mean((ringdown(0.0, *smooth, refinement=refinement).values(TIP[None]) - fine) ** 2))
-        )
+        errors.append(np.sqrt(np.mean((values(ringdown(0.0, *smooth, refinement=refinement)) - fine) ** 2)))
     assert errors[0] / errors[1] > 3.0
 
 
@@ -310,19 +312,18 @@ def test_a_slow_force_leads_through_the_static_states(name: str) -> None:
     time = np.linspace(0.0, 90.0, 3001)
     force = np.asarray(15.0 * np.sin(2.0 * np.pi * time / 90.0))
     rows = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
-    moved = system.motion(Acting(time, np.zeros(len(TIP)), [(TIP, Course.of(time, force))]), laws).values(
-        rows
-    )
+    acting = Acting(time, np.zeros(len(TIP)), [(TIP, Course.of(time, force))])
+    moved = values(system.motion(acting, laws), rows)
     still = system.static(np.outer(force, TIP), laws).values @ rows.T
     assert np.abs(moved - still).max(axis=0) == pytest.approx(np.zeros(2), abs=7e-3 * np.abs(still).max())
 
 
 @pytest.mark.parametrize("name", LAWS)
 def test_a_release_goes_on_from_its_static_state(name: str) -> None:
-    assert np.abs(ringdown(BETA, *LAWS[name]).values(TIP[None])).max() <= 0.02 * 1.001  # no law adds energy
+    assert np.abs(values(ringdown(BETA, *LAWS[name]))).max() <= 0.02 * 1.001  # no law adds energy
     motion = ringdown(1e-3, *LAWS[name])
     rows = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
-    first = motion.response(rows, (Quantity.DISPLACEMENT,) * 2).values[0]
+    first = values(motion, rows)[0]
     assert first[0] == pytest.approx(0.02, rel=1e-9)
     system = motion.system
     at_rest = system.static(np.stack((0.0 * TIP, motion.holding)), motion.laws).values[-1]

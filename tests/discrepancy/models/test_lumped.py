@@ -16,7 +16,7 @@ from scipy.linalg import eigh
 
 from discrepancy.campaign.records import Campaign, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Course
+from discrepancy.models.acting import Acting, Course, Shown
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
@@ -319,7 +319,8 @@ def test_omitted_modes_follow_slow_forces() -> None:
     force = 1.0 - np.cos(4.0 * time)
     row = np.array([0.0, 1.0, 0.0])
     acting = Acting(time, np.zeros(3), [(row, Course.of(time, force))])
-    answers = [system.motion(acting, NO_LAWS).values(np.eye(3)) for system in (whole, one)]
+    shown = [Shown(row) for row in np.eye(3)]
+    answers = [system.motion(acting, NO_LAWS).seen(shown).values for system in (whole, one)]
     bare = one.motion(acting, NO_LAWS).q @ one.shapes.T
     scale = np.max(np.abs(answers[0]))
     assert np.max(np.abs(answers[0] - answers[1])) < 2e-3 * scale
@@ -402,7 +403,7 @@ def test_an_empty_patch_and_sensor_primitives_change_no_bit(chain: LumpedModel) 
         (trial(TrialKind.FLIGHT), DISPLACEMENTS, (), "is a flight, but the lumped model"),
         (static([1.0]), (("x9", Quantity.DISPLACEMENT),), (), "has no output 'x9'; it has x1, x2"),
         (static([1.0]), (("x1", Quantity.STRAIN),), (), "is a displacement, but a channel"),
-        (static([1.0]), (("x1", Quantity.VELOCITY),), (), "is static, but a channel"),
+        (static([1.0]), (("x1", Quantity.VELOCITY),), (), "is at rest, but a channel"),
         (static([1.0], load_place="nose"), DISPLACEMENTS, (), "load place is 'nose', .* takes forces at end"),
         (static([1.0], load_place=(0.1, 0.2)), DISPLACEMENTS, (), "takes forces at"),
         (static([1.0]), DISPLACEMENTS, (Washout(0.1, 1.0),), "cannot carry the primitive 'washout'"),

@@ -28,7 +28,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course, Drive
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_scales import FORCES
+from discrepancy.models.natural_scales import FORCES
 from fe.runtime.patch import ModelPatch, ModulusTemperature, PowerDamping, PowerStiffness, Primitive
 from tests.discrepancy.rigs import model_of
 

@@ -14,6 +14,7 @@ from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.stepwise import Boundaries, CoupledModes, exact_steps
+from discrepancy.models.system_model import State
 from fe.runtime.motion import NO_LAWS, laws_of, simulate
 from fe.runtime.patch import HighPass, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.runtime.sensors import SensorRecord, apply_sensors
@@ -59,18 +60,19 @@ def test_steps_of_any_length_are_matrix_exponentials(coupled: bool) -> None:
     system = CoupledModes(frequency, damping)
     lengths = np.array([0.01, 0.013, 0.01, 0.4])
     time = np.concatenate(([0.0], np.cumsum(lengths)))
-    found = exact_steps(system, Boundaries(time, np.arange(5), lengths))
-    np.testing.assert_array_equal(found.length[found.which], lengths)
+    distinct, which = Boundaries(time, np.arange(5), lengths).alike
+    np.testing.assert_array_equal(distinct[which], lengths)
+    transition, begin, end = exact_steps(system, distinct)
     for k, h in enumerate(lengths):
         matrix = np.zeros((12, 12))
         matrix[:3, 3:6] = np.eye(3)
         matrix[3:6, :3], matrix[3:6, 3:6] = -np.diag(frequency**2), -damping
         matrix[3:6, 6:9], matrix[6:9, 9:] = np.eye(3), np.eye(3) / h
         whole = expm(h * matrix)
-        at = found.which[k]
-        np.testing.assert_allclose(found.transition[at], whole[:6, :6], rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(found.end[at], whole[:6, 9:], rtol=1e-9, atol=1e-13)
-        np.testing.assert_allclose(found.begin[at], whole[:6, 6:9] - whole[:6, 9:], rtol=1e-9, atol=1e-13)
+        at = which[k]
+        np.testing.assert_allclose(transition[at], whole[:6, :6], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(end[at], whole[:6, 9:], rtol=1e-9, atol=1e-13)
+        np.testing.assert_allclose(begin[at], whole[:6, 6:9] - whole[:6, 9:], rtol=1e-9, atol=1e-13)
 
 
 @pytest.mark.parametrize("laws", [(), (COULOMB,), (QUADRATIC, CUBIC)])
@@ -97,7 +99,7 @@ def test_a_forced_motion_at_uneven_stamps_is_exact(chain: LumpedModel) -> None:
     time = jittered(200, 0.02, 0.9)
     force = np.random.default_rng(2).normal(size=len(time))
     force[0] = 0.0
-    system = chain.rig(np.ones(3)).system()
+    system = chain.rig(State(np.ones(3))).system()
     matrix = np.zeros((8, 8))
     matrix[:3, 3:6] = np.eye(3)
     matrix[3:6, :3] = -np.linalg.solve(system.mass, system.stiffness)

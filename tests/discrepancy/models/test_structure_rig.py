@@ -99,7 +99,7 @@ def test_it_is_its_fmu(
         fmu.ports(), [(p.name, p.mean, pytest.approx(p.deviation), p.low, p.high) for p in fmu.parameters],
     )  # fmt: skip
     release = Release(1e-4, mode_count=1) if kind is TrialKind.RINGDOWN else None
-    load = np.sin(np.arange(40) / 4.0) * (kind is not TrialKind.RINGDOWN)
+    load = np.sin(np.arange(40) / 4.0 + 0.5 * (law is None)) * (kind is not TrialKind.RINGDOWN)
     flight = kind is TrialKind.FLIGHT
     trial = replace(
         TRIAL, kind=kind, release=release, force=zero if flight else 50.0 * load,
@@ -124,19 +124,24 @@ def test_any_region_is_known_by_its_name(pair: tuple[FmuModel, ReducedModel]) ->
         own.respond(named, OUTPUTS[:1], ModelPatch(), Conditions(conditions, health=health[:, ::-1]))
 
 
-def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(pair: tuple[FmuModel, ReducedModel]) -> None:
+def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(
+    pair: tuple[FmuModel, ReducedModel], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A spring of next to no stiffness changes nothing, nor the acceleration that a release begins with."""
     model, _ = pair
+    asked: list[int] = []
+    advanced = model.runs.advanced
+    monkeypatch.setattr(model.runs, "advanced", lambda *given: (asked.append(given[-1]), advanced(*given))[1])
     spring = ModelPatch((PowerStiffness("tip", 1e-9, 1.0, 0, 1e-3),))
     for e in (1.0, 1.03):
         conditions = Conditions(np.array([e, 0.05]))
         wanted = model.respond(RELEASED, OUTPUTS, ModelPatch(), conditions).values
         for refinement in (8, 16):
-            before = model.runs.step_count
+            before = len(asked)
             seen = model.respond(RELEASED, OUTPUTS, spring, replace(conditions, refinement=refinement)).values
             largest = np.abs(wanted).max(axis=0)
             np.testing.assert_allclose(seen / largest, wanted / largest, atol=1e-6)
-    assert model.runs.step_count == before  # confirmed at the first parameters
+    assert 0 < len(asked) == before  # confirmed at the first parameters
 
 
 def test_an_accelerometer_that_nobody_reads_does_not_shorten_the_steps(

@@ -14,12 +14,13 @@ from discrepancy.files.patch import read_patch
 from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import read_verdict_file as read_verdict
 from discrepancy.judgement.separability import Separability
-from discrepancy.report.figures import ReportInput, draw, report_figures
+from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
 from discrepancy.workflow import Investigation, investigate
 from reporting.errors import FileNotWrittenError
+from reporting.figures import to_svg
 from tests.discrepancy.rigs import ORIGIN, measured
 
 pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
@@ -55,7 +56,7 @@ def test_a_report_repeats_bit_for_bit(drag: Investigation, able: Separability, w
     effects = read_patch(written / "patch.json").effects
     content = ReportInput(drag, ORIGIN, able, intervals=[effect.intervals for effect in effects])
     figures = report_figures(content)
-    page = render_report(content, draw(figures), figures)
+    page = render_report(content, {name: to_svg(item.figure) for name, item in figures.items()}, figures)
     assert page == next(written.glob("*.html")).read_text(encoding="utf-8")
 
 

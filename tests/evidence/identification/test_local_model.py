@@ -10,7 +10,8 @@ from evidence.identification.residuals import fitted_residuals
 from evidence.identification.targets import Targets, Weights
 from fe.wing.design import WingDesign
 from fe.wing.operators import assemble
-from fe.wing.responses import eigenmodes, solve_static, tip_stiffness
+from fe.wing.responses import eigenmodes, solve_static
+from tests.wings import tip_stiffness
 
 
 @pytest.mark.parametrize("relief", [False, True])

@@ -93,7 +93,7 @@ def compare_loads(wing: PatchedWing, structure: Any, operators: AffineOperators,
 def frequencies(stiffness: Any, mass: Any, count: int = 3) -> FloatArray:
     factors = Factorisation(stiffness)
     n = stiffness.shape[0]
-    inverse = LinearOperator((n, n), matvec=factors.raw_solve, dtype=np.float64)
+    inverse = LinearOperator((n, n), matvec=factors.riesz, dtype=np.float64)
     start = np.random.default_rng(2).normal(size=n)
     square = eigsh(stiffness, count, mass, sigma=0.0, OPinv=inverse, v0=start, return_eigenvectors=False)
     return np.sort(np.sqrt(square))

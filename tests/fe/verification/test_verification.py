@@ -6,29 +6,27 @@ from fe.verification.known_answers import (
     macneal_harder_beam,
     mesh_convergence,
     patch_test,
-    rigid_body_check,
     rigid_body_residual,
+    rigid_body_values,
     wing_balance,
 )
 
 
 def test_a_constant_strain_passes_through_distorted_cells():
-    result = patch_test()
-    assert result.displacement_error < 1e-12
-    assert result.strain_error < 1e-12
+    assert max(patch_test()) < 1e-12
 
 
 def test_an_unsupported_body_has_six_rigid_motions():
-    result = rigid_body_check()
-    assert result.count == 6
-    assert result.smallest_elastic > 1e-6
+    values = rigid_body_values()
+    assert (values < 1e-12).sum() == 6
+    assert values[6] > 1e-6
 
 
 def test_a_cantilever_bends_as_timoshenko_says():
-    assert abs(cantilever_check().relative_error) < 1e-3
+    assert abs(cantilever_check()) < 1e-3
     # It converges to the beam, and a coarse one is already near.
-    coarse, fine = (abs(cantilever_check(cells).relative_error) for cells in (5, 10))
-    assert abs(cantilever_check(20).relative_error) < fine < coarse < 0.01
+    coarse, fine = (abs(cantilever_check(cells)) for cells in (5, 10))
+    assert abs(cantilever_check(20)) < fine < coarse < 0.01
     assert 2.5 < np.log2(coarse / fine) < 4.5  # the tip of a quadratic element: third to fourth order
 
 
@@ -48,15 +46,14 @@ def test_the_wing_resists_no_rigid_motion(coarse_operators):
 
 def test_mass_reactions_and_energy_balance(coarse_operators):
     balance = wing_balance(coarse_operators)
-    assert balance.structural_mass == pytest.approx(balance.volume_mass, rel=1e-10)
-    assert balance.spring_force == pytest.approx(balance.lift, rel=1e-5)
-    assert balance.spring_moment == pytest.approx(balance.lift_moment, rel=1e-5)
-    assert balance.strain_energy == pytest.approx(balance.work, rel=1e-5)
+    assert list(balance) == ["mass", "reaction", "root moment", "energy and work"]
+    for name, (found, expected, _) in balance.items():
+        assert found == pytest.approx(expected, rel=1e-10 if name == "mass" else 1e-5)
 
 
 def test_the_structure_weighs_what_it_should(shipped_operators):
     # No weight is published: this is what the parts of the shipped design weigh on the shipped mesh.
-    assert wing_balance(shipped_operators).structural_mass == pytest.approx(0.947, rel=0.002)
+    assert wing_balance(shipped_operators)["mass"][0] == pytest.approx(0.947, rel=0.002)
 
 
 @pytest.mark.long

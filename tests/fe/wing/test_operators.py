@@ -11,8 +11,8 @@ from fe.wing.operators import (
     modulus_variation,
     point_masses,
 )
-from fe.wing.responses import tip_stiffness
 from fe.wing.turn_load import STANDARD_GRAVITY
+from tests.wings import tip_stiffness
 
 
 def _heave(operators):

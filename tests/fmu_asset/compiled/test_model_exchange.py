@@ -249,7 +249,7 @@ def test_loads_in_straight_lines_are_those_of_the_linear_system(
         np.testing.assert_allclose(seen, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
         np.testing.assert_allclose(slave.fmu.getReal(places), load, rtol=1e-14)
     slow = binding.model_copy(update={"binding": binding.binding.model_copy(update={"step_size": 0.02})})
-    linear = slow.with_interpolation("linear")
+    linear = slow.with_header(interpolation="linear")
     with FmiAsset(compiled_fmu, linear, parameters=MOVING, isolated=False) as asset:
         asset.reset(health={"z1": 0.3})
         low, high = asset.input_range("control", "load_factor")

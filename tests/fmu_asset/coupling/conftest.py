@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fmu_asset.companions.build import build_companion
+from fmu_asset.companions.build import companion_bytes
 from fmu_asset.coupling.structure import (
     Component,
     Connection,
@@ -23,6 +23,7 @@ from fmu_asset.coupling.structure import (
     expand_connection,
 )
 from fmu_asset.door.binding import Binding, parse_binding
+from reporting.files import atomic_write_bytes
 
 
 @pytest.fixture(scope="session")
@@ -114,4 +115,4 @@ def companions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The companion FMUs."""
     folder = tmp_path_factory.mktemp("companions")
     names = ("damage_growth", "strain_gauges")
-    return {name: build_companion(name, folder / f"{name}.fmu").path for name in names}
+    return {name: atomic_write_bytes(folder / f"{name}.fmu", companion_bytes(name)) for name in names}

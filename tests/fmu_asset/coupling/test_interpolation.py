@@ -34,7 +34,7 @@ def circle(fmu: Any, *, exchange: bool = False, delayed: bool = False, substeps:
 
 def watched(step: float, kind: str) -> Binding:
     """Return a binding of both states."""
-    binding = watch("first.x", "second.x", step_size=step).with_interpolation(kind)  # type: ignore[arg-type]
+    binding = watch("first.x", "second.x", step_size=step).with_header(interpolation=kind)
     header = binding.binding.model_copy(update={"tolerance": 1e-10})
     return binding.model_copy(update={"binding": header})
 
@@ -94,4 +94,4 @@ def test_a_restored_system_goes_on_to_the_bit(foreign_fmu: Any) -> None:
 def test_a_system_in_which_nothing_can_follow_is_refused(state_fmu: Any) -> None:
     pair = [linear("a", state_fmu, c=np.eye(2)), linear("b", state_fmu, c=np.eye(2))]
     with pytest.raises(BindingError, match=r"no component of the system test has a continuous input and"):
-        CoupledAsset(system(pair, [("a.y1", "b.u1")]), watch("b.y1").with_interpolation("linear"))
+        CoupledAsset(system(pair, [("a.y1", "b.u1")]), watch("b.y1").with_header(interpolation="linear"))

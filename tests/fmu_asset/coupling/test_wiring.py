@@ -131,9 +131,9 @@ def test_units_of_connections_are_converted(base: SystemStructure) -> None:
     ):
         joined = (link("damage.z1", "percent", **options), link("damage.z1", "wing.health.z1"), seen)
         wiring = Wiring(replace(base, connections=joined))
-        assert wiring.outward["percent"].conversion == conversion
+        assert wiring.ends["percent"][0].conversion == conversion
         assert next(iter(wiring.feeds.values())).conversion == (1.0, 0.0)
-        assert (wiring.outward["seen"].conversion, wiring.units["seen"]) == ((2.0, 0.5), "m")
+        assert (wiring.ends["seen"][0].conversion, wiring.units["seen"]) == ((2.0, 0.5), "m")
 
 
 def test_an_input_that_is_only_set_keeps_its_value(base: SystemStructure) -> None:

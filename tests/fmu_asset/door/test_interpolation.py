@@ -82,7 +82,9 @@ def test_a_restored_state_goes_on_along_the_same_lines(foreign_fmu: Any, state: 
 def test_an_input_that_stays_is_held_to_the_bit(foreign_fmu: Any, interface: str) -> None:
     binding, seen = followed(interface=interface, step_size=0.1, decimation=3), []
     for kind in ("zero-order", "linear"):
-        with FmiAsset(foreign_fmu("follow2"), binding.with_interpolation(kind), isolated=False) as asset:
+        with FmiAsset(
+            foreign_fmu("follow2"), binding.with_header(interpolation=kind), isolated=False
+        ) as asset:
             asset.reset(control={"u": 0.7})
             seen.append(asset.simulate(steps=5).values.tobytes())
     assert seen[0] == seen[1]

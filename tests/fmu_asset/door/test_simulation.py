@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.compiler import find_compiler
-from fmu_asset.door import session, simulation
+from fmu_asset.door import session
 from fmu_asset.door.binding import Binding
-from fmu_asset.door.reading import Observation
+from fmu_asset.door.layout import Observation
 from fmu_asset.door.saved_state import SavedState
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import (
@@ -270,6 +270,6 @@ def test_what_is_sent_is_what_a_step_sends(foreign_fmu: Any, power: list[float],
         refused = error.sentence
     if refused:
         with pytest.raises(FmuInputError, match=re.escape(refused)):
-            simulation.request_rows(exchange, held, roles, None)
+            exchange.rows(held, roles, None)
     else:
-        assert simulation.request_rows(exchange, held, roles, None).tobytes() == np.array(sent).tobytes()
+        assert exchange.rows(held, roles, None).tobytes() == np.array(sent).tobytes()

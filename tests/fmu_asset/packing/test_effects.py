@@ -37,9 +37,8 @@ from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
 from fmu_asset.packing.patch_file import SCHEMA, PatchFile, parse_patch
-from fmu_asset.packing.patched_runtime import output_channels, plain_effects
 from fmu_asset.packing.structure_fmu import build_fmu
-from fmu_asset.slaves.effects import active_primitives, effect_rows, numbers_of
+from fmu_asset.slaves.effects import active_primitives, effect_rows, numbers_of, output_channels
 from tests.command_line import command
 
 BIN = Path(sys.executable).parent
@@ -183,7 +182,7 @@ def test_quasi_static_sensor_effects_are_those_of_whole_records(
     shown = flown(patched, everything, inputs, **on)[:, :26]
     plain = flown(fmu, everything, inputs)[:, :26]
     whole = ModelPatch(
-        tuple(item for effect in parse_patch(content()).for_outputs(CHANNELS) for item in effect.patch)
+        tuple(item for effect in parse_patch(content()).for_gauges(24).effects for item in effect.patch)
     )
     record = SensorRecord(CHANNELS, "flight", 0.05 * np.arange(1, 5), 0.0, np.zeros(4))
     expected, _ = apply_sensors(whole, record, plain)
@@ -209,7 +208,7 @@ def test_transient_sensor_effects_are_those_of_whole_records(
         rows.append(np.array(own))
     plain, shown = rows
     whole = ModelPatch(
-        tuple(item for effect in parse_patch(content()).for_outputs(CHANNELS) for item in effect.patch)
+        tuple(item for effect in parse_patch(content()).for_gauges(24).effects for item in effect.patch)
     )
     since = 0.05 * np.arange(steps + 1)
     seen = SensorRecord(CHANNELS, "ringdown", since, 2.0, np.zeros(steps + 1), release=0.03)
@@ -283,22 +282,22 @@ def test_state_goes_on_to_the_bit_in_a_new_process(patched: Path, sending: Bindi
 
 @given(st.data())
 def test_values_and_patch_belong_together(data: st.DataObject) -> None:
-    effects = plain_effects(parse_patch(content()).for_outputs(CHANNELS))
+    effects = parse_patch(content()).for_gauges(24).plain
     rows = effect_rows(effects, 7, {})
     assert [row.reference for row in rows] == list(range(7, 7 + len(rows)))
     value = {row.name: float(row.start or 0.0) for row in rows}
     assert active_primitives(effects, value) == []
     on = data.draw(st.sets(st.sampled_from(sorted(EFFECTS))))
     value |= {f"effect.{name}.active": 1.0 for name in on}
-    changed = data.draw(st.sampled_from([item.name for effect in effects for item in numbers_of(effect)]))
+    changed = data.draw(st.sampled_from([name for effect in effects for name in numbers_of(effect)]))
     value[changed] = 0.125
     found = ModelPatch.from_list(active_primitives(effects, value)).to_list()
     expected = []
     for effect in effects:
         rows_of = [dict(item) for item in effect["primitives"]]
-        for number in numbers_of(effect):
-            if number.name == changed:
-                rows_of[number.primitive][number.key] = 0.125
+        for name, (number, key) in numbers_of(effect).items():
+            if name == changed:
+                rows_of[number][key] = 0.125
         expected += rows_of if effect["id"] in on else []
     assert found == expected
 

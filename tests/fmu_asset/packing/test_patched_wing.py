@@ -47,8 +47,8 @@ from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
 from fmu_asset.packing.patch_file import SCHEMA, PatchFile, load_patch, parse_patch
-from fmu_asset.packing.patched_runtime import output_channels
 from fmu_asset.packing.structure_fmu import build_fmu
+from fmu_asset.slaves.effects import output_channels
 from reporting.provenance import collect_provenance
 
 OUTPUTS = [name for name, _ in output_channels(24)]

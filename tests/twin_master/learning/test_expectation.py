@@ -24,7 +24,7 @@ from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.hypotheses import quantiles_of
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
 from twin_master.network.estimator import Estimate
-from twin_master.network.rewards import RewardModel, RewardSettings, error_reward
+from twin_master.network.rewards import RewardModel, RewardSettings
 from twin_master.network.sensor_model import GaussianSensorModel
 
 Float = NDArray[np.float64]
@@ -72,7 +72,8 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(
             np.testing.assert_allclose(found.standard_deviation[t], deviation, atol=1e-8)
             np.testing.assert_allclose(found.noise[t], [0.7, 1.1])
             health = rewards.health_per_draw[:, :, CONTROLS[t]].T[..., None]
-            error = error_reward(seen[t], shown, 0.8, np.array((2.0, 3.0))[CONTROLS[t]])[..., None]
+            distance = np.ma.masked_invalid(np.abs(seen[t] - shown)).mean(axis=-1, keepdims=True)
+            error = -distance.filled(np.nan) / (0.8 * np.array((2.0, 3.0))[CONTROLS[t]])
             for place, reward in ((0, health), (2, error)):
                 mean, deviation = moments(reward, weight)
                 np.testing.assert_allclose(found.reward_mean[t, place], mean[0], atol=1e-8)

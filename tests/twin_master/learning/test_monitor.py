@@ -14,8 +14,9 @@ from scipy.stats import t as student
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.learning import switching
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
-from twin_master.learning.monitor import WatchfulEstimator, Words
+from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.learning.switching import at_first, one_turn_later
+from twin_master.learning.words import Words
 from twin_master.mission.journal import belief_record, line_of
 from twin_master.mission.preparation import Knowledge, prepare_twin
 from twin_master.network.estimator import Carried, Estimate, ExactFilter

@@ -42,8 +42,7 @@ from twin_master.mission.preparation import (
 )
 from twin_master.mission.side_by_side import fly_side_by_side
 from twin_master.network.estimator import Carried, Estimator, ExactFilter
-from twin_master.network.planner import BeliefPolicy
-from twin_master.network.step_many import rationed
+from twin_master.network.planner import BeliefPolicy, rationed
 from twin_master.network.transition import TransitionModel
 from twin_master.report.reading import open_run
 from twin_master.scenario.reading import parse_scenario
@@ -271,7 +270,7 @@ def test_inspections_of_a_fleet_go_where_they_are_worth_most() -> None:
     model = replace(known.model, transition=TransitionModel((np.tile(np.eye(25), (5, 1, 1)),)))
     chosen = plan.policy.decide(ahead)
     wanting = np.flatnonzero(chosen == INSPECT)
-    few = rationed(model, ahead, np.zeros(60, dtype=int), chosen, plan.policy, [INSPECT], 3)
+    few = rationed(model.transition, ahead, np.zeros(60, dtype=int), chosen, plan.policy, [INSPECT], 3)
     value = plan.policy.action_value(ahead, 5)
     other = np.delete(value, INSPECT, axis=1).max(axis=1)
     gain = value[:, INSPECT] - other

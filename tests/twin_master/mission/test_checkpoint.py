@@ -15,6 +15,7 @@ from twin_master.mission import loop as checkpoint
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import Checkpoint, CheckpointFile
 from twin_master.mission.turns import Happened, Reading, Turn
+from twin_master.network.estimator import Carried
 from twin_master.network.inference import Predicted
 from twin_master.network.twin import TwinTurn
 
@@ -31,7 +32,10 @@ def flown(count: int) -> list[tuple[Turn, bytes]]:
         monitors = {"a.b": float(generator.random())}
         happened = Happened(generator.random(2), generator.random(24), monitors)
         belief = Predicted(np.empty(0), np.empty(0), np.empty(0))
-        concluded = TwinTurn(number, 1, np.ones(1), 0.0, belief, np.array([0.0, 1.0]), number % 2)
+        concluded = TwinTurn(
+            forecast=np.ones(1), filtered=np.ones(1), log_evidence=0.0, carried=Carried(1, {}), turn=number,
+            prediction=belief, decision_probability=np.array([0.0, 1.0]), next_control=number % 2,
+        )  # fmt: skip
         kept.append((Turn(Reading(observed, 1, happened=happened), concluded), STATE * (number + 1)))
     return kept
 

@@ -15,7 +15,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from fe.reduction.model_cache import reduced_model
-from fe.structure.location import Locator
+from fe.structure.location import on_surface
 from fe.structure.mesh_file import read_mesh
 from fe.wing.design import load_design
 from scenarios import structure_files
@@ -138,7 +138,7 @@ def test_gauges_may_be_anywhere_on_the_surface_of_a_structure(
     assert len(cloud.points) == 6 + 3 * 10
     mesh = read_mesh(structure_files()["stiffened_panel"].with_suffix(".msh"), 1e-3, "mm")
     places = cloud.points[6::3]
-    off = [Locator(mesh).on_surface(place, "it").distance for place in places]
+    off = [on_surface(mesh, place, "it").distance for place in places]
     assert max(off) < 1e-9
     apart = np.linalg.norm(places[:, None] - places, axis=2) + np.eye(10)
     assert apart.min() > 0.02  # of a panel of 0.3 m by 0.2 m

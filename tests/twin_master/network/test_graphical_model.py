@@ -15,7 +15,7 @@ from twin_master.network.graphical_model import (
     deterministic_policy,
     worsening_table,
 )
-from twin_master.network.transition import TransitionModel
+from twin_master.network.transition import TransitionModel, predecessor_lists
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8)
 SPACE = StateSpace((Factor("z1", LEVELS), Factor("z2", (0.0, 0.5, 1.0))))
@@ -136,15 +136,15 @@ def test_predecessor_lists_hold_every_non_zero_transition_and_no_other():
     matrix = TransitionModel.from_factors(
         [[worsening_table(4, p), worsening_table(3, 0.5)] for p in (0.0, 1.0)]
     )
-    sparse = matrix.sparse
+    _, _, start, source, probability, log_probability = predecessor_lists([matrix.matrix])
     rebuilt = np.zeros_like(matrix.matrix)
     for control in range(2):
         for state in range(12):
             row = control * 12 + state
-            for k in range(sparse.start[row], sparse.start[row + 1]):
-                rebuilt[control, sparse.source[k], state] = sparse.probability[k]
+            for k in range(start[row], start[row + 1]):
+                rebuilt[control, source[k], state] = probability[k]
     np.testing.assert_array_equal(rebuilt, matrix.matrix)
-    np.testing.assert_allclose(np.exp(sparse.log_probability), sparse.probability, rtol=1e-15)
+    np.testing.assert_allclose(np.exp(log_probability), probability, rtol=1e-15)
 
 
 def test_deterministic_policy():

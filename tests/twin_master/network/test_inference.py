@@ -54,7 +54,7 @@ MODEL = worsening_model()
 
 def infer(model, control, log_likelihood):
     filtered = filter_sequence(model, control, log_likelihood)
-    return filtered, smooth(model, control, filtered.log_filtered).smoothed
+    return filtered, smooth(model, control, filtered.log_filtered)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -254,5 +254,5 @@ def test_shapes_and_controls_are_checked(make, sentence):
 def test_an_empty_history_is_no_error():
     filtered = filter_sequence(MODEL, [], np.zeros((0, 25)))
     assert filtered.filtered.shape == (0, 25)
-    assert smooth(MODEL, [], filtered.log_filtered).smoothed.shape == (0, 25)
+    assert smooth(MODEL, [], filtered.log_filtered).shape == (0, 25)
     assert predict(MODEL, MODEL.prior, 1, POLICY, 0).joint.shape == (0, 25, 2)

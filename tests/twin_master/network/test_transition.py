@@ -45,7 +45,7 @@ def both(rng, shape=(3, 4, 2), zeros=0.3, least=0.0):
 
 def infer(model, control, rows):
     filtered = filter_sequence(model, control, rows)
-    return filtered, smooth(model, control, filtered.log_filtered).smoothed
+    return filtered, smooth(model, control, filtered.log_filtered)
 
 
 @settings(max_examples=40)

@@ -79,7 +79,7 @@ def test_turn_by_turn_equals_the_whole_sequence(knowledge: Knowledge) -> None:
     np.testing.assert_allclose([turn.filtered for turn in turns], whole.filtered, atol=1e-14)
     np.testing.assert_allclose([turn.log_evidence for turn in turns], whole.log_evidence, atol=1e-12)
     np.testing.assert_allclose(
-        twin.smoothed(), smooth(knowledge.model, controls, whole.log_filtered).smoothed, atol=1e-14
+        twin.smoothed(), smooth(knowledge.model, controls, whole.log_filtered), atol=1e-14
     )
     # A step without any observation follows the dynamics and says nothing.
     np.testing.assert_allclose(

@@ -33,7 +33,7 @@ def flown(run: Run, *gentle: int, level: float = 0.6, **changes: np.ndarray | No
     """The first sentence of a run that flew 2g at these turns, by a policy that leaves 3g from a level on."""
     control = np.ones(50, dtype=np.int64)
     control[list(gentle)] = 0
-    policy = np.where(run.coordinates[:, 0] > level - 0.01, 0, 1)
+    policy = np.where(run.model.states.coordinates[:, 0] > level - 0.01, 0, 1)
     return opening_sentences(
         altered(run, observed__control_index=control, policy__control_index=policy, **changes)
     )[0]

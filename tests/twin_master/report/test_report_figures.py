@@ -35,7 +35,7 @@ def test_the_mission_figure_draws_the_stored_arrays(run: Run) -> None:
     assert truth is not None
     for factor in range(2):
         axes = panel(figure, f"region {factor + 1}")
-        assert_allclose(line(axes, "past")[:, 1], 100.0 * (belief @ run.coordinates)[:, factor])
+        assert_allclose(line(axes, "past")[:, 1], 100.0 * (belief @ run.model.states.coordinates)[:, factor])
         assert_allclose(line(axes, "at the time")[:, 1], 100.0 * run["filtered/mean"][: now + 1, factor])
         coming = line(axes, "prediction")
         assert_array_equal(coming[:, 0], np.arange(19, 29))

@@ -1,0 +1,256 @@
+"""A model by its matrices, a wing, a structure or a lumped rig: under patches, at rest and in motion."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import replace
+from itertools import groupby
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from discrepancy.campaign.records import Campaign, FloatArray, Start, Trial
+from discrepancy.errors import ModelError
+from discrepancy.models.acting import Acting, Shown
+from discrepancy.models.interface import (
+    NO_PATCH,
+    Conditions,
+    Model,
+    Outputs,
+    PortedSystem,
+    PortScale,
+    Response,
+)
+from discrepancy.models.linear_system import Resting, at_rest
+from discrepancy.models.questions import check_carried, check_parameters, laws_at
+from discrepancy.models.second_order import Motion, SecondOrderSystem
+from fe.runtime.errors import FiniteElementError
+from fe.runtime.motion import NO_LAWS, Laws
+from fe.runtime.patch import INTERNAL_FORCES, STRUCTURE, ModelPatch, ModulusTemperature, PortLoad
+from fe.runtime.state import Losses
+
+
+class State(NamedTuple):
+    """What matrices depend on: parameters, losses of regions, a patch of structure, a temperature [K]."""
+
+    parameters: FloatArray
+    losses: Losses = ()
+    structure: ModelPatch = NO_PATCH
+    warmer: float = 0.0
+
+
+class Case(NamedTuple):
+    """A trial under a patch and in conditions, and the state of the matrices in it."""
+
+    trial: Trial
+    conditions: Conditions
+    patch: ModelPatch
+    state: State
+
+
+class SystemModel(Model):
+    """A model by its matrices (`discrepancy.models.interface.Model`), in N coordinates of its own.
+
+    Attributes
+    ----------
+    regions : tuple of str
+        Damage regions.
+    port_rows : mapping of str to (N,) ndarray
+        Rows of all ports where laws act.
+    missing : tuple of str
+        Further ports of `port_rows` where missing forces are looked for.
+    displacements : int or None
+        How many of the coordinates are displacements, the others being states; None: all.
+    components : int
+        3 if it tells transverse and shear strain, too; else 1.
+    """
+
+    regions: tuple[str, ...] = ()
+    port_rows: Mapping[str, FloatArray]
+    missing: tuple[str, ...] = ()
+    displacements: int | None = None
+    components: ClassVar[int] = 1
+    shows_ports: ClassVar[bool] = True
+
+    # ------------------------------------------------------------ what each says
+
+    @property
+    def what(self) -> str:
+        """What it is called where a sentence begins."""
+        return self.name
+
+    @abstractmethod
+    def check(self, trial: Trial) -> None:
+        """Refuse a trial of a kind that it cannot follow."""
+
+    @abstractmethod
+    def loads(self, case: Case) -> tuple[FloatArray, FloatArray]:
+        """Return the loads (k, N) of a trial at rest, and how much of each (L, k) acts in each row."""
+
+    @abstractmethod
+    def rest(self, state: State) -> Resting:
+        """Return what has a rest in a state."""
+
+    @abstractmethod
+    def acting(self, case: Case) -> Acting:
+        """Return what acts in a dynamic trial."""
+
+    @abstractmethod
+    def system(self, case: Case, acting: Acting, ports: tuple[str, ...]) -> SecondOrderSystem:
+        """Return what moves in a dynamic trial under what acts and forces at ports."""
+
+    @abstractmethod
+    def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
+        """Return what outputs show under what acts, in its coordinates, or at rest.
+
+        `component` 1 and 2: transverse and shear strain.
+        """
+
+    @abstractmethod
+    def base(self, state: State, *, closed: bool = True) -> SecondOrderSystem:
+        """Return what moves without prescribed motions, with its controllers or without."""
+
+    @abstractmethod
+    def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
+        """Return the load (N,) at whose place stiffness and modal mass are the natural ones."""
+
+    def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
+        """Return the scales of forces that are spread over the structure, by the first mode (N,)."""
+        return {}
+
+    def own_laws(self, parameters: FloatArray) -> ModelPatch:
+        """Return the laws of ports that it has as it is."""
+        return NO_PATCH
+
+    # ------------------------------------------------------------ what all do alike
+
+    def laws(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> Laws:
+        """Return the laws at its ports, its own and those of a patch."""
+        forces = self.at_ports(self.own_laws(parameters) + patch.of(*INTERNAL_FORCES))
+        return laws_at(forces, self.port_rows, in_windows=self.follows_windows)
+
+    def case(self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH) -> Case:
+        """Return a trial as it is at its begin."""
+        losses, warmer = self._losses(trial, conditions)[0], float(trial.temperature[0])
+        return Case(
+            trial, conditions, patch, State(conditions.parameters, losses, patch.of(*STRUCTURE), warmer)
+        )
+
+    def begun(self, case: Case, ports: tuple[str, ...]) -> tuple[SecondOrderSystem, Acting]:
+        """Return what moves under forces at ports, and what acts on it."""
+        acting = self.acting(case)
+        system = self.system(case, acting, ports)
+        return system, acting if system.basis is None else acting.along(system.basis)
+
+    def moved(
+        self, case: Case, laws: Laws = NO_LAWS, ports: tuple[str, ...] | None = None, *, still: bool = False
+    ) -> Motion:
+        """Return the motion in a dynamic trial, `ports` being those of the laws; `still`: begun at rest.
+
+        Raises
+        ------
+        ModelError
+            If it cannot begin so, or what acts is not the model's.
+        """
+        system, acting = self.begun(case, laws.ports if ports is None else ports)
+        if still:
+            acting = replace(acting, begins=Start.STILL)
+        try:
+            return system.motion(acting, laws, case.conditions.refinement)
+        except ModelError as cause:
+            raise ModelError(f"The trial {case.trial.name!r} of {self.name!r}: {cause}") from cause
+
+    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
+        """Return the response of a trial.
+
+        The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero. In a
+        dynamic trial the structure is that at its first temperature.
+        """
+        self.check(trial)
+        check_parameters(self.what, self.parameters, conditions.parameters)
+        patch = patch.in_trial(trial.name)
+        check_carried(patch, self, self.what)
+        components = range(self.components if conditions.components else 1)
+        try:
+            laws, case = self.laws(conditions.parameters, patch), self.case(trial, conditions, patch)
+            if not trial.is_dynamic:
+                return self._at_rest(case, outputs, laws, components)
+            motion = self.moved(case, laws)
+            shown = (self.shown(case, outputs, motion.acting, number) for number in components)
+            found, *further = map(motion.seen, shown)
+            return Response(found.values, found.rates, *(part.values for part in further))
+        except FiniteElementError as cause:
+            raise ModelError(str(cause)) from cause
+
+    def _at_rest(self, case: Case, outputs: Outputs, laws: Laws, components: range) -> Response:
+        """Return what is shown at rest; rows of one structure that follow one another go together."""
+        trial, conditions, patch, first = case
+        if laws.spans or len(patch.of(PortLoad)):
+            raise ModelError(
+                f"The trial {trial.name!r} has no time, which a law or a force in time asks for."
+            )
+        count, losses = len(trial.force), self._losses(trial, conditions)
+        losses = losses * count if len(losses) == 1 else losses
+        warmer = trial.temperature.tolist() if len(patch.of(ModulusTemperature)) else [0.0] * count
+        values = np.empty((count, len(components) * len(outputs)))
+        memory, before, start = None, None, 0
+        for (lost, warm), group in groupby(zip(losses, warmer, strict=True)):
+            rows = slice(start, start + len(list(group)))
+            case = case._replace(state=first._replace(losses=lost, warmer=warm))
+            shown = [item for number in components for item in self.shown(case, outputs, None, number)]
+            for (_, quantity), item in zip(outputs, shown, strict=False):
+                if item.further or (quantity.is_rate and np.any(item.row[: self.displacements])):
+                    raise ModelError(
+                        f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
+                        "acceleration."
+                    )
+            units, amounts = self.loads(case)
+            ports = laws.rows(self.port_rows, units.shape[1])
+            if self.displacements is not None:
+                ports[:, self.displacements :] = 0.0  # ports of states are at no position
+            try:
+                found = at_rest(self.rest(case.state), units, amounts[rows], laws, ports, memory, before)
+            except ModelError as cause:
+                raise ModelError(f"The trial {trial.name!r} is at rest, but {cause}") from cause
+            values[rows] = found.seen(np.array([item.row for item in shown]))
+            values[rows] += [item.constant for item in shown]
+            memory, before, start = found.memory, amounts[rows.stop - 1], rows.stop
+        seen, *further = np.split(values, len(components), axis=1)
+        return Response(seen, None, *further)
+
+    def _losses(self, trial: Trial, conditions: Conditions) -> list[Losses]:
+        """Return the losses of the regions in each row from those that the trial names."""
+        losses = np.zeros((len(conditions.health), len(self.regions)))
+        for name, column in zip(trial.regions, conditions.health.T, strict=False):
+            if name in self.regions:
+                losses[:, self.regions.index(name)] = column
+            elif np.any(column):
+                raise ModelError(
+                    f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but "
+                    f"{self.name} has {', '.join(self.regions)}."
+                )
+        return [tuple(row) for row in losses.tolist()]
+
+    # ------------------------------------------------------------ ports
+
+    @property
+    def _mean(self) -> FloatArray:
+        return np.array([item.mean for item in self.declared])
+
+    def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
+        """Return the system by which outputs see missing forces, in the modes of the prior means."""
+        patch = self.patch.in_trial(trial.name)
+        at_mean, case = (
+            self.case(trial, Conditions(values, health=trial.health[:1]), patch)
+            for values in (self._mean, parameters)
+        )
+        (base, _), (system, acting) = (self.begun(item, self.missing) for item in (at_mean, case))
+        shapes = base.shapes
+        if base.basis is not None and system.basis is not None:
+            # both bases hold nearly the same shapes of the whole structure
+            shapes = np.asarray(np.linalg.lstsq(system.basis, base.basis @ shapes, rcond=None)[0])
+        return system.seen_by(self.shown(case, outputs, acting), shapes)
+
+    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
+        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
+        case = self.case(trial, conditions, self.patch.in_trial(trial.name))
+        return self.moved(case, ports=self.missing).at_ports
