@@ -235,6 +235,15 @@ class Acting:
         """Times (N,) at which the samples show the motion [s]."""
         return (1.0 + self.clock[0]) * self.time + self.clock[1]
 
+    @property
+    def levels(self) -> tuple[FloatArray, FloatArray]:
+        """Loads (k, n + m), and how much of each (L, k) acts in the rows of a trial at rest."""
+        pushes = [(row, course.values) for row, course in self.loads if isinstance(course, Course)]
+        if self.constant.any():
+            pushes.append((self.constant, np.ones(len(self.time))))
+        units, amounts = zip(*pushes, strict=True)
+        return np.array(units), np.column_stack(amounts)
+
     def load_at(self, time: FloatArray, base: FloatArray) -> FloatArray:
         """Return the loads (T, B) in a base (n + m, B) at times, held ones as they were just before."""
         return self.total([course.at(time) for _, course in self.loads], base, len(time))

@@ -1,6 +1,7 @@
 """A lumped linear structure as a model: masses, springs, dampers with named inputs, outputs and ports."""
 
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -130,24 +131,15 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the laws of ports that it has as it is."""
         return self.description.own_laws(self._factors(parameters))
 
-    def base(self, state: State, *, closed: bool = True) -> SecondOrderSystem:
-        """Return the rig without prescribed motions, with its controllers or without."""
-        return self.rig(state).system(closed=closed)
-
-    rest = base
+    def system(self, state: State) -> SecondOrderSystem:
+        """Return the rig, with prescribed motions and controllers as the state says."""
+        return self.rig(state).system(state.drives, closed=state.closed)
 
     def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
         """Return the load (N,) at whose place stiffness and modal mass are the natural ones."""
         places = [trial.load_place for trial in campaign.trials]
         item = self._input_at(places[0]) if places else self.description.input[0]
         return self._moved_row(self.rig(State(parameters)), item)
-
-    def loads(self, case: Case) -> tuple[FloatArray, FloatArray]:
-        """Return the loads (2, N) of a static trial, and how much of each (L, 2) acts in each row."""
-        rig, change, force = self.rig(case.state), LoadChange.of(case.patch), case.trial.force
-        row = self._moved_row(rig, self._input_at(case.trial.load_place), change)
-        amounts = np.column_stack((change.changed(force, force), np.ones(len(force))))
-        return np.stack((row, rig.constant)), amounts
 
     def acting(self, case: Case) -> Acting:
         """Return what acts in a dynamic trial.
@@ -172,11 +164,14 @@ class LumpedModel(DescribedModel, SystemModel):
         loads, drives, references = list[Load](), dict[str, Drive](), dict[str, Sequence[Load]]()
         offsets = (*conditions.offset, *(0.0,) * len(recorded))
         for item, offset in zip(recorded, offsets, strict=False):
-            following = [loop for loop in rig.loops if loop.section.reference == item.name]
-            for loop in following:
-                references[loop.section.name] = loop.loads(trial, item, offset)
-                loads += references[loop.section.name]
+            following = {
+                name: loop.loads(trial, item, offset)
+                for name, loop in rig.loops.items()
+                if loop.section.reference == item.name
+            }
             if following:
+                references |= following
+                loads += chain.from_iterable(following.values())
                 continue
             section = self._section(trial, item)
             values = item.values + offset if offset else item.values
@@ -265,10 +260,6 @@ class LumpedModel(DescribedModel, SystemModel):
         spans = tuple(window.span for window in load.windows)
         return rows[load.port], FormulaCourse(course_of(load.force, load.kind), spans)
 
-    def system(self, case: Case, acting: Acting, ports: tuple[str, ...]) -> SecondOrderSystem:
-        """Return the rig with the motions prescribed that the trial drives."""
-        return self.rig(case.state).system(tuple(acting.drives))
-
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
         """Return what each output shows under what acts; None: at rest."""
         check_outputs(self.what, self, outputs, self.quantities)
@@ -285,8 +276,8 @@ class LumpedModel(DescribedModel, SystemModel):
                     )
                 found.append(Shown(padded(()), reaction=list(drives).index(item.reaction)))
             elif item.controller is not None:
-                loops = {loop.section.name: loop for loop in self.rig(case.state).loops}
-                found.append(loops[item.controller].effort(references.get(item.controller, ())))
+                loop = self.rig(case.state).loops[item.controller]
+                found.append(loop.effort(references.get(item.controller, ())))
             else:
                 row, order = padded(item.vector or ()), order_of(item.quantity) + further
                 found.append(Shown(row, order, further, constant=item.constant * (not further)))
@@ -298,7 +289,7 @@ class LumpedModel(DescribedModel, SystemModel):
     @property
     def oscillates(self) -> bool:
         """Whether it has a mode that vibrates."""
-        return bool(np.any(self.base(State(self._mean)).angular_frequency > 0.0))
+        return bool(np.any(self.system(State(self._mean)).angular_frequency > 0.0))
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of the state at the begin of a driven or forced trial."""
@@ -350,7 +341,7 @@ class LumpedModel(DescribedModel, SystemModel):
 
     def rig(self, state: State) -> LumpedRig:
         """Return the model at values of the parameters and a temperature above the reference [K]."""
-        parameters, _, structure, temperature = state
+        parameters, _, structure, temperature, *_ = state
         softening = temperature * sum(
             (item.coefficient for item in structure if isinstance(item, ModulusTemperature)), 0.0
         )

@@ -143,12 +143,12 @@ def natural_scales(model: SystemModel, campaign: Campaign) -> Scales:
     """
     trials, parameters = campaign.trials, prior_mean(campaign, model.declared)
     state, names = State(parameters, (0.0,) * len(model.regions)), model.ports()
-    system, rest, laws = model.base(state), model.rest(state), model.laws(parameters)
+    system, rest, laws = model.system(state), model.rest(state), model.laws(parameters)
     held = system.mode_count is not None and all(
         trial.kind is not TrialKind.DRIVEN and trial.begins is Start.SETTLED for trial in trials
     )
     driven_only = all(trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN for trial in trials)
-    ports = PortSizes(names, model.base(state, closed=False), driven_only=driven_only)
+    ports = PortSizes(names, model.system(state._replace(closed=False)), driven_only=driven_only)
     rows = np.array([model.port_rows[name] for name in names])
     conditions, peak, speed, weight = Conditions(parameters), 0.0, 0.0, 0.0
     for trial in trials:
@@ -210,5 +210,5 @@ def _held(model: SystemModel, case: Case) -> FloatArray:
         row, release = let_go
         shape = rest.resting(row[None])
         return np.asarray(release.displacement / float(row @ shape[0]) * shape)
-    units, amounts = model.loads(case)
+    units, amounts = model.acting(case).levels
     return np.asarray(amounts @ rest.resting(units))

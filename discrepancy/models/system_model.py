@@ -16,6 +16,7 @@ from discrepancy.models.interface import (
     Conditions,
     Model,
     Outputs,
+    Place,
     PortedSystem,
     PortScale,
     Response,
@@ -30,12 +31,34 @@ from fe.runtime.state import Losses
 
 
 class State(NamedTuple):
-    """What matrices depend on: parameters, losses of regions, a patch of structure, a temperature [K]."""
+    """What a system depends on.
+
+    Attributes
+    ----------
+    parameters : (P,) ndarray
+        Values of the model's.
+    losses : tuple of float
+        Of its damage regions.
+    structure : ModelPatch
+        What of a patch changes it.
+    warmer : float
+        Temperature above the reference [K].
+    place, ports : str or (float, float), tuple of str
+        Where it is let go or pushed, and where forces act: what a system of few coordinates must hold.
+    drives : tuple of str
+        Inputs whose motion is prescribed.
+    closed : bool
+        Whether its controllers act.
+    """
 
     parameters: FloatArray
     losses: Losses = ()
     structure: ModelPatch = NO_PATCH
     warmer: float = 0.0
+    place: Place | None = None
+    ports: tuple[str, ...] = ()
+    drives: tuple[str, ...] = ()
+    closed: bool = True
 
 
 class Case(NamedTuple):
@@ -83,20 +106,16 @@ class SystemModel(Model):
         """Refuse a trial of a kind that it cannot follow."""
 
     @abstractmethod
-    def loads(self, case: Case) -> tuple[FloatArray, FloatArray]:
-        """Return the loads (k, N) of a trial at rest, and how much of each (L, k) acts in each row."""
+    def system(self, state: State) -> SecondOrderSystem:
+        """Return what moves in a state."""
 
-    @abstractmethod
     def rest(self, state: State) -> Resting:
         """Return what has a rest in a state."""
+        return self.system(state)
 
     @abstractmethod
     def acting(self, case: Case) -> Acting:
-        """Return what acts in a dynamic trial."""
-
-    @abstractmethod
-    def system(self, case: Case, acting: Acting, ports: tuple[str, ...]) -> SecondOrderSystem:
-        """Return what moves in a dynamic trial under what acts and forces at ports."""
+        """Return what acts in a trial; at rest the values of the loads' courses count, one for each row."""
 
     @abstractmethod
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
@@ -104,10 +123,6 @@ class SystemModel(Model):
 
         `component` 1 and 2: transverse and shear strain.
         """
-
-    @abstractmethod
-    def base(self, state: State, *, closed: bool = True) -> SecondOrderSystem:
-        """Return what moves without prescribed motions, with its controllers or without."""
 
     @abstractmethod
     def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
@@ -138,7 +153,8 @@ class SystemModel(Model):
     def begun(self, case: Case, ports: tuple[str, ...]) -> tuple[SecondOrderSystem, Acting]:
         """Return what moves under forces at ports, and what acts on it."""
         acting = self.acting(case)
-        system = self.system(case, acting, ports)
+        moving = case.state._replace(place=case.trial.load_place, ports=ports, drives=tuple(acting.drives))
+        system = self.system(moving)
         return system, acting if system.basis is None else acting.along(system.basis)
 
     def moved(
@@ -203,7 +219,7 @@ class SystemModel(Model):
                         f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
                         "acceleration."
                     )
-            units, amounts = self.loads(case)
+            units, amounts = self.acting(case).levels
             ports = laws.rows(self.port_rows, units.shape[1])
             if self.displacements is not None:
                 ports[:, self.displacements :] = 0.0  # ports of states are at no position
