@@ -1,0 +1,88 @@
+"""Exact steps of modes against matrix exponentials, and the damping of Rayleigh."""
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from fe.runtime.modal_system import (
+    ModalSystem,
+    exact_step,
+    linear_step,
+    rayleigh_coefficients,
+    rayleigh_damping_ratio,
+)
+
+
+def transition(omega: float, damping: float, duration: float) -> np.ndarray:
+    """Of displacements times the larger of omega and one, so that all entries are of order one."""
+    found, _, _ = exact_step(np.array([omega**2]), np.array([[damping]]), np.array([duration]))
+    unit = np.array([max(omega, 1.0), 1.0])
+    return np.asarray(found[0]) * unit[:, None] / unit
+
+
+@given(omega=st.floats(0.0, 500.0), damping=st.floats(0.0, 2000.0), duration=st.floats(1e-6, 1.0))
+@settings(max_examples=60, deadline=None)
+def test_the_step_of_any_oscillator_is_the_exponential(omega: float, damping: float, duration: float) -> None:
+    unit = max(omega, 1.0)
+    expected = expm(np.array([[0.0, unit], [-omega * omega / unit, -damping]]) * duration)
+    np.testing.assert_allclose(transition(omega, damping, duration), expected, atol=1e-9)
+    step = linear_step(
+        ModalSystem(np.array([omega]), np.array([[damping]])), np.ones(1), np.zeros(1), duration
+    )
+    np.testing.assert_array_equal(
+        transition(omega, damping, duration), step.transition * [[unit], [1.0]] / [unit, 1.0]
+    )
+
+
+@pytest.mark.parametrize("zeta", [0.0, 0.03, 0.7, 1 - 1e-9, 1.0, 1 + 1e-9, 1 + 1e-4, 1.5, 20.0, 1e4])
+def test_a_step_near_critical_damping_is_the_exponential(zeta: float) -> None:
+    for duration in (1e-5, 0.01, 0.3, 2.0):
+        wanted = expm(np.array([[0.0, 1.0], [-81.0, -18.0 * zeta]]) * duration)
+        found = transition(9.0, 18.0 * zeta, duration) / np.array([9.0, 1.0])[:, None] * [9.0, 1.0]
+        np.testing.assert_allclose(found, wanted, rtol=1e-7, atol=9e-10)
+
+
+@given(
+    omega=st.floats(0.1, 1e4),
+    zeta=st.floats(0.0, 0.99) | st.floats(0.99, 1.01) | st.floats(1.01, 1e3),
+    duration=st.floats(1e-6, 10.0),
+)
+def test_two_half_steps_are_one_step(omega: float, zeta: float, duration: float) -> None:
+    unit = np.array([min(omega, 1.0), 1.0])  # below one, displacements times omega
+    half, whole = (
+        transition(omega, 2.0 * zeta * omega, d) * unit[:, None] / unit for d in (duration / 2, duration)
+    )
+    np.testing.assert_allclose(half @ half, whole, atol=1e-9 * (1 + zeta))
+    assert np.isfinite(whole).all()
+    assert np.abs(whole).max() <= 1.0 + 1e-9 + 2 * zeta
+
+
+@given(
+    alpha=st.floats(0.0, 100.0),
+    beta=st.floats(0.0, 1.0),
+    first=st.floats(0.1, 10.0),
+    factor=st.floats(1.5, 100.0),
+)
+@example(alpha=1.0735, beta=7.3124e-4, first=5.6492, factor=29.9699 / 5.6492)
+def test_rayleigh_coefficients_are_the_inverse_of_the_ratios(alpha, beta, first, factor) -> None:
+    frequency = (first, first * factor)
+    low, high = rayleigh_damping_ratio(alpha, beta, frequency)
+    found = rayleigh_coefficients(frequency, (float(low), float(high)))
+    np.testing.assert_allclose(found, (alpha, beta), rtol=1e-9, atol=1e-9)
+
+
+def test_published_coefficients_give_the_measured_damping() -> None:
+    # Kapteyn et al. 2021, Results: alpha and beta fitted to 2.81 % and 7.17 % at 5.65 and 29.97 Hz
+    alpha, beta = rayleigh_coefficients((5.6492, 29.9699), (0.0281, 0.0717))
+    np.testing.assert_allclose(
+        rayleigh_damping_ratio(alpha, beta, (5.6492, 29.9699)), (0.0281, 0.0717), rtol=1e-12
+    )
+    assert min(alpha, beta) > 0.0
+
+
+@pytest.mark.parametrize("frequency", [(1.0, 1.0), (0.0, 1.0), (-1.0, 2.0)])
+def test_two_different_positive_frequencies_are_needed(frequency: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="Two different positive frequencies"):
+        rayleigh_coefficients(frequency, (0.1, 0.1))
