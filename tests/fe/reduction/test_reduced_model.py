@@ -1,4 +1,4 @@
-"""The contract of a reduced model, of a wing, a structure, springs: its full model within certified bounds."""
+"""The contract of reduced models of a wing, a structure, springs: the full model within certified bounds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from fe.full.statics import Factorisation
 from fe.reduction.certified_basis import compressed
-from fe.reduction.reduced_basis import reduce_model, reduce_structure
+from fe.reduction.reduced_basis import reduce_structure
 from fe.reduction.structure_errors import measured_errors
 from fe.runtime import kept_arrays
 from fe.runtime.errors import OutsideModelError, ReducedModelFileError
@@ -24,7 +24,7 @@ from fe.structure.affine import AffineStructure
 from fe.structure.field import natural_frequencies, static_response
 from fe.structure.operators import load_and_assemble
 from fe.wing.responses import eigenmodes
-from tests.fe.springs import SETTINGS, springs
+from tests.fe.springs import SETTINGS, reduced_springs, springs
 from tests.wings import tip_stiffness
 
 HURT = {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 3.0, "push": -120.0}
@@ -42,21 +42,14 @@ class Pair(NamedTuple):
 
 @pytest.fixture(scope="module", params=["wing", "beam", "springs", "springs 1", "springs 4", "rough springs"])
 def pair(request: pytest.FixtureRequest) -> Pair:
-    kind = request.param
+    kind, get = request.param, request.getfixturevalue
     if kind == "wing":
-        return Pair(
-            request.getfixturevalue("coarse_operators"), request.getfixturevalue("model"), 1e-3, 1e-4, 15
-        )
+        return Pair(get("coarse_operators"), get("model"), 1e-3, 1e-4, 15)
     if kind == "beam":
-        return Pair(
-            request.getfixturevalue("beam"), request.getfixturevalue("beam_reduction").model, 1e-3, 2e-5, 15
-        )
+        return Pair(get("beam"), get("beam_reduction").model, 1e-3, 2e-5, 15)
     if kind in ("springs 1", "springs 4"):
-        full = springs(int(kind[-1]))
-        model = reduce_model(full, replace(SETTINGS, bound_tolerance=5e-3, most_snapshots=30)).model
-        return Pair(full, model, 1e-2, 2e-3, 40)
-    full = springs()
-    model = reduce_model(full, SETTINGS).model
+        return Pair(springs(int(kind[-1])), reduced_springs(int(kind[-1])).model, 1e-2, 2e-3, 40)
+    full, model = springs(2), reduced_springs(2).model
     if kind == "springs":
         return Pair(full, model, 2.0 * SETTINGS.bound_tolerance, 1e-4, 100)
     # so small that its errors are far above rounding
@@ -286,7 +279,7 @@ def test_modal_compliance_adds_up_to_the_static_one(model: ReducedModel) -> None
 
 
 def test_a_beam_in_all_its_parts(beam, beam_reduction) -> None:
-    """Parameter times loss, controls, and the weight of a free mass are those of the full sums; so are modes."""
+    """Parameter times loss, controls, the weight of a free mass and modes are those of the full sums."""
     model, masses = beam_reduction.model, {"pump": 0.07}
     stiffness, mass = beam.stiffness({"e": 1.05}, {"z1": 0.6, "z2": 0.3}), beam.mass(masses)
     full = Factorisation(stiffness).solve(beam.load("weight", 3.0, masses) + beam.load("pushed", -120.0))

@@ -30,7 +30,7 @@ from fe.runtime.errors import FiniteElementError, ReductionError, SolutionError
 from fe.structure.design import load_structure, structure_hash
 from fe.structure.field import static_response
 from fe.structure.operators import load_and_assemble
-from tests.fe.springs import SETTINGS, springs
+from tests.fe.springs import SETTINGS, reduced_springs, springs
 
 SYSTEM = springs()
 STIFFNESS = tuple(term.matrix for term in SYSTEM.stiffness_terms)
@@ -39,7 +39,7 @@ TERMS = ReductionTerms(replace(SYSTEM, ranges=SETTINGS.named_ranges(SYSTEM.regio
 
 @pytest.fixture(scope="module")
 def reduction() -> Reduction:
-    return reduce_model(SYSTEM, SETTINGS)
+    return reduced_springs(2)
 
 
 def values(state: Any) -> dict[str, float]:
@@ -111,7 +111,7 @@ def test_same_system_gives_the_same_bytes(reduction: Reduction) -> None:
 
 @pytest.mark.parametrize("regions", [1, 4])
 def test_few_regions_have_a_bound_of_each_and_many_one_together(regions: int) -> None:
-    found = reduce_model(springs(regions), replace(SETTINGS, bound_tolerance=5e-3, most_snapshots=30))
+    found = reduced_springs(regions)
     combined, model = regions > 3, found.model
     assert (model.dual_counts.prod(), model.dual_output.shape[1] > 0) == (1 if combined else 2, combined)
     assert found.bound_history[-1] <= 5e-3

@@ -223,7 +223,9 @@ def whole_force(law: Primitive, path: np.ndarray[Any, Any]) -> np.ndarray[Any, A
 
     It is a static solution of a structure without compliance.
     """
-    forces = static_solution(laws(law), path[:, None], np.zeros((1, 1))).forces[:, 0]
+    forces = static_solution(laws(law), path[:, None], np.zeros((1, 1)), kernel=compiled_kernel()).forces[
+        :, 0
+    ]
     return forces + law.stiffness * path
 
 
