@@ -40,7 +40,7 @@ class Pair(NamedTuple):
     examples: int
 
 
-@pytest.fixture(scope="module", params=["wing", "beam", "springs", "springs 1", "springs 4", "rough springs"])
+@pytest.fixture(scope="module", params=["wing", "beam", "springs", "springs 1", "springs 4", "rough"])
 def pair(request: pytest.FixtureRequest) -> Pair:
     kind, get = request.param, request.getfixturevalue
     if kind == "wing":
