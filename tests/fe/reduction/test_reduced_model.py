@@ -31,7 +31,7 @@ HURT = {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 3.0, "push
 
 
 class Pair(NamedTuple):
-    """A full model and its reduced one, what its bounds and frequencies are good to, and how often to look."""
+    """A full model and its reduced one, what bounds and frequencies are good to, how often to look."""
 
     full: AffineStructure
     model: ReducedModel
