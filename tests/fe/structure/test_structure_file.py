@@ -191,10 +191,10 @@ def test_a_rosette_is_gauges_at_one_point(make: Callable[[str], Path]) -> None:
     wanted = 0.25 * first + 0.75 * last + half * np.sin(np.radians(120.0))
     np.testing.assert_allclose(fourth, wanted, atol=1e-12 * np.abs(first).max())
     for old, new, sentence in (
-        ("[1, 2, 0]]", "[2, 0, 0]]", r"rosette\[1\]: axes: the two axes .* must point in two directions"),
-        ("axes", "axis", r"rosette\[1\]: 'axis' is not a key of a rosette"),
+        ("[1, 2, 0]]", "[2, 0, 0]]", r"rosette\[1\]\.axes: the two axes .* must point in two directions"),
+        ("axes", "axis", r"'rosette\[1\]\.axis' is not a key of a structure"),
         ("[1, 2, 0]]", "[0, 0, 1]]", r"gauge\[3\] \(r_b\): its direction points 45 degrees out of"),
-        ('"r"', '"a"\nangles = []', r"rosette\[1\]: angles: at least 2 entries are expected"),
+        ('"r"', '"a"\nangles = []', r"rosette\[1\]\.angles: at least 2 entries are expected"),
     ):
         with pytest.raises(FiniteElementError, match=sentence):
             load_and_assemble(make(GOOD + rosette.replace(old, new)))
