@@ -153,10 +153,10 @@ def advance(
     for first, last, acting in _sections(laws, steps.time):
         now = acting[:, None]
         ports = laws.at(rows * now, flexibility, system.relaxation, acts * now)
-        started = acting & ~before
-        state.memory[started] = 0.0
-        moving = started & (laws.of_speed == 1)
-        state.memory[moving, 1] = rows[moving] @ state.q
+        for j in np.flatnonzero(acting & ~before):
+            state.memory[j] = 0.0
+            if laws.of_speed[j]:
+                state.memory[j, 1] = rows[j] @ state.q
         state.current[:] = 0.0
         own, part = steps, out
         if laws.spans:
