@@ -17,7 +17,7 @@ from fe.runtime.errors import InvalidPatchError, SolutionError
 from fe.runtime.flexible_ports import settle_port
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import NO_LAWS, Laws, laws_of, simulate, static_solution, substeps_for
+from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
 from fe.runtime.motion_arrays import State
 from fe.runtime.patch import (
     BoucWen,
@@ -32,6 +32,8 @@ from fe.runtime.patch import (
 )  # fmt: skip
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.planform_forces import PLANFORM, STATION_COUNT, STATION_PORTS, at_stations, planform_stations
+from fe.runtime.stepwise import substeps
+from tests.fe.runtime.stepping import simulate
 
 A, W = 0.05, 2.0 * np.pi * np.array([5.6, 20.0, 35.0, 60.0])
 PORTS = {"tip": np.array([1.3, -1.1, 0.2, 1.2]), "root": np.array([0.8, 2.0, -0.3, 3.0])}
@@ -253,7 +255,7 @@ def test_laws_without_magnitude_leave_the_linear_structure() -> None:
     damping, play = PowerDamping("tip", 0.0, 0, 0, 1, 1), FreePlay("tip", 10.0, 0.0)
     nothing = laws(damping, play, patch.StiffnessDrift(0.0), patch.PointMass(1.0, 0.5))
     assert nothing is NO_LAWS
-    assert substeps_for(W, nothing, 0.005) == 1
+    assert len(substeps(WING, nothing, np.array([0.0, 0.005])).lengths) == 1
 
 
 @pytest.mark.parametrize(

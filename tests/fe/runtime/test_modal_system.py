@@ -6,18 +6,14 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from fe.runtime.modal_system import (
-    ModalSystem,
-    exact_step,
-    linear_step,
-    rayleigh_coefficients,
-    rayleigh_damping_ratio,
-)
+from fe.runtime.modal_system import ModalSystem, rayleigh_coefficients, rayleigh_damping_ratio
+from fe.runtime.stepwise import Boundaries
 
 
 def transition(omega: float, damping: float, duration: float) -> np.ndarray:
     """Of displacements times the larger of omega and one, so that all entries are of order one."""
-    found, _, _ = exact_step(np.array([omega**2]), np.array([[damping]]), np.array([duration]))
+    system = ModalSystem(np.array([omega]), np.array([[damping]]))
+    found, _, _ = system.exact_steps(np.array([duration]))
     unit = np.array([max(omega, 1.0), 1.0])
     return np.asarray(found[0]) * unit[:, None] / unit
 
@@ -28,12 +24,26 @@ def test_the_step_of_any_oscillator_is_the_exponential(omega: float, damping: fl
     unit = max(omega, 1.0)
     expected = expm(np.array([[0.0, unit], [-omega * omega / unit, -damping]]) * duration)
     np.testing.assert_allclose(transition(omega, damping, duration), expected, atol=1e-9)
-    step = linear_step(
-        ModalSystem(np.array([omega]), np.array([[damping]])), np.ones(1), np.zeros(1), duration
-    )
-    np.testing.assert_array_equal(
-        transition(omega, damping, duration), step.transition * [[unit], [1.0]] / [unit, 1.0]
-    )
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+def test_steps_of_any_length_are_matrix_exponentials(coupled: bool) -> None:
+    """With the parts of forces that are linear in time, Van Loan 1978."""
+    damping = np.diag([0.3, 1.0, 200.0]) + coupled * np.random.default_rng(3).normal(size=(3, 3))
+    frequency, lengths = np.array([0.0, 7.0, 60.0]), np.array([0.01, 0.013, 0.01, 0.4])
+    time = np.concatenate(([0.0], np.cumsum(lengths)))
+    distinct, which = Boundaries(time, np.arange(5), lengths).alike
+    np.testing.assert_array_equal(distinct[which], lengths)
+    transition, begin, end = ModalSystem(frequency, damping).exact_steps(distinct)
+    for h, at in zip(lengths, which, strict=True):
+        matrix = np.zeros((12, 12))
+        matrix[:3, 3:6] = np.eye(3)
+        matrix[3:6, :3], matrix[3:6, 3:6] = -np.diag(frequency**2), -damping
+        matrix[3:6, 6:9], matrix[6:9, 9:] = np.eye(3), np.eye(3) / h
+        whole = expm(h * matrix)
+        np.testing.assert_allclose(transition[at], whole[:6, :6], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(end[at], whole[:6, 9:], rtol=1e-9, atol=1e-13)
+        np.testing.assert_allclose(begin[at], whole[:6, 6:9] - whole[:6, 9:], rtol=1e-9, atol=1e-13)
 
 
 @pytest.mark.parametrize("zeta", [0.0, 0.03, 0.7, 1 - 1e-9, 1.0, 1 + 1e-9, 1 + 1e-4, 1.5, 20.0, 1e4])

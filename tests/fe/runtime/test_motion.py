@@ -16,8 +16,10 @@ from discrepancy.models.compiled_motion import compiled_kernel
 from fe.runtime import patch
 from fe.runtime.laws.micro_slip import slip_displacements
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import NO_LAWS, Laws, ModalMotion, laws_of, simulate, static_solution
+from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
+from fe.runtime.stepwise import ModalMotion
+from tests.fe.runtime.stepping import simulate
 
 W = 2.0 * np.pi  # one second for a period
 ONE = ModalSystem(np.array([W]), np.zeros((1, 1)), {"mass": np.array([1.0])})
