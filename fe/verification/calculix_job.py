@@ -38,8 +38,8 @@ def read_tables(text: str) -> dict[str, list[FloatArray]]:
             rows = np.loadtxt(body.splitlines(), ndmin=2)
         except ValueError as error:
             raise CalculixError(
-                f"The table of {what} that CalculiX printed holds what is not a row of numbers ({error}); its "
-                "version may print another format (2.20 is known)."
+                f"The table of {what} that CalculiX printed holds what is not a row of numbers ({error}); "
+                "its version may print another format (2.20 is known)."
             ) from None
         tables.setdefault(name, []).append(rows)
     return tables
