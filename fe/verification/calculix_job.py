@@ -97,8 +97,6 @@ def run_calculix(text: str, folder: Path, name: str) -> str:
         )
     except subprocess.TimeoutExpired:
         raise CalculixError(f"CalculiX took more than {_TIME_LIMIT:g} s for {folder / name}.inp.") from None
-    except OSError as error:
-        raise CalculixError(f"CalculiX ({program}) cannot be run: {error.strerror}.") from None
     log = folder / f"{name}.log"
     log.write_text(done.stdout + done.stderr, encoding="utf-8")
     result = folder / f"{name}.dat"
