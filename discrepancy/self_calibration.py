@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import binomtest
 
-from discrepancy.campaign.records import Campaign
+from discrepancy.campaign.records import Campaign, IntArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.files.document import Origin, plain
 from discrepancy.judgement.separability import usable
@@ -139,7 +138,7 @@ class SelfCalibration:
         inside = [item.inside for case in self.cases for item in case.covered]
         return wilson(sum(inside), len(inside))
 
-    def confusion(self) -> tuple[list[str], list[str], NDArray[np.int64]]:
+    def confusion(self) -> tuple[list[str], list[str], IntArray]:
         """Return what was hidden (rows), verdicts (columns), and counts."""
         rows = list(dict.fromkeys(case.hidden for case in self.cases))
         rows.sort(key=lambda name: (name != NOTHING, name))

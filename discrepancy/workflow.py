@@ -18,22 +18,26 @@ from discrepancy.catalogue.needs import NO_PORT
 from discrepancy.checks.fault import DataFault
 from discrepancy.checks.outliers import wrong_ends
 from discrepancy.checks.quality import check_against_model, check_data, mark_outliers
-from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import solver_share
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import calibrated_parameters
-from discrepancy.judgement.look_alikes import look_alike_remark, with_untested
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
-from discrepancy.judgement.when import acting_sentence, begins_inside, when_sentence
+from discrepancy.judgement.when import (
+    acting_sentence,
+    begins_inside,
+    look_alike_remark,
+    when_sentence,
+    with_untested,
+)
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.force import MissingForce
+from discrepancy.missing_force.shares import MissingForce
 from discrepancy.missing_force.windows import gap_windows, residual_windows
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel

@@ -255,7 +255,6 @@ def _packing(choice: "ModelChoice", progress: "Progress") -> "Pack":
 def _show(found: "Investigation", folder: Path) -> None:
     from discrepancy.files.patch import PATCH_NAME, read_patch
     from discrepancy.judgement.when import when_sentence
-    from discrepancy.report.sizes import size_sentence
     from discrepancy.report.text import (
         estimate_text,
         force_sentence,
@@ -264,6 +263,7 @@ def _show(found: "Investigation", folder: Path) -> None:
         remainders_sentence,
         rests_on_force,
         shares_sentence,
+        size_sentence,
         unit_text,
     )
     from discrepancy.verdict import VerdictKind

@@ -52,8 +52,7 @@ from pydantic import ConfigDict, Field
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Number, Setting, ShapeParameter
-from discrepancy.catalogue.needs import NEEDS, USUAL, first_reason
-from discrepancy.catalogue.places import PLACES, Entry, Kinds, Target, targets_of
+from discrepancy.catalogue.needs import NEEDS, PLACES, USUAL, Entry, Kinds, Target, first_reason, targets_of
 from discrepancy.catalogue.scales import SCALES, Here, names_with
 from discrepancy.errors import CatalogueError
 from fe.runtime.errors import InvalidPatchError

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
-from discrepancy.catalogue.places import DYNAMIC
+from discrepancy.catalogue.needs import DYNAMIC
 from discrepancy.errors import CatalogueError
 from fe.runtime.patch import SENSORS, ModelPatch, Window
 

@@ -17,7 +17,7 @@ from scipy.special import beta
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import Setting
-from discrepancy.catalogue.places import Kinds, Target, channels, largest_reading, trials
+from discrepancy.catalogue.needs import Kinds, Target, channels, largest_reading, trials
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import PortScale
 from fe.runtime.patch import EVERY_CHANNEL

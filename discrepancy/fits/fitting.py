@@ -11,13 +11,12 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
+from discrepancy.fits.candidate import Base, Linearisation, Point, Remainder
+from discrepancy.fits.elimination import Cholesky, finite
 
 from .candidate import Candidate
-from .cholesky import Cholesky, finite
 from .elimination import eliminated
-from .linearisation import Base, Linearisation, Point
 from .problem import Problem
-from .remainder import Remainder
 
 LARGEST_EFFECT = 8.0
 """Effect parameters stay within this many prior deviations of their median."""

@@ -11,24 +11,28 @@ from dataclasses import replace
 from math import inf
 
 import numpy as np
-from numpy.typing import NDArray
 
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
+from discrepancy.fits.candidate import (
+    LEAST_STEP,
+    PARAMETER_STEP,
+    SHARED_STEP,
+    Base,
+    Linearisation,
+    Point,
+    moved,
+)
+from discrepancy.fits.trial_data import GlobalUnknowns, TrialDerivatives, global_unknowns
 from discrepancy.models.interface import Model
 from discrepancy.models.memory import Memory
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
 from .candidate import Candidate
-from .derivatives import TrialDerivatives
-from .linearisation import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Base, Linearisation, Point, moved
 from .trial_data import TrialData, noise_models
-from .unknowns import GlobalUnknowns, global_unknowns
-
-IntArray = NDArray[np.int64]
 
 KEPT = 2000
 """Responses that a problem keeps."""

@@ -15,6 +15,7 @@ from scipy.special import logsumexp
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
+from discrepancy.judgement.conclusion import UNSTATED_GAIN, is_one_driven_channel, small_terms
 from discrepancy.missing_force.hypotheses import key_of
 from discrepancy.missing_force.shares import Share
 from discrepancy.search.honest_evidence import weigh_with_remainders
@@ -38,7 +39,6 @@ from .conclusion import (
 )
 from .consistency_gate import consistency_gate
 from .court import Court, H, names, part, percent
-from .practical_size import UNSTATED_GAIN, is_one_driven_channel, small_terms
 from .proof import held_out_gate
 
 LEAST_SHOWN = 0.1

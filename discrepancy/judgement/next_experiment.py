@@ -13,9 +13,9 @@ from scipy.special import logsumexp
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.cholesky import finite
+from discrepancy.fits.candidate import Point
+from discrepancy.fits.elimination import finite
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.sentences import SENTENCES
 from discrepancy.verdict import Experiment

@@ -10,26 +10,23 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import TrialKind
+from discrepancy.campaign.records import BoolArray, FloatArray, TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
+from discrepancy.missing_force.shares import of_nothing
 from discrepancy.models.interface import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
 
 from .events import GROUND, MOST_EVENTS, Events, changes, events
 from .filtered import Process
-from .force import of_nothing
 from .naming import Explained, ForceSearch, seen
 from .trial import SeenTrial
 from .view import View
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 IN_TIME = frozenset(TrialKind) - {TrialKind.STATIC}
 
 SHOWS = 0.2

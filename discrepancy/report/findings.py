@@ -7,8 +7,7 @@ from discrepancy.judgement.conclusion import effects_text, named_effects
 from discrepancy.judgement.when import when_sentence
 from discrepancy.report import text as words
 from discrepancy.report.figures import ReportInput
-from discrepancy.report.sizes import size_sentence
-from discrepancy.report.text import WORDS
+from discrepancy.report.text import WORDS, size_sentence
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page

@@ -11,17 +11,16 @@ from scipy.special import ndtri
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, attempt, fit, objective
 from discrepancy.fits.gates import absolute_gate
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.fits.trial_data import shortened
+from discrepancy.search.hypotheses import starts
 from discrepancy.search_settings import SEARCH
 
 from .hypotheses import Tell, in_silence
-from .starting_points import starts
 
 
 def gap_row(residual: FloatArray) -> int:

@@ -9,20 +9,19 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
-from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.candidate import Base, Candidate, Point
 from discrepancy.fits.fitting import CandidateFit, attempt, fit
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
-from discrepancy.fits.linearisation import Base, Point
 from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.missing_force.hypotheses import key_of, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
+from discrepancy.search.hypotheses import acts_within, are_related, pairs, slips, starts
 from discrepancy.search_settings import SEARCH
 
 from .growing_records import Beginnings
 from .hypotheses import Hypotheses, Tell, in_silence
-from .starting_points import acts_within, are_related, pairs, slips, starts
 
 
 @dataclass

@@ -25,8 +25,15 @@ from discrepancy.report.residual_figures import (
     size_by_channel,
     size_table,
 )
-from discrepancy.report.sizes import si_sizes, size_sentence
-from discrepancy.report.text import formula, headline, number, probability_text, rounded
+from discrepancy.report.text import (
+    formula,
+    headline,
+    number,
+    probability_text,
+    rounded,
+    si_sizes,
+    size_sentence,
+)
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import Investigation, patch_draws
 from fe.runtime.patch import (
