@@ -1,6 +1,7 @@
 """A lumped linear structure as a model: masses, springs, dampers with named inputs, outputs and ports."""
 
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -9,14 +10,13 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Course, Drive, FormulaCourse, Load, Shown, order_of
-from discrepancy.models.interface import Conditions, Outputs, Place, Scales
+from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, Shown, order_of
+from discrepancy.models.interface import Conditions, Outputs, Place
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped
 from discrepancy.models.lumped_rig import LumpedRig
 from discrepancy.models.lumped_sections import InputSection
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.natural_scales import natural_scales, state_sizes
 from discrepancy.models.questions import (
     LoadChange,
     check_no_inputs,
@@ -106,10 +106,6 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the least and largest station [m] of the places, None without places."""
         return (self._stations[0], self._stations[-1]) if self._stations else None
 
-    def scales(self, campaign: Campaign) -> Scales:
-        """Return the natural scales under a campaign."""
-        return natural_scales(self, campaign)
-
     # ------------------------------------------------------------ in a trial
 
     @property
@@ -130,24 +126,15 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the laws of ports that it has as it is."""
         return self.description.own_laws(self._factors(parameters))
 
-    def base(self, state: State, *, closed: bool = True) -> SecondOrderSystem:
-        """Return the rig without prescribed motions, with its controllers or without."""
-        return self.rig(state).system(closed=closed)
-
-    rest = base
+    def system(self, state: State) -> SecondOrderSystem:
+        """Return the rig, with prescribed motions and controllers as the state says."""
+        return self.rig(state).system(state.drives, closed=state.closed)
 
     def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
         """Return the load (N,) at whose place stiffness and modal mass are the natural ones."""
         places = [trial.load_place for trial in campaign.trials]
         item = self._input_at(places[0]) if places else self.description.input[0]
         return self._moved_row(self.rig(State(parameters)), item)
-
-    def loads(self, case: Case) -> tuple[FloatArray, FloatArray]:
-        """Return the loads (2, N) of a static trial, and how much of each (L, 2) acts in each row."""
-        rig, change, force = self.rig(case.state), LoadChange.of(case.patch), case.trial.force
-        row = self._moved_row(rig, self._input_at(case.trial.load_place), change)
-        amounts = np.column_stack((change.changed(force, force), np.ones(len(force))))
-        return np.stack((row, rig.constant)), amounts
 
     def acting(self, case: Case) -> Acting:
         """Return what acts in a dynamic trial.
@@ -169,14 +156,17 @@ class LumpedModel(DescribedModel, SystemModel):
                 trial.time, rig.constant, initial=conditions.initial, clock=conditions.clock, release=release
             )
         recorded = self._recorded(trial)
-        loads, drives, references = list[Load](), dict[str, Drive](), dict[str, Sequence[Load]]()
+        loads, drives, references = list[Load](), dict[str, Course](), dict[str, Sequence[Load]]()
         offsets = (*conditions.offset, *(0.0,) * len(recorded))
         for item, offset in zip(recorded, offsets, strict=False):
-            following = [loop for loop in rig.loops if loop.section.reference == item.name]
-            for loop in following:
-                references[loop.section.name] = loop.loads(trial, item, offset)
-                loads += references[loop.section.name]
+            following = {
+                name: loop.loads(trial, item, offset)
+                for name, loop in rig.loops.items()
+                if loop.section.reference == item.name
+            }
             if following:
+                references |= following
+                loads += chain.from_iterable(following.values())
                 continue
             section = self._section(trial, item)
             values = item.values + offset if offset else item.values
@@ -188,7 +178,7 @@ class LumpedModel(DescribedModel, SystemModel):
                         "`reference` and `hold` out."
                     )
                 values = rig.factors.get(item.name, 1.0) * values
-                drives[item.name] = Drive.of(trial.time, values, order_of(item.quantity))
+                drives[item.name] = Course.of(trial.time, values, Hold.SMOOTH, order_of(item.quantity))
                 continue
             if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
                 values = change.changed(values, item.values)
@@ -197,7 +187,7 @@ class LumpedModel(DescribedModel, SystemModel):
         reactions = {item.reaction for item in self.description.output} - {item.name for item in recorded}
         for name, section in self._inputs.items():
             if section.quantity.moving and name in reactions:
-                drives[name] = Drive.of(trial.time, np.zeros(len(trial.time)))
+                drives[name] = Course.of(trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, 0)
         return Acting(
             trial.time, rig.constant, loads, drives, trial.begins, conditions.initial.ravel(),
             conditions.clock, references,
@@ -265,10 +255,6 @@ class LumpedModel(DescribedModel, SystemModel):
         spans = tuple(window.span for window in load.windows)
         return rows[load.port], FormulaCourse(course_of(load.force, load.kind), spans)
 
-    def system(self, case: Case, acting: Acting, ports: tuple[str, ...]) -> SecondOrderSystem:
-        """Return the rig with the motions prescribed that the trial drives."""
-        return self.rig(case.state).system(tuple(acting.drives))
-
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
         """Return what each output shows under what acts; None: at rest."""
         check_outputs(self.what, self, outputs, self.quantities)
@@ -285,8 +271,8 @@ class LumpedModel(DescribedModel, SystemModel):
                     )
                 found.append(Shown(padded(()), reaction=list(drives).index(item.reaction)))
             elif item.controller is not None:
-                loops = {loop.section.name: loop for loop in self.rig(case.state).loops}
-                found.append(loops[item.controller].effort(references.get(item.controller, ())))
+                loop = self.rig(case.state).loops[item.controller]
+                found.append(loop.effort(references.get(item.controller, ())))
             else:
                 row, order = padded(item.vector or ()), order_of(item.quantity) + further
                 found.append(Shown(row, order, further, constant=item.constant * (not further)))
@@ -298,11 +284,11 @@ class LumpedModel(DescribedModel, SystemModel):
     @property
     def oscillates(self) -> bool:
         """Whether it has a mode that vibrates."""
-        return bool(np.any(self.base(State(self._mean)).angular_frequency > 0.0))
+        return bool(np.any(self.system(State(self._mean)).angular_frequency > 0.0))
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of the state at the begin of a driven or forced trial."""
-        return state_sizes(self, campaign, trial, Conditions(prior_mean(campaign, self.declared)))
+        return self.state_sizes(campaign, trial, Conditions(prior_mean(campaign, self.declared)))
 
     # ------------------------------------------------------------ ports
 
@@ -350,7 +336,7 @@ class LumpedModel(DescribedModel, SystemModel):
 
     def rig(self, state: State) -> LumpedRig:
         """Return the model at values of the parameters and a temperature above the reference [K]."""
-        parameters, _, structure, temperature = state
+        parameters, _, structure, temperature, *_ = state
         softening = temperature * sum(
             (item.coefficient for item in structure if isinstance(item, ModulusTemperature)), 0.0
         )

@@ -1,6 +1,6 @@
 """A lumped model as a TOML file: matrices, named vectors and calibrated parameters, checked strictly."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -89,6 +89,10 @@ class LumpedDescription(ModelDescription):
         """Displacements n."""
         return len(self.mass)
 
+    def unknowns(self, kind: str) -> slice:
+        """Return which of the unknowns the matrix of a kind is of."""
+        return slice(self.size, self.size + self.states) if kind in OF_STATES else slice(self.size)
+
     @property
     def states(self) -> int:
         """States m of first order."""
@@ -122,10 +126,6 @@ class LumpedDescription(ModelDescription):
         for kind in ("input", "output", "port", "place", "load", "controller"):
             for item in getattr(self, kind):
                 self._check_vectors(kind, item)
-        for port in self.port:
-            self._check_flow(port)
-        for item in self.controller:
-            self._check_controller(item)
         n = self.size
         if self.root is not None and (len(self.root.lever) != n or not any(self.root.lever)):
             raise ValueError(f"lever of root needs {counted(n, 'entry', 'entries')}, not all zero")
@@ -144,22 +144,21 @@ class LumpedDescription(ModelDescription):
             raise ValueError("stiffness is missing: give it, or [[stiffness_part]], or say `free = true`")
         if n and self.damping is None and not self.free:
             raise ValueError("'damping' is missing")
-        given = [(name, getattr(self, name)) for name in ("mass", "stiffness", "capacity", "conductance")]
-        given.append(("damping.matrix", (self.damping and self.damping.matrix) or ()))
-        given += [(f"{kind}_part {part.name!r}", part.matrix) for kind in KINDS for part in self.parts(kind)]
-        for where, content in given:
-            count, reference = (m, "capacity") if where.startswith(OF_STATES) else (n, "mass")
-            needed = where == "conductance" and m and not self.conductance_part
-            if content and not count:
-                raise ValueError(f"{where} is there, but {reference} is missing")
-            if content or needed:
-                _check_matrix(where, content, count, reference)
-        for where, loose in (("mass", ""), ("capacity", ""), ("stiffness", _LOOSE)):
-            whole = self.whole(where)
-            least, most = np.linalg.eigvalsh(whole)[[0, -1]] if len(whole) else (1.0, 1.0)
-            singular = where == "stiffness" and self.free and least >= -1e-9 * max(abs(most), 1e-300)
-            if least <= 0.0 and not singular:
-                raise ValueError(f"{where} (with its parts) must be positive definite{loose}")
+        for kind in KINDS:
+            where, content = ("damping.matrix" if kind == "damping" else kind), self._base(kind)
+            count, reference = (m, "capacity") if kind in OF_STATES else (n, "mass")
+            parts = [(f"{kind}_part {part.name!r}", part.matrix) for part in self.parts(kind)]
+            if content or (kind == "conductance" and m and not parts):
+                parts.append((where, content))
+            for place, matrix in parts:
+                if not count:
+                    raise ValueError(f"{place} is there, but {reference} is missing")
+                _check_matrix(place, matrix, count, reference, symmetric=kind != "conductance")
+            whole, loose = self.whole(kind), _LOOSE if kind == "stiffness" else ""
+            least, most = np.linalg.eigvalsh(whole)[[0, -1]] if count else (1.0, 1.0)
+            singular = kind == "stiffness" and self.free and least >= -1e-9 * max(abs(most), 1e-300)
+            if kind in ("mass", "capacity", "stiffness") and least <= 0.0 and not singular:
+                raise ValueError(f"{kind} (with its parts) must be positive definite{loose}")
         for name, rows, columns in (
             ("force_of_states", n, m), ("flow_of_speeds", m, n), ("flow_of_displacements", m, n),
         ):  # fmt: skip
@@ -167,101 +166,101 @@ class LumpedDescription(ModelDescription):
             if content is not None and [len(row) for row in content] != [columns] * rows:
                 raise ValueError(f"coupling.{name} must be a {rows} x {columns} matrix by rows")
 
-    def whole(self, name: str, factors: Mapping[str, float] = MappingProxyType({})) -> FloatArray:
-        """Return "mass", "stiffness", "capacity" or "conductance" with its parts, each times its factor.
+    def _base(self, kind: str) -> Matrix:
+        """Return the matrix of a kind without its parts, empty where there is none."""
+        if kind == "damping":
+            return (self.damping and self.damping.matrix) or ()
+        found: Matrix = getattr(self, kind)
+        return found
 
-        The factor of the matrix itself is that of the whole.
+    def whole(self, kind: str, factors: Mapping[str, float] = MappingProxyType({})) -> FloatArray:
+        """Return the matrix of a kind with its parts, each times its factor.
+
+        The factor of the matrix itself is that of the whole. Damping by modes is left out.
         """
-        count = self.size if name in ("mass", "stiffness") else self.states
-        base = getattr(self, name)
-        whole = np.array(base) if len(base) else np.zeros((count, count))
-        for part in self.parts(name):
+        count = self.states if kind in OF_STATES else self.size
+        whole = np.array(self._base(kind) or np.zeros((count, count)))
+        for part in self.parts(kind):
             whole = whole + factors.get(part.name, 1.0) * np.array(part.matrix)
-        return np.asarray(whole * factors.get(name, 1.0))
+        return np.asarray(whole * factors.get(kind, 1.0))
 
     def own_laws(self, factors: Mapping[str, float]) -> ModelPatch:
         """Return the laws of ports that the model has as it is, each times its factor."""
         return ModelPatch(tuple(law.scaled(factors.get(law.name, 1.0)) for law in self.law))
 
     def _check_vectors(self, kind: str, item: NamedVector | OutputSection | ControllerSection) -> None:
-        """Refuse vectors of another length and zero ones."""
-        n = self.size + self.states
+        """Refuse vectors of another length and zero ones, and what sees both displacements and states."""
+        n, m = self.size, self.states
         for key in ("vector", "acts", "station_derivative", "chord_derivative"):
             vector = getattr(item, key, None)
-            if vector is not None and len(vector) != n:
-                came = counted(len(vector), "entry", "entries")
-                raise ValueError(
-                    f"{key} of {kind} {item.name!r} has {came}, but the model has {counted(n, 'unknown')}"
-                )
-        if item.vector is not None and not any(item.vector):
+            if vector is not None and len(vector) != n + m:
+                came, has = counted(len(vector), "entry", "entries"), counted(n + m, "unknown")
+                raise ValueError(f"{key} of {kind} {item.name!r} has {came}, but the model has {has}")
+        row = np.array(item.vector or ())
+        if item.vector is not None and not any(row):
             raise ValueError(f"vector of {kind} {item.name!r} is zero")
-
-    def _check_flow(self, port: PortSection) -> None:
-        """Refuse a port of displacements and states, and a flow that feeds its own store."""
-        n, row, push = self.size, np.array(port.vector), np.array(port.acts or port.vector)
-        if any(row[:n]) and any(row[n:]):
-            raise ValueError(f"the port {port.name!r} is of displacements or of states, not of both")
-        if port.acts is not None and (
-            any(row[:n])
-            or any(push[:n])
-            or row[n:] @ np.linalg.solve(self.whole("capacity"), push[n:]) <= 0.0
-        ):
-            raise ValueError(
-                f"`acts` of the port {port.name!r} is for states, and must take from what its vector sees"
-            )
-
-    def _check_controller(self, item: ControllerSection) -> None:
-        of_states, order = any(item.vector[self.size :]), order_of(item.quantity)
-        if of_states and any(item.vector[: self.size]):
-            raise ValueError(f"the controller {item.name!r} measures displacements or states, not both")
-        if order == 2:
-            raise ValueError(f"the controller {item.name!r} cannot follow an acceleration")
-        if item.derivative and (of_states or order == 1):
-            what = "a state" if of_states else "a speed"
-            raise ValueError(
-                f"the controller {item.name!r} measures {what}, whose derivative it cannot take: "
-                "leave `derivative` out"
-            )
+        if kind in ("port", "controller") and any(row[:n]) and any(row[n:]):
+            raise ValueError(f"the {kind} {item.name!r} sees displacements or states, not both")
+        if isinstance(item, PortSection) and item.acts is not None:
+            push = np.array(item.acts)
+            of_states = not any(row[:n]) and not any(push[:n])
+            if not of_states or row[n:] @ np.linalg.solve(self.whole("capacity"), push[n:]) <= 0.0:
+                raise ValueError(
+                    f"`acts` of the port {item.name!r} is for states, and must take from what its vector sees"
+                )
+        if isinstance(item, ControllerSection):
+            order, what = order_of(item.quantity), "a state" if any(row[n:]) else "a speed"
+            if order == 2:
+                raise ValueError(f"the controller {item.name!r} cannot follow an acceleration")
+            if item.derivative and (any(row[n:]) or order == 1):
+                raise ValueError(
+                    f"the controller {item.name!r} measures {what}, whose derivative it cannot take: "
+                    "leave `derivative` out"
+                )
 
     def _check_names(self) -> None:
         """Refuse names that are there twice, and those that name nothing."""
-        for kind in ("output", "port", "place", "load", "controller", "law", "parameter"):
-            check_unique(kind, [item.name for item in getattr(self, kind)])
         references = [item.reference for item in self.controller if item.reference]
-        check_unique("input", [item.name for item in self.input])
-        check_unique("input or reference", [*(item.name for item in self.input), *references])
-        check_unique("place station", [f"{place.station:g}" for place in self.place])
-        check_unique("part", [*(part.name for kind in KINDS for part in self.parts(kind)), *KINDS])
-        named = (self.law,) if self.is_plain else (self.input, self.load, self.law, self.controller)
-        gains = [f"{item.name}.{gain}" for item in self.controller for gain in GAINS]
-        scaled = [*self.terms, *(item.name for items in named for item in items), *gains]
+        parts = [part.name for kind in KINDS for part in self.parts(kind)]
+        names = {
+            kind: [item.name for item in getattr(self, kind)]
+            for kind in ("output", "port", "place", "load", "controller", "law", "parameter", "input")
+        }
+        names["input or reference"] = [*names["input"], *references]
+        names["place station"] = [f"{place.station:g}" for place in self.place]
+        names["part"] = [*parts, *KINDS]
+        for kind, given in names.items():
+            check_unique(kind, given)
+        kinds = (*(KINDS[:3] if self.size else ()), *(OF_STATES if self.states else ()))
+        terms, gains = [*kinds, *parts], [f"{name}.{gain}" for name in names["controller"] for gain in GAINS]
+        named = ("law",) if self.is_plain else ("input", "load", "law", "controller")
+        scaled = [*terms, *(name for kind in named for name in names[kind]), *gains]
         driven = [item.name for item in self.input if item.quantity.moving]
         pushing: tuple[InputSection | LoadSection, ...] = (*self.input, *self.load)
-        for item in pushing:
-            _check_known(f"{item.name!r} acts through", item.through, self.terms)
-        for law in self.law:
-            _check_known(
-                f"the law {law.name!r} acts on the port", law.port, [item.name for item in self.port]
-            )
-        for output in self.output:
-            what = f"the output {output.name!r} is"
-            _check_known(f"{what} the reaction of the prescribed motion", output.reaction, driven)
-            controllers = [item.name for item in self.controller]
-            _check_known(f"{what} what a controller gives,", output.controller, controllers)
-        for parameter in self.parameter:
-            for term in parameter.scaled:
-                _check_known(f"parameter {parameter.name!r} scales", term, dict.fromkeys(scaled))
+        for what, name, known in (
+            *((f"{item.name!r} acts through", item.through, terms) for item in pushing),
+            *((f"the law {law.name!r} acts on the port", law.port, names["port"]) for law in self.law),
+            *(
+                (f"the output {output.name!r} is {role}", name, known)
+                for output in self.output
+                for role, name, known in (
+                    ("the reaction of the prescribed motion", output.reaction, driven),
+                    ("what a controller gives,", output.controller, names["controller"]),
+                )
+            ),
+            *(
+                (f"parameter {item.name!r} scales", term, [*dict.fromkeys(scaled)])
+                for item in self.parameter
+                for term in item.scaled
+            ),
+        ):
+            if name is not None and name not in known:
+                raise ValueError(f"{what} {name!r}, but there are {', '.join(known) or 'none'}")
 
     def parts(self, kind: str) -> tuple[PartSection, ...]:
         """Return the parts of the matrix of a kind."""
         found: tuple[PartSection, ...] = getattr(self, f"{kind}_part")
         return found
-
-    @property
-    def terms(self) -> list[str]:
-        """Matrices and their parts by what a parameter or `through` calls them."""
-        kinds = (*(KINDS[:3] if self.size else ()), *(OF_STATES if self.states else ()))
-        return [*kinds, *(part.name for kind in KINDS for part in self.parts(kind))]
 
 
 KINDS = ("mass", "stiffness", "damping", "capacity", "conductance")
@@ -275,24 +274,16 @@ _LOOSE = (
 )
 
 
-def _check_known(what: str, name: str | None, known: Collection[str]) -> None:
-    """Refuse a name that is said, but is none of those known."""
-    if name is not None and name not in known:
-        raise ValueError(f"{what} {name!r}, but there are {', '.join(known) or 'none'}")
-
-
-def _check_matrix(where: str, content: Matrix, count: int, reference: str) -> None:
+def _check_matrix(where: str, content: Matrix, count: int, reference: str, *, symmetric: bool) -> None:
     """Refuse a matrix of another size than the reference, that is not symmetric or feeds energy."""
     if [len(row) for row in content] != [count] * count:
         raise ValueError(
             f"{where} must be a {count} x {count} matrix (or {counted(count, 'diagonal value')}), as "
             f"{reference} has {counted(count, 'row')}"
         )
-    if reference == "capacity" and where.startswith("conductance"):
-        return
     full = np.array(content)
     size = float(np.max(np.abs(full)))
-    if np.max(np.abs(full - full.T)) > 1e-9 * max(size, 1e-300):
+    if symmetric and np.max(np.abs(full - full.T)) > 1e-9 * max(size, 1e-300):
         raise ValueError(f"{where} must be symmetric")
     if where.startswith("damping") and np.min(np.linalg.eigvalsh(full)) < -1e-9 * size:
         raise ValueError(f"{where} must not feed energy: it has a negative eigenvalue")

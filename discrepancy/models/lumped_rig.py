@@ -1,19 +1,117 @@
-"""A lumped model at values of its parameters: its matrices, and the systems that they make."""
+"""A lumped model at values of its parameters: matrices, controllers, and the systems that they make."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eigh
 
-from discrepancy.campaign.records import FloatArray
-from discrepancy.models.lumped_controllers import loops
-from discrepancy.models.lumped_file import KINDS, OF_STATES, LumpedDescription
+from discrepancy.campaign.records import FloatArray, Hold, RecordedInput, Trial
+from discrepancy.errors import ModelError
+from discrepancy.models.acting import Course, Load, Shown, order_of
+from discrepancy.models.lumped_file import GAINS, KINDS, LumpedDescription
+from discrepancy.models.lumped_sections import ControllerSection
 from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
 from fe.runtime.patch import PointMass, Primitive, RootCompliance
 
 MOST_MODES = 8
 """Modes that move of a structure on springs; the others follow without inertia."""
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A controller in a rig of N unknowns, n of them displacements.
+
+    Attributes
+    ----------
+    section : ControllerSection
+        As in the file.
+    gains : sequence of float
+        Proportional, derivative and integral, times their factors.
+    sees, acts : (N,) ndarray
+        What it measures, and along which it acts.
+    displacements : int
+        n.
+    state : int or None
+        Unknown that is the integral of its error; None without an integral gain.
+    """
+
+    section: ControllerSection
+    gains: Sequence[float]
+    sees: FloatArray
+    acts: FloatArray
+    displacements: int
+    state: int | None
+
+    @property
+    def of_speed(self) -> bool:
+        """Whether it measures the speed of a displacement."""
+        return order_of(self.section.quantity) == 1
+
+    @property
+    def gives(self) -> tuple[FloatArray, FloatArray]:
+        """Rows (N,) of the unknowns and (n,) of the speeds that it gives without a reference."""
+        n, (proportional, derivative, integral) = self.displacements, self.gains
+        row, speed = -proportional * self.sees, -derivative * self.sees[:n]
+        if self.of_speed:
+            speed, row[:n] = speed + row[:n], 0.0
+        if self.state is not None:
+            row[self.state] += integral
+        return row, speed
+
+    def close(self, damping: FloatArray, stiffness: FloatArray) -> None:
+        """Add the feedback to the matrices (N, N) of a rig."""
+        n, (row, speed) = self.displacements, self.gives
+        stiffness[:, :n] -= np.outer(self.acts, row[:n])
+        damping[:, n:] -= np.outer(self.acts, row[n:])
+        damping[:, :n] -= np.outer(self.acts, speed)
+        if self.state is not None:
+            (damping if self.of_speed else stiffness)[self.state, :n] += self.sees[:n]
+            damping[self.state, n:] += self.sees[n:]
+
+    def loads(self, trial: Trial, item: RecordedInput, offset: float) -> list[Load]:
+        """Return what a recorded reference does, as loads.
+
+        Raises
+        ------
+        ModelError
+            If the reference is of another quantity, or goes in steps and is to be differentiated.
+        """
+        section = self.section
+        if item.quantity is not section.quantity:
+            raise ModelError(
+                f"The controller {section.name!r} follows {section.quantity.value}, but the trial "
+                f"{trial.name!r} records its reference {item.name!r} as {item.quantity.value}."
+            )
+        course = Course.of(trial.time, item.values + offset, item.hold)
+        found: list[Load] = [(self.gains[0] * self.acts, course)]
+        if self.gains[1] != 0.0 and section.derivative_of == "error":
+            found.append((self.gains[1] * self.acts, _slope(course, trial, section)))
+        if self.state is not None:
+            found.append((np.eye(len(self.acts))[self.state], course))
+        return found
+
+    def effort(self, loads: Sequence[Load]) -> Shown:
+        """Return what it gives, from the `loads` of its reference (none where there is no reference)."""
+        row, speed = self.gives
+        along = self.acts / float(self.acts @ self.acts)
+        courses = tuple((float(push @ along), course) for push, course in loads if push @ along != 0.0)
+        return Shown(row, speed=speed, courses=courses)
+
+
+def _slope(course: Course, trial: Trial, section: ControllerSection) -> Course:
+    """Return the derivative of a reference."""
+    if course.hold is Hold.ZERO_ORDER:
+        raise ModelError(
+            f"The reference {section.reference!r} of the trial {trial.name!r} goes in steps, which "
+            f"the controller {section.name!r} cannot differentiate: say derivative_of = 'measurement' in the "
+            "model, or hold = 'linear' in the campaign."
+        )
+    if course.hold is Hold.SMOOTH:
+        return Course(course.time, course.at(course.time, 1), Hold.SMOOTH)
+    slopes = np.diff(course.values) / np.diff(course.time)
+    return Course(course.time, np.append(slopes, slopes[-1]), Hold.ZERO_ORDER)
 
 
 class LumpedRig:
@@ -38,96 +136,94 @@ class LumpedRig:
         structure: Sequence[Primitive] = (),
         softening: float = 0.0,
     ) -> None:
-        self.description, self.factors = description, factors
-        self._inputs = {item.name: np.array(item.vector) for item in description.input}
-        self.loops = loops(description, factors)
-        self.width, self.padded = description.width, description.padded
+        self.description, self.factors, self._systems = description, factors, Memory()
         softened = {**factors, "stiffness": factors.get("stiffness", 1.0) * (1.0 - softening)}
-        whole = {kind: description.whole(kind, softened) for kind in KINDS if kind != "damping"}
-        for change in structure:
-            self._change(change, whole["mass"], whole["stiffness"])
-        whole["damping"] = self._damping(whole["mass"], whole["stiffness"])
-        self._terms = {
-            part.name: self._placed(kind, factors.get(part.name, 1.0) * np.array(part.matrix))
-            for kind in KINDS
-            for part in description.parts(kind)
-        }
-        self._terms |= {kind: self._placed(kind, matrix) for kind, matrix in whole.items()}
-        self._systems = Memory()
+        width, self._terms = description.width, dict[str, FloatArray]()
+        for kind in KINDS:
+            own = description.unknowns(kind)
+            for part in description.parts(kind):
+                self._terms[part.name] = np.zeros((width, width))
+                self._terms[part.name][own, own] = factors.get(part.name, 1.0) * np.array(part.matrix)
+            self._terms[kind] = np.zeros((width, width))
+            self._terms[kind][own, own] = description.whole(kind, softened)
+        if n := description.size:
+            mass, stiffness, damping = (self._terms[kind][:n, :n] for kind in KINDS[:3])
+            for change in structure:
+                self._change(change, mass, stiffness)
+            damping += factors.get("damping", 1.0) * self._damping(mass, stiffness)
         self.constant = sum(
             (self.along(item.vector, item.through, item.name) for item in description.load),
-            np.zeros(self.width),
+            np.zeros(width),
         )
-
-    def _placed(self, kind: str, matrix: FloatArray) -> FloatArray:
-        """Return a matrix of a kind among all unknowns (N, N)."""
-        first = self.description.size if kind in OF_STATES else 0
-        whole, at = np.zeros((self.width, self.width)), slice(first, first + len(matrix))
-        whole[at, at] = matrix
-        return whole
+        self.loops, state = dict[str, Loop](), n + description.states
+        for item in description.controller:
+            named = (factors.get(f"{item.name}.{gain}", 1.0) * getattr(item, gain) for gain in GAINS)
+            gains = [factors.get(item.name, 1.0) * gain for gain in named]
+            sees, acts = description.padded(item.vector), description.padded(item.acts)
+            self.loops[item.name] = Loop(item, gains, sees, acts, n, state if item.integral else None)
+            state += item.integral != 0.0
 
     def _change(self, change: Primitive, mass: FloatArray, stiffness: FloatArray) -> None:
         """Put a point mass or a compliance of the root into the matrices."""
+        root = self.description.root
         if isinstance(change, PointMass):
             places = sorted(self.description.place, key=lambda place: place.station)
             stations = [place.station for place in places]
             columns = zip(*(place.vector for place in places), strict=True)
             row = np.array([np.interp(change.station, stations, column) for column in columns])
             mass += change.mass * np.outer(row, row)
-        elif isinstance(change, RootCompliance) and self.description.root is not None:
+        elif isinstance(change, RootCompliance) and root is not None:
             # in series: K^-1 + c l l^T, by Sherman and Morrison
-            pull = stiffness @ np.array(self.description.root.lever)
-            stiff = float(pull @ np.array(self.description.root.lever))
+            pull = stiffness @ np.array(root.lever)
+            stiff = float(pull @ np.array(root.lever))
             stiffness -= np.outer(pull, pull) * change.compliance / (1.0 + change.compliance * stiff)
 
     def _damping(self, mass: FloatArray, stiffness: FloatArray) -> FloatArray:
-        given, factor = self.description.damping, self.factors.get("damping", 1.0)
-        if given is None or not len(mass):
-            matrix = np.zeros_like(mass)
-        elif given.matrix is not None:
-            matrix = np.array(given.matrix)
-        elif given.ratios is not None:
-            square, shapes = eigh(stiffness, mass)
-            weighted, w = mass @ shapes, np.sqrt(np.maximum(square, 0.0))
-            twice = 2.0 * np.array(given.ratios) * w
-            matrix = (weighted * twice) @ weighted.T
-        else:
-            matrix = (given.alpha or 0.0) * mass + (given.beta or 0.0) * stiffness
-        for part in self.description.parts("damping"):
-            matrix = matrix + self.factors.get(part.name, 1.0) * np.array(part.matrix)
-        return np.asarray(factor * matrix)
+        """Return what ratios of modes or Rayleigh coefficients add to the damping."""
+        given = self.description.damping
+        if given is None or given.ratios is None:
+            alpha, beta = (0.0, 0.0) if given is None else (given.alpha or 0.0, given.beta or 0.0)
+            return alpha * mass + beta * stiffness
+        square, shapes = eigh(stiffness, mass)
+        weighted, w = mass @ shapes, np.sqrt(np.maximum(square, 0.0))
+        return np.asarray((weighted * (2.0 * np.array(given.ratios) * w)) @ weighted.T)
 
     def along(self, vector: Sequence[float] | FloatArray, through: str | None, name: str) -> FloatArray:
         """Return the vector (N,) of a load, through a matrix where it says so, times its own factor."""
-        row = self.padded(vector) if through is None else self._terms[through] @ self.padded(vector)
-        return np.asarray(self.factors.get(name, 1.0) * row)
+        row = self.description.padded(vector)
+        return np.asarray(
+            self.factors.get(name, 1.0) * (row if through is None else self._terms[through] @ row)
+        )
 
     def system(self, drives: tuple[str, ...] = (), *, closed: bool = True) -> SecondOrderSystem:
         """Return the system with the motions of some inputs prescribed, with its controllers or without."""
         return self._systems.get((drives, closed), lambda: self._made(drives, closed=closed))
 
     def _made(self, drives: tuple[str, ...], *, closed: bool) -> SecondOrderSystem:
-        description, n, m = self.description, self.description.size, self.description.states
-        own, terms = slice(n, n + m), self._terms
+        description, terms, padded = self.description, self._terms, self.description.padded
+        n = description.size
+        own, rest = description.unknowns("capacity"), slice(n + description.states, None)
         mass, damping = terms["mass"] + terms["capacity"], terms["damping"] + terms["conductance"]
-        mass[n + m :, n + m :], stiffness = np.eye(self.width - n - m), terms["stiffness"].copy()
+        stiffness = terms["stiffness"].copy()
+        mass[rest, rest] = np.eye(len(mass[rest]))
         coupling = description.coupling
         for content, into, rows, columns in (
-            (coupling.force_of_states, damping, slice(0, n), own),
-            (coupling.flow_of_speeds, damping, own, slice(0, n)),
-            (coupling.flow_of_displacements, stiffness, own, slice(0, n)),
+            (coupling.force_of_states, damping, slice(n), own),
+            (coupling.flow_of_speeds, damping, own, slice(n)),
+            (coupling.flow_of_displacements, stiffness, own, slice(n)),
         ):
             if content is not None:
                 into[rows, columns] = -np.array(content)
-        for loop in self.loops if closed else ():
+        for loop in self.loops.values() if closed else ():
             loop.close(damping, stiffness)
         beta = description.damping.beta if description.damping is not None else None
+        inputs = {item.name: padded(item.vector) for item in description.input}
         return SecondOrderSystem(
             mass, damping, stiffness,
-            {item.name: self.padded(item.vector) for item in description.port},
+            {item.name: padded(item.vector) for item in description.port},
             mode_count=MOST_MODES if description.is_plain else None,
             relaxation=self.factors.get("damping", 1.0) * (beta or 0.0),
-            states=self.width - n,
-            drives=np.array([self.padded(self._inputs[name]) for name in drives]),
-            actions={item.name: self.padded(item.acts) for item in description.port if item.acts is not None},
+            states=len(mass) - n,
+            drives=np.array([inputs[name] for name in drives]),
+            actions={item.name: padded(item.acts) for item in description.port if item.acts is not None},
         )  # fmt: skip

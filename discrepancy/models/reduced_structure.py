@@ -1,20 +1,28 @@
-"""A structure from a mesh or matrices as a model: its reduced model, whose modes and statics are known."""
+"""Structures that springs hold as models: what all have, and one from a mesh or matrices by its modes."""
 
+from abc import abstractmethod
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import inv
 
-from discrepancy.campaign.records import FloatArray, Quantity, Trial
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Shown, shown_rows
-from discrepancy.models.interface import ModelParameter, Outputs, Place
+from discrepancy.models.acting import Acting, Course, Shown, shown_rows
+from discrepancy.models.interface import NO_PATCH, ModelParameter, Outputs, Place
 from discrepancy.models.memory import Memory
-from discrepancy.models.questions import check_outputs, place_among
+from discrepancy.models.questions import (
+    LoadChange,
+    check_no_inputs,
+    check_outputs,
+    check_plain,
+    place_among,
+    release_of,
+)
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.structural import StructuralModel
-from discrepancy.models.system_model import Case, State
-from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, ModelPatch, Primitive
+from discrepancy.models.system_model import Case, State, SystemModel
+from fe.runtime.patch import INTERNAL_FORCES, LOADS, SENSORS, LoadGain, ModelPatch, PointMass, Primitive
 from fe.runtime.reduced import ReducedModel, ReducedState, dense_sum
 from fe.runtime.state import Losses
 
@@ -24,6 +32,52 @@ DEVIATION = 0.25
 """Standard deviation of a parameter whose calibration is not known, as a share of its range."""
 SAME = 1e-9
 """Difference of two rows, relative to the largest entry, that is rounding."""
+
+
+class StructuralModel(SystemModel):
+    """A structure that springs hold, under a force or lift.
+
+    Attributes
+    ----------
+    reference : str
+        Place whose stiffness and modal mass are the natural ones.
+    """
+
+    reference: str
+
+    @abstractmethod
+    def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+        """Return the load (n,) of 1 N at a place, as load primitives have it."""
+
+    @abstractmethod
+    def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+        """Return the loads (2, n) of a load factor and of its square in a flight, as load primitives do."""
+
+    def check(self, trial: Trial) -> None:
+        """Refuse a trial that is driven, begins otherwise than settled, or holds other inputs at rest."""
+        check_plain(trial, self.name)
+        check_no_inputs(trial, self.name)
+
+    def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
+        """Return the load (n,) at whose place stiffness and modal mass are the natural ones."""
+        return self.force_row(self.reference, parameters, NO_PATCH)
+
+    def acting(self, case: Case) -> Acting:
+        """Return what acts in a trial: a force at a place, lift, or what holds it until it is let go."""
+        trial, conditions, patch, state = case
+        loads = NO_PATCH if trial.kind is TrialKind.RINGDOWN else patch.of(*LOADS)
+        if trial.kind is TrialKind.FLIGHT:
+            # where a mass has weight; other zeros are read with it in place
+            rows = self.lift(trial, state.parameters, patch.of(*LOADS, PointMass))
+            amounts = [trial.load_factor, trial.load_factor**2]
+        else:
+            rows = self.force_row(trial.load_place, state.parameters, loads)[None]
+            amounts = [LoadChange.of(loads).changed(trial.force, trial.force)]
+        acting = Acting(trial.time, np.zeros(rows.shape[1]), clock=conditions.clock)
+        if trial.kind is TrialKind.RINGDOWN:
+            return replace(acting, release=(rows[0], release_of(trial)), initial=conditions.initial)
+        courses = [Course.of(trial.time, values, trial.hold) for values in amounts]
+        return replace(acting, loads=list(zip(rows, courses, strict=True)))
 
 
 class StructureModel(StructuralModel):
@@ -46,16 +100,13 @@ class StructureModel(StructuralModel):
 
     def __init__(self, model: ReducedModel) -> None:
         nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
-        self.name, self.parameters = (
-            model.name,
-            tuple(
-                ModelParameter(name, nominal[name], DEVIATION * (high - low), unit, low, high)
-                for names, unit in ((model.parameters, "1"), (model.masses, "kg"))
-                for name in names
-                for low, high in [model.validity[name]]
-            ),
+        self.model, self.name, self.regions = model, model.name, model.regions
+        self.parameters = tuple(
+            ModelParameter(name, nominal[name], DEVIATION * (high - low), unit, low, high)
+            for names, unit in ((model.parameters, "1"), (model.masses, "kg"))
+            for name in names
+            for low, high in [model.validity[name]]
         )
-        self.model, self.regions = model, model.regions
         units = zip(model.controls, model.control_units.split(), strict=True)
         self.forces = tuple(name for name, unit in units if unit == "N")
         if not self.forces and LOAD_FACTOR not in model.controls:
@@ -114,10 +165,10 @@ class StructureModel(StructuralModel):
         check_outputs(self.name, self, outputs, known)
         size = len(self.model.rows[0])
         rows = np.array([self._rows[output] for output, _ in outputs]).reshape(len(outputs), size)
-        found, always = shown_rows(rows, outputs), self.always(case.state.parameters)
-        if acting is None or always is None:
+        found, always = shown_rows(rows, outputs), self._always(case.state.parameters)
+        if acting is None or not always.any():
             return found
-        still = self.rest(case.state).flexibility(always)
+        still = self.system(case.state).flexibility(always)
         return [item._replace(constant=float(item.row @ still) * (item.order == 0)) for item in found]
 
     def supports(self, primitive: type[Primitive]) -> bool:
@@ -133,8 +184,7 @@ class StructureModel(StructuralModel):
         ModelError
             If there is no such force, or none is named of several.
         """
-        place = place_among(self.forces or (self.reference,), place, self.name)
-        return self._load(parameters, place)
+        return self._load(parameters, place_among(self.forces or (self.reference,), place, self.name))
 
     def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
         """Return the loads (2, n) of the load factor and of its square, which is zero."""
@@ -145,20 +195,20 @@ class StructureModel(StructuralModel):
         row = self._load(parameters, LOAD_FACTOR)
         return np.stack((row, np.zeros_like(row)))
 
-    def always(self, parameters: FloatArray) -> FloatArray | None:
-        """Return the load (n,) of constant loads and of controls that no trial records, if there is any."""
+    def _always(self, parameters: FloatArray) -> FloatArray:
+        """Return the load (n,) of constant loads and of controls that no trial records."""
         recorded = {name: 0.0 for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls}
-        acting = self.model.load_coefficients(self._vector(parameters, recorded))
-        return np.asarray(self.model.rows[0] @ acting) if acting.any() else None
+        coefficients = self.model.load_coefficients(self._vector(parameters, recorded))
+        return np.asarray(self.model.rows[0] @ coefficients)
 
-    def loads(self, case: Case) -> tuple[FloatArray, FloatArray]:
-        """Return the loads (k, n) of a trial at rest, and how much of each (L, k) acts in each row."""
-        units, amounts = super().loads(case)
-        if (always := self.always(case.state.parameters)) is None:
-            return units, amounts
-        return np.vstack((units, always)), np.column_stack((amounts, np.ones(len(amounts))))
+    def acting(self, case: Case) -> Acting:
+        """Return what acts in a trial; what always acts is in what a motion shows."""
+        acting = super().acting(case)
+        return (
+            acting if case.trial.is_dynamic else replace(acting, constant=self._always(case.state.parameters))
+        )
 
-    def rest(self, state: State) -> SecondOrderSystem:
+    def system(self, state: State) -> SecondOrderSystem:
         """Return the structure at parameters and losses, in the coordinates of `ReducedModel.at`.
 
         Raises
@@ -186,7 +236,3 @@ class StructureModel(StructuralModel):
             mass, alpha * mass + beta * stiffness, stiffness, self.port_rows, model.mode_count, float(beta),
             known=modes, compliance=compliance,
         )  # fmt: skip
-
-    def moving(self, state: State, place: Place, ports: tuple[str, ...] = ()) -> SecondOrderSystem:
-        """Return the structure as it moves; errors as of `rest`."""
-        return self.rest(state)

@@ -17,8 +17,8 @@ from discrepancy.models.acting import Acting, Shown, shown_rows
 from discrepancy.models.interface import ModelParameter, Outputs, Place, PortScale
 from discrepancy.models.memory import Memory
 from discrepancy.models.questions import check_outputs
+from discrepancy.models.reduced_structure import StructuralModel
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.structural import StructuralModel
 from discrepancy.models.system_model import Case, State
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime.errors import FiniteElementError
@@ -180,9 +180,7 @@ class WingModel(StructuralModel):
         rows = self._rows.get((outputs, component), lambda: self._made_rows(outputs, component))
         factors = self.wing.strain_factors(case.patch.of(LocalStiffnessLoss))
         if factors is not None:
-            gauges = self._rows.get(
-                (outputs, "gauges"), lambda: np.array([strain_gauge(output) for output, _ in outputs])
-            )
+            gauges = np.array([strain_gauge(output) for output, _ in outputs])
             rows = rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
         return shown_rows(rows if acting is None or acting.basis is None else rows @ acting.basis, outputs)
 
@@ -228,12 +226,13 @@ class WingModel(StructuralModel):
         """Return the stiffness in a state."""
         factor = float(state.parameters[0])
         return self._stiffnesses.get(
-            _stiffness_key(state), lambda: Stiffness(self.wing.stiffness(factor, *state[1:]))
+            _stiffness_key(state), lambda: Stiffness(self.wing.stiffness(factor, *state[1:4]))
         )
 
-    def moving(self, state: State, place: Place, ports: tuple[str, ...] = ()) -> SecondOrderSystem:
-        """Return the wing as it moves when released from, or pushed at, a place, with forces at `ports`."""
-        masses, held = state.structure.of(PointMass), self.wing.held_ports(ports)
+    def system(self, state: State) -> SecondOrderSystem:
+        """Return the wing as it moves when let go, or pushed, at a place under forces at ports."""
+        masses, held = state.structure.of(PointMass), self.wing.held_ports(state.ports)
+        place = state.place or self.reference
 
         def make() -> SecondOrderSystem:
             _, servo, pitot, alpha, beta = state.parameters.tolist()

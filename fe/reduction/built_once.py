@@ -25,17 +25,6 @@ def cache_folder() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "uav-twin"
 
 
-def kept(load: Callable[[], _Kept]) -> _Kept | None:
-    """Return what `load` reads, or nothing if it is not there or not usable."""
-    try:
-        return load()
-    except OSError:  # not there, or not readable
-        return None
-    except ReducedModelFileError as error:
-        _logger.warning("What is kept is not usable and is built anew: %s", error)
-        return None
-
-
 def built_once(
     path: Path, load: Callable[[], _Kept], build: Callable[[], _Kept], keep: Callable[[_Kept], None]
 ) -> _Kept:
@@ -57,14 +46,14 @@ def built_once(
     ReductionError
         If another process has been building it for an hour.
     """
-    found = kept(load)
-    if found is not None:
-        return found
-    with _locked(path.with_suffix(".lock"), path):
+    with suppress(OSError):  # not there, or not readable
         try:
+            return load()
+        except ReducedModelFileError as error:
+            _logger.warning("What is kept is not usable and is built anew: %s", error)
+    with _locked(path.with_suffix(".lock"), path):
+        with suppress(OSError, ReducedModelFileError):
             return load()  # another process may have been faster
-        except (OSError, ReducedModelFileError):
-            pass
         built = build()
         try:
             keep(built)

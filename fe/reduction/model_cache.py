@@ -6,7 +6,7 @@ bytes on a machine whatever its cores do.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -17,15 +17,13 @@ from fe.runtime.reduced import ReducedModel
 from fe.structure.design import load_structure, structure_hash
 from fe.structure.operators import assemble_structure
 from fe.wing.design import WingDesign, load_design
+from fe.wing.operators import AffineOperators, assemble
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_bytes, hash_tree
 
 from .built_once import built_once, cache_folder
 from .fields import WingFields, field_basis
 from .settings import PatchSettings, ReductionSettings, StructureSettings
-
-if TYPE_CHECKING:
-    from fe.wing.operators import AffineOperators
 
 MODELLING_ROOMS = ("runtime", "elements", "full", "structure", "wing", "reduction")
 """The rooms that decide what a reduced model holds; a change in any of their files makes a new entry."""
@@ -45,8 +43,11 @@ def entry(kind: str, design_hash: str, settings: object) -> Path:
     return cache_folder() / f"{kind}-{hash_bytes(content.encode())[:32]}.npz"
 
 
-def _once(kind: type[_Kept], path: Path, design_hash: str, build: Callable[[], _Kept]) -> _Kept:
+def _once(
+    kind: type[_Kept], name: str, design_hash: str, settings: object, build: Callable[[], _Kept]
+) -> _Kept:
     """Return the arrays of a design from their file, or else build them in one thread, and keep them."""
+    path = entry(name, design_hash, settings)
 
     def load() -> _Kept:
         arrays = kind.load(path)
@@ -83,8 +84,9 @@ def reduced_model(
         If the design cannot be modelled or reduced.
     """
     wing = design or load_design()
-    path = entry("wing", wing.hash, settings)
-    return _once(ReducedModel, path, wing.hash, lambda: wing_fields(wing, progress, settings).model)
+    return _once(
+        ReducedModel, "wing", wing.hash, settings, lambda: wing_fields(wing, progress, settings).model
+    )
 
 
 def wing_fields(
@@ -97,8 +99,7 @@ def wing_fields(
     Parameters and errors as of `reduced_model`.
     """
     wing = design or load_design()
-    path = entry("fields", wing.hash, settings)
-    return _once(WingFields, path, wing.hash, lambda: build(wing, progress, settings))
+    return _once(WingFields, "fields", wing.hash, settings, lambda: build(wing, progress, settings))
 
 
 def build(
@@ -111,9 +112,7 @@ def build(
     return field_basis(operators, reduce_model(operators, settings, progress))
 
 
-def _assembled(design: WingDesign, progress: Progress | None) -> "AffineOperators":
-    from fe.wing.operators import assemble
-
+def _assembled(design: WingDesign, progress: Progress | None) -> AffineOperators:
     with (progress or SilentProgress()).stage("Meshing and assembling the wing"):
         return assemble(design)
 
@@ -129,8 +128,9 @@ def patch_arrays(
     they are held.
     """
     wing = design or load_design()
-    path = entry("patches", wing.hash, settings)
-    return _once(PatchArrays, path, wing.hash, lambda: build_patch_arrays(wing, progress, settings))
+    return _once(
+        PatchArrays, "patches", wing.hash, settings, lambda: build_patch_arrays(wing, progress, settings)
+    )
 
 
 def build_patch_arrays(
@@ -167,7 +167,7 @@ def reduced_structure(
     FiniteElementError
         If the structure cannot be read, modelled or reduced.
     """
-    path, design_hash, chosen = _place(Path(file), settings)
+    design_hash, chosen = _asked(Path(file), settings)
 
     def build_structure() -> ReducedModel:
         from .reduced_basis import reduce_structure
@@ -176,7 +176,7 @@ def reduced_structure(
             structure = assemble_structure(file, memory_limit)
         return reduce_structure(structure, structure.design.name, chosen, progress).model
 
-    return _once(ReducedModel, path, design_hash, build_structure)
+    return _once(ReducedModel, "structure", design_hash, chosen, build_structure)
 
 
 def check_structure(file: Path | str) -> None:
@@ -187,12 +187,11 @@ def check_structure(file: Path | str) -> None:
     FiniteElementError
         If the structure cannot be read or modelled.
     """
-    if not _place(Path(file))[0].is_file():
+    if not entry("structure", *_asked(Path(file))).is_file():
         assemble_structure(file)
 
 
-def _place(file: Path, settings: StructureSettings | None = None) -> tuple[Path, str, StructureSettings]:
-    """Return where the model of a structure is kept, the hash of file and mesh, and how it is reduced."""
+def _asked(file: Path, settings: StructureSettings | None = None) -> tuple[str, StructureSettings]:
+    """Return the hash of a structure file with its mesh, and how it is to be reduced."""
     design = load_structure(file)
-    settings, design_hash = settings or StructureSettings.of(design), structure_hash(design, file.parent)
-    return entry("structure", design_hash, settings), design_hash, settings
+    return structure_hash(design, file.parent), settings or StructureSettings.of(design)

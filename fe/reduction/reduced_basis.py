@@ -164,17 +164,13 @@ def _named(terms: ReductionTerms, name: str) -> dict[str, Any]:
     structure = terms.structure
     chosen = (*structure.parameters, *structure.regions, *structure.masses, *structure.controls)
     nominal = structure.parameters | structure.masses | structure.controls
+    kinds = ("region", "parameter", "control", "gauge", "displacement", "acceleration")
     return {
         "design_hash": structure.design_hash,
         "name": name,
-        "region_names": " ".join(structure.regions),
-        "parameter_names": " ".join(structure.parameters),
+        **{f"{kind}_names": " ".join(getattr(structure, f"{kind}s")) for kind in kinds},
         "mass_names": " ".join(structure.masses),
-        "control_names": " ".join(structure.controls),
         "control_units": " ".join(structure.control_units[name] for name in structure.controls),
-        "gauge_names": " ".join(structure.gauges),
-        "displacement_names": " ".join(structure.displacements),
-        "acceleration_names": " ".join(structure.accelerations),
         "validity_box": np.array([structure.ranges[name] for name in chosen], dtype=np.float64),
         "nominal": np.array([nominal.get(name, 0.0) for name in chosen], dtype=np.float64),
         "damping": np.array((structure.damping_alpha, structure.damping_beta)),

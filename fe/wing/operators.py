@@ -29,7 +29,7 @@ from fe.structure.affine import AffineStructure, LoadTerm, StiffnessTerm
 from fe.structure.supports import RigidSet, SupportedUnknowns, rigid_motions
 
 from .design import WingDesign
-from .mesh import SurfacePoint, WingMesh, build_mesh
+from .mesh import WingMesh, build_mesh
 from .parts import PointMassPlace
 from .turn_load import STANDARD_GRAVITY, lift_load
 
@@ -59,9 +59,7 @@ def gauge_output(mesh: WingMesh, turned: float = 0.0) -> sparse.csr_array:
     """
     design = mesh.design
     gauges, plan = design.gauges, design.planform
-    owner: list[int] = []
-    share: list[float] = []
-    points: list[SurfacePoint] = []
+    found: list[tuple[int, float, int, FloatArray]] = []
     for gauge, (distance, chord_fraction) in enumerate(gauges.positions):
         # The patch is a rectangle: the same distances fore and aft of the gauge's own chord line.
         middle = (chord_fraction - plan.straight_chord_line) * plan.chord(distance / plan.semi_span)
@@ -71,17 +69,14 @@ def gauge_output(mesh: WingMesh, turned: float = 0.0) -> sparse.csr_array:
             lead = plan.straight_chord_line * plan.chord(place / plan.semi_span)
             behind = patch_pieces(middle + lead, gauges.averaging_chordwise, mesh.chord_places(place))
             for chordwise, chord_weight in zip(*behind, strict=True):
-                owner.append(gauge)
-                share.append(span_weight * chord_weight)
-                points.append(mesh.skin_point(place, chordwise))
-    cells = np.array([point.cell for point in points])
-    local = np.array([point.local for point in points])
+                found.append((gauge, span_weight * chord_weight, *mesh.skin_point(place, chordwise)))
+    owner, share, cells, local = map(np.array, zip(*found, strict=True))
     if gauges.surface == "middle":
         local[:, 2] = 0.5
     direction, aft = _in_skin(mesh, cells, local)
     direction = np.cos(turned) * direction + np.sin(turned) * aft
     weights = strain_weights(mesh.kind, mesh.nodes[cells], local, direction)
-    values = -np.array(share)[:, None] * weights.reshape(len(cells), -1)
+    values = -share[:, None] * weights.reshape(len(cells), -1)
     rows = np.repeat(owner, values.shape[1])
     places = (rows, mesh.unknowns_of(cells).ravel())
     return sparse.coo_array((values.ravel(), places), (len(gauges.positions), mesh.unknowns)).tocsr()

@@ -15,8 +15,11 @@ import pytest
 
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
+from fmu_asset.companions import COMPANION_NAMES
+from fmu_asset.companions.build import companion_bytes
 from fmu_asset.door.binding import Binding, load_binding, parse_binding
 from fmu_asset.packing.structure_fmu import build_fmu
+from reporting.files import atomic_write_bytes
 
 ROOT = Path(__file__).parents[2]
 NODES = 16
@@ -115,6 +118,15 @@ def fmu(model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def binding() -> Binding:
     return load_binding(ROOT / "scenarios" / "bindings" / "uav_wing.toml")
+
+
+@pytest.fixture(scope="session")
+def companions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """The companion FMUs."""
+    folder = tmp_path_factory.mktemp("companions")
+    return {
+        name: atomic_write_bytes(folder / f"{name}.fmu", companion_bytes(name)) for name in COMPANION_NAMES
+    }
 
 
 SPRING_MASS = {

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import signal
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from random import Random
-from types import FrameType
 from typing import Any
 
 import meshio
@@ -22,55 +20,14 @@ from reporting.json_file import parse_json
 from reporting.table_file import TableErrors, parse_table
 from reporting.toml_file import parse_toml
 from scenarios import structure_files
+from tests.refusals import Inputs
 
+pytestmark = pytest.mark.usefixtures("alarm")
+
+INPUTS = Inputs(__file__)
 LIMIT = 60
 """Seconds after which a reader hangs; every file here is read in hundredths of one."""
-ABAQUS = """*HEADING
-a brick
-*SYSTEM
-0, 0, 0, 1, 0, 0
-0, 1, 0
-*NODE, NSET=FLOOR, SYSTEM=C
-1, 1, 0, 0
-2, 2, 0, 0
-11, 1, 90, 0
-12, 2, 90, 0
-*SYSTEM
-*NODE
-101, 1, 0, 1
-102, 2, 0, 1
-111, 0, 1, 1
-112, 0, 2, 1
-*ELEMENT, TYPE=C3D8, ELSET=BODY
-1, 1, 2, 12, 11,
-101, 102, 112, 111
-*NSET, NSET=ROOT, GENERATE
-1, 11, 10
-*NSET, NSET=BOTH
-ROOT, 2
-*SURFACE, NAME=TOP
-BODY, S2
-*SOLID SECTION, ELSET=BODY, MATERIAL=M
-*STEP
-*STATIC
-*END STEP
-"""
-NASTRAN = """SOL 101
-BEGIN BULK
-CORD2C         3       0      0.      0.      0.      0.      0.      1.+A
-+A            1.      0.      0.
-GRID           1       3      1.      0.      0.
-GRID           2       3      1.     90.      0.
-GRID,3,,-1.,0.,0.
-GRID*                  4                              0.              0.*B
-*B                    2.
-CORD1R,7,1,2,4
-PSOLID,1,1
-CTETRA,9,1,1,2,3,
-,4
-CTRIA3,10,2,1,2,3
-ENDDATA
-"""
+WORDS = (*words_of("abaqus").refused, *words_of("nastran").refused)
 PIECES = (
     *"*,+=.$#-\n\t \"'[]{}", "0", "-1", "1e999", "nan", "99999999999999999999", "1.5-3", "7" * 5000, "\0",
     "é",     "*NODE", "GENERATE", "ELSET=BODY", "1, 99999999", "a.a.a", "GRID", "=", '"""', "[[load]]",
@@ -79,7 +36,7 @@ PIECES = (
 
 @pytest.fixture
 def alarm() -> Iterator[None]:
-    def ring(number: int, frame: FrameType | None) -> None:
+    def ring(*_: object) -> None:
         raise TimeoutError(f"nothing was read or refused within {LIMIT} s")
 
     before = signal.signal(signal.SIGALRM, ring)
@@ -88,7 +45,7 @@ def alarm() -> Iterator[None]:
     signal.signal(signal.SIGALRM, before)
 
 
-def mutations(text: str, count: int, extra: tuple[str, ...], seed: int) -> Iterator[str]:
+def mutations(text: str, count: int, seed: int) -> Iterator[str]:
     """One to three faults in each: a piece lost, put in or doubled, lines moved, the end cut off."""
     random = Random(seed)
     for _ in range(count):
@@ -96,7 +53,7 @@ def mutations(text: str, count: int, extra: tuple[str, ...], seed: int) -> Itera
         for _ in range(random.choice((1, 1, 1, 2, 3))):
             start = random.randrange(len(found) + 1)
             end = min(len(found), start + random.choice((0, 0, 0, 1, 1, 2, 10)))
-            piece = random.choice((*PIECES, *extra, found[start:end] * 2, ""))
+            piece = random.choice((*PIECES, *WORDS, found[start:end] * 2, ""))
             found = found[:start] + (piece if random.random() < 0.9 else "") + found[end:]
             if random.random() < 0.1:
                 lines = found.split("\n")
@@ -120,38 +77,33 @@ def check(read: Callable[[], Any], *expected: type[Exception]) -> bool:
     return True
 
 
+def read_structure(path: Path) -> None:
+    parse_structure(parse_toml(path.read_bytes(), "s.toml", DesignFileError))
+
+
 @pytest.mark.parametrize("count", [40, pytest.param(300, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", ["m.inp", "m.bdf", "m.msh", "m.vtu", "s.toml"])
-@pytest.mark.usefixtures("alarm")
-def test_a_file_with_faults_is_read_or_refused(
-    name: str, count: int, box: Callable[..., Any], tmp_path: Path
-) -> None:
-    path = tmp_path / name
-    texts: dict[str, str] = {"m.inp": ABAQUS, "m.bdf": NASTRAN}
-    points, cells = box("tetra", (1, 1, 1))
+def test_a_file_with_faults_is_read_or_refused(name: str, count: int, box, tmp_path: Path) -> None:
+    path, (points, cells) = tmp_path / name, box("tetra", (1, 1, 1))
     tags = {"gmsh:physical": [[1, 1, 1, 2, 2, 2]], "gmsh:geometrical": [[1] * 6]}
     mesh = meshio.Mesh(points, [("tetra", cells)], cell_data=tags if name == "m.msh" else {"part": [[1] * 6]})
-    if name == "m.msh":
-        meshio.write(path, mesh, file_format="gmsh22", binary=False)
-    elif name == "m.vtu":
-        mesh.write(path, binary=False)
+    if name in ("m.msh", "m.vtu"):
+        mesh.write(path, **({"file_format": "gmsh22"} if name == "m.msh" else {}), binary=False)
+        text = path.read_text()
     elif name == "s.toml":
-        path.write_text(structure_files()["bracket"].read_text())
-    text = texts.get(name) or path.read_text()
-    words = (*words_of("abaqus").refused, *words_of("nastran").refused)
-    read = refused = 0
-    for mutated in mutations(text, count, words, seed=2028):
+        text = structure_files()["bracket"].read_text()
+    else:
+        text = INPUTS.text({"m.inp": "brick.inp", "m.bdf": "pieces.bdf"}[name])
+    read, faults = partial(read_mesh, path, 1.0, "m"), (MeshError,)
+    if name == "s.toml":
+        read, faults = partial(read_structure, path), (DesignFileError, InvalidDesignError)
+    path.write_text(text, encoding="utf-8")
+    assert check(read), "it is read before it is changed"
+    done = []
+    for mutated in mutations(text, count, seed=2028):
         path.write_text(mutated, encoding="utf-8", newline="")
-        if name == "s.toml":
-            done = check(
-                lambda: parse_structure(parse_toml(path.read_bytes(), "s.toml", DesignFileError)),
-                DesignFileError,
-                InvalidDesignError,
-            )
-        else:
-            done = check(lambda: read_mesh(path, 1.0, "m"), MeshError)
-        read, refused = read + done, refused + (not done)
-    assert min(read, refused) > 1, "the faults are too small, or too large, to find anything"
+        done.append(check(read, *faults))
+    assert 1 < sum(done) < count - 1, "the faults are too small, or too large, to find anything"
 
 
 LONG = 300_000
@@ -172,39 +124,35 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("what", HOSTILE)
-@pytest.mark.usefixtures("alarm")
 def test_a_long_text_is_read_or_refused(what: str, tmp_path: Path) -> None:
     """None of these takes a time that grows with the square of its length."""
-    check(lambda: parse_toml(HOSTILE[what], "f", DesignFileError), DesignFileError)
-    check(lambda: parse_json(HOSTILE[what], "f", DesignFileError), DesignFileError)
     errors = TableErrors(DesignFileError, InvalidDesignError)
-    check(lambda: parse_table(HOSTILE[what], "f", errors), DesignFileError)
-    for name, before in itertools.product(
-        ("m.inp", "m.bdf"), ("", "*NODE\n", "*ELEMENT, TYPE=C3D8\n", "GRID,")
-    ):
-        path = tmp_path / name
-        path.write_text(before + HOSTILE[what])
-        assert not check(partial(read_mesh, path, 1.0, "m"), MeshError)
+    for parse, last in ((parse_toml, DesignFileError), (parse_json, DesignFileError), (parse_table, errors)):
+        check(partial(parse, HOSTILE[what], "f", last), DesignFileError)
+    for path in (tmp_path / "m.inp", tmp_path / "m.bdf"):
+        for before in ("", "*NODE\n", "*ELEMENT, TYPE=C3D8\n", "GRID,"):
+            path.write_text(before + HOSTILE[what])
+            assert not check(partial(read_mesh, path, 1.0, "m"), MeshError)
 
 
-@pytest.mark.parametrize(
-    "rows",
-    [
-        [f"*NSET, NSET=S{n}\nS{n + 1}, 1" for n in range(20_000)],
-        ["*NSET, NSET=A, GENERATE\n1, 9, 2"]
-        + [f"*NSET, NSET=B{n}\n" + f"B{n - 1}, " * 50 for n in range(30)],
-        [f"*NODE, NSET=S\n{n}, 0, 0, 0" for n in range(20_000)],
-        ["*ELSET, ELSET=E, GENERATE", *["1, 1"] * 50_000, "*SURFACE, NAME=T", *["E, S1"] * 10_000],
-        ["*SURFACE, NAME=T"] + ["E, S1"] * 20_000,
-        [f"*UNKNOWN{n}" for n in range(20_000)],
-    ],
-    ids=["sets of sets", "sets that grow", "blocks", "large faces", "faces", "words"],
-)
-@pytest.mark.usefixtures("alarm")
-def test_short_lines_that_ask_for_much_are_read_or_refused(rows: list[str], tmp_path: Path) -> None:
-    solid = ["*NODE", "1, 0, 0, 0", "2, 1, 0, 0", "3, 0, 1, 0", "4, 0, 0, 1", "*ELEMENT, TYPE=C3D4, ELSET=E"]
-    (tmp_path / "m.inp").write_text("\n".join((*solid, "1, 1, 2, 3, 4", *rows)))
-    check(lambda: read_mesh(tmp_path / "m.inp", 1.0, "m"), MeshError)
+MUCH = {
+    "sets of sets": [f"*NSET, NSET=S{n}\nS{n + 1}, 1" for n in range(20_000)],
+    "sets that grow": ["*NSET, NSET=A, GENERATE\n1, 9, 2"]
+    + [f"*NSET, NSET=B{n}\n" + f"B{n - 1}, " * 50 for n in range(30)],
+    "blocks": [f"*NODE, NSET=S\n{n}, 0, 0, 0" for n in range(20_000)],
+    "large faces": ["*ELSET, ELSET=E, GENERATE", *["1, 1"] * 50_000, "*SURFACE, NAME=T", *["E, S1"] * 10_000],
+    "faces": ["*SURFACE, NAME=T"] + ["E, S1"] * 20_000,
+    "words": [f"*UNKNOWN{n}" for n in range(20_000)],
+}
+
+
+@pytest.mark.parametrize("what", MUCH)
+def test_short_lines_that_ask_for_much_are_read_or_refused(what: str, tmp_path: Path) -> None:
+    solid = (
+        "*NODE\n1, 0, 0, 0\n2, 1, 0, 0\n3, 0, 1, 0\n4, 0, 0, 1\n*ELEMENT, TYPE=C3D4, ELSET=E\n1, 1, 2, 3, 4"
+    )
+    (tmp_path / "m.inp").write_text("\n".join((solid, *MUCH[what])))
+    check(partial(read_mesh, tmp_path / "m.inp", 1.0, "m"), MeshError)
 
 
 def test_a_chain_of_coordinate_systems_ends(tmp_path: Path) -> None:
@@ -212,9 +160,3 @@ def test_a_chain_of_coordinate_systems_ends(tmp_path: Path) -> None:
     (tmp_path / "m.bdf").write_text("\n".join([*rows, "GRID,1,1,0.,0.,0."]))
     with pytest.raises(MeshError, match="rests on itself, or on too many others"):
         read_mesh(tmp_path / "m.bdf", 1.0, "m")
-
-
-def test_the_decks_are_read_before_they_are_changed(tmp_path: Path) -> None:
-    for name, text in {"m.inp": ABAQUS, "m.bdf": NASTRAN}.items():
-        (tmp_path / name).write_text(text)
-        assert len(read_mesh(tmp_path / name, 1.0, "m").cells) == 1

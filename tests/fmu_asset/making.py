@@ -1,0 +1,112 @@
+"""What these tests make things with: archives, changed FMUs, bindings, systems, other processes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fmu_asset.coupling.structure import (
+    Component,
+    Connection,
+    Connector,
+    Setting,
+    SystemStructure,
+    expand_connection,
+)
+from fmu_asset.door.binding import Binding, parse_binding
+
+ROOT = Path(__file__).parents[2]
+DESCRIPTION = "modelDescription.xml"
+
+
+def members(path: Path) -> dict[str, bytes]:
+    """Return the contents of an archive by name."""
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def archive_of(path: Path, contents: Mapping[str, str | bytes]) -> Path:
+    """Write an archive; the inverse of `members`."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content)
+    return path
+
+
+def edited(fmu: Path, target: Path, *changes: tuple[str, str], entry: str = DESCRIPTION) -> Path:
+    """Write a copy of an FMU with texts of one entry, its model description, replaced."""
+    contents = members(fmu)
+    text = contents[entry].decode()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    return archive_of(target, contents | {entry: text.encode()})
+
+
+def run_python(program: str, *arguments: object, **options: Any) -> str:
+    """Return what a program, run in a process of its own, writes; it must end well."""
+    words = [sys.executable, "-c", program, *map(str, arguments)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False, **options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+Ends = Mapping[str, tuple[Any, Any]]
+
+
+def bound(step_size: float, observation: Ends, *, record: object = None, **roles: Any) -> Binding:
+    """Return a binding: of each name in each role its variable and unit, and its range where there are more.
+
+    `header` has further keys; `limits` and `port` are tables as in the file.
+    """
+    header = {"name": "bound", "step_size": step_size, **roles.pop("header", {})}
+    tables: dict[str, Any] = {name: roles.pop(name) for name in ("limits", "port") if name in roles}
+    keys = "variable", "unit", "minimum", "maximum"
+    for role, ends in roles.items():
+        tables[role] = {name: dict(zip(keys, end, strict=False)) for name, end in ends.items()}
+    if record is not None:
+        tables["record"] = {"variables": record}
+    observed = {name: {"variables": names, "unit": unit} for name, (names, unit) in observation.items()}
+    return parse_binding({"binding": header, "observation": observed, **tables})
+
+
+def changed(binding: Binding, *, header: Mapping[str, object] | None = None, **tables: Any) -> Binding:
+    """Return a binding with further keys of its header, and some tables replaced."""
+    record = binding.model_dump(exclude_none=True, mode="json")
+    return parse_binding(record | {"binding": record["binding"] | dict(header or {})} | tables)
+
+
+def linear(name: str, fmu: Path, substeps: int = 1, **values: Any) -> Component:
+    """Return a component of `linear_system.py`; matrices as nested lists, `initial` as a pair."""
+    settings = {}
+    for key, value in values.items():
+        for place, x in np.ndenumerate(np.array(value, dtype=float)):
+            settings[key + "".join(str(index + 1) for index in place)] = Setting(float(x))
+    return Component(name, fmu, settings, substeps)
+
+
+def system(
+    components: Sequence[Component], connections: Sequence[tuple[str, str]], name: str = "test"
+) -> SystemStructure:
+    """Return a system; ends without a dot become connectors."""
+    names = [component.name for component in components]
+    joined: list[Connection] = []
+    for source, target in connections:
+        joined += expand_connection(source, target, names)
+    connectors = dict.fromkeys(
+        [Connector(c.target.variable, "output") for c in joined if not c.target.component]
+        + [Connector(c.source.variable, "input") for c in joined if not c.source.component]
+    )
+    return SystemStructure(name, tuple(components), tuple(connectors), tuple(joined))
+
+
+def watch(*names: str, step_size: float = 1.0, inputs: Sequence[str] = (), **header: object) -> Binding:
+    """Return a binding that observes ends of a system, all without unit."""
+    control = {name: (name, "1") for name in inputs}
+    return bound(step_size, {"all": (list(names), "1")}, control=control, header={"name": "watch", **header})

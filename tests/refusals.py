@@ -1,0 +1,30 @@
+"""Good inputs as files beside the tests, and tables of what is refused in them."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+
+class Inputs:
+    """The files in the folder `inputs` beside a test file.
+
+    Each row of a table of `refused.toml` is a piece of a good input, what stands there instead, and the
+    sentence, as a regular expression, that refuses it.
+    """
+
+    def __init__(self, test_file: str) -> None:
+        self.folder = Path(test_file).with_name("inputs")
+
+    def text(self, name: str, *changes: tuple[str, str]) -> str:
+        """Return a good input in which pieces are exchanged."""
+        text = (self.folder / name).read_text(encoding="utf-8")
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new, 1)
+        return text
+
+    def refused(self, table: str) -> list[tuple[str, ...]]:
+        """Return the rows of a table."""
+        tables = tomllib.loads((self.folder / "refused.toml").read_text(encoding="utf-8"))
+        return [tuple(row) for row in tables[table]]
