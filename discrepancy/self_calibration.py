@@ -20,15 +20,14 @@ from scipy.stats import binomtest
 
 from discrepancy.campaign.records import Campaign, IntArray
 from discrepancy.catalogue.entry import Effect
+from discrepancy.errors import FitError, ModelError
 from discrepancy.files.document import Origin, plain
 from discrepancy.judgement.separability import usable
 from discrepancy.models.interface import Model
 from discrepancy.sources.simulated_campaigns import Hidden, Simulator
+from discrepancy.verdict import VerdictKind
+from discrepancy.workflow import checked, investigate
 from reporting.files import atomic_write_text
-
-from .errors import FitError, ModelError
-from .verdict import VerdictKind
-from .workflow import checked, investigate
 
 SELF_CALIBRATION_NAME = "self_calibration.json"
 SCHEMA = "uav-twin self calibration 1"

@@ -9,12 +9,13 @@ import numpy as np
 
 from discrepancy.campaign.noise import MAINS, aliased
 from discrepancy.campaign.records import Channel, Quantity, Trial, TrialKind
-from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, Response
 from discrepancy.sentences import SENTENCES, said
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.planform_forces import PLANFORM
+
+from .entry import Setting
 
 Kinds = frozenset[TrialKind]
 Names = tuple[str, ...]

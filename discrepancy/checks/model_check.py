@@ -12,9 +12,6 @@ from scipy.optimize import linear_sum_assignment
 
 from discrepancy.campaign.records import BoolArray, Campaign, FloatArray, Hold, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Setting
-from discrepancy.checks.fault import DataFault, FaultKind, fault
-from discrepancy.checks.rest import rest_faults
-from discrepancy.checks.unit_slips import unit_slips
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.elimination import eliminated
 from discrepancy.fits.fitting import fit
@@ -24,6 +21,10 @@ from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
 from discrepancy.sentences import said
 from fe.runtime.patch import ModelPatch
+
+from .fault import DataFault, FaultKind, fault
+from .rest import rest_faults
+from .unit_slips import unit_slips
 
 LEFT = 0.9
 """A parameter of whose prior deviation the records leave more than this share is not observable in them."""

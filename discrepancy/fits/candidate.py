@@ -1,7 +1,7 @@
 """A candidate explanation: effects at given places, shapes fixed or free; where it stands, what it leaves."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -160,6 +160,36 @@ class Point:
     shared: FloatArray
     local: tuple[FloatArray, ...]
     effect: FloatArray
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a candidate stands: a fit, or on the way to one.
+
+    Attributes
+    ----------
+    point : Point
+        Values of all unknowns.
+    objective : float
+        -ln posterior there, up to a constant shared by all candidates [nat].
+    residuals : tuple of (N, C) ndarray
+        Standardised, of each trial.
+    sums : (channels,) ndarray
+        Sum of squared residuals by channel.
+    linearisations : tuple of Linearisation
+        At the point (or older, after chord steps).
+    """
+
+    point: Point
+    objective: float
+    residuals: tuple[FloatArray, ...]
+    sums: FloatArray
+    linearisations: tuple[Linearisation, ...] = field(repr=False)
+
+    @property
+    def responses(self) -> tuple[FloatArray, ...]:
+        """Of each trial, (N, C), without gain and zero."""
+        return tuple(part.response for part in self.linearisations)
 
 
 @dataclass(frozen=True)

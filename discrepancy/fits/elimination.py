@@ -5,16 +5,17 @@ A factor of a curvature that is singular or not finite is a `FitError`, whatever
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from discrepancy.campaign.records import FloatArray, IntArray
 from discrepancy.errors import FitError
-from discrepancy.fits.candidate import Candidate, Linearisation, Point
-from discrepancy.fits.problem import Problem
-from discrepancy.fits.trial_data import TrialDerivatives
+
+from .candidate import Candidate, State
+from .problem import Problem
+from .trial_data import TrialDerivatives
 
 
 def finite(values: FloatArray) -> FloatArray:
@@ -111,26 +112,10 @@ class TrialBlock:
         return self.shared_gradient - self.followed.T @ self.local_gradient
 
 
-class Fitted(Protocol):
-    """Where a candidate stands: a fit, or a state on the way to it."""
-
-    @property
-    def point(self) -> Point:
-        """Values of all unknowns."""
-
-    @property
-    def residuals(self) -> tuple[FloatArray, ...]:
-        """Of each trial, standardised."""
-
-    @property
-    def linearisations(self) -> tuple[Linearisation, ...]:
-        """Of each trial."""
-
-
 def trial_block(
     problem: Problem,
     number: int,
-    found: Fitted,
+    found: State,
     candidate: Candidate,
     precision: FloatArray,
     damping: float = 0.0,
@@ -177,7 +162,7 @@ class Eliminated(NamedTuple):
 
 def eliminated(
     problem: Problem,
-    found: Fitted,
+    found: State,
     candidate: Candidate,
     precision: FloatArray,
     *,
@@ -190,7 +175,7 @@ def eliminated(
     ----------
     problem : Problem
         Campaign and model.
-    found : Fitted
+    found : State
         Where they are taken.
     candidate : Candidate
         Its effect parameters are unknowns.

@@ -7,10 +7,9 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import EffectParameter, ShapeParameter
-from discrepancy.fits.candidate import Point
 from discrepancy.search_settings import SEARCH
 
-from .candidate import Candidate, Term
+from .candidate import Candidate, Point, Term
 from .fitting import CandidateFit, attempt
 from .problem import Problem
 from .screening import is_magnitude

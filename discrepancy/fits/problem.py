@@ -16,23 +16,13 @@ from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
-from discrepancy.fits.candidate import (
-    LEAST_STEP,
-    PARAMETER_STEP,
-    SHARED_STEP,
-    Base,
-    Linearisation,
-    Point,
-    moved,
-)
-from discrepancy.fits.trial_data import GlobalUnknowns, TrialDerivatives, global_unknowns
 from discrepancy.models.interface import Model
 from discrepancy.models.memory import Memory
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
-from .candidate import Candidate
-from .trial_data import TrialData, noise_models
+from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Base, Candidate, Linearisation, Point, moved
+from .trial_data import GlobalUnknowns, TrialData, TrialDerivatives, global_unknowns, noise_models
 
 KEPT = 2000
 """Responses that a problem keeps."""

@@ -21,12 +21,11 @@ from scipy.special import ndtri
 from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.catalogue.entry import EffectParameter, ShapeParameter
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.elimination import Cholesky, finite
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch
 
 from .candidate import Candidate, Term
-from .elimination import eliminated
+from .elimination import Cholesky, eliminated, finite
 from .fitting import LARGEST_EFFECT, CandidateFit
 from .problem import Problem
 

@@ -16,7 +16,6 @@ from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate
 from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.judgement.consistency_gate import sizes_by_trial
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.missing_force.naming import Explained, ForceSearch
@@ -37,7 +36,7 @@ from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 
 from .conclusion import sizes
-from .consistency_gate import consistency_gate
+from .consistency_gate import consistency_gate, sizes_by_trial
 from .court import Court
 from .proof import held_out_gate
 
@@ -204,7 +203,7 @@ class ByReadings(Court[CandidateFit]):
                 self._free[key_of(item.candidate)] = free
                 if free.log_evidence > best.log_evidence + SHAPE_GAIN:
                     joined[key_of(free.candidate)] = free
-        self.found.judge(joined)
+        self.found.judged = joined
 
     def freed(self, item: CandidateFit) -> CandidateFit | None:
         """Return a single law with a shape of its own, where that was compared."""

@@ -5,6 +5,7 @@ A gain of half a thousandth is a nuisance of instruments, not a cause.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from math import isnan
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -177,9 +178,15 @@ def effects_text(effects: Iterable[NamedEffect], joint: str = "and") -> str:
     return listing(dict.fromkeys(found), joint)
 
 
-def certain(probability: float) -> str:
-    """Return the probability of a name, which is never one."""
-    return "> 0.999" if probability > 0.9995 else f"{probability:.3f}"
+def probability_text(probability: float) -> str:
+    """Return a probability that is neither rounded to one nor to zero."""
+    if isnan(probability):
+        return "not known"
+    if probability > 0.9995:
+        return "> 0.999"
+    if probability < 5e-4:
+        return f"{probability:.0e}" if probability > 1e-99 else "< 1e-99"
+    return f"{probability:.3f}"
 
 
 def below_limit(names: Sequence[str], coloured: str = "") -> str:

@@ -24,10 +24,10 @@ from .conclusion import (
     Conclusion,
     Outcome,
     below_limit,
-    certain,
     effects_text,
     named_effects,
     plain_names,
+    probability_text,
 )
 from .consistency_gate import consistency_gate
 
@@ -207,7 +207,7 @@ class Case:
         named = named_effects(self.problem, best)
         limit = "" if gate.passed else f" {gate.reason}"
         told = {"what": " and ".join(effects_text([effect]) for effect in named), "limit": limit}
-        sentence = said("verdict.named", certain=certain(self.probability), **told)
+        sentence = said("verdict.named", certain=probability_text(self.probability), **told)
         more = {"effects": named, "gates": self.all_gates}
         return self.told.outcome(VerdictKind.NAMED, sentence, self.probability, best, **more)
 

@@ -14,8 +14,9 @@ from scipy.linalg import block_diag
 
 from discrepancy.campaign.noise_tests import periodogram
 from discrepancy.campaign.records import FloatArray
-from discrepancy.location.map import Part, explained, features, part_of
-from discrepancy.location.residuals import FittedTrial, ResidualSet
+
+from .map import Part, explained, features, part_of
+from .residuals import FittedTrial, ResidualSet
 
 _PERIODS = 2.0  # of the lowest frequency, or of the closest difference, in a window
 

@@ -12,25 +12,12 @@ import numpy as np
 from discrepancy.campaign.noise_tests import holm, variance_p_value
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
-from discrepancy.location.dependence import (
-    Explanation,
-    excess,
-    explanations,
-    kinds,
-    mode_shares,
-    predicted_frequencies,
-)
-from discrepancy.location.map import Cell, residual_map
-from discrepancy.location.omnibus_tests import (
-    OmnibusTest,
-    coloured_noise,
-    mean_square,
-    noise_groups,
-    serial_tests,
-    variance_test,
-)
-from discrepancy.location.residuals import FittedTrial, ResidualSet, at_own_scale
 from discrepancy.sentences import said
+
+from .dependence import Explanation, excess, explanations, kinds, mode_shares, predicted_frequencies
+from .map import Cell, residual_map
+from .omnibus_tests import OmnibusTest, coloured_noise, mean_square, noise_groups, serial_tests, variance_test
+from .residuals import FittedTrial, ResidualSet, at_own_scale
 
 ALIKE = 0.9
 """Squared cosine from which two patterns over the channels count as the same."""

@@ -16,7 +16,8 @@ from scipy.linalg import block_diag
 
 from discrepancy.campaign.noise_tests import benjamini_yekutieli, periodogram, variance_p_value
 from discrepancy.campaign.records import BoolArray, FloatArray, Trial
-from discrepancy.location.residuals import FittedTrial, ResidualSet, quadratic_moments
+
+from .residuals import FittedTrial, ResidualSet, quadratic_moments
 
 _FREE_SHARE = 0.02  # of a direction's square must survive the fit, else it says nothing
 

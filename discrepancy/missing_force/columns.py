@@ -13,8 +13,6 @@ from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.trial import SeenTrial
-from discrepancy.missing_force.view import Column, Motion, Part, View, combined
 from discrepancy.models.compiled_motion import law_functions
 from discrepancy.models.interface import Response
 from discrepancy.models.sensing import observe_response
@@ -25,6 +23,9 @@ from fe.runtime.laws.interface import HEAD, PARAMETERS, PortForce
 from fe.runtime.motion_arrays import FIRST_PARTS
 from fe.runtime.patch import SENSORS, LoggerClock, ModelPatch
 from fe.runtime.sensors import clock_of
+
+from .trial import SeenTrial
+from .view import Column, Motion, Part, View, combined
 
 WIDER = 10.0
 """By which a deviation of the speed is too small: that of the process does not know of steps."""

@@ -11,9 +11,10 @@ from functools import cached_property
 import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
-from discrepancy.missing_force.filtered import LEAST_PRECISION
-from discrepancy.missing_force.kalman_kernels import is_steady
 from fe.compilation import compiled
+
+from .filtered import LEAST_PRECISION
+from .kalman_kernels import is_steady
 
 
 @compiled

@@ -13,8 +13,9 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from discrepancy.campaign.records import FloatArray, IntArray
-from discrepancy.missing_force import kalman_kernels as kernels
-from discrepancy.missing_force.trial import SeenTrial
+
+from . import kalman_kernels as kernels
+from .trial import SeenTrial
 
 LATER = 200
 """Samples after which more of them tell nothing of a moment."""

@@ -17,10 +17,9 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.filtered import Solution
 
 from .columns import Columns
-from .filtered import Process
+from .filtered import Process, Solution
 from .hypotheses import Key, both_signs, key_of, log_prior, scaled, sized, stepped, variants
 from .trial import seen_trial
 from .view import SHARES, Column, Motion, Processes, View, combined

@@ -12,13 +12,14 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Point
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.columns import Columns
-from discrepancy.missing_force.hypotheses import scaled
-from discrepancy.missing_force.naming import Explained, ForceSearch
-from discrepancy.missing_force.trial import SeenTrial, seen_trial
-from discrepancy.missing_force.view import Motion, View
 from discrepancy.models.interface import Model
 from discrepancy.verdict import ForceAtPort, ForceMoment
+
+from .columns import Columns
+from .hypotheses import scaled
+from .naming import Explained, ForceSearch
+from .trial import SeenTrial, seen_trial
+from .view import Motion, View
 
 WINDOWS, SHORTEST = 12, 8
 """Blocks into which a trial is cut, and samples of a block at least."""

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.missing_force.filtered import Regression, Solution, local_solution, regression
 
-from .filtered import Filtered, Process
+from .filtered import Filtered, Process, Regression, Solution, local_solution, regression
 from .trial import SeenTrial
 
 Processes = Mapping[int, Process]

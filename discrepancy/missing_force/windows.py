@@ -17,13 +17,13 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.shares import of_nothing
 from discrepancy.models.interface import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
 
 from .events import GROUND, MOST_EVENTS, Events, changes, events
 from .filtered import Process
 from .naming import Explained, ForceSearch, seen
+from .shares import of_nothing
 from .trial import SeenTrial
 from .view import View
 

@@ -17,10 +17,6 @@ from discrepancy.files.patch import PrimitiveInterval
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.shares import MissingForce
-from discrepancy.report.kit import heat_map, panels, plain_powers
-from discrepancy.report.motion_figures import backbone_figure, history_figure, spectrum_figure, worst_record
-from discrepancy.report.residual_figures import heat_figure, load_figure, planform_figure, time_line_figure
-from discrepancy.report.text import WORDS, added_label, force_sentence, motion_of, scored
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.verdict import ForceAtPort, Scores
 from discrepancy.workflow import Investigation
@@ -36,6 +32,11 @@ from reporting.figures import (
 )
 from reporting.page import ReportFigure
 from reporting.words import listing
+
+from .kit import heat_map, panels, plain_powers
+from .motion_figures import backbone_figure, history_figure, spectrum_figure, worst_record
+from .residual_figures import heat_figure, load_figure, planform_figure, time_line_figure
+from .text import WORDS, added_label, force_sentence, motion_of, scored
 
 _LARGEST_DISTANCE = 1e4
 

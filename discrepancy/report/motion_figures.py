@@ -14,9 +14,10 @@ from discrepancy.errors import FitError
 from discrepancy.location.backbone import Backbone, backbones
 from discrepancy.location.dependence import predicted_frequencies
 from discrepancy.location.residuals import FittedTrial, ResidualSet
-from discrepancy.report.kit import draw_noise, models, panels, plain_powers
-from discrepancy.report.residual_figures import size
 from reporting.figures import OBSERVED, REFERENCE, TRUTH, publication_style
+
+from .kit import draw_noise, models, panels, plain_powers
+from .residual_figures import size
 
 LEAST_POINTS = 4
 """Fewest measured points of a mode whose backbone is drawn."""

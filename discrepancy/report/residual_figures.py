@@ -13,10 +13,11 @@ from matplotlib.ticker import MaxNLocator
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import FittedTrial, ResidualSet
-from discrepancy.report.kit import Shown, draw_noise, heat_map, models, panels, scale_of, size_bar, titles
 from discrepancy.verdict import GapWindow, Moment
 from fe.wing.design import WingDesign
 from reporting.figures import LEVELS, OBSERVED, REFERENCE, publication_style
+
+from .kit import Shown, draw_noise, heat_map, models, panels, scale_of, size_bar, titles
 
 MOST_RECORDS = 12
 """Records that are drawn; those with the largest gaps go first."""

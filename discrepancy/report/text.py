@@ -9,7 +9,7 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.catalogue.entry import Effect
 from discrepancy.document_types import PRIMITIVE_UNITS
 from discrepancy.files.patch import PrimitiveInterval
-from discrepancy.judgement.conclusion import effects_text
+from discrepancy.judgement.conclusion import effects_text, probability_text
 from discrepancy.models.interface import Model
 from discrepancy.verdict import (
     Estimate,
@@ -72,17 +72,6 @@ def rounded(value: float, spread: float) -> Callable[[float], str]:
         return text + (f"e{power}" if power else "")
 
     return show
-
-
-def probability_text(probability: float) -> str:
-    """Return a probability that is neither rounded to one nor to zero."""
-    if isnan(probability):
-        return "not known"
-    if probability > 0.9995:
-        return "> 0.999"
-    if probability < 5e-4:
-        return f"{probability:.0e}" if probability > 1e-99 else "< 1e-99"
-    return f"{probability:.3f}"
 
 
 def p_value_text(p: float) -> str:

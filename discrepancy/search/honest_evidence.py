@@ -20,8 +20,9 @@ from discrepancy.fits.candidate import Remainder
 from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.hypotheses import Key, key_of
-from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
+
+from .strategy import Search
 
 LEVEL = 1e-3
 """p-value below which what is left is more than noise, or no white noise."""
@@ -174,7 +175,7 @@ def weigh_with_remainders(found: Search) -> None:
         if key_of(leading.candidate) == key_of(best.candidate):
             break
         best = leading
-    found.judge(judged)
+    found.judged = judged
 
 
 def _judged(found: Search, wide: Problem, chosen: list[CandidateFit]) -> dict[Key, CandidateFit]:

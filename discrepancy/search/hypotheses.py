@@ -98,10 +98,6 @@ class Hypotheses:
         """The fit without effect as it is compared, with its remainder where others have theirs."""
         return self.judged.get((), self.none)
 
-    def judge(self, fits: dict[Key, CandidateFit]) -> None:
-        """Compare these from now on."""
-        self.judged = fits
-
     def set_probabilities(self) -> dict[tuple[str, ...], float]:
         """Return the probability of each set of identifiers, places summed, most probable first."""
         scores: dict[tuple[str, ...], list[float]] = {}

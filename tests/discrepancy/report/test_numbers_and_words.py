@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from discrepancy.files.patch import primitive_intervals
-from discrepancy.judgement.conclusion import named_effects
+from discrepancy.judgement.conclusion import named_effects, probability_text
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import parse_lumped
@@ -29,7 +29,6 @@ from discrepancy.report.text import (
     formula,
     headline,
     number,
-    probability_text,
     rounded,
     si_sizes,
     size_sentence,
