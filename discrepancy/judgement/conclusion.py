@@ -94,6 +94,16 @@ class Conclusion:
         verdict = Verdict(kind, sentence, probability, self.log_bayes_factor, **alike, **more)  # type: ignore[arg-type]
         return Outcome(verdict, self.found, self.found.none if fit is None else fit)
 
+    def named(self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...], **more: Any) -> Outcome:
+        """Return the verdict that names the effects of a fit; the first gate is that of absolute fit."""
+        named, limit = (
+            named_effects(self.found.problem, fit),
+            "" if gates[0].passed else f" {gates[0].reason}",
+        )
+        told = {"what": effects_text(named), "certain": probability_text(probability), "limit": limit}
+        more |= {"effects": named, "gates": gates}
+        return self.outcome(VerdictKind.NAMED, said("verdict.named", **told), probability, fit, **more)
+
     def family(self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...]) -> Outcome:
         """Return the verdict that names the family of a fit with a free shape."""
         drawn = with_draws(self.found.problem, fit)

@@ -139,12 +139,7 @@ def _beside_coloured_noise(court: ByReadings) -> Outcome | None:
     gates = (absolute_gate(problem, best), consistency_gate(problem, best), held_out)
     if probability < SEARCH.sure or any(gate.passed is False for gate in gates):
         return None
-    named = named_effects(problem, best)
-    sentence = said(
-        "verdict.named", what=effects_text(named), certain=probability_text(probability), limit=""
-    )
-    more = {"effects": named, "gates": gates, "remainders": remainder_estimates(problem, best)}
-    return told.outcome(VerdictKind.NAMED, sentence, probability, best, **more)
+    return told.named(best, probability, gates, remainders=remainder_estimates(problem, best))
 
 
 def _is_coloured(item: CandidateFit) -> bool:
