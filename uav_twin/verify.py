@@ -211,10 +211,11 @@ def convergence_checks(
     from fe.verification.known_answers import mesh_convergence, observed_order
 
     rows = mesh_convergence(design, refinements)
-    group = f"mesh x{refinements[-2]:g} to x{refinements[-1]:g}"
+    middle, fine = refinements[-2:]
+    group = f"mesh x{middle:g} to x{fine:g}"
 
     def order(values: list[float]) -> str:
-        found = observed_order(refinements, values)
+        found = observed_order(fine / middle, values)
         return "not monotone" if math.isnan(found) else f"order {found:.2f}"
 
     limit = 0.01 if limited else None

@@ -123,8 +123,7 @@ def _compiled(loop: Callable[..., None]) -> Callable[..., None]:
 
 def _ports(internal: Laws) -> Ports:
     """Return the laws for the loops above, which know the ports by their own rows."""
-    count = len(internal)
-    return internal.at(np.zeros((count, 0)), np.zeros(count), 0.0, np.zeros((2, count)))
+    return internal.at(np.zeros((len(internal), 0)))
 
 
 def first_memory(internal: Laws, positions: FloatArray) -> FloatArray:

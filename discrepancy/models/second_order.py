@@ -1,23 +1,29 @@
 """Motion of a linear system with internal forces at its ports: after a release, or under what acts.
 
 A model makes a `SecondOrderSystem` from its parameters and the structural part of a patch, keeps it, and asks
-it for a `Motion`, which says what outputs show. Between the stamps the linear part is exact (`stepwise`).
+it for a `Motion`, which says what outputs show. Between the stamps the linear part is exact
+(`fe.runtime.stepwise`).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from discrepancy.campaign.records import FloatArray, Release, Start
+from discrepancy.campaign.sampling import is_even
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown
-from discrepancy.models.compiled_motion import Steps
+from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Response
 from discrepancy.models.linear_system import LinearSystem, solved
-from discrepancy.models.stepwise import Begin, Boundaries, advance, exact_steps, free_motion, substeps
-from fe.runtime.motion import Laws, ModalMotion
+from fe.runtime.modal_system import ModalSystem
+from fe.runtime.motion import Laws
+from fe.runtime.motion_arrays import Steps
+from fe.runtime.stepwise import Begin, Boundaries, ModalMotion, advance, steps_under, substeps
 
 
 @dataclass(frozen=True)
@@ -280,7 +286,7 @@ class SecondOrderSystem(LinearSystem):
 
     def _backwards(self, q: FloatArray, v: FloatArray, duration: float) -> Begin:
         """Return the state a duration [s] earlier, without internal forces."""
-        step = exact_steps(self.free, np.array([duration]))[0][0]
+        step = self.free.exact_steps(np.array([duration]))[0][0]
         state = np.linalg.solve(step, np.concatenate((q, v)))
         return Begin(state[: len(q)], state[len(q) :])
 
@@ -314,29 +320,26 @@ class SecondOrderSystem(LinearSystem):
         feed = np.zeros((len(boundaries.time), len(laws)))
         if self.truncated and len(laws) and acting.loads:
             feed = acting.load_at(boundaries.time, self.residual(self.port_rows(laws).T))
-        return advance(self.modal, laws, self._steps(acting, boundaries, feed), begin)
+        return advance(self.modal, laws, self._steps(acting, boundaries, feed), begin, compiled_kernel())
 
     def _steps(self, acting: Acting, boundaries: Boundaries, feed: FloatArray) -> Steps:
         """Return the steps of all coordinates; the drives follow from nothing but what is prescribed."""
         begin, end = self._modal_forces(acting, boundaries)
-        (lengths, which), time = boundaries.alike, boundaries.time
-        exact, *by = exact_steps(self.free, lengths)
         count, whole = len(self.angular_frequency), begin.shape[1]
-        moved = sum(
-            forces @ part[0].T if len(lengths) == 1 else np.einsum("knm,km->kn", part[which], forces)
-            for part, forces in zip(by, (begin[:, :count], end[:, :count]), strict=True)
-        )
-        transition, push = np.zeros((len(exact), 2, whole, 2, whole)), np.zeros((len(begin), 2, whole))
-        transition[:, :, :count, :, :count] = exact.reshape(len(exact), 2, count, 2, count)
-        push[..., :count] = moved.reshape(len(push), 2, count)
+        steps = steps_under(self.free, boundaries, begin[:, :count], end[:, :count], feed)
+        if not acting.drives:
+            return steps
+        transition = np.zeros((len(steps.transition), 2, whole, 2, whole))
+        push = np.zeros((len(begin), 2, whole))
+        transition[:, :, :count, :, :count] = steps.transition.reshape(-1, 2, count, 2, count)
+        push[..., :count] = steps.push.reshape(-1, 2, count)
         for number, drive in enumerate(acting.drives.values()):
             for order in range(2):
-                push[:, order, count + number] = self.heaviness * drive.at(time[1:], order)
+                push[:, order, count + number] = self.heaviness * drive.at(boundaries.time[1:], order)
         size = 2 * whole
-        return Steps(
-            transition.reshape(-1, size, size), lengths, which, push.reshape(-1, size), begin, end, feed,
-            time, boundaries.sample,
-        )  # fmt: skip
+        return steps._replace(
+            transition=transition.reshape(-1, size, size), push=push.reshape(-1, size), begin=begin, end=end
+        )
 
     def _modal_forces(self, acting: Acting, boundaries: Boundaries) -> tuple[FloatArray, FloatArray]:
         """Return the modal forces (K, M + P) at both ends of each step, those of splines made good for it.
@@ -357,3 +360,42 @@ class SecondOrderSystem(LinearSystem):
                 side[:, :count] -= np.outer(w[2], parts[2])
                 side[:, count + number] = self.heaviness * w[2]
         return begin, end
+
+
+def free_motion(
+    modal: ModalSystem, q: FloatArray, v: FloatArray, times: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return free motion (N, M), displacement and velocity, of uncoupled modes.
+
+    Parameters
+    ----------
+    modal : ModalSystem
+        The modes; only the diagonal of their damping acts.
+    q, v : (M,) ndarray
+        Displacement and velocity at time zero, mass-normalised.
+    times : (N,) ndarray
+        [s]; evenly spaced ones take a tenth of the time.
+    """
+    half = 0.5 * np.diag(modal.damping)
+    w = modal.angular_frequency
+    root = np.sqrt((half**2 - w**2).astype(complex))
+    root = np.where(np.abs(root) < 1e-6 * w, 1e-6 * w, root)  # critical: beside it, by 1e-12 of w^2
+    fast, slow = -half - root, -half + root
+    first = (v - fast * q) / (2.0 * root)  # q = first e^(slow t) + second e^(fast t)
+    if np.all(root.imag != 0.0):  # the two are conjugate
+        wave = 2.0 * first * _waves(slow, times)
+        return np.ascontiguousarray(wave.real), np.ascontiguousarray((slow * wave).real)
+    one, two = first * _waves(slow, times), (q - first) * _waves(fast, times)
+    return np.ascontiguousarray((one + two).real), np.ascontiguousarray((slow * one + fast * two).real)
+
+
+def _waves(rates: NDArray[Any], times: FloatArray) -> NDArray[np.complex128]:
+    """Return e^(rate t) (N, M); at evenly spaced times as products of few exponentials."""
+    count, block = len(times), 32
+    if count <= 2 * block or not is_even(times):
+        return np.asarray(np.exp(np.outer(times, rates)))
+    interval = (times[-1] - times[0]) / (count - 1)
+    blocks = -(-count // block)
+    coarse = np.exp(np.outer(times[0] + interval * block * np.arange(blocks), rates))
+    fine = np.exp(np.outer(interval * np.arange(block), rates))
+    return np.asarray((coarse[:, None, :] * fine).reshape(blocks * block, -1)[:count])

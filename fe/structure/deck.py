@@ -5,7 +5,7 @@ Last the coordinate systems of decks: points that are given by radii and angles,
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
@@ -21,6 +21,7 @@ from fe.elements.kinds import KINDS, ElementKind
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
 from reporting.section import shown
+from reporting.text_file import read_text
 from reporting.toml_file import parse_toml
 
 from .mesh import StructureMesh
@@ -70,12 +71,23 @@ def fail(where: str, sentence: str) -> NoReturn:
     raise MeshError(f"{where}: {sentence}")
 
 
-def included(where: str, files: tuple[Path, ...], name: str) -> tuple[Path, ...]:
-    """Return files that include one another and one that the last of them includes; none may come twice."""
-    inner = (files[-1].parent / name).resolve()
-    if inner in files:
-        fail(where, f"{inner} includes itself.")
-    return (*files, inner)
+def lines_of(
+    files: tuple[Path, ...], comment: re.Pattern[str], include: re.Pattern[str]
+) -> Iterator[tuple[str, str]]:
+    """Yield where each line of the last of files that include one another stands, and its text.
+
+    Comments and empty lines are left out; the lines of a file whose name `include` finds stand in its place.
+    """
+    text = read_text(files[-1], MeshError, what="mesh file", otherwise="latin-1")
+    for number, line in enumerate(text.splitlines(), start=1):
+        where, line = f"{files[-1]}, line {number}", comment.sub("", line).rstrip()
+        if found := include.fullmatch(line):
+            inner = (files[-1].parent / found[1].strip(" '\"")).resolve()
+            if inner in files:
+                fail(where, f"{inner} includes itself.")
+            yield from lines_of((*files, inner), comment, include)
+        elif line:
+            yield where, line
 
 
 def whole(where: str, text: str) -> int:
@@ -233,15 +245,15 @@ class Deck:
     def _kind(self) -> ElementKind:
         """Return the one kind of the solid elements."""
         counts = Counter(kind for kind, _ in self.elements.values() if kind not in FLAT)
-        names = {name: KINDS[name].name if name in KINDS else name for name in counts}
-        came = ", ".join(f"{counts[name]} {title}" for name, title in names.items())
-        where = [str(self.path), *self._solids.values()][-1]
-        if not counts or not counts.keys() <= KINDS.keys():
+        if len(counts) != 1 or not counts.keys() <= KINDS.keys():
             readable = ", ".join(kind.name for kind in KINDS.values())
-            came = came or "none that is solid"
-            fail(where, f"a whole mesh of {readable} is expected, but {came} came.")
-        if len(counts) > 1:
-            fail(where, f"one kind of elements is expected, but {came} came; mesh it with tetrahedra alone.")
+            names = {name: KINDS[name].name if name in KINDS else name for name in counts}
+            came = ", ".join(f"{counts[name]} {title}" for name, title in names.items())
+            fail(
+                [str(self.path), *self._solids.values()][-1],
+                f"a whole mesh of one kind of elements is expected ({readable}), but "
+                f"{came or 'none that is solid'} came; mesh it with tetrahedra alone.",
+            )
         return KINDS[next(iter(counts))]
 
     def _places(self, members: Iterable[int], what: str) -> list[int]:

@@ -203,7 +203,7 @@ def _places(design: MatrixDesign, folder: Path) -> list[Place]:
         return read_unknowns(folder / design.unknowns)
     found: set[Place] = set()
     for name in design.stiffness_matrix:
-        own = read_matrix(folder, name).places
+        _, own = read_matrix(folder, name)
         if own is None:
             raise MeshError(
                 f"{folder / name} does not say which node and component each row is; name a file with a line "

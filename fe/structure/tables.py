@@ -1,7 +1,7 @@
 """The tables that every structure file has, whether its structure comes from a mesh or from matrices."""
 
 import itertools
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
@@ -26,14 +26,14 @@ class Part(Section):
     @model_validator(mode="before")
     @classmethod
     def _lists_as_tuples(cls, content: object) -> object:
-        return _tuples(content) if isinstance(content, dict) else content
-
-
-def _tuples(content: Any) -> Any:
-    """Return the content of a file with its lists as the tuples that a strict section takes."""
-    if isinstance(content, dict):
+        if not isinstance(content, dict):
+            return content
         return {key: _tuples(item) for key, item in content.items()}
-    return tuple(_tuples(item) for item in content) if isinstance(content, list | tuple) else content
+
+
+def _tuples(item: object) -> object:
+    """Return the lists of a file as the tuples that a strict section takes."""
+    return tuple(map(_tuples, item)) if isinstance(item, list) else item
 
 
 def _points_somewhere(vector: Vector) -> Vector:

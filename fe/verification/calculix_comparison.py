@@ -1,6 +1,6 @@
 """Structures and the wing against CalculiX on the identical mesh: statics, modes and a ring-down."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,9 +15,9 @@ from fe.structure.field import natural_frequencies
 from fe.structure.operators import Structure
 from fe.wing.operators import AffineOperators
 
-from .calculix_deck import CalculixDeck
+from .calculix_deck import CalculixDeck, Step, number_line
 from .calculix_job import read_frequencies, read_tables, run_calculix
-from .calculix_models import gauge_cells, load_lines, structure_deck, wing_deck
+from .calculix_models import STATIC, gauge_cells, load_step, structure_deck, wing_deck
 
 TEST_FORCE = 10.0
 """Upward force of the static test and before the ring-down [N]."""
@@ -85,26 +85,26 @@ class Agreement:
 
 def _agreement(
     deck: CalculixDeck,
-    loads: Mapping[str, tuple[FloatArray, Iterable[str]]],
+    loads: Mapping[str, tuple[FloatArray, Step]],
     folder: Path,
     modes: int,
     relative: Callable[[FloatArray, FloatArray], float],
     tensor: Callable[[FloatArray], FloatArray] | None = None,
 ) -> Agreement:
-    """Solve loads (n,) [N], given with their lines, and the lowest modes by both codes.
+    """Solve loads (n,) [N], given with their steps, and the lowest modes by both codes.
 
     `relative` compares strains and outputs; `tensor` gives our strains (p, 6) in the cells EGAUGES.
     """
-    structure, prints = (
-        deck.structure,
-        () if tensor is None else ("*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E"),
-    )
-    text = deck.static_steps((lines for _, lines in loads.values()), prints)
+    structure = deck.structure
+    prints = ["*NODE PRINT, NSET=NALL", "U"]
+    prints += ["*NODE PRINT, NSET=NPROBES", "U"] if len(deck.probes) else []
+    prints += ["*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E"] if tensor else []
+    text = deck.text(*(step._replace(lines=[*step.lines, *prints]) for _, step in loads.values()))
     printed = read_tables(run_calculix(text, folder, "static")) if loads else {}
     if (count := len(printed.get("NALL", ()))) != len(loads):
         raise CalculixError(f"CalculiX printed {count} static solutions instead of {len(loads)}.")
     frequencies = natural_frequencies(structure, modes, deck.values)[0]
-    theirs = read_frequencies(run_calculix(deck.frequency_step(modes), folder, "modes"))
+    theirs = read_frequencies(run_calculix(deck.text(Step(("*FREQUENCY", f"{modes}"))), folder, "modes"))
     if len(theirs) < modes:
         raise CalculixError(f"CalculiX printed {len(theirs)} frequencies instead of {modes}.")
     solve = Factorisation(structure.at(deck.values)[0]).solve
@@ -141,7 +141,9 @@ def structure_agreement(structure: Structure, folder: Path, modes: int = 6) -> A
         If CalculiX is not there, fails, or has no such element.
     """
     deck = structure_deck(structure)
-    loads = {load.name: (structure.load(load.name), load_lines(deck, load)) for load in structure.design.load}
+    loads = {
+        load.name: (structure.load(load.name), load_step(structure, load)) for load in structure.design.load
+    }
     return _agreement(deck, loads, folder, modes, _relative)
 
 
@@ -170,7 +172,7 @@ def wing_agreement(
     loads = {"tip force": operators.turn(0.0, TEST_FORCE), "lift": operators.turn(lift.load_factor)}
     return _agreement(
         deck,
-        {name: (load, deck.force_lines(load)) for name, load in loads.items()},
+        {name: (load, Step(STATIC, load)) for name, load in loads.items()},
         folder,
         modes,
         _relative_each,
@@ -265,7 +267,17 @@ def ring_down_agreement(
     for step in range(steps):
         current = integrator.advance(current, increment, (0.0, 0.0))
         ours[step] = integrator.outputs(current)[-1]
-    text = wing_deck(operators, state).ring_down_steps(operators.turn(0.0, TEST_FORCE), increment, steps)
+    load = operators.turn(0.0, TEST_FORCE)
+    text = wing_deck(operators, state).text(
+        # CalculiX balances energy in a dynamic step and wants it asked for from the first step on.
+        Step(STATIC, load, ("*EL PRINT, ELSET=E0", "ENER")),
+        Step(
+            ("*DYNAMIC, DIRECT, ALPHA=0.", number_line([increment, increment * steps])),
+            0.0 * load,
+            ("*NODE PRINT, NSET=NPROBES, FREQUENCY=1", "U"),
+            steps + 10,
+        ),
+    )
     tables, tip = read_tables(run_calculix(text, folder, "ring_down")), len(operators.gauges)
     theirs = np.array([rows[:, 1:].ravel()[tip] for rows in tables.get("NPROBES", ())])
     if len(theirs) != steps:

@@ -13,11 +13,13 @@ from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.stepwise import Boundaries, CoupledModes, exact_steps
 from discrepancy.models.system_model import State
-from fe.runtime.motion import NO_LAWS, laws_of, simulate
+from fe.runtime.modal_system import ModalSystem
+from fe.runtime.motion import NO_LAWS, laws_of
 from fe.runtime.patch import HighPass, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.runtime.sensors import SensorRecord, apply_sensors
+from fe.runtime.stepwise import Boundaries
+from tests.fe.runtime.stepping import simulate
 
 pytestmark = pytest.mark.xdist_group("compiling")
 
@@ -57,12 +59,12 @@ def test_steps_of_any_length_are_matrix_exponentials(coupled: bool) -> None:
     if coupled:
         damping = damping + generator.normal(size=(3, 3))
     frequency = np.array([0.0, 7.0, 60.0])
-    system = CoupledModes(frequency, damping)
+    system = ModalSystem(frequency, damping)
     lengths = np.array([0.01, 0.013, 0.01, 0.4])
     time = np.concatenate(([0.0], np.cumsum(lengths)))
     distinct, which = Boundaries(time, np.arange(5), lengths).alike
     np.testing.assert_array_equal(distinct[which], lengths)
-    transition, begin, end = exact_steps(system, distinct)
+    transition, begin, end = system.exact_steps(distinct)
     for k, h in enumerate(lengths):
         matrix = np.zeros((12, 12))
         matrix[:3, 3:6] = np.eye(3)

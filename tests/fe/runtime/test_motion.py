@@ -16,8 +16,8 @@ from scipy.special import ellipk
 from discrepancy.models.compiled_motion import compiled_kernel
 from fe.runtime.errors import InvalidPatchError, SolutionError
 from fe.runtime.laws.micro_slip import slip_displacements
-from fe.runtime.modal_system import ModalSystem, linear_step
-from fe.runtime.motion import NO_LAWS, Laws, ModalMotion, laws_of, simulate, static_solution, substeps_for
+from fe.runtime.modal_system import ModalSystem
+from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
 from fe.runtime.patch import (
     BoucWen,
     FreePlay,
@@ -29,6 +29,8 @@ from fe.runtime.patch import (
     Primitive,
     StiffnessDrift,
 )
+from fe.runtime.stepwise import ModalMotion, substeps
+from tests.fe.runtime.stepping import simulate
 
 W = 2.0 * np.pi  # one second for a period
 ONE = ModalSystem(np.array([W]), np.zeros((1, 1)), {"mass": np.array([1.0])})
@@ -100,12 +102,12 @@ def test_a_force_that_is_linear_between_samples_is_exact() -> None:
 @given(w=st.floats(0.0, 500.0), damping=st.floats(0.0, 2000.0), h=st.floats(1e-6, 1.0))
 @settings(max_examples=60, deadline=None)
 def test_the_linear_step_of_any_oscillator_is_the_exponential(w: float, damping: float, h: float) -> None:
-    step = linear_step(ModalSystem(np.array([w]), np.array([[damping]])), np.ones(1), np.zeros(1), h)
+    steps, _, _ = ModalSystem(np.array([w]), np.array([[damping]])).exact_steps(np.array([h]))
     unit = max(w, 1.0)
     matrix = np.array([[0.0, unit], [-w * w / unit, -damping]])
     expected = expm(matrix * h)
     scale = np.array([1.0, unit])
-    np.testing.assert_allclose(step.transition * scale / scale[:, None], expected, atol=1e-9)
+    np.testing.assert_allclose(steps[0] * scale / scale[:, None], expected, atol=1e-9)
 
 
 # ---------------------------------------------------------------- damping
@@ -528,7 +530,7 @@ def test_laws_without_magnitude_leave_the_linear_structure() -> None:
     damping, play = PowerDamping("tip", 0.0, 0, 0, 1, 1), FreePlay("tip", 10.0, 0.0)
     nothing = laws(damping, play, StiffnessDrift(0.0), PointMass(1.0, 0.5))
     assert nothing is NO_LAWS
-    assert substeps_for(WING.angular_frequency, nothing, 0.005) == 1
+    assert len(substeps(WING, nothing, np.array([0.0, 0.005])).lengths) == 1
 
 
 @pytest.mark.parametrize(

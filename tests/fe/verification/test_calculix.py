@@ -75,7 +75,7 @@ def test_calculix_that_is_not_there_is_one_sentence(monkeypatch: pytest.MonkeyPa
 
 
 def test_every_cell_has_its_nodes_material_and_axes(coarse_operators: AffineOperators) -> None:
-    lines = list(wing_deck(coarse_operators, DigitalState(stiffness_loss=DAMAGED)).definition())
+    lines = wing_deck(coarse_operators, DigitalState(stiffness_loss=DAMAGED)).text().splitlines()
     cells = len(coarse_operators.wing_mesh.cells)
     assert sum(line.startswith("*SOLID SECTION, ELSET=E") for line in lines) == cells
     assert sum(line.startswith("*ORIENTATION") for line in lines) == cells
