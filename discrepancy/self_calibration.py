@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from discrepancy.campaign.records import Campaign, IntArray
+from discrepancy.campaign.records import Campaign
+from discrepancy.campaign.sampling import IntArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import FitError, ModelError
 from discrepancy.files.document import Origin, plain

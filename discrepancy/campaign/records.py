@@ -17,7 +17,6 @@ from discrepancy.errors import CampaignDataError
 from reporting.words import brief
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from discrepancy.campaign.records import FloatArray, IntArray
+from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.sampling import IntArray
 from discrepancy.errors import FitError
 
 from .candidate import Candidate, State

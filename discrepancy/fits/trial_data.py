@@ -14,7 +14,8 @@ from math import isinf
 import numpy as np
 
 from discrepancy.campaign.noise import NoiseModel, noise_model
-from discrepancy.campaign.records import Campaign, FloatArray, IntArray, Quantity, Start, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
+from discrepancy.campaign.sampling import IntArray
 from discrepancy.models.interface import Conditions, Model
 
 FREE_MOTION = 3.0

@@ -10,7 +10,8 @@ from functools import cached_property
 
 import numpy as np
 
-from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
+from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.campaign.sampling import IntArray
 from fe.compilation import compiled
 
 from .filtered import LEAST_PRECISION

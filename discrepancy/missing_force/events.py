@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
+from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.campaign.sampling import IntArray
 
 from .event_steps import Steps, joined, without
 from .filtered import Filtered, Process

@@ -12,7 +12,8 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from discrepancy.campaign.records import FloatArray, IntArray
+from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.sampling import IntArray
 
 from . import kalman_kernels as kernels
 from .trial import SeenTrial

@@ -9,7 +9,8 @@ Shapes: n states, c channels, N samples, K columns that are filtered alike, J di
 
 import numpy as np
 
-from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
+from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.campaign.sampling import IntArray
 from fe.compilation import callable_when_compiled, compiled
 
 SMALL_PART, ORDERS = 0.25, 12

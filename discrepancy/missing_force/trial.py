@@ -17,7 +17,8 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import NoiseModel
-from discrepancy.campaign.records import BoolArray, FloatArray, IntArray, Quantity, Trial
+from discrepancy.campaign.records import BoolArray, FloatArray, Quantity, Trial
+from discrepancy.campaign.sampling import IntArray
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, moved
 from discrepancy.fits.problem import Problem
 from discrepancy.models.acting import refined
