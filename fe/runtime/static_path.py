@@ -78,12 +78,13 @@ def static_path(
         done, step = 0.0, 1.0
         while done < 1.0:
             goal = old + (linear[level] - old) * min(done + step, 1.0)
-            scale = np.max(np.abs(goal)) + np.max(np.abs(x)) + 1e-300
             for j in range(count):  # fixed during the iteration, so that the force is a smooth function
                 least[j] = parts(ports.numbers[j], ports.values[j], abs(goal[j] - x[j]))
             guess = x.copy()
             static_forces(guess, ports, memory, least, own, gradient)
-            residual = guess + compliance @ own - goal
+            yielded = compliance @ own  # what a law that pulls without a load moves
+            scale = np.max(np.abs(goal)) + np.max(np.abs(x)) + np.max(np.abs(yielded)) + 1e-300
+            residual = guess + yielded - goal
             size = np.max(np.abs(residual))
             found = size <= 1e-12 * scale
             for _ in range(60):
