@@ -38,9 +38,12 @@ void structure_solve_upper(const double *restrict factor, size_t size, double *r
 /* Replace each column of `right` (size, size) by the solution of U' y = column. */
 void structure_solve_lower_columns(const double *restrict factor, size_t size, double *restrict right);
 
-/* Eigenvalues, and unit eigenvectors as rows, of a symmetric matrix, in no order. The matrix is destroyed;
-   `work` has room for 3 size doubles. False if the iteration does not end, which finite numbers do not cause. */
-bool structure_symmetric_eigen(double *restrict matrix, size_t size, double *restrict values,
+/* The `count` lowest eigenvalues of a symmetric matrix, ascending, and their unit vectors as rows. Few of a positive
+   definite one are found several times faster than all, where they lie apart and the least of its
+   diagonal are near them. The matrix is destroyed; `values` has room for `size`, `vectors` for (size, size), `work` for
+   STRUCTURE_EIGEN_WORK(size) doubles. False if the iteration does not end, which finite numbers do not cause. */
+#define STRUCTURE_EIGEN_WORK(size) (27 * (size))
+bool structure_symmetric_eigen(double *restrict matrix, size_t size, size_t count, double *restrict values,
                           double *restrict vectors, double *restrict work);
 
 #if defined(__GNUC__) && !defined(_WIN32)
