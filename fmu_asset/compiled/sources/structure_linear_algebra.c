@@ -30,8 +30,7 @@ void structure_add(double *restrict sum, size_t size, double factor, const doubl
     }
 }
 
-STRUCTURE_WIDE
-static void add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
+static inline void inline_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
                         size_t count, const double *restrict coefficients) {
     size_t c = 0;
     for (; c + 4 <= count; c += 4) { /* four at a time, so that the sum is loaded and stored less often */
@@ -51,8 +50,17 @@ static void add_columns(double *restrict sum, size_t size, const double *restric
         c += 2;
     }
     if (c < count) {
-        structure_add(sum, size, coefficients[c], columns + c * stride);
+        const double *a = columns + c * stride, fa = coefficients[c];
+        for (size_t i = 0; i < size; ++i) {
+            sum[i] += fa * a[i];
+        }
     }
+}
+
+STRUCTURE_WIDE
+static void add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
+                        size_t count, const double *restrict coefficients) {
+    inline_add_columns(sum, size, columns, stride, count, coefficients);
 }
 
 void structure_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
@@ -96,18 +104,19 @@ void structure_sum_terms(double *restrict result, size_t size, const double *res
     structure_add_columns(result, size * size, terms, size * size, count, theta);
 }
 
-bool structure_cholesky(double *matrix, size_t size) {
+STRUCTURE_WIDE
+static bool cholesky(double *matrix, size_t size) {
     for (size_t k = 0; k < size; ++k) {
         double *row = matrix + k * size;
         /* Column k of the factor, negative, moves to the lower triangle, where it lies in one piece. */
         for (size_t i = 0; i < k; ++i) {
             row[i] = -matrix[i * size + k];
         }
-        structure_add_columns(row + k, size - k, matrix + k, size, k, row);
+        inline_add_columns(row + k, size - k, matrix + k, size, k, row);
         if (!(row[k] > 0.0)) { /* also NaN */
             return false;
         }
-        const double scale = 1.0 / sqrt(row[k]);
+        const double scale = sqrt(row[k]) * (1.0 / row[k]); /* neither waits for the other */
         row[k] = scale;
         for (size_t j = k + 1; j < size; ++j) {
             row[j] *= scale;
@@ -116,19 +125,36 @@ bool structure_cholesky(double *matrix, size_t size) {
     return true;
 }
 
-void structure_solve_lower(const double *restrict factor, size_t size, double *restrict right) {
+bool structure_cholesky(double *matrix, size_t size) { return cholesky(matrix, size); }
+
+STRUCTURE_WIDE
+static void solve_lower(const double *restrict factor, size_t size, double *restrict right) {
     for (size_t k = 0; k < size; ++k) {
-        const double *row = factor + k * size;
-        right[k] *= row[k];
-        structure_add(right + k + 1, size - k - 1, -right[k], row + k + 1);
+        const double *row = factor + k * size, found = right[k] * row[k];
+        right[k] = found;
+        for (size_t i = k + 1; i < size; ++i) {
+            right[i] -= found * row[i];
+        }
+    }
+}
+
+void structure_solve_lower(const double *restrict factor, size_t size, double *restrict right) {
+    solve_lower(factor, size, right);
+}
+
+STRUCTURE_WIDE
+static void solve_upper(const double *restrict factor, size_t size, double *restrict right) {
+    for (size_t k = size; k-- > 0;) {
+        const double *row = factor + k * size, found = right[k] * row[k];
+        right[k] = found;
+        for (size_t i = 0; i < k; ++i) { /* column k, negative */
+            right[i] += found * row[i];
+        }
     }
 }
 
 void structure_solve_upper(const double *restrict factor, size_t size, double *restrict right) {
-    for (size_t k = size; k-- > 0;) {
-        const double *row = factor + k * size;
-        right[k] = (right[k] - structure_dot(row + k + 1, right + k + 1, size - k - 1)) * row[k];
-    }
+    solve_upper(factor, size, right);
 }
 
 STRUCTURE_WIDE

@@ -27,8 +27,9 @@ void structure_multiply(double *restrict result, const double *restrict matrix, 
 void structure_sum_terms(double *restrict result, size_t size, const double *restrict terms, size_t count,
                     const double *restrict theta);
 
-/* Replace the upper triangle of a symmetric positive definite matrix A by the upper factor U, A = U' U, with one
-   over its diagonal, by which is only divided; false if A is not positive definite. The lower triangle is not read, and is used for intermediate numbers. */
+/* Replace the upper triangle of a symmetric positive definite matrix A by the upper factor U, A = U' U, with one over
+   its diagonal, by which is only divided; false if A is not positive definite. The lower triangle is not read; it then
+   holds -U', so that columns of U lie in one piece, too. */
 bool structure_cholesky(double *matrix, size_t size);
 
 /* Replace `right` (size) by the solution of U' y = right, then of U x = y, then of both. */
