@@ -6,11 +6,11 @@ from math import inf
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from discrepancy.campaign.noise_records import pre_trigger_record, with_noise
 from discrepancy.campaign.records import (
     USUAL_REGIONS,
+    BoolArray,
     Campaign,
     Channel,
     Event,
@@ -262,7 +262,7 @@ def _measured(
 
 def _readings(
     channel: ChannelSection, section: TrialSection, table: TextTable, remarks: list[str]
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+) -> tuple[FloatArray, BoolArray]:
     """Return a channel's readings and which of them are used; an empty cell is bridged and left out."""
     values = _numbers(table, channel, f"the channel {channel.name!r}", empty_allowed=True)
     used = np.isfinite(values)

@@ -13,7 +13,7 @@ from discrepancy.campaign.records import FloatArray, Hold, Quantity, Release, St
 from discrepancy.models.memory import Memory
 from fe.runtime.expression import Expression
 
-KEPT_COURSES, KEPT_TIMES = 64, 24
+KEPT_COURSES, KEPT_TIMES = 64, 48
 """Records whose courses are kept, and times at which each of them is: a search asks for the same ones."""
 _courses = Memory(KEPT_COURSES)
 
@@ -23,27 +23,33 @@ SMOOTH_PARTS = 8
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """A load over time.
+    """A load or a prescribed motion over time.
 
     Attributes
     ----------
     time, values : (N,) ndarray
         Its samples [s], [SI].
     hold : Hold
-        Between them; before the first and after the last it keeps their values.
+        Between them. A load keeps its values before the first and after the last.
+    motion : int, optional
+        What was recorded of a motion, which is `SMOOTH`: 0 displacement, 1 velocity, 2 acceleration; the
+        latter two begin at zero displacement, and the last at zero velocity. None: it is a load.
     """
 
     time: FloatArray
     values: FloatArray
     hold: Hold
+    motion: int | None = None
     _known: Memory = field(default_factory=lambda: Memory(KEPT_TIMES), init=False, repr=False)
 
     @staticmethod
-    def of(time: FloatArray, values: FloatArray, hold: Hold | None = None) -> "Course":
+    def of(
+        time: FloatArray, values: FloatArray, hold: Hold | None = None, motion: int | None = None
+    ) -> "Course":
         """Return the course of a record, the same one for the same record; linear unless it is said."""
         known = hold or Hold.LINEAR
-        key = (known, time.tobytes(), values.tobytes())
-        return _courses.get(key, lambda: Course(time, values, known))
+        key = (known, motion, time.tobytes(), values.tobytes())
+        return _courses.get(key, lambda: Course(time, values, known, motion))
 
     edges: ClassVar[tuple[float, ...]] = ()
     """Moments at which it jumps between the stamps: none."""
@@ -54,40 +60,53 @@ class Course:
         return self.hold is Hold.SMOOTH
 
     @cached_property
-    def _spline(self) -> CubicSpline:
-        return CubicSpline(self.time, self.values)
+    def _splines(self) -> list[PPoly]:
+        """The spline and its derivatives up to the third, before it those that lead to a motion."""
+        base: PPoly = CubicSpline(self.time, self.values)
+        lower = [base.antiderivative(number) for number in range(self.motion or 0, 0, -1)]
+        return [*lower, base, *(base.derivative(number) for number in range(1, 4 - len(lower)))]
 
-    def _inside(self, time: FloatArray) -> FloatArray:
-        return np.clip(time, self.time[0], self.time[-1])
+    @cached_property
+    def first_speed(self) -> float:
+        """Speed at the first stamp of a motion; zero where the record does not tell it from that.
 
-    def at(self, time: FloatArray) -> FloatArray:
-        """Return the values (N,) at times; of a held one that of just before."""
-        return self._known.get(time.tobytes(), lambda: self._at(time))
+        It does not where the slope of a parabola through the first three stamps is as far from the spline's.
+        """
+        first = self.time[:1]
+        speed = float(self.at(first, 1)[0])
+        if self.motion == 0:
+            parabola = np.polynomial.Polynomial.fit(self.time[:3], self.values[:3], 2).deriv()
+            if abs(speed) <= abs(speed - float(parabola(first[0]))):
+                return 0.0
+        return speed
 
-    def _at(self, time: FloatArray) -> FloatArray:
+    def at(self, time: FloatArray, order: int = 0) -> FloatArray:
+        """Return the values (N,) at times, of a held one that of just before, or a derivative of a spline."""
+        return self._known.get((order, time.tobytes()), lambda: self._at(time, order))
+
+    def _at(self, time: FloatArray, order: int) -> FloatArray:
         if self.hold is Hold.ZERO_ORDER:
             row = np.searchsorted(self.time, time - 1e-9 * (self.time[-1] - self.time[0]) / len(self.time))
             return np.asarray(self.values[np.maximum(row - 1, 0)])
-        if self.is_smooth:
-            return np.asarray(self._spline(self._inside(time)))
-        return np.asarray(np.interp(time, self.time, self.values))
+        if self.hold is Hold.LINEAR:
+            return np.asarray(np.interp(time, self.time, self.values))
+        inside = np.clip(time, self.time[0], self.time[-1]) if self.motion is None else time
+        return np.asarray(self._splines[order](inside))
 
-    def ends(self, time: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def ends(self, time: FloatArray, order: int = 0) -> tuple[FloatArray, FloatArray]:
         """Return the values (K,) at the begin and at the end of the steps between times (K + 1,).
 
-        Of a spline those of straight lines that have its mean effect, to fourth order in the step.
+        Of a spline, or of a derivative of it, those of straight lines that have its mean effect, to fourth
+        order in the step.
         """
-        return self._known.get(("ends", time.tobytes()), lambda: self._ends(time))
+        return self._known.get((order, "ends", time.tobytes()), lambda: self._ends(time, order))
 
-    def _ends(self, time: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _ends(self, time: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
         if self.hold is Hold.ZERO_ORDER:
             held = self.at(0.5 * (time[1:] + time[:-1]))
             return held, held
-        found = self.at(time)
-        if not self.is_smooth:
-            return found[:-1], found[1:]
-        bend = np.diff(time) ** 2 / 12.0
-        curve = self._spline(self._inside(time), 2)
+        found, bend = self.at(time, order), np.diff(time) ** 2 / 12.0
+        curve = self.at(time, order + 2) if self.is_smooth and order < 2 else np.zeros(len(time))
         return found[:-1] - bend * curve[:-1], found[1:] - bend * curve[1:]
 
 
@@ -129,56 +148,6 @@ class FormulaCourse:
         return inside * found[:-1], inside * found[1:]
 
 
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """A prescribed motion: a spline through the record of its displacement, velocity or acceleration.
-
-    Attributes
-    ----------
-    time, values : (N,) ndarray
-        Its samples [s], [SI].
-    order : int
-        0 displacement, 1 velocity, 2 acceleration; the latter two begin at zero displacement, and the last at
-        zero velocity.
-    """
-
-    time: FloatArray
-    values: FloatArray
-    order: int = 0
-    _known: Memory = field(default_factory=lambda: Memory(4 * KEPT_TIMES), init=False, repr=False)
-
-    @staticmethod
-    def of(time: FloatArray, values: FloatArray, order: int = 0) -> "Drive":
-        """Return the drive by a record, the same one for the same record."""
-        key = (order, time.tobytes(), values.tobytes())
-        return _courses.get(key, lambda: Drive(time, values, order))
-
-    @cached_property
-    def _splines(self) -> tuple[PPoly, ...]:
-        base: PPoly = CubicSpline(self.time, self.values)
-        lower = [base.antiderivative(number) for number in range(self.order, 0, -1)]
-        upper = [base.derivative(number) for number in range(1, 4 - self.order)]
-        return (*lower, base, *upper)
-
-    @cached_property
-    def first_speed(self) -> float:
-        """Speed at the first stamp; zero where the record does not tell it from that.
-
-        It does not where the slope of a parabola through the first three stamps is as far from the spline's.
-        """
-        first = self.time[:1]
-        speed = float(self.at(first, 1)[0])
-        if self.order == 0:
-            parabola = np.polynomial.Polynomial.fit(self.time[:3], self.values[:3], 2).deriv()
-            if abs(speed) <= abs(speed - float(parabola(first[0]))):
-                return 0.0
-        return speed
-
-    def at(self, time: FloatArray, order: int) -> FloatArray:
-        """Return the motion (N,), its first, second or third derivative at times."""
-        return self._known.get((order, time.tobytes()), lambda: np.asarray(self._splines[order](time)))
-
-
 Load = tuple[FloatArray, Course | FormulaCourse]
 """Row (N,) along which a load acts, and its course."""
 
@@ -195,7 +164,7 @@ class Acting:
         Constant load.
     loads : sequence of Load
         What else pushes.
-    drives : mapping of str to Drive
+    drives : mapping of str to Course
         Prescribed motions by their inputs, in the order of `LinearSystem.drives`.
     begins : Start
         How it began, where it was not released.
@@ -216,7 +185,7 @@ class Acting:
     time: FloatArray
     constant: FloatArray
     loads: Sequence[Load] = ()
-    drives: Mapping[str, Drive] = field(default_factory=dict)
+    drives: Mapping[str, Course] = field(default_factory=dict)
     begins: Start = Start.SETTLED
     initial: FloatArray = field(default_factory=lambda: np.zeros(0))
     clock: tuple[float, float] = (0.0, 0.0)

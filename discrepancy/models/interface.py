@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import ClassVar, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -183,8 +183,7 @@ class Conditions:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Response:
+class Response(NamedTuple):
     """What perfect sensors would show.
 
     Attributes

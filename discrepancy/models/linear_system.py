@@ -21,8 +21,8 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import PortedSystem
-from discrepancy.models.stepwise import CoupledModes
 from fe.runtime.errors import SolutionError
+from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, StaticSolution, static_solution
 
 HEAVY = 1e12
@@ -241,7 +241,7 @@ class LinearSystem:
         return np.hstack((self.shapes, self.lift / self.heaviness)) if len(self.drives) else self.shapes
 
     @cached_property
-    def free(self) -> CoupledModes:
+    def free(self) -> ModalSystem:
         """What is free, with ports; what couples modes by rounding only does not."""
         frequency, shapes, _ = self.modes
         damping, stiffness = (shapes.T @ matrix @ shapes for matrix in (self.damping, self.stiffness))
@@ -251,7 +251,7 @@ class LinearSystem:
             loose = bool(apart > ROUNDING * np.abs(stiffness).max(initial=1e-300))
         if np.abs(damping - diagonal).max(initial=0.0) <= ROUNDING * np.abs(diagonal).max(initial=1e-300):
             damping = diagonal
-        return CoupledModes(
+        return ModalSystem(
             frequency, damping, self._modal(self.ports), self._left_out, self.relaxation,
             stiffness if loose else None, self._modal(self.acting_rows if self.actions else {}),
         )  # fmt: skip
@@ -260,7 +260,7 @@ class LinearSystem:
         return {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
 
     @cached_property
-    def modal(self) -> CoupledModes:
+    def modal(self) -> ModalSystem:
         """What is free and the drives, with ports."""
         if not len(self.drives):
             return self.free

@@ -10,14 +10,13 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Course, Drive, FormulaCourse, Load, Shown, order_of
-from discrepancy.models.interface import Conditions, Outputs, Place, Scales
+from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, Shown, order_of
+from discrepancy.models.interface import Conditions, Outputs, Place
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped
 from discrepancy.models.lumped_rig import LumpedRig
 from discrepancy.models.lumped_sections import InputSection
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.natural_scales import natural_scales, state_sizes
 from discrepancy.models.questions import (
     LoadChange,
     check_no_inputs,
@@ -107,10 +106,6 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the least and largest station [m] of the places, None without places."""
         return (self._stations[0], self._stations[-1]) if self._stations else None
 
-    def scales(self, campaign: Campaign) -> Scales:
-        """Return the natural scales under a campaign."""
-        return natural_scales(self, campaign)
-
     # ------------------------------------------------------------ in a trial
 
     @property
@@ -161,7 +156,7 @@ class LumpedModel(DescribedModel, SystemModel):
                 trial.time, rig.constant, initial=conditions.initial, clock=conditions.clock, release=release
             )
         recorded = self._recorded(trial)
-        loads, drives, references = list[Load](), dict[str, Drive](), dict[str, Sequence[Load]]()
+        loads, drives, references = list[Load](), dict[str, Course](), dict[str, Sequence[Load]]()
         offsets = (*conditions.offset, *(0.0,) * len(recorded))
         for item, offset in zip(recorded, offsets, strict=False):
             following = {
@@ -183,7 +178,7 @@ class LumpedModel(DescribedModel, SystemModel):
                         "`reference` and `hold` out."
                     )
                 values = rig.factors.get(item.name, 1.0) * values
-                drives[item.name] = Drive.of(trial.time, values, order_of(item.quantity))
+                drives[item.name] = Course.of(trial.time, values, Hold.SMOOTH, order_of(item.quantity))
                 continue
             if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
                 values = change.changed(values, item.values)
@@ -192,7 +187,7 @@ class LumpedModel(DescribedModel, SystemModel):
         reactions = {item.reaction for item in self.description.output} - {item.name for item in recorded}
         for name, section in self._inputs.items():
             if section.quantity.moving and name in reactions:
-                drives[name] = Drive.of(trial.time, np.zeros(len(trial.time)))
+                drives[name] = Course.of(trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, 0)
         return Acting(
             trial.time, rig.constant, loads, drives, trial.begins, conditions.initial.ravel(),
             conditions.clock, references,
@@ -293,7 +288,7 @@ class LumpedModel(DescribedModel, SystemModel):
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of the state at the begin of a driven or forced trial."""
-        return state_sizes(self, campaign, trial, Conditions(prior_mean(campaign, self.declared)))
+        return self.state_sizes(campaign, trial, Conditions(prior_mean(campaign, self.declared)))
 
     # ------------------------------------------------------------ ports
 

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 
 from discrepancy.campaign.records import FloatArray, Hold, RecordedInput, Trial
@@ -110,7 +109,7 @@ def _slope(course: Course, trial: Trial, section: ControllerSection) -> Course:
             "model, or hold = 'linear' in the campaign."
         )
     if course.hold is Hold.SMOOTH:
-        return Course(course.time, CubicSpline(course.time, course.values)(course.time, 1), Hold.SMOOTH)
+        return Course(course.time, course.at(course.time, 1), Hold.SMOOTH)
     slopes = np.diff(course.values) / np.diff(course.time)
     return Course(course.time, np.append(slopes, slopes[-1]), Hold.ZERO_ORDER)
 

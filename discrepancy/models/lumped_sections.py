@@ -27,12 +27,11 @@ from reporting.section import shown
 def _numbers(value: object) -> tuple[float, ...]:
     """Return one number, or a list of them, as numbers: with one unknown nobody needs brackets."""
     found = value if isinstance(value, list | tuple) else (value,)
-    numbers = [isinstance(item, int | float) and not isinstance(item, bool) for item in found]
-    if not numbers or not all(numbers) or not all(map(isfinite, found)):
+    if not found or not all(type(item) in (int, float) and isfinite(item) for item in found):
         raise ValueError(
             f"a list of finite numbers such as [1.0, 0.0] is expected, or one number, but {shown(value)} came"
         )
-    return tuple(float(item) for item in found)
+    return tuple(map(float, found))
 
 
 def _rows(value: object, *, diagonal: bool = False) -> tuple[tuple[float, ...], ...]:
@@ -41,12 +40,12 @@ def _rows(value: object, *, diagonal: bool = False) -> tuple[tuple[float, ...], 
         if isinstance(value, list | tuple) and value and all(isinstance(row, list | tuple) for row in value):
             return tuple(map(_numbers, value))
         numbers = _numbers(value)
-        return tuple(map(tuple, np.diag(numbers).tolist())) if diagonal else (numbers,)
     except ValueError:
         raise ValueError(
             "a matrix of finite numbers by rows such as [[2.0, -1.0], [-1.0, 2.0]] is expected, or its "
             f"diagonal, or one number, but {shown(value)} came"
         ) from None
+    return tuple(map(tuple, np.diag(numbers).tolist())) if diagonal else (numbers,)
 
 
 Vector = Annotated[tuple[Number, ...], BeforeValidator(_numbers)]

@@ -10,9 +10,8 @@ from scipy.linalg import inv
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Shown, shown_rows
-from discrepancy.models.interface import NO_PATCH, ModelParameter, Outputs, Place, Scales
+from discrepancy.models.interface import NO_PATCH, ModelParameter, Outputs, Place
 from discrepancy.models.memory import Memory
-from discrepancy.models.natural_scales import natural_scales
 from discrepancy.models.questions import (
     LoadChange,
     check_no_inputs,
@@ -62,10 +61,6 @@ class StructuralModel(SystemModel):
     def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
         """Return the load (n,) at whose place stiffness and modal mass are the natural ones."""
         return self.force_row(self.reference, parameters, NO_PATCH)
-
-    def scales(self, campaign: Campaign) -> Scales:
-        """Return the natural scales under a campaign, by the structure without a patch."""
-        return natural_scales(self, campaign)
 
     def acting(self, case: Case) -> Acting:
         """Return what acts in a trial: a force at a place, lift, or what holds it until it is let go."""

@@ -1,7 +1,8 @@
 """Motion of a linear system with internal forces at its ports: after a release, or under what acts.
 
 A model makes a `SecondOrderSystem` from its parameters and the structural part of a patch, keeps it, and asks
-it for a `Motion`, which says what outputs show. Between the stamps the linear part is exact (`stepwise`).
+it for a `Motion`, which says what outputs show. Between the stamps the linear part is exact
+(`fe.runtime.stepwise`).
 """
 
 from collections.abc import Sequence
@@ -13,11 +14,12 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray, Release, Start
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown
-from discrepancy.models.compiled_motion import Steps
+from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Response
 from discrepancy.models.linear_system import LinearSystem, solved
-from discrepancy.models.stepwise import Begin, Boundaries, advance, exact_steps, free_motion, substeps
-from fe.runtime.motion import Laws, ModalMotion
+from fe.runtime.motion import Laws
+from fe.runtime.motion_arrays import Steps
+from fe.runtime.stepwise import Begin, Boundaries, ModalMotion, advance, steps_under, substeps
 
 
 @dataclass(frozen=True)
@@ -192,19 +194,15 @@ class SecondOrderSystem(LinearSystem):
         if memory is not None and laws.spans:
             begin = begin._replace(memory=laws.filled(memory, acts))
         held = int(np.searchsorted(times, 0.0)) if release.at_rest else 0
-        stamps, at_first = times[held:], np.zeros(len(laws)) if begin.memory is None else begin.memory[:, 2]
-        if (laws.linear and not self.modal.coupled) or held == len(times):
-            none = np.zeros((len(stamps), len(laws)))
-            parts = [*free_motion(self.modal, q, v, stamps), none, none]
-        else:
-            if stamps[0] < 0.0:
-                begin = self._backwards(q, v, -float(stamps[0]))
-            found = self._followed(acting, laws, 0.0, stamps, begin, refinement)
-            parts = [found.q, found.v, found.port_forces, found.lagged]
-        if held:
-            still = zip((q, v, at_first, at_first), parts, strict=True)
-            parts = [np.vstack((np.tile(first, (held, 1)), part)) for first, part in still]
-        q, v, forces, lagged = parts
+        stamps = times[held:] if held < len(times) else np.zeros(1)  # which nobody looks at
+        if stamps[0] < 0.0:
+            begin = self._backwards(q, v, -float(stamps[0]))
+        found = self._followed(acting, laws, 0.0, stamps, begin, refinement)
+        felt = np.zeros(len(laws)) if begin.memory is None else begin.memory[:, 2]
+        parts = zip((q, v, felt, felt), (found.q, found.v, found.port_forces, found.lagged), strict=True)
+        q, v, forces, lagged = (
+            np.vstack((np.tile(still, (held, 1)), part))[: len(times)] for still, part in parts
+        )
         return Motion(self, acting, times, q, v, forces, lagged, laws, held, holding)
 
     # ------------------------------------------------------------ begin
@@ -219,11 +217,10 @@ class SecondOrderSystem(LinearSystem):
         ]
         (q, v), memory = np.zeros((2, count + len(drive))), None
         if acting.begins is Start.SETTLED:
-            parts = (float(course.at(first)[0]) * row for row, course in acting.loads)
-            load = sum(parts, acting.constant)
+            load = acting.load_at(first, np.eye(len(self.mass)))
             if load.any() or drive.any():
                 acts = laws.act_at(float(first[0]))
-                found = self.static(load[None], laws.only(acts) if laws.spans else laws, drive=drive)
+                found = self.static(load, laws.only(acts) if laws.spans else laws, drive=drive)
                 amounts = self.shapes.T @ (self.mass @ (found.values[0] - self.lift @ drive))
                 q[:moving], v[moving:count] = amounts[:moving], amounts[moving:]
                 memory = None if found.memory is None else laws.filled(found.memory, acts)
@@ -280,7 +277,7 @@ class SecondOrderSystem(LinearSystem):
 
     def _backwards(self, q: FloatArray, v: FloatArray, duration: float) -> Begin:
         """Return the state a duration [s] earlier, without internal forces."""
-        step = exact_steps(self.free, np.array([duration]))[0][0]
+        step = self.free.exact_steps(np.array([duration]))[0][0]
         state = np.linalg.solve(step, np.concatenate((q, v)))
         return Begin(state[: len(q)], state[len(q) :])
 
@@ -314,46 +311,22 @@ class SecondOrderSystem(LinearSystem):
         feed = np.zeros((len(boundaries.time), len(laws)))
         if self.truncated and len(laws) and acting.loads:
             feed = acting.load_at(boundaries.time, self.residual(self.port_rows(laws).T))
-        return advance(self.modal, laws, self._steps(acting, boundaries, feed), begin)
+        return advance(self.modal, laws, self._steps(acting, boundaries, feed), begin, compiled_kernel())
 
     def _steps(self, acting: Acting, boundaries: Boundaries, feed: FloatArray) -> Steps:
         """Return the steps of all coordinates; the drives follow from nothing but what is prescribed."""
-        begin, end = self._modal_forces(acting, boundaries)
-        (lengths, which), time = boundaries.alike, boundaries.time
-        exact, *by = exact_steps(self.free, lengths)
-        count, whole = len(self.angular_frequency), begin.shape[1]
-        moved = sum(
-            forces @ part[0].T if len(lengths) == 1 else np.einsum("knm,km->kn", part[which], forces)
-            for part, forces in zip(by, (begin[:, :count], end[:, :count]), strict=True)
-        )
-        transition, push = np.zeros((len(exact), 2, whole, 2, whole)), np.zeros((len(begin), 2, whole))
-        transition[:, :, :count, :, :count] = exact.reshape(len(exact), 2, count, 2, count)
-        push[..., :count] = moved.reshape(len(push), 2, count)
-        for number, drive in enumerate(acting.drives.values()):
-            for order in range(2):
-                push[:, order, count + number] = self.heaviness * drive.at(time[1:], order)
-        size = 2 * whole
-        return Steps(
-            transition.reshape(-1, size, size), lengths, which, push.reshape(-1, size), begin, end, feed,
-            time, boundaries.sample,
-        )  # fmt: skip
-
-    def _modal_forces(self, acting: Acting, boundaries: Boundaries) -> tuple[FloatArray, FloatArray]:
-        """Return the modal forces (K, M + P) at both ends of each step, those of splines made good for it.
-
-        Straight lines through f - h^2/12 f'' have the mean effect of the curve to fourth order in the step h.
-        """
-        count = len(self.angular_frequency)
-        begin, end = acting.ends(boundaries.time, self.shapes)
+        time, count, heaviness = boundaries.time, len(self.angular_frequency), self.heaviness
+        begin, end = acting.ends(time, self.all_shapes)
+        for number, drive in enumerate(acting.drives.values(), count):
+            for order, part in enumerate(self.driven(number - count)):
+                for side, amount in zip((begin, end), drive.ends(time, order), strict=True):
+                    side[:, :count] -= np.outer(amount, part)
+                    side[:, number] = heaviness * amount
+        steps = steps_under(self.modal, boundaries, begin, end, feed)
         if acting.drives:
-            begin, end = (np.pad(side, ((0, 0), (0, len(acting.drives)))) for side in (begin, end))
-        bend = boundaries.lengths**2 / 12.0
-        for number, drive in enumerate(acting.drives.values()):
-            parts = self.driven(number)
-            for side, time in ((begin, boundaries.time[:-1]), (end, boundaries.time[1:])):
-                w = [drive.at(time, order) for order in range(4)]
-                side[:, :count] -= np.outer(w[0] - bend * w[2], parts[0])
-                side[:, :count] -= np.outer(w[1] - bend * w[3], parts[1])
-                side[:, :count] -= np.outer(w[2], parts[2])
-                side[:, count + number] = self.heaviness * w[2]
-        return begin, end
+            steps = steps._replace(transition=steps.transition.copy())
+        for number, drive in enumerate(acting.drives.values(), count):
+            for order, coordinate in enumerate((number, begin.shape[1] + number)):
+                steps.transition[:, coordinate] = 0.0
+                steps.push[:, coordinate] = heaviness * drive.at(time[1:], order)
+        return steps

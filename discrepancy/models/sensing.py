@@ -1,22 +1,20 @@
 """What the channels of a trial would show: the response of a model, seen through the sensors of a patch."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
+from discrepancy.models.high_pass import filtered_record
 from discrepancy.models.interface import Conditions, Model, Response
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive
+from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive, SensorRotation
 from fe.runtime.sensors import (
     SensorRecord,
     apply_sensors,
     check_channels,
     clock_of,
-    needs_components,
-    uses_sensors,
 )
 
 
@@ -55,22 +53,26 @@ def observe(
         (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
     )
     patch = (_by_channels(model.sensors, campaign) + patch).in_trial(trial.name)
-    if not uses_sensors(patch):
+    if not len(patch.of(*SENSORS)):
         return model.respond(trial, outputs, patch, conditions)
-    rate, zero = clock_of(patch)
-    components = needs_components(patch)
+    (rate, zero), components = clock_of(patch), len(patch.of(SensorRotation)) > 0
     if rate or zero or components:
         clock = (conditions.clock[0] + rate, conditions.clock[1] + zero)
         conditions = replace(conditions, clock=clock, components=components)
     bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SENSORS)))
-    loggers = logger_rates(campaign, trial, patch)
-
-    def responded(stamped: Trial, given: Conditions) -> Response:
-        return model.respond(stamped, outputs, bare, given)
-
-    response = (
-        responded(trial, conditions) if loggers is None else _logged(trial, conditions, loggers, responded)
-    )
+    # inputs at their true times, each channel sampled by its own clock
+    inputs, channels = _logger_rates(campaign, trial, patch)
+    stamped, clock = trial, conditions.clock
+    if inputs:
+        stamped = replace(trial, time=(1.0 + inputs) * trial.time)
+    rates, found = np.unique(channels).tolist(), list[Response]()
+    for rate in rates:
+        beside = (rate - inputs) / (1.0 + inputs) * (1.0 + clock[0]) + clock[0]
+        found.append(model.respond(stamped, outputs, bare, replace(conditions, clock=(beside, clock[1]))))
+    response, own = found[0], [channels == rate for rate in rates]
+    if len(found) > 1:
+        each = zip(*found, strict=True)
+        response = Response._make(None if part[0] is None else np.select(own, part) for part in each)
     if components and (response.transverse is None or response.shear is None):
         raise ModelError(
             f"{model.name} gives no transverse and shear strain, so a turned gauge cannot be computed: leave "
@@ -79,57 +81,26 @@ def observe(
     return observe_response(campaign, trial, patch, conditions, response)
 
 
-def logger_rates(campaign: Campaign, trial: Trial, patch: ModelPatch) -> tuple[float, FloatArray] | None:
-    """Return the clock rates of a trial's inputs, and of its channels (C,), less one; None if all are right.
+def _logger_rates(campaign: Campaign, trial: Trial, patch: ModelPatch) -> tuple[float, FloatArray]:
+    """Return the clock rates of a trial's inputs, and of its channels (C,), less one.
 
     Raises
     ------
     CatalogueError
         If a patch names a logger that the campaign does not have.
     """
-    clocks = [item for item in patch if isinstance(item, LoggerClock)]
-    if not clocks or not trial.is_dynamic:
-        return None
     inputs, channels = 1.0, np.ones(len(trial.channels))
-    for item in clocks:
-        if item.logger == EVERY_CHANNEL:
-            inputs, channels = inputs * (1.0 + item.rate), channels * (1.0 + item.rate)
-            continue
-        members = campaign.loggers.get(item.logger)
-        if members is None:
-            known = ", ".join(map(repr, campaign.loggers)) or "one for all, '*'"
-            raise CatalogueError(f"The campaign has no logger {item.logger!r}; it has {known}.")
+    for item in (item for item in patch if isinstance(item, LoggerClock) and trial.is_dynamic):
+        members = (*trial.channels, *trial.input_names)
+        if item.logger != EVERY_CHANNEL:
+            if item.logger not in campaign.loggers:
+                known = ", ".join(map(repr, campaign.loggers)) or "one for all, '*'"
+                raise CatalogueError(f"The campaign has no logger {item.logger!r}; it has {known}.")
+            members = campaign.loggers[item.logger]
         channels = channels * np.array([1.0 + item.rate * (name in members) for name in trial.channels])
-        if any(name in members for name in trial.input_names):
+        if item.logger == EVERY_CHANNEL or any(name in members for name in trial.input_names):
             inputs *= 1.0 + item.rate
     return inputs - 1.0, channels - 1.0
-
-
-def _logged(
-    trial: Trial,
-    conditions: Conditions,
-    loggers: tuple[float, FloatArray],
-    responded: Callable[[Trial, Conditions], Response],
-) -> Response:
-    """Return the response with the inputs at their true times, each channel sampled by its own clock."""
-    inputs, channels = loggers
-    stamped = replace(trial, time=(1.0 + inputs) * trial.time) if inputs else trial
-    rates = np.unique(channels)
-    found = []
-    for rate in rates.tolist():
-        beside = (1.0 + rate) / (1.0 + inputs) * (1.0 + conditions.clock[0]) - 1.0
-        beside = 0.0 if abs(beside) < 1e-15 else beside
-        found.append(responded(stamped, replace(conditions, clock=(beside, conditions.clock[1]))))
-    own = [channels == rate for rate in rates]
-
-    def merged(parts: list[FloatArray | None]) -> FloatArray | None:
-        given = [part for part in parts if part is not None]
-        return np.asarray(np.select(own, given)) if len(given) == len(parts) else None
-
-    return Response(
-        np.asarray(np.select(own, [one.values for one in found])),
-        *(merged([getattr(one, part) for one in found]) for part in ("rates", "transverse", "shear")),
-    )
 
 
 def _by_channels(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
@@ -156,32 +127,17 @@ def observe_response(
     For callers that keep the response of a structure and try sensors on it. The clock of the patch must be in
     the response.
     """
-    try:
-        check_channels(patch, [(name, channel.quantity.value) for name, channel in campaign.channels.items()])
-        record = record_of(campaign, trial, conditions)
-        parts = (response.values, response.rates, response.transverse, response.shear)
-        return Response(*apply_sensors(patch, record, *parts))
-    except InvalidPatchError as cause:
-        raise CatalogueError(str(cause)) from cause
-
-
-def record_of(campaign: Campaign, trial: Trial, conditions: Conditions) -> SensorRecord:
-    """Return the record of a trial as `fe.runtime.sensors` wants it.
-
-    The release amplitude is the nominal one; where the motion starts from the static shape, times
-    (1 + initial[0, 0]).
-    """
-    release = 1.0
+    release = 1.0  # the nominal one; where the motion starts from the static shape, as that is scaled
     if trial.kind is TrialKind.RINGDOWN and trial.release is not None:
         release = trial.release.displacement
         if trial.release.at_rest and len(conditions.initial):
             release *= 1.0 + float(conditions.initial[0, 0])
-    return SensorRecord(
-        channels=tuple((name, campaign.channels[name].quantity.value) for name in trial.channels),
-        kind=trial.kind.value,
-        time=trial.time,
-        start=trial.start,
-        temperature=trial.temperature,
-        run=trial.run,
-        release=release,
-    )
+    record = SensorRecord(
+        tuple((name, campaign.channels[name].quantity.value) for name in trial.channels), trial.kind.value,
+        trial.time, trial.start, trial.temperature, trial.run, release,
+    )  # fmt: skip
+    try:
+        check_channels(patch, [(name, channel.quantity.value) for name, channel in campaign.channels.items()])
+        return Response(*apply_sensors(patch, record, *response, filtered=filtered_record))
+    except InvalidPatchError as cause:
+        raise CatalogueError(str(cause)) from cause

@@ -8,7 +8,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from discrepancy.campaign.records import Campaign, FloatArray, Start, Trial
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown
 from discrepancy.models.interface import (
@@ -20,9 +20,12 @@ from discrepancy.models.interface import (
     PortedSystem,
     PortScale,
     Response,
+    Scales,
+    campaign_sizes,
 )
 from discrepancy.models.linear_system import Resting, at_rest
-from discrepancy.models.questions import check_carried, check_parameters, laws_at
+from discrepancy.models.natural_scales import PortSizes
+from discrepancy.models.questions import check_carried, check_parameters, laws_at, prior_mean
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws
@@ -270,3 +273,105 @@ class SystemModel(Model):
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         case = self.case(trial, conditions, self.patch.in_trial(trial.name))
         return self.moved(case, ports=self.missing).at_ports
+
+    # ------------------------------------------------------------ sizes
+
+    def state_sizes(self, campaign: Campaign, trial: Trial, conditions: Conditions) -> FloatArray:
+        """Return natural sizes (L,) of a state at the begin of a trial: of motion from rest, and of data."""
+        moved = self.moved(self.case(trial, conditions), self.laws(conditions.parameters), still=True)
+        rig = moved.system
+        count, moving = len(rig.angular_frequency), rig.moving
+        x, v = (np.max(np.abs(item[:, :count]), axis=0) for item in (moved.q, moved.velocity))
+        pace = np.maximum(rig.angular_frequency[:moving], 1.0 / float(trial.time[-1] - trial.time[0]))
+        n, shapes = rig.displacements, rig.shapes
+        channels = [campaign.channels[name] for name in trial.channels]
+        outputs = tuple((channel.output, channel.quantity) for channel in channels)
+        shown = self.shown(self.case(trial, conditions), outputs, moved.acting)
+        for column, item in enumerate(shown):
+            kept = trial.values[trial.used[:, column], column] - item.constant
+            if item.reaction is not None or item.speed is not None or not kept.size:
+                continue
+            size = float(np.max(np.abs(kept)))
+            of_u, of_x = item.row[:n] @ shapes[:n, :moving], item.row[n:] @ shapes[n:, moving:]
+            if np.any(of_u):
+                at = size / float(np.linalg.norm(of_u)) / pace**item.order
+                x[:moving], v[:moving] = np.maximum(x[:moving], at), np.maximum(v[:moving], at * pace)
+            if np.any(of_x):
+                v[moving:] = np.maximum(v[moving:], size / float(np.linalg.norm(of_x)))
+        found = np.concatenate((x[:moving], v))
+        return np.asarray(np.where(found > 0.0, found, max(float(found.max(initial=0.0)), 1e-9)))
+
+    def scales(self, campaign: Campaign) -> Scales:
+        """Return the natural scales of a model under a campaign, at its prior mean and without a patch.
+
+        A structure that springs hold, which only forces move from rest, has scales of its own; for others
+        what acts and moves is the measure.
+        """
+        trials, parameters = campaign.trials, prior_mean(campaign, self.declared)
+        state, names = State(parameters, (0.0,) * len(self.regions)), self.ports()
+        system, rest, laws = self.system(state), self.rest(state), self.laws(parameters)
+        held = system.mode_count is not None and all(
+            trial.kind is not TrialKind.DRIVEN and trial.begins is Start.SETTLED for trial in trials
+        )
+        driven_only = all(trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN for trial in trials)
+        ports = PortSizes(names, self.system(state._replace(closed=False)), driven_only=driven_only)
+        rows = np.array([self.port_rows[name] for name in names])
+        conditions, largest = Conditions(parameters), [0.0, 0.0, 0.0]
+        for trial in trials:
+            case, fitted = self.case(trial, conditions), trial.is_dynamic and not trial.held_out
+            if not trial.is_dynamic or trial.kind is TrialKind.RINGDOWN:
+                if held and names:
+                    position = self._held(case) @ rows.T
+                    ports.see(position, 0.0 * position, fitted)
+                continue
+            try:
+                motion = self.moved(case, laws)
+            except ModelError:
+                motion = self.moved(case, laws, still=True)
+            if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
+                initial = self.state_sizes(campaign, trial, conditions)
+                motion = self.moved(self.case(trial, replace(conditions, initial=initial)), laws)
+            pushes = [
+                float(np.max(np.abs(trial.values[trial.used[:, column], column]), initial=0.0))
+                for column, name in enumerate(trial.channels)
+                if campaign.channels[name].quantity in (Quantity.FORCE, Quantity.TORQUE)
+            ]
+            ports.add(motion, max(pushes, default=0.0), fitted)
+            shapes = motion.system.all_shapes[: self.displacements].T
+            loads = motion.acting.load_at(motion.time, np.eye(len(motion.acting.constant)))
+            for number, item in enumerate((motion.q @ shapes, motion.velocity @ shapes, loads)):
+                largest[number] = max(largest[number], float(np.max(np.abs(item), initial=0.0)))
+        (peak, speed, weight), sizes = largest, campaign_sizes(campaign)
+        shape, still = np.zeros(0), [0.0] * len(names)
+        if held:
+            row, shape = self.reference_load(parameters, campaign), system.shapes[:, 0]
+            shape = shape if system.basis is None else system.basis @ shape
+            still = [1.0 / float(own @ rest.resting(own[None])[0]) for own in rows]
+            frequency, participation = float(system.angular_frequency[0]), float(row @ shape) ** 2
+            mass = 1.0 / participation if participation else float(np.trace(system.mass))
+            stiffness = 1.0 / float(row @ rest.resting(row[None])[0])
+        else:
+            elastic = system.angular_frequency[system.angular_frequency > 0.0]
+            usual = speed / peak if peak > 0.0 < speed else 1.0 / sizes["duration"]
+            frequency = float(elastic[0]) if len(elastic) else usual
+            mass = float(np.trace(system.mass)) / max(len(system.mass), 1)
+            stiffness = weight / peak if peak > 0.0 < weight else mass * frequency**2
+        found = {name: ports.scale(number, still[number]) for number, name in enumerate(names)}
+        return Scales(
+            **{**sizes, "force": sizes["force"] or weight},
+            length=self.length or max(map(abs, self.stations() or (0.0,))) or 1.0,
+            tip_stiffness=stiffness,
+            modal_mass=mass,
+            angular_frequency=frequency,
+            ports=found | self.spread(found, shape),
+        )
+
+    def _held(self, case: Case) -> FloatArray:
+        """Return the displacements (L, N) in a trial at rest, or from which a ring-down is released."""
+        rest, acting = self.rest(case.state), self.acting(case)
+        if acting.release is None:
+            units, amounts = acting.levels
+            return np.asarray(amounts @ rest.resting(units))
+        row, release = acting.release
+        shape = rest.resting(row[None])
+        return np.asarray(release.displacement / float(row @ shape[0]) * shape)

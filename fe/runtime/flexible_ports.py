@@ -10,17 +10,17 @@ into the FMU.
 """
 
 from .laws import advance, dry, pull
-from .motion_arrays import FIRST_PARTS, Acting, Course, IntArray, Ports, State, add, at_port
+from .motion_arrays import FIRST_PARTS, Acting, IntArray, Ports, State, add, at_port
 
 
-def begin_flexible(ports: Ports, acting: Acting, state: State, course: Course) -> None:
+def begin_flexible(ports: Ports, acting: Acting, state: State, h: float, known: bool) -> None:
     """Take the laws on flexible ports to the first sample; without a known memory they follow at once."""
     count = len(ports.numbers)
-    at_once = 1.0 if ports.relaxation == 0.0 or not course.known else 0.0
+    at_once = 1.0 if ports.relaxation == 0.0 or not known else 0.0
     for port in range(count):
         if acting.leader[port] != port:  # one law for each flexible port
             continue
-        y = ports.feed[0, port] * course.load[0] + ports.feed[1, port] + state.memory[port, 3]
+        y = ports.feed[port] + state.memory[port, 3]
         y += at_port(ports.rows, port, state.q)
         springs = -1
         for j in range(count):
@@ -33,11 +33,11 @@ def begin_flexible(ports: Ports, acting: Acting, state: State, course: Course) -
                 springs = j if springs < 0 else springs
                 acting.springs[j] = springs
                 last = state.memory[j, 1]
-                state.current[j], _ = pull_of(ports, state, j, last, course.h, FIRST_PARTS)
+                state.current[j], _ = pull_of(ports, state, j, last, h, FIRST_PARTS)
         x = y
         if springs >= 0:
             r = at_once * ports.flexibility[port]
-            x = settle_port(springs, acting.springs, ports, state, y, r, course.h, FIRST_PARTS)
+            x = settle_port(springs, acting.springs, ports, state, y, r, h, FIRST_PARTS)
         for j in range(count):
             if acting.leader[j] != port:
                 continue
@@ -45,7 +45,7 @@ def begin_flexible(ports: Ports, acting: Acting, state: State, course: Course) -
                 arrive(ports, state, j, x, FIRST_PARTS)
                 if at_once == 1.0:
                     state.memory[j, 2] = state.current[j]
-            elif not course.known:
+            elif not known:
                 state.memory[j, 1] = x
 
 
@@ -55,7 +55,7 @@ def arrive(ports: Ports, state: State, j: int, x: float, least: int) -> None:
     state.memory[j, 1] = x
 
 
-def carry_flexible(ports: Ports, acting: Acting, state: State, load: float, h: float) -> None:
+def carry_flexible(ports: Ports, acting: Acting, state: State, h: float) -> None:
     """Carry the laws on flexible ports to the step's end, and give the second half of their impulse."""
     count = len(ports.numbers)
     keep = ports.relaxation / (ports.relaxation + h)
@@ -63,7 +63,7 @@ def carry_flexible(ports: Ports, acting: Acting, state: State, load: float, h: f
     for port in range(count):
         if acting.leader[port] != port:
             continue
-        y = ports.feed[0, port] * load + ports.feed[1, port] + keep * state.memory[port, 3]
+        y = ports.feed[port] + keep * state.memory[port, 3]
         y += at_port(ports.rows, port, state.q)
         for j in range(count):
             if acting.leader[j] == port:

@@ -1,4 +1,4 @@
-"""A linear structure in few modes, its Rayleigh damping, and its exact step under a force linear in time.
+"""A linear system in few coordinates, Rayleigh damping, and its exact step under a force linear in time.
 
 The damping is that of Kapteyn et al. 2021, eqs. (17) and (18).
 
@@ -8,8 +8,8 @@ NumPy and relative imports only: this file is copied into the FMU.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, NamedTuple
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -80,12 +80,12 @@ def rayleigh_coefficients(
 
 @dataclass(frozen=True)
 class ModalSystem:
-    """A linear structure in mass-normalised modal coordinates: q'' + D q' + W^2 q = forces.
+    """A linear system in mass-normalised coordinates: q'' + D q' + S q = forces.
 
     Attributes
     ----------
     angular_frequency : (M,) ndarray
-        Undamped angular frequencies [rad/s]; zero is allowed.
+        Undamped angular frequencies [rad/s]; zero is allowed, and is that of coordinates of first order.
     damping : (M, M) ndarray
         D [1/s]; diagonal 2 zeta w for modal damping.
     ports : mapping of str to (M,) ndarray
@@ -96,6 +96,10 @@ class ModalSystem:
     relaxation : float
         What is left out follows a force with this lag, the factor of damping in proportion to the stiffness
         [s].
+    stiffness_matrix : (M, M) ndarray, optional
+        S [1/s^2]; the squared angular frequencies where it is left out.
+    actions : mapping of str to (M,) ndarray
+        Rows along which laws at ports act, where that is not how they see; empty: everywhere the same.
     """
 
     angular_frequency: FloatArray
@@ -103,6 +107,8 @@ class ModalSystem:
     ports: Mapping[str, FloatArray] = field(default_factory=dict)
     flexibility: FloatArray | None = None
     relaxation: float = 0.0
+    stiffness_matrix: FloatArray | None = None
+    actions: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @cached_property
     def stiffness(self) -> FloatArray:
@@ -111,49 +117,42 @@ class ModalSystem:
 
     @cached_property
     def coupled(self) -> bool:
-        """Whether damping couples the modes."""
-        return bool(np.any(self.damping != np.diag(np.diag(self.damping))))
+        """Whether damping or stiffness couples the coordinates."""
+        return self.stiffness_matrix is not None or bool(
+            np.any(self.damping != np.diag(np.diag(self.damping)))
+        )
+
+    @cached_property
+    def whole(self) -> FloatArray:
+        """S, a matrix where no coordinate is coupled too."""
+        return np.diag(self.stiffness) if self.stiffness_matrix is None else self.stiffness_matrix
+
+    @cached_property
+    def paces(self) -> FloatArray:
+        """Frequencies, or magnitudes (2M,) of the eigenvalues [1/s] of the motion that are not zero."""
+        count = len(self.angular_frequency)
+        if self.stiffness_matrix is None and np.all(self.angular_frequency > 0.0):
+            return self.angular_frequency
+        matrix = np.block([[np.zeros((count, count)), np.eye(count)], [-self.whole, -self.damping]])
+        found = np.abs(np.linalg.eigvals(matrix))
+        return np.asarray(found[found > 1e-7 * np.max(found, initial=0.0)])
+
+    def exact_steps(self, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return its `exact_step` for lengths (S,): transitions, and the parts of the forces."""
+        matrix = self.whole if self.coupled else self.stiffness
+        return _kept_steps(matrix.tobytes(), self.damping.tobytes(), lengths.tobytes())
 
 
-class LinearStep(NamedTuple):
-    """Exact linear step: y(h) = `transition` y + `begin` f(0) + `end` f(h) + `constant`, y = (q, v)."""
-
-    transition: FloatArray
-    begin: FloatArray
-    end: FloatArray
-    constant: FloatArray
-
-
-def linear_step(system: ModalSystem, shape: FloatArray, constant: FloatArray, h: float) -> LinearStep:
-    """Return the exact step of the linear system under a force that is linear in time.
-
-    Parameters
-    ----------
-    system : ModalSystem
-        The structure.
-    shape, constant : (M,) ndarray
-        b of the force and the constant modal force.
-    h : float
-        Duration [s].
-
-    Returns
-    -------
-    LinearStep
-        Arrays over (q, v).
-    """
-    key = (system.stiffness.tobytes(), system.damping.tobytes(), h)
-    if key not in _STEPS:
-        if len(_STEPS) >= MOST_STEPS:
-            _STEPS.pop(next(iter(_STEPS)))
-        stiffness = system.stiffness if not system.coupled else np.diag(system.stiffness)
-        _STEPS[key] = tuple(part[0] for part in exact_step(stiffness, system.damping, np.array([h])))
-    transition, begin, end = _STEPS[key]
-    return LinearStep(transition, begin @ shape, end @ shape, (begin + end) @ constant)
+@lru_cache(maxsize=16)  # the same system is often moved again with other laws
+def _kept_steps(
+    stiffness: bytes, damping: bytes, lengths: bytes
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    own, matrix = np.frombuffer(stiffness), np.frombuffer(damping)
+    count = math.isqrt(len(matrix))
+    own = own if len(own) == count else own.reshape(count, count)
+    return exact_step(own, matrix.reshape(count, count), np.frombuffer(lengths))
 
 
-_STEPS: dict[tuple[bytes, bytes, float], tuple[FloatArray, ...]] = {}
-MOST_STEPS = 64
-"""Linear steps that are kept, because the same structure is often moved again with other laws."""
 _TAYLOR = 14
 
 

@@ -1,6 +1,6 @@
-"""Motion of a structure in few modes with internal forces: laws from a patch, steps, static solution.
+"""Internal forces at ports: laws from a patch, and the static solution under them.
 
-`fe.runtime.motion_kernel` has the equation and the method. NumPy and relative imports only: this file is
+`fe.runtime.stepwise` moves a structure under them. NumPy and relative imports only: this file is
 copied into the FMU. The loops run as plain Python here; `discrepancy.models.compiled_motion` has the same
 functions compiled, to be given as `kernel`.
 """
@@ -17,8 +17,8 @@ from .arrays import BoolArray, FloatArray, IntArray
 from .errors import InvalidPatchError, SolutionError
 from .laws import LAWS
 from .laws.interface import HEAD, PARAMETERS, PortForce
-from .modal_system import ModalSystem, linear_step
-from .motion_arrays import Course, Linear, Ports, Samples, State
+from .modal_system import ModalSystem
+from .motion_arrays import Ports
 from .motion_kernel import integrate
 from .patch import ModelPatch, StiffnessDrift
 from .planform_forces import place_of
@@ -33,9 +33,6 @@ class Kernel(NamedTuple):
 
 
 PLAIN = Kernel(integrate, static_path)
-
-SLOWEST_PHASE, FASTEST_PHASE = 0.05, 0.4
-"""Longest substep with laws: radians of the slowest and of the fastest mode that it may span."""
 
 
 @dataclass(frozen=True)
@@ -117,9 +114,8 @@ class Laws:
     def at(
         self,
         rows: FloatArray,
-        flexibility: FloatArray,
-        relaxation: float,
-        feed: FloatArray,
+        flexibility: FloatArray | None = None,
+        relaxation: float = 0.0,
         acts: FloatArray | None = None,
     ) -> Ports:
         """Return the laws at ports, for the loops; what is given is that of `Ports`."""
@@ -129,9 +125,9 @@ class Laws:
             self.of_speed,
             self.values,
             self.elements,
-            flexibility,
+            np.zeros(len(self)) if flexibility is None else flexibility,
             float(relaxation),
-            feed,
+            np.zeros(len(self)),
             rows if acts is None else acts,
         )
 
@@ -217,121 +213,6 @@ def port_flexibility(system: ModalSystem, laws: Laws) -> FloatArray:
     return np.where(stiff | (own <= 0.0), 0.0, own)
 
 
-def substeps_for(angular_frequency: FloatArray, laws: Laws, interval: float) -> int:
-    """Return how many steps an interval [s] is divided into; one without laws, where the step is exact."""
-    if laws.linear or interval <= 0.0:
-        return 1
-    moving = angular_frequency[angular_frequency > 0.0]
-    if not len(moving):
-        return 8
-    phase = max(float(moving.min()) / SLOWEST_PHASE, float(moving.max()) / FASTEST_PHASE) * interval
-    return max(1, int(np.ceil(phase)))
-
-
-class ModalMotion(NamedTuple):
-    """Motion at samples: `q`, `v` (N, M), `port_forces` (N, J) of the laws, their `memory` at the end.
-
-    `lagged` (N, J) are the forces as what the modes leave out follows them.
-    """
-
-    q: FloatArray
-    v: FloatArray
-    port_forces: FloatArray
-    memory: FloatArray
-    lagged: FloatArray
-
-
-def simulate(
-    system: ModalSystem,
-    laws: Laws,
-    *,
-    q: FloatArray,
-    v: FloatArray,
-    force: FloatArray,
-    interval: float,
-    shape: FloatArray | None = None,
-    constant: FloatArray | None = None,
-    memory: FloatArray | None = None,
-    feed: FloatArray | None = None,
-    start: float = 0.0,
-    refinement: int = 1,
-    substeps: int | None = None,
-    kernel: Kernel | None = None,
-) -> ModalMotion:
-    """Return the motion from a given state.
-
-    Parameters
-    ----------
-    system : ModalSystem
-        The linear structure.
-    laws : Laws
-        Its internal forces.
-    q, v : (M,) ndarray
-        State at the first sample.
-    force : (N,) ndarray
-        Applied force at the samples [N]; linear between them.
-    interval : float
-        Between samples [s].
-    shape, constant : (M,) ndarray, optional
-        Modal shape of the force, and a constant modal force; zero if left out.
-    memory : (J, 5 + E) ndarray, optional
-        Of the laws, as `static_solution` or an earlier call returned it. Left out: each law has been loaded
-        from zero to its first position without turning back.
-    feed : (2, J) ndarray, optional
-        What the modes leave out of the positions of the laws' ports by a force of 1 N, and by the constant
-        force; zero if left out.
-    start : float
-        Time of the first sample since the beginning of the record, for stiffness drift [s].
-    refinement : int
-        Steps are this many times smaller than usual.
-    substeps : int, optional
-        For each interval; by default from `substeps_for`.
-    kernel : mapping, optional
-        Compiled functions, see `discrepancy.models.compiled_motion`.
-
-    Returns
-    -------
-    ModalMotion
-        At the samples, the first included.
-    """
-    modes = len(system.angular_frequency)
-    shape = np.zeros(modes) if shape is None else np.ascontiguousarray(shape, dtype=np.float64)
-    constant = np.zeros(modes) if constant is None else np.ascontiguousarray(constant, dtype=np.float64)
-    if substeps is None:
-        substeps = substeps_for(system.angular_frequency, laws, interval)
-    substeps *= refinement
-    h = interval / substeps
-    step = linear_step(system, shape, constant, h)
-    count = len(force)
-    result = ModalMotion(
-        np.empty((count, modes)),
-        np.empty((count, modes)),
-        np.empty((count, len(laws))),
-        laws.memory() if memory is None else memory.copy(),
-        np.empty((count, len(laws))),
-    )
-    linear = Linear(
-        *step,
-        system.coupled,
-        system.stiffness,
-        np.ascontiguousarray(system.damping),
-        shape,
-        constant,
-        laws.rate,
-    )
-    fed = np.zeros((2, len(laws))) if feed is None else np.ascontiguousarray(feed, dtype=np.float64)
-    state = State(
-        np.array(q, dtype=np.float64), np.array(v, dtype=np.float64), result.memory, np.zeros(len(laws))
-    )
-    ports = laws.at(laws.rows(system.ports, modes), port_flexibility(system, laws), system.relaxation, fed)
-    course = Course(
-        np.ascontiguousarray(force, dtype=np.float64), float(start), h, substeps, memory is not None
-    )
-    out = Samples(result.q, result.v, result.port_forces, result.lagged)
-    (kernel or PLAIN).integrate(tuple(linear), tuple(ports), tuple(course), tuple(state), tuple(out))
-    return result
-
-
 class StaticSolution(NamedTuple):
     """Static states: `positions` and `forces` (L, J) of the laws' ports, their `memory` after the last."""
 
@@ -382,7 +263,7 @@ def static_solution(
         level = (kernel or PLAIN).static_path(
             linear,
             np.ascontiguousarray(compliance, dtype=np.float64),
-            tuple(laws.at(np.zeros((len(laws), 0)), np.zeros(len(laws)), 0.0, np.zeros((2, len(laws))))),
+            tuple(laws.at(np.zeros((len(laws), 0)))),
             memory,
             np.zeros(len(laws)) if start is None else np.ascontiguousarray(start, dtype=np.float64),
             positions,

@@ -5,6 +5,8 @@ NumPy and relative imports only: this file is copied into the FMU.
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from .arrays import FloatArray as FloatArray
 from .arrays import IntArray as IntArray
 
@@ -18,35 +20,73 @@ STILL, SPEED, POSITION, FLEXIBLE = 0, 1, 2, 3
 """How a law acts: not, its port being still; on the modes, by speed or position; on what they leave out."""
 
 
-class Linear(NamedTuple):
-    """The linear structure and its exact step (`fe.runtime.modal_system`).
+class Steps(NamedTuple):
+    """K steps, M modes, J laws; boundary k is the begin of step k.
 
     Attributes
     ----------
-    transition, begin, end, constant : (2M, 2M), (2M,), (2M,), (2M,) ndarray
-        Step of (q, v): from the state, from the force at its begin and at its end [1/N], from the constant.
-    coupled : bool
-        Whether `transition` couples modes.
+    transition : (S, 2M, 2M) ndarray
+        Of (q, v), one for each distinct length.
+    length : (S,) ndarray
+        [s].
+    which : (K,) ndarray of int
+        Length of each step.
+    push : (K, 2M) ndarray
+        What the applied forces add to (q, v) in each step.
+    begin, end : (K, M) ndarray
+        Modal forces at the begin and at the end of each step.
+    feed : (K + 1, J) ndarray
+        What loads add to the positions of the laws' ports beyond the modes.
+    time : (K + 1,) ndarray
+        Of the boundaries [s].
+    sample : (N,) ndarray of int
+        Boundary of each sample, the first at 0.
+    """
+
+    transition: FloatArray
+    length: FloatArray
+    which: IntArray
+    push: FloatArray
+    begin: FloatArray
+    end: FloatArray
+    feed: FloatArray
+    time: FloatArray
+    sample: IntArray
+
+    def between(self, first: int, last: int) -> "Steps":
+        """Return the steps between two boundaries, each of which is a sample."""
+        steps, boundaries = slice(first, last), slice(first, last + 1)
+        return self._replace(
+            which=self.which[steps], push=self.push[steps], begin=self.begin[steps], end=self.end[steps],
+            feed=self.feed[boundaries], time=self.time[boundaries], sample=np.arange(last - first + 1),
+        )  # fmt: skip
+
+
+class Linear(NamedTuple):
+    """The linear structure, and its exact motion in the step that is taken.
+
+    Attributes
+    ----------
     stiffness : (M,) ndarray
         Squared angular frequencies [1/s^2].
     damping : (M, M) ndarray
         D [1/s].
-    shape, load : (M,) ndarray
-        b and c.
+    coupled : bool
+        Whether `transition` couples modes.
     rate : float
         Stiffness drift r [1/s].
+    transition, push, begin, end : (2M, 2M), (2M,), (M,), (M,) ndarray
+        Those of the step in `Steps`.
     """
 
-    transition: FloatArray
-    begin: FloatArray
-    end: FloatArray
-    constant: FloatArray
-    coupled: bool
     stiffness: FloatArray
     damping: FloatArray
-    shape: FloatArray
-    load: FloatArray
+    coupled: bool
     rate: float
+    transition: FloatArray
+    push: FloatArray
+    begin: FloatArray
+    end: FloatArray
 
 
 class Ports(NamedTuple):
@@ -67,8 +107,8 @@ class Ports(NamedTuple):
         row have the same, or zero, which leaves a law to the modes.
     relaxation : float
         beta of that flexibility [s].
-    feed : (2, J) ndarray
-        What the modes do not hold of the ports' positions by the force f = 1, and by the constant force.
+    feed : (J,) ndarray
+        What loads add to the ports' positions beyond the modes, at the end of the step that is taken.
     acts : (J, M) ndarray
         Row along which each law acts; that of its port, but for flows from one store into another.
     """
@@ -152,30 +192,8 @@ class Before(NamedTuple):
     freed: FloatArray
 
 
-class Course(NamedTuple):
-    """What is integrated over.
-
-    Attributes
-    ----------
-    load : (N,) ndarray
-        Force f at the samples [N].
-    start, h : float
-        Time of the first sample and length of a substep [s].
-    substeps : int
-        For each sample.
-    known : bool
-        Whether the memory is that of a state; otherwise each law is loaded from zero to its first position.
-    """
-
-    load: FloatArray
-    start: float
-    h: float
-    substeps: int
-    known: bool
-
-
 class Samples(NamedTuple):
-    """Results at the samples: `q`, `v` (N, M), `forces`, `lagged` (N, J), as in `motion.ModalMotion`."""
+    """Results at the samples: `q`, `v` (N, M), `forces`, `lagged` (N, J), as in `stepwise.ModalMotion`."""
 
     q: FloatArray
     v: FloatArray

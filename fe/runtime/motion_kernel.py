@@ -1,7 +1,7 @@
 """Motion of a few modes with internal forces at ports: loops over numbers, and nothing else.
 
-q'' + D q' + W^2 (1 + r t) q = b f(t) + c - sum_j p_j F_j(p_j . q, p_j . v, memory_j). The linear part is
-advanced exactly (matrix exponential, force linear between samples); internal forces are split off
+q'' + D q' + W^2 (1 + r t) q = f(t) - sum_j p_j F_j(p_j . q, p_j . v, memory_j). The linear part is advanced
+exactly, in steps of any lengths that come from `fe.runtime.stepwise`; internal forces are split off
 symmetrically (Strang 1968): laws of speed, laws of position, linear motion, laws of position, laws of speed.
 Laws of speed have a closed form. Where friction turns over inside a step, the impulse and its first moment
 are corrected for the moment of the turn; where it holds, the port is held in place by the impulses that this
@@ -35,59 +35,67 @@ from .motion_arrays import (
     STILL,
     Acting,
     Before,
-    Course,
     FloatArray,
     Linear,
     Ports,
     Samples,
     State,
+    Steps,
     Unnamed,
     add,
     at_port,
 )
 
 
-def integrate(linear: Unnamed, ports: Unnamed, course: Unnamed, state: Unnamed, out: Unnamed) -> None:
-    """Integrate over the samples of a course; the state is changed in place, `out` is filled.
+def integrate(
+    steps: Unnamed, linear: Unnamed, known: bool, ports: Unnamed, state: Unnamed, out: Unnamed
+) -> None:
+    """Integrate over steps; the state is changed in place, `out` is filled.
 
-    Given are the fields of `Linear`, `Ports`, `Course`, `State` and `Samples` without their names: numba
-    takes three times as long for a tuple with names as for one without.
+    Given are the fields of `Steps`, `Linear`, `Ports`, `State` and `Samples` without their names: numba takes
+    three times as long for a tuple with names as for one without. `known`: the memory is that of a state;
+    otherwise each law is loaded from zero to its first position.
     """
-    named_state, named_ports = State(*state), Ports(*ports)
-    modes, count = len(named_state.q), len(named_ports.numbers)
+    go, body, samples = Steps(*steps), Linear(*linear), Samples(*out)
+    laws, moving = Ports(*ports), State(*state)
+    modes, count = len(moving.q), len(laws.numbers)
     none, whole = np.zeros((7, count)), np.zeros((3, count), dtype=np.int64)
     acting = Acting(
         whole[0], whole[1], whole[2], none[0], none[1], none[2], np.zeros((count, modes)),
         np.zeros((count, 2 * modes)),
     )  # fmt: skip
     before = Before(np.zeros(modes), np.zeros(modes), np.zeros(2 * modes), none[3], none[4], none[5], none[6])
-    follow(Linear(*linear), named_ports, Course(*course), named_state, acting, before, Samples(*out))
-
-
-def follow(
-    linear: Linear, ports: Ports, course: Course, state: State, acting: Acting, before: Before, out: Samples
-) -> None:
-    """Integrate with room to work in; no array is made from here on."""
-    h, substeps = course.h, course.substeps
-    find_routes(ports, acting)
-    begin_on_modes(linear, ports, acting, state, course.known)
-    begin_flexible(ports, acting, state, course)
-    driven = False
-    for sample in range(len(course.load)):
-        driven = driven or course.load[sample] != 0.0
-    for sample in range(len(course.load)):
-        for part in range(substeps if sample > 0 else 0):
-            time = course.start + ((sample - 1) * substeps + part) * h
-            first, change = course.load[sample - 1], course.load[sample] - course.load[sample - 1]
-            load_begin = first + change * (part / substeps)
-            load_end = first + change * (part + 1) / substeps
-            first_half(linear, ports, acting, state, before, time, h)
-            move(linear, state, before.room, load_begin, load_end, driven)
-            hold(ports, acting, state, before, h)
-            carry_flexible(ports, acting, state, load_end, h)
-            second_half(linear, ports, acting, state, before, time, h, load_begin, load_end)
-        time = course.start + sample * substeps * h
-        record(linear, ports, acting, state, course.load[sample], time, sample, out)
+    h = go.length[go.which[0]]
+    laws.feed[:] = go.feed[0]
+    body.transition[:, :] = go.transition[go.which[0]]
+    body.end[:] = go.begin[0]
+    find_routes(laws, acting)
+    begin_on_modes(body, laws, acting, moving, known)
+    begin_flexible(laws, acting, moving, h, known)
+    record(body, laws, acting, moving, go.time[0], 0, samples)
+    sample, last = 1, go.which[0]
+    for k in range(len(go.which)):
+        if go.which[k] != last:
+            last = go.which[k]
+            h = go.length[last]
+            body.transition[:, :] = go.transition[last]
+            for j in range(count):
+                if acting.route[j] == SPEED:
+                    find_answer(body, laws, acting, j)
+        for m in range(modes):
+            body.begin[m] = go.begin[k, m]
+            body.end[m] = go.end[k, m]
+            body.push[m] = go.push[k, m]
+            body.push[modes + m] = go.push[k, modes + m]
+        laws.feed[:] = go.feed[k + 1]
+        first_half(body, laws, acting, moving, before, go.time[k], h)
+        move(body, moving, before.room)
+        hold(laws, acting, moving, before, h)
+        carry_flexible(laws, acting, moving, h)
+        second_half(body, laws, acting, moving, before, go.time[k], h)
+        if k + 1 == go.sample[sample]:
+            record(body, laws, acting, moving, go.time[k + 1], sample, samples)
+            sample += 1
 
 
 def find_routes(ports: Ports, acting: Acting) -> None:
@@ -181,16 +189,13 @@ def first_half(
             state.v[m] -= half * linear.rate * time * linear.stiffness[m] * state.q[m]
 
 
-def move(
-    linear: Linear, state: State, new: FloatArray, load_begin: float, load_end: float, driven: bool
-) -> None:
+def move(linear: Linear, state: State, new: FloatArray) -> None:
     """Move the linear structure; exact."""
     modes = len(state.q)
     if linear.coupled:
         for m in range(modes):
             i = modes + m
-            total_q = linear.constant[m] + linear.begin[m] * load_begin + linear.end[m] * load_end
-            total_v = linear.constant[i] + linear.begin[i] * load_begin + linear.end[i] * load_end
+            total_q, total_v = linear.push[m], linear.push[i]
             for k in range(modes):
                 total_q += linear.transition[m, k] * state.q[k] + linear.transition[m, modes + k] * state.v[k]
                 total_v += linear.transition[i, k] * state.q[k] + linear.transition[i, modes + k] * state.v[k]
@@ -203,14 +208,9 @@ def move(
         for m in range(modes):
             i = modes + m
             total_q = linear.transition[m, m] * state.q[m] + linear.transition[m, i] * state.v[m]
-            total_q += linear.constant[m]
             total_v = linear.transition[i, m] * state.q[m] + linear.transition[i, i] * state.v[m]
-            total_v += linear.constant[i]
-            if driven:
-                total_q += linear.begin[m] * load_begin + linear.end[m] * load_end
-                total_v += linear.begin[i] * load_begin + linear.end[i] * load_end
-            state.q[m] = total_q
-            state.v[m] = total_v
+            state.q[m] = total_q + linear.push[m]
+            state.v[m] = total_v + linear.push[i]
 
 
 def hold(ports: Ports, acting: Acting, state: State, before: Before, h: float) -> None:
@@ -231,8 +231,7 @@ def hold(ports: Ports, acting: Acting, state: State, before: Before, h: float) -
 
 
 def second_half(
-    linear: Linear, ports: Ports, acting: Acting, state: State, before: Before, time: float, h: float,
-    load_begin: float, load_end: float,
+    linear: Linear, ports: Ports, acting: Acting, state: State, before: Before, time: float, h: float
 ) -> None:  # fmt: skip
     """Give the modes the second half of the impulse; look for friction that turned over."""
     half = 0.5 * h
@@ -264,7 +263,7 @@ def second_half(
         end = speed - before.lost[j]
         can_hold = holds(ports.numbers[j], ports.values[j])
         if can_hold and before.freed[j] == 0.0 and before.speed[j] != 0.0 and before.speed[j] * end <= 0.0:
-            slopes = slopes_at_port(linear, ports, state, before, j, time, h, load_begin, load_end)
+            slopes = slopes_at_port(linear, ports, state, before, j, time, h)
             turn_over(ports, acting, state, before, j, now, slopes, h)
         else:
             after = kick(ports.numbers[j], ports.values[j], speed, now, half, False)
@@ -275,16 +274,14 @@ def second_half(
 
 
 def slopes_at_port(
-    linear: Linear, ports: Ports, state: State, before: Before, j: int, time: float, h: float,
-    load_begin: float, load_end: float,
+    linear: Linear, ports: Ports, state: State, before: Before, j: int, time: float, h: float
 ) -> tuple[float, float]:  # fmt: skip
     """Return the acceleration of a port at both ends of a step, as friction of the first sign has it."""
     modes, count = len(state.q), len(ports.numbers)
     at_begin = -2.0 * before.lost[j] / h
     at_end = -2.0 * before.lost[j] / h
     for m in range(modes):
-        first = linear.shape[m] * load_begin + linear.load[m]
-        last = linear.shape[m] * load_end + linear.load[m]
+        first, last = linear.begin[m], linear.end[m]
         first -= linear.stiffness[m] * (1.0 + linear.rate * time) * before.q[m]
         last -= linear.stiffness[m] * (1.0 + linear.rate * (time + h)) * state.q[m]
         for k in range(modes):
@@ -319,8 +316,7 @@ def turn_over(
 
 
 def record(
-    linear: Linear, ports: Ports, acting: Acting, state: State, load: float, time: float, sample: int,
-    out: Samples,
+    linear: Linear, ports: Ports, acting: Acting, state: State, time: float, sample: int, out: Samples
 ) -> None:  # fmt: skip
     """Write state and forces at a sample."""
     modes, count = len(state.q), len(ports.numbers)
@@ -337,7 +333,7 @@ def record(
         if state.memory[j, 0] == 1.0:  # what it takes to hold the port
             need = 0.0
             for m in range(modes):
-                push = linear.shape[m] * load + linear.load[m]
+                push = linear.end[m]
                 push -= linear.stiffness[m] * (1.0 + linear.rate * time) * state.q[m]
                 for k in range(modes):
                     push -= linear.damping[m, k] * state.v[k]

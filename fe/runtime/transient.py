@@ -3,7 +3,7 @@
 Kapteyn et al. 2021, eq. (12), in modal coordinates: q'' + 2 zeta omega q' + omega^2 q = shape^T f, one
 equation for each mode, because Rayleigh damping (17) leaves the modes uncoupled; exact for loads that are
 held. Modes that are not kept follow the load without delay (static correction). Laws at ports couple the
-modes: `fe.runtime.motion` steps them, and omitted modes follow their forces with the lag of the damping.
+modes: `fe.runtime.stepwise` steps them, and omitted modes follow their forces with the lag of the damping.
 
 NumPy and relative imports only: this file is copied into the FMU. Laws are imported where there are any.
 """
@@ -22,7 +22,12 @@ from .errors import InvalidStateError
 from .modal_system import ModalSystem, exact_step, rayleigh_damping_ratio
 
 if TYPE_CHECKING:
-    from .motion import Laws, ModalMotion
+    from .motion import Laws
+    from .stepwise import ModalMotion
+
+
+INSTANT = 1e-6
+"""Duration of a step of which only the begin is looked at [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,17 +229,17 @@ class ModalIntegrator:
     def _moved(
         self, state: TransientState, acting: FloatArray, duration: float, time: float
     ) -> "ModalMotion":
-        """Return the motion under laws and loads (L,) that are held, at the begin and, if any, the end."""
-        from .motion import simulate
+        """Return the motion under laws and loads (L,) that are held, at the begin and the end."""
+        from .stepwise import Begin, advance, steps_under, substeps
 
         assert self._laws is not None
+        boundaries = substeps(self._system, self._laws, np.array([0.0, duration]))
+        held = np.tile(self._participation[:, : self._loads] @ acting, (len(boundaries.lengths), 1))
         beyond = self.structure.loads[:, self._loads :].T @ (self._left_out[:, : self._loads] @ acting)
-        return simulate(
-            self._system, self._laws, q=state.displacement, v=state.velocity,
-            force=np.zeros(2 if duration else 1), interval=duration or 1.0, memory=state.memory, start=time,
-            constant=self._participation[:, : self._loads] @ acting,
-            feed=np.stack((np.zeros(len(beyond)), beyond)),
-        )  # fmt: skip
+        feed = np.tile(beyond, (len(boundaries.time), 1))
+        steps = steps_under(self._system, boundaries, held, held, feed)
+        begin = Begin(state.displacement, state.velocity, state.memory)
+        return advance(self._system, self._laws, steps._replace(time=time + steps.time), begin)
 
     def settled(self, load: npt.ArrayLike, before: TransientState | None = None) -> TransientState:
         """Return the equilibrium, without motion, under loads (L,) that are reached from those `before`.
@@ -313,7 +318,7 @@ class ModalIntegrator:
             # of the ports' positions; fades after the release
             rest.memory[:, 3] = held * (self.structure.loads[:, self._loads :].T @ self._left_out[:, point])
         state = self._let_go(rest, held, point)
-        felt = self._moved(state, rest.load, 0.0, 0.0)
+        felt = self._moved(state, rest.load, INSTANT, 0.0)
         return TransientState(state.displacement, state.velocity, state.load, felt.lagged[0], state.memory)
 
     def _let_go(self, rest: TransientState, held: float, point: int) -> TransientState:

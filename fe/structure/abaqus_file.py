@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from fe.elements.kinds import KINDS
-from fe.runtime.errors import MeshError
 from reporting.section import shown
-from reporting.text_file import read_text
 
-from .deck import FLAT, GLOBAL, Deck, System, fail, frame, included, real, whole, words_of
+from .deck import FLAT, GLOBAL, Deck, System, fail, frame, lines_of, real, whole, words_of
 
+_COMMENT = re.compile(r"^\s*\*\*.*")
+_INCLUDE = re.compile(r"\s*\*\s*INCLUDE\s*,\s*INPUT\s*=(.*)", re.IGNORECASE)
 _VARIANT = re.compile(r"(C3D\d+)(?:[IMR]?H?|T)")
 """Reduced, hybrid and other variants are the same cells; they are integrated here as the plain ones."""
 _FLAT = {
@@ -55,7 +55,7 @@ def read_abaqus(path: Path) -> Deck:
     """
     words = words_of("abaqus")
     deck, system = Deck(path, words), GLOBAL
-    for block in _blocks((path,)):
+    for block in _blocks(path):
         if block.keyword.endswith(" SECTION"):
             deck.sections[block.parameters.get("ELSET", "").casefold()] = block.where
         if block.keyword not in words.read:
@@ -77,14 +77,10 @@ def read_abaqus(path: Path) -> Deck:
     return deck
 
 
-def _blocks(files: tuple[Path, ...]) -> Iterator[_Block]:
+def _blocks(path: Path) -> Iterator[_Block]:
     found: list[tuple[str, list[str], list[tuple[str, list[str]]]]] = []
-    lines = read_text(files[-1], MeshError, what="mesh file", otherwise="latin-1").splitlines()
-    for number, line in enumerate(lines, start=1):
+    for where, line in lines_of((path,), _COMMENT, _INCLUDE):
         text = line.strip()
-        where = f"{files[-1]}, line {number}"
-        if not text or text.startswith("**"):
-            continue
         if text.startswith("*"):
             found.append((where, [text[1:]], []))
         elif found and not found[-1][2] and found[-1][1][-1].endswith(","):  # the parameters go on
@@ -95,10 +91,7 @@ def _blocks(files: tuple[Path, ...]) -> Iterator[_Block]:
         keyword, *rest = (" ".join(part.split()) for part in "".join(head).split(","))
         pairs = (part.partition("=") for part in rest if part)
         given = {key.strip().upper(): value.strip().strip('"') for key, _, value in pairs}
-        if keyword.upper() != "INCLUDE":
-            yield _Block(where, keyword.upper(), given, data)
-        else:
-            yield from _blocks(included(where, files, given.get("INPUT", "")))
+        yield _Block(where, keyword.upper(), given, data)
 
 
 def _system(block: _Block) -> System:

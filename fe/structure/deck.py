@@ -5,7 +5,7 @@ Last the coordinate systems of decks: points that are given by radii and angles,
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
@@ -21,6 +21,7 @@ from fe.elements.kinds import KINDS, ElementKind
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
 from reporting.section import shown
+from reporting.text_file import read_text
 from reporting.toml_file import parse_toml
 
 from .mesh import StructureMesh
@@ -70,12 +71,23 @@ def fail(where: str, sentence: str) -> NoReturn:
     raise MeshError(f"{where}: {sentence}")
 
 
-def included(where: str, files: tuple[Path, ...], name: str) -> tuple[Path, ...]:
-    """Return files that include one another and one that the last of them includes; none may come twice."""
-    inner = (files[-1].parent / name).resolve()
-    if inner in files:
-        fail(where, f"{inner} includes itself.")
-    return (*files, inner)
+def lines_of(
+    files: tuple[Path, ...], comment: re.Pattern[str], include: re.Pattern[str]
+) -> Iterator[tuple[str, str]]:
+    """Yield where each line of the last of files that include one another stands, and its text.
+
+    Comments and empty lines are left out; the lines of a file whose name `include` finds stand in its place.
+    """
+    text = read_text(files[-1], MeshError, what="mesh file", otherwise="latin-1")
+    for number, line in enumerate(text.splitlines(), start=1):
+        where, line = f"{files[-1]}, line {number}", comment.sub("", line).rstrip()
+        if found := include.fullmatch(line):
+            inner = (files[-1].parent / found[1].strip(" '\"")).resolve()
+            if inner in files:
+                fail(where, f"{inner} includes itself.")
+            yield from lines_of((*files, inner), comment, include)
+        elif line:
+            yield where, line
 
 
 def whole(where: str, text: str) -> int:
@@ -197,19 +209,21 @@ class Deck:
             for name, members in self._sets["NSET"].values()
         }
         cell_sets, face_sets = {}, {}
+        facets = {name: [*self._of_surface(rows, kind, solid)] for name, rows in self.surfaces.items()}
         for name, members in self._sets["ELSET"].values():
             flat = self._flat(name, [number for number in members if number not in cell])
             inside = _once([cell[number] for number in members if number in cell])
             if len(inside) or not flat:
                 cell_sets[name] = inside
-                continue
-            node_sets.setdefault(name, kept[_once([node for _, nodes in flat for node in nodes])])
-            corners = (np.sort(kept[nodes[: FLAT[what][1]]]) for what, nodes in flat)
-            if faces := frozenset(tuple(face.tolist()) for face in corners if len(face) > 2):
-                face_sets[name] = faces
-        for name, rows in self.surfaces.items():
-            face_sets[name], nodes = self._faces(rows, kind, kept[cells], cell)
-            node_sets.setdefault(name, nodes)
+            else:
+                facets.setdefault(name, flat)
+        for name, found in facets.items():
+            faces = [
+                (kept[self._places(nodes, f"the set {name!r}")].tolist(), count) for nodes, count in found
+            ]
+            node_sets.setdefault(name, _once([node for nodes, _ in faces for node in nodes]))
+            if corners := frozenset(tuple(sorted(nodes[:count])) for nodes, count in faces if count > 2):
+                face_sets[name] = corners
         return StructureMesh(
             source=source,
             kind=kind,
@@ -233,15 +247,15 @@ class Deck:
     def _kind(self) -> ElementKind:
         """Return the one kind of the solid elements."""
         counts = Counter(kind for kind, _ in self.elements.values() if kind not in FLAT)
-        names = {name: KINDS[name].name if name in KINDS else name for name in counts}
-        came = ", ".join(f"{counts[name]} {title}" for name, title in names.items())
-        where = [str(self.path), *self._solids.values()][-1]
-        if not counts or not counts.keys() <= KINDS.keys():
+        if len(counts) != 1 or not counts.keys() <= KINDS.keys():
             readable = ", ".join(kind.name for kind in KINDS.values())
-            came = came or "none that is solid"
-            fail(where, f"a whole mesh of {readable} is expected, but {came} came.")
-        if len(counts) > 1:
-            fail(where, f"one kind of elements is expected, but {came} came; mesh it with tetrahedra alone.")
+            names = {name: KINDS[name].name if name in KINDS else name for name in counts}
+            came = ", ".join(f"{counts[name]} {title}" for name, title in names.items())
+            fail(
+                [str(self.path), *self._solids.values()][-1],
+                f"a whole mesh of one kind of elements is expected ({readable}), but "
+                f"{came or 'none that is solid'} came; mesh it with tetrahedra alone.",
+            )
         return KINDS[next(iter(counts))]
 
     def _places(self, members: Iterable[int], what: str) -> list[int]:
@@ -255,8 +269,8 @@ class Deck:
     def _place(self) -> dict[int, int]:
         return {number: index for index, number in enumerate(self.nodes)}
 
-    def _flat(self, name: str, members: list[int]) -> list[tuple[str, list[int]]]:
-        """Return types and nodes of those elements of a set that only name nodes and faces."""
+    def _flat(self, name: str, members: list[int]) -> list[tuple[list[int], int]]:
+        """Return nodes, of which so many are corners, of elements of a set that only name nodes and faces."""
         lost = next((number for number in members if number not in self.elements), None)
         if lost is not None:
             fail(str(self.path), f"the set {name!r} names element {lost}, which is not there.")
@@ -266,28 +280,22 @@ class Deck:
                 f"{len(members)} bars, membranes or shells of the set {name!r} have a section and bear loads"
             )
             fail(section, f"{what}, but solids alone are read; delete one or the other.")
-        own = ((number, *self.elements[number]) for number in members)
-        return [(kind, self._places(nodes, f"element {number}")) for number, kind, nodes in own]
+        return [(nodes, FLAT[kind][1]) for kind, nodes in map(self.elements.__getitem__, members)]
 
-    def _faces(
-        self, rows: list[tuple[str, str, str]], kind: ElementKind, cells: IntArray, cell: dict[int, int]
-    ) -> tuple[frozenset[tuple[int, ...]], IntArray]:
-        """Return the faces of a surface, by their corners, and its nodes."""
-        found: set[tuple[int, ...]] = set()
-        nodes: set[int] = set()
+    def _of_surface(
+        self, rows: list[tuple[str, str, str]], kind: ElementKind, solid: dict[int, list[int]]
+    ) -> Iterator[tuple[list[int], int]]:
+        """Yield the nodes of the faces of a surface, and how many of them, the first, are corners."""
         for where, member, face in rows:
-            label = face.upper()
+            label, last = face.upper(), len(kind.faces)
             number = int(label[1:]) if re.fullmatch("S[1-6]", label) else 0
-            if not 1 <= number <= len(kind.faces):
-                last = len(kind.faces)
+            if not 1 <= number <= last:
                 fail(where, f"a face S1 to S{last} of {kind.name} is expected, but {shown(face)} came.")
-            members = set(self.named("ELSET", where, member))
-            for lost in members - cell.keys():
-                fail(where, f"the surface names element {lost}, which is not a solid element.")
-            inside = cells[[cell[element] for element in members]]
-            found.update(map(tuple, np.sort(inside[:, kind.faces[number - 1]], axis=1).tolist()))
-            nodes.update(inside[:, kind.face_nodes[number - 1]].ravel().tolist())
-        return frozenset(found), _once([*nodes])
+            for element in {*self.named("ELSET", where, member)}:
+                if element not in solid:
+                    fail(where, f"the surface names element {element}, which is not a solid element.")
+                nodes = [solid[element][node] for node in kind.face_nodes[number - 1]]
+                yield nodes, len(kind.faces[number - 1])
 
 
 def _once(numbers: list[int]) -> IntArray:

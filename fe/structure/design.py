@@ -71,36 +71,26 @@ class Rosette(Spot):
     axes: Axes
     angles: Annotated[tuple[float, ...], Field(min_length=2, max_length=6)] = (0.0, 45.0, 90.0)
 
-    def gauges(self) -> list[dict[str, Any]]:
-        """Return its gauges as tables of a structure file."""
+    def gauges(self) -> list[Gauge]:
+        """Return its gauges."""
         first, second, _ = axes_of(*self.axes)
         common, found = self.model_dump(include={*Spot.model_fields}), []
         for letter, angle in zip("abcdef", np.radians(self.angles).tolist(), strict=False):
-            direction = np.cos(angle) * first + np.sin(angle) * second
-            found.append({"name": f"{self.name}_{letter}", "direction": tuple(direction.tolist())} | common)
+            direction = tuple((np.cos(angle) * first + np.sin(angle) * second).tolist())
+            found.append(Gauge(name=f"{self.name}_{letter}", direction=direction, **common))
         return found
 
 
-def with_rosettes(content: dict[str, Any], source: str) -> dict[str, Any]:
-    """Return the content of a structure file whose rosettes have become gauges, behind its own.
+class Gauged(Part):
+    """Gauges; those of rosettes come behind the others."""
 
-    Raises
-    ------
-    InvalidDesignError
-        One sentence that names `source`, the rosette and its fault.
-    """
-    tables = content.get("rosette")
-    if not isinstance(tables, list):
-        return content
-    rosettes = [
-        checked(Rosette, table, f"{source}: rosette[{number}]", InvalidDesignError, what="a rosette")
-        for number, table in enumerate(tables, start=1)
-    ]
-    kept = {key: value for key, value in content.items() if key != "rosette"}
-    own = content.get("gauge", [])
-    if not isinstance(own, list):
-        return kept
-    return kept | {"gauge": [*own, *(gauge for rosette in rosettes for gauge in rosette.gauges())]}
+    gauge: tuple[Gauge, ...] = ()
+    rosette: tuple[Rosette, ...] = Field(default=(), exclude=True)
+
+    @model_validator(mode="after")
+    def _with_those_of_rosettes(self) -> "Gauged":
+        self.__dict__["gauge"] = (*self.gauge, *(own for part in self.rosette for own in part.gauges()))
+        return self
 
 
 SetName = Annotated[str, Field(min_length=1, max_length=200)]
@@ -163,10 +153,9 @@ class Material(Given):
         """Compliance (6, 6) [1/Pa] in the axes of the material; strains 11, 22, 33, 23, 13, 12."""
         if self.young_modulus is not None and self.poisson_ratio is not None:
             return isotropic_compliance(self.young_modulus, self.poisson_ratio)
-        assert self.young_moduli is not None
-        assert self.poisson_ratios is not None
-        assert self.shear_moduli is not None
-        return orthotropic_compliance(self.young_moduli, self.poisson_ratios, self.shear_moduli)
+        return orthotropic_compliance(
+            *map(np.asarray, (self.young_moduli, self.poisson_ratios, self.shear_moduli))
+        )
 
     @property
     def elasticity(self) -> FloatArray:
@@ -195,14 +184,12 @@ class Support(Part):
     @model_validator(mode="after")
     def _holds_something(self) -> "Support":
         springs = self.springs or ()
-        if self.rigid_about is None:
-            turns = len(springs) > 3 or any(name not in MOTIONS[:3] for name in self.hold)
-            if turns or bool(self.hold) == any(springs):
-                raise ValueError(
-                    'either hold = ["x", "y", "z"] or springs = [x, y, z] in N/m is expected; what turns, '
-                    "too, is a rigid set, with the point `rigid_about`"
-                )
-            return self
+        turns = len(springs) > 3 or any(name not in MOTIONS[:3] for name in self.hold)
+        if self.rigid_about is None and (turns or bool(self.hold) == any(springs)):
+            raise ValueError(
+                'either hold = ["x", "y", "z"] or springs = [x, y, z] in N/m is expected; what turns, '
+                "too, is a rigid set, with the point `rigid_about`"
+            )
         if not self.hold and not any(springs):
             raise ValueError("a rigid set needs hold, springs or both")
         for name, spring in zip(MOTIONS, springs, strict=False):
@@ -246,7 +233,7 @@ class PointOutput(Named):
     direction: Direction
 
 
-class MeshDesign(StructureDesign):
+class MeshDesign(StructureDesign, Gauged):
     """A structure from a mesh."""
 
     mesh: str = Field(min_length=1)
@@ -285,7 +272,6 @@ def parse_structure(content: dict[str, Any], source: str = "the structure") -> M
     """
     if "stiffness_matrix" in content:
         return checked(MatrixDesign, content, source, InvalidDesignError, what="a structure from matrices")
-    content = with_rosettes(content, source)
     return checked(MeshDesign, content, source, InvalidDesignError, what="a structure")
 
 

@@ -3,11 +3,13 @@
 Last the nodal loads (nodes, 3) [N] of forces and pressures there.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from fe.elements.cells import CellMesh, point_jacobians
+from fe.elements.cells import CellMesh
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError
 
@@ -53,38 +55,64 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
         If it lies outside; the sentence begins with `where`.
     """
     near = np.linalg.norm(mesh.centres - point, axis=1) <= 1.001 * mesh.cell_radius
-    cells = np.flatnonzero(near)
-    if len(cells):
-        local = _local(mesh, cells, point)
-        inside = mesh.kind.inside(local, _INSIDE)
-        if inside.any():
-            first = int(np.flatnonzero(inside)[0])
-            return int(cells[first]), local[first]
+    kind, cells = mesh.kind, np.flatnonzero(near)
+    start = np.tile(np.mean(kind.corners, axis=0), (len(cells), 1))
+    local, residual, _ = _nearest(
+        mesh, cells, point, start, lambda place: (place, np.eye(3)), lambda place: np.clip(place, -2.0, 3.0)
+    )
+    inside = kind.inside(local, _INSIDE) & (np.linalg.norm(residual, axis=1) <= 1e-9 * mesh.size)
+    if inside.any():
+        first = int(inside.argmax())
+        return int(cells[first]), local[first]
     found = on_surface(mesh, point, where)
     return int(found.cell[0]), found.local[0]
 
 
-def _local(mesh: StructureMesh, cells: IntArray, point: FloatArray) -> FloatArray:
-    """Local places (n, 3) of a point in cells (n,), by Newton's method; far away where it is in none."""
-    kind, nodes = mesh.kind, mesh.nodes[cells]
-    local = np.tile(np.mean(kind.corners, axis=0), (len(cells), 1))
-    for _ in range(_STEPS):
-        residual = point - _position(mesh, cells, local)
-        jacobian = point_jacobians(kind, nodes, local)
-        # Outside its cell the map may fold: such a place is no solution, wherever the next step leads.
-        jacobian[np.linalg.det(jacobian) == 0.0] = np.eye(3)
-        step = np.linalg.solve(jacobian, residual[..., None])[..., 0]
-        local = np.clip(local + step, -2.0, 3.0)
-        if np.abs(step).max() < 1e-13:
+def _nearest(
+    mesh: StructureMesh,
+    cells: IntArray,
+    point: FloatArray,
+    along: FloatArray,
+    places: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    kept: Callable[[FloatArray], FloatArray],
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Find the places in cells (n,) that are nearest to a point, by Gauss and Newton.
+
+    Parameters
+    ----------
+    mesh : StructureMesh
+        The mesh.
+    cells : (n,)
+        The cells.
+    point : (3,) m
+        The point.
+    along : (n, t)
+        Coordinates to start from.
+    places : callable
+        Returns local places (n, 3) at coordinates, and their derivatives (t, 3).
+    kept : callable
+        Returns the nearest coordinates that are allowed.
+
+    Returns
+    -------
+    local, residual, edges : (n, 3), (n, 3) m, (n, t, 3) m
+        The places, what is left to the point, and the derivatives of the places in space.
+    """
+    nodes, moved = mesh.nodes[cells], np.inf
+    for step in range(_STEPS + 1):
+        local, tangents = places(along)
+        values, slopes = mesh.kind.shape_functions(local)
+        residual = point - np.einsum("na,nai->ni", values, nodes)
+        edges = np.einsum("nai,naj,tj->nti", nodes, slopes, tangents)
+        if step == _STEPS or moved < 1e-14:
             break
-    miss = np.linalg.norm(point - _position(mesh, cells, local), axis=1) > 1e-9 * mesh.size
-    local[miss] = 9.0
-    return local
-
-
-def _position(mesh: StructureMesh, cells: IntArray, local: FloatArray) -> FloatArray:
-    values, _ = mesh.kind.shape_functions(local)
-    return np.asarray(np.einsum("na,nai->ni", values, mesh.nodes[cells]))
+        gram = np.einsum("nti,nsi->nts", edges, edges)
+        # Outside its cell the map may fold: such a place is no solution, wherever the next step leads.
+        gram[np.linalg.det(gram) == 0.0] = np.eye(len(tangents))
+        move = np.linalg.solve(gram, np.einsum("nti,ni->nt", edges, residual)[..., None])[..., 0]
+        before, along = along, kept(along + move)
+        moved = float(np.abs(along - before).max(initial=0.0))
+    return local, residual, edges
 
 
 def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoint:
@@ -95,57 +123,39 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     InvalidDesignError
         If it lies farther off than `FARTHEST`; the sentence begins with `where`.
     """
-    surface, (centre, radius) = mesh.boundary, mesh.face_spheres
+    kind, surface, (centre, radius) = mesh.kind, mesh.boundary, mesh.face_spheres
     away = np.linalg.norm(centre - point, axis=1)
     near = np.flatnonzero(away - 1.1 * radius <= away.min())
     cells = surface.cell[near]
-    local, distance, normal = (np.empty((len(near), 3)), np.empty(len(near)), np.empty((len(near), 3)))
-    for number in np.unique(surface.face[near]):
-        on = np.flatnonzero(surface.face[near] == number)
-        local[on], distance[on], normal[on] = _project(mesh, int(number), cells[on], point)
+    local, residual, edges = (np.empty((len(near), *shape)) for shape in ((3,), (3,), (2, 3)))
+    for number in np.unique(surface.face[near]).tolist():
+        on, triangle = np.flatnonzero(surface.face[near] == number), len(kind.faces[number]) == 3
+        local[on], residual[on], edges[on] = _nearest(
+            mesh,
+            cells[on],
+            point,
+            np.full((len(on), 2), 1.0 / 3.0 if triangle else 0.5),
+            partial(kind.face_places, number),
+            _on_triangle if triangle else lambda along: np.clip(along, 0.0, 1.0),
+        )
+    distance, normal = np.linalg.norm(residual, axis=1), np.cross(edges[:, 0], edges[:, 1])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     best = int(distance.argmin())
     size = float(radius[near[best]])
     if distance[best] > FARTHEST * size:
-        foot = _position(mesh, cells[[best]], local[[best]])[0]
-        inside = float((point - foot) @ normal[best]) < 0.0
+        inside = float(residual[best] @ normal[best]) < 0.0
         raise InvalidDesignError(
             f"{where} lies {distance[best] / mesh.unit:.3g} {mesh.unit_name} off the surface of "
             f"{mesh.source}{', inside' if inside else ''}; the nearest point of the surface is "
-            f"{mesh.place(foot)}."
+            f"{mesh.place(point - residual[best])}."
         )
     same = (distance <= distance[best] + _SAME_PLACE * size) & (normal @ normal[best] > _SAME_SIDE)
     mean = normal[same].mean(axis=0)
     return SurfacePoint(cells[same], local[same], mean / np.linalg.norm(mean), float(distance[best]))
 
 
-def _project(
-    mesh: StructureMesh, face: int, cells: IntArray, point: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Nearest local place (n, 3) on a face of cells (n,), its distance (n,) [m] and normal (n, 3)."""
-    kind, nodes = mesh.kind, mesh.nodes[cells]
-    triangle = len(kind.faces[face]) == 3
-    along = np.full((len(cells), 2), 1.0 / 3.0 if triangle else 0.5)
-    moved = np.inf
-    for step in range(_STEPS + 1):
-        local, tangents = kind.face_places(face, along)
-        values, slopes = kind.shape_functions(local)
-        residual = point - np.einsum("na,nai->ni", values, nodes)
-        edges = np.einsum("nai,naj,tj->nti", nodes, slopes, tangents)
-        if step == _STEPS or moved < 1e-14:
-            break
-        gram = np.einsum("nti,nsi->nts", edges, edges)
-        move = np.linalg.solve(gram, np.einsum("nti,ni->nt", edges, residual)[..., None])[..., 0]
-        before, along = along, _on_face(along + move, triangle=triangle)
-        moved = float(np.abs(along - before).max())
-    normal = np.cross(edges[:, 0], edges[:, 1])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return local, np.linalg.norm(residual, axis=1), normal
-
-
-def _on_face(along: FloatArray, *, triangle: bool) -> FloatArray:
-    """Nearest places (n, 2) on the unit triangle or the unit square."""
-    if not triangle:
-        return np.clip(along, 0.0, 1.0)
+def _on_triangle(along: FloatArray) -> FloatArray:
+    """Nearest places (n, 2) on the unit triangle."""
     over = along.sum(axis=1) > 1.0
     middle = 0.5 * (along[over, 0] - along[over, 1] + 1.0)
     along = np.clip(along, 0.0, 1.0)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy import io as scipy_io
 from scipy import sparse
 
-from fe.runtime.arrays import FloatArray, IntArray
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import MeshError
 from reporting.text_file import read_text
 
@@ -32,16 +32,9 @@ _SQUARE, _REAL = (1, 6), (1, 2)  # forms and types of Nastran
 
 
 class _Table(NamedTuple):
-    """The numbers of a text file, line by line."""
+    """The numbers of a text file, line by line: a place and a value, or two places and a value."""
 
     lines: FloatArray
-
-
-class StoredMatrix(NamedTuple):
-    """A matrix as it was stored, and the unknown of each row where the file says it."""
-
-    matrix: sparse.csr_array
-    places: list[Place] | None = None
 
 
 def read_unknowns(path: Path) -> list[Place]:
@@ -65,8 +58,10 @@ def read_unknowns(path: Path) -> list[Place]:
     return found
 
 
-def read_matrix(folder: Path, name: str) -> StoredMatrix:
-    """Read the matrix that `FILE` or `FILE:MATRIX` names, both triangles of it.
+def read_matrix(folder: Path, name: str) -> tuple[sparse.csr_array, list[Place] | None]:
+    """Read the matrix that `FILE` or `FILE:MATRIX` names, and the unknown of each row where the file says it.
+
+    One of each two entries that mirror each other may be left out of a table.
 
     Raises
     ------
@@ -76,16 +71,34 @@ def read_matrix(folder: Path, name: str) -> StoredMatrix:
     file, chosen = file_of(name)
     path = folder / file
     stored = _read(path, chosen)
-    if isinstance(stored, _Table):
-        stored = _from_table(path, stored.lines)
-    if isinstance(stored, StoredMatrix):
-        return stored
-    if stored.ndim != 2 or stored.shape[0] != stored.shape[1] or stored.dtype.kind not in "fiu":
+    if not isinstance(stored, _Table):
+        if stored.ndim != 2 or stored.shape[0] != stored.shape[1] or stored.dtype.kind not in "fiu":
+            came = f"{stored.dtype} of shape {stored.shape}"
+            fail(str(path), f"a square matrix of real numbers is expected, but {came} came.")
+        return sparse.csr_array(stored, dtype=np.float64), None
+    table = stored.lines
+    width = table.shape[1]
+    if width not in (3, 5) or not table.size or not np.array_equal(table[:, :-1], np.rint(table[:, :-1])):
         fail(
             str(path),
-            f"a square matrix of real numbers is expected, but {stored.dtype} of shape {stored.shape} came.",
+            "lines of row, column and value, or of node, component, node, component and value, are expected, "
+            f"but {table.shape[0]} lines of {width} numbers came.",
         )
-    return StoredMatrix(sparse.csr_array(stored, dtype=np.float64))
+    whole, places = table[:, :-1].astype(np.int64), None
+    if width == 5:
+        own, number = np.unique(whole.reshape(-1, 2), axis=0, return_inverse=True)
+        places = [(node, component) for node, component in own.tolist()]
+        whole = number.reshape(-1, 2) + 1
+    elif whole.min() < 1:
+        fail(str(path), "rows and columns are counted from 1, but there is a smaller one.")
+    at, size = tuple(whole.T - 1), int(whole.max())
+    matrix, pattern = (
+        sparse.coo_array((values, at), (size, size)).tocsr() for values in (table[:, -1], np.ones(len(table)))
+    )
+    both = pattern.multiply(pattern.T).tocoo()
+    if (both.row == both.col).all():
+        matrix = (matrix + matrix.T - sparse.diags_array(matrix.diagonal())).tocsr()
+    return matrix, places
 
 
 def read_vector(folder: Path, name: str, named: Callable[[Place], FloatArray], size: int) -> FloatArray:
@@ -114,8 +127,6 @@ def read_vector(folder: Path, name: str, named: Callable[[Place], FloatArray], s
         if found.shape[1] == 3:
             parts = [value * named((int(node), int(component))) for node, component, value in found]
             return np.asarray(np.sum(parts, axis=0))
-    if isinstance(found, StoredMatrix):
-        found = found.matrix
     values = np.asarray(found.todense() if sparse.issparse(found) else found, dtype=np.float64)
     if values.size != size or max(values.shape) != size:
         fail(
@@ -154,47 +165,11 @@ def _archived(path: Path, chosen: str) -> Any:
         return archive[chosen or names[0]]
 
 
-def _from_table(path: Path, table: FloatArray) -> Any:
-    """Return the matrix of a table with the rows `row column value` or `node component ... value`."""
-    width = table.shape[1]
-    if width not in (3, 5) or not table.size or not np.array_equal(table[:, :-1], np.rint(table[:, :-1])):
-        fail(
-            str(path),
-            "lines of row, column and value, or of node, component, node, component and value, are expected, "
-            f"but {table.shape[0]} lines of {width} numbers came.",
-        )
-    whole = table[:, :-1].astype(np.int64)
-    if width == 3:
-        size = int(whole.max())
-        if whole.min() < 1:
-            fail(str(path), "rows and columns are counted from 1, but there is a smaller one.")
-        return _mirrored(whole[:, 0] - 1, whole[:, 1] - 1, table[:, 2], size)
-    return _by_place(whole[:, :2], whole[:, 2:], table[:, 4])
-
-
-def _mirrored(rows: IntArray, columns: IntArray, values: FloatArray, size: int) -> sparse.csr_array:
-    """Return a matrix of which one of each two entries that mirror each other may be left out."""
-    matrix = sparse.coo_array((values, (rows, columns)), (size, size)).tocsr()
-    pattern = sparse.coo_array((np.ones(len(rows)), (rows, columns)), (size, size)).tocsr()
-    both = pattern.multiply(pattern.T).tocoo()
-    if (both.row == both.col).all():
-        matrix = (matrix + matrix.T - sparse.diags_array(matrix.diagonal())).tocsr()
-    return matrix
-
-
-def _by_place(rows: IntArray, columns: IntArray, values: FloatArray) -> StoredMatrix:
-    """Return a matrix whose rows and columns (n, 2) are nodes with their components."""
-    places, number = np.unique(np.concatenate((rows, columns)), axis=0, return_inverse=True)
-    row, column = number.reshape(2, -1)
-    matrix = _mirrored(row, column, values, len(places))
-    return StoredMatrix(matrix, [(node, component) for node, component in places.tolist()])
-
-
-def _nastran(path: Path, chosen: str) -> StoredMatrix:
+def _nastran(path: Path, chosen: str) -> _Table:
     """Read a real square matrix from the DMIG of the bulk data."""
     kind: dict[str, int] = {}
     entries: dict[str, list[tuple[float, ...]]] = {}
-    for card in cards((path,)):
+    for card in cards(path):
         if card.word != "DMIG":
             continue
         name = card.fields[0].upper()
@@ -212,8 +187,6 @@ def _nastran(path: Path, chosen: str) -> StoredMatrix:
     wanted = chosen.upper() or (next(iter(kind)) if len(kind) == 1 else "")
     if wanted not in entries or not entries[wanted]:
         fail(str(path), f"one of its matrices is expected, as FILE:MATRIX; it has {', '.join(kind)}.")
-    table = np.array(entries[wanted])
-    places = table[:, :4].astype(np.int64)
     if kind[wanted] not in _SQUARE:
         fail(str(path), f"a square or symmetric matrix is expected, but {wanted} is of form {kind[wanted]}.")
-    return _by_place(places[:, :2], places[:, 2:], table[:, 4])
+    return _Table(np.array(entries[wanted]))

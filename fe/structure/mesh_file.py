@@ -53,11 +53,12 @@ def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
         One sentence that names the file and the place: cells of an unknown kind or of several, a negative
         Jacobian, a mid-edge node far from its edge, parts that do not hang together.
     """
-    if path.is_dir():
+    if not path.is_file():
         raise MeshError(
-            f"The mesh {path} is a folder; `mesh` must name a mesh file, as seen from the structure file."
+            f"The mesh file {path} is {'a folder' if path.is_dir() else 'not there'}; `mesh` must name it as "
+            "seen from the structure file."
         )
-    if path.is_file() and not path.stat().st_size:
+    if not path.stat().st_size:
         raise MeshError(f"The mesh file {path} is empty; write it anew.")
     mesh = _READERS.get(path.suffix.lower(), read_by_meshio)(path).mesh(unit, unit_name)
     _check_edges(mesh)
@@ -117,8 +118,7 @@ def read_by_meshio(path: Path) -> Deck:
     deck, where, suffix = Deck(path), str(path), path.suffix.lower()
     points = np.atleast_2d(found.points)
     points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
-    for number, point in enumerate(points.tolist(), start=1):
-        deck.add_node(where, number, point)
+    deck.nodes = dict(enumerate(map(tuple, points.tolist()), start=1))
     numbers, first, count = [], dict[Any, int](), 0
     for block in found.cells:
         known = block.type in KINDS or block.type in FLAT
@@ -133,29 +133,33 @@ def read_by_meshio(path: Path) -> Deck:
             if mine[-1] == count:
                 deck.add_element(where, count, block.type, nodes)
         numbers.append(np.array(mine, dtype=np.int64))
-    for name, blocks in found.cell_sets.items():
-        if not name.startswith("gmsh:"):
-            for own, chosen in zip(numbers, blocks, strict=True):
-                if chosen is not None and len(chosen):
-                    deck.members("ELSET", name).extend(own[np.asarray(chosen, dtype=np.int64)].tolist())
-    for label, arrays in found.cell_data.items():
-        for number, own in enumerate(numbers):
-            for name, chosen in _named(found, label, arrays, number):
-                if name not in found.cell_sets:
-                    deck.members("ELSET", name).extend(own[chosen].tolist())
-    for name, chosen in found.point_sets.items():
-        deck.members("NSET", name).extend((np.asarray(chosen, dtype=np.int64) + 1).tolist())
-    for label, array in found.point_data.items():
-        for name, chosen in _named(found, label, [array], 0):
-            deck.members("NSET", name).extend((chosen + 1).tolist())
+    point_sets, point_data = (
+        {name: [part] for name, part in own.items()} for own in (found.point_sets, found.point_data)
+    )
+    for key, members, sets, data in (
+        ("ELSET", numbers, found.cell_sets, found.cell_data),
+        ("NSET", [np.array(list(deck.nodes))], point_sets, point_data),
+    ):
+        named = [
+            (name, number, np.asarray(chosen, dtype=np.int64))
+            for name, parts in sets.items()
+            for number, chosen in enumerate(parts)
+            if chosen is not None and not name.startswith("gmsh:")
+        ]
+        named += [
+            (name, number, chosen)
+            for label, arrays in data.items()
+            for number in range(len(members))
+            for name, chosen in _named(found, label, arrays, number)
+            if name not in sets
+        ]
+        for name, number, chosen in named:
+            deck.members(key, name).extend(members[number][chosen].tolist())
     return deck
 
 
 def _found_by_meshio(path: Path) -> Any:
     """Return what meshio reads of a file, or say in one sentence why it does not."""
-    meshio = meshio_with_wedges()
-    if not path.is_file():
-        raise MeshError(f"The mesh file {path} is not there.")
     said = io.StringIO()
     try:
         # meshio writes what it thinks of a file to the terminal, and ends the program where it fails.
@@ -165,22 +169,15 @@ def _found_by_meshio(path: Path) -> Any:
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
-            return meshio.read(path)
-    except meshio.ReadError as error:
-        raise MeshError(
-            f"The mesh file {path} cannot be read: {str(error).strip('. ') or 'its format is not known'}; "
-            "write it as .msh, .inp, .med or .bdf."
-        ) from None
-    except OSError as error:
-        raise MeshError(f"The mesh file {path} cannot be read: {error.strerror}.") from None
+            return meshio_with_wedges().read(path)
     except SystemExit:
-        why = " ".join(said.getvalue().split()).removeprefix("Error: ").rstrip(".")
-        raise MeshError(f"The mesh file {path} cannot be read as {path.suffix}: {why}.") from None
+        why = said.getvalue().removeprefix("Error: ")
     except Exception as error:  # noqa: BLE001 - the readers of formats fail in any way
-        raise MeshError(
-            f"The mesh file {path} cannot be read as {path.suffix}: the reader (meshio) says {str(error)!r}; "
-            "it is damaged, cut off, or of another dialect. Write it anew, or as .msh or .inp."
-        ) from None
+        why = getattr(error, "strerror", None) or str(error) or "its format is not known"
+    raise MeshError(
+        f"The mesh file {path} cannot be read as {path.suffix}: {' '.join(why.split()).rstrip('.')}; it is "
+        "damaged, cut off, or of another dialect. Write it anew, or as .msh, .inp, .med or .bdf."
+    )
 
 
 def _named(found: Any, label: str, arrays: list[Any], number: int) -> Iterator[tuple[str, IntArray]]:
@@ -208,33 +205,19 @@ GIB = 2.0**30
 _PROGRAM = 0.35 * GIB  # libraries, and the triplets of a part of the cells
 _MATRICES = 5  # stiffness, its terms, their sum, mass and the residual's copy, each with as many entries
 _ENTRY = 12  # bytes of an entry of a sparse matrix
-_BULKY = 520.0
-"""Bytes over unknowns^(4/3) of factors and fronts of a cube, the bulkiest body (measured 340 to 500)."""
 
 
-def upper_estimate(mesh: StructureMesh) -> float:
-    """Bytes that assembly and factorisation take for a bulky body of as many unknowns, from sizes alone."""
-    entries = 9 * mesh.cells.size * mesh.cells.shape[1] / 4.0
-    return float(_PROGRAM + _MATRICES * _ENTRY * entries + _BULKY * mesh.unknowns ** (4.0 / 3.0))
-
-
-def analysed_estimate(mesh: StructureMesh) -> float:
+def memory_estimate(mesh: StructureMesh) -> float:
     """Bytes that assembly and factorisation take, from the order of elimination that this mesh leads to."""
     cells = np.repeat(np.arange(len(mesh.cells)), mesh.cells.shape[1])
     shape = (len(mesh.cells), len(mesh.points))
     inside = sparse.coo_array((np.ones(len(cells), dtype=np.int32), (cells, mesh.cells.ravel())), shape=shape)
     graph = (inside.T @ inside).tocsr()  # of nodes that share a cell
-    waiting: dict[int, int] = {}
-    factors = peak = 0
-    for number, front in enumerate(analyse(graph).fronts):
-        pivots, boundary = front.end - front.start, len(front.boundary)
-        here = pivots * (pivots + boundary)
-        peak = max(peak, factors + sum(waiting.values()) + 2 * here + boundary**2)
-        waiting.pop(number, None)
-        factors += here
-        if front.parent >= 0:
-            waiting[front.parent] = waiting.get(front.parent, 0) + boundary**2
-    return float(_PROGRAM + _MATRICES * _ENTRY * 9 * graph.nnz + 8 * 9 * peak)
+    sizes = [(front.end - front.start, len(front.boundary)) for front in analyse(graph).fronts]
+    pivots, boundary = np.array(sizes).T
+    factors = pivots * (pivots + boundary)
+    most = factors.sum() + (2 * factors + boundary**2).max()  # the last fronts are the largest
+    return float(_PROGRAM + _MATRICES * _ENTRY * 9 * graph.nnz + 8 * 9 * most)
 
 
 def available_memory() -> float:
@@ -265,9 +248,7 @@ def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
         If it would take more.
     """
     allowed = available_memory() if limit is None else limit
-    if upper_estimate(mesh) <= allowed:
-        return
-    needed = analysed_estimate(mesh)
+    needed = memory_estimate(mesh)
     if needed > allowed:
         raise MeshError(
             f"{mesh.source}: {mesh.unknowns:,} unknowns would take about {needed / GIB:.1f} GiB, but "

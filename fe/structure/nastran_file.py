@@ -5,7 +5,6 @@ not name the line of a fault.
 """
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,11 +12,9 @@ import numpy as np
 
 from fe.elements.kinds import KINDS
 from fe.runtime.arrays import FloatArray
-from fe.runtime.errors import MeshError
 from reporting.section import shown
-from reporting.text_file import read_text
 
-from .deck import FLAT, GLOBAL, Deck, System, fail, frame, included, real, whole, words_of
+from .deck import FLAT, GLOBAL, Deck, System, fail, frame, lines_of, real, whole, words_of
 
 _SOLIDS = {"CTETRA": 4, "CHEXA": 8, "CPENTA": 6}
 """Solid elements with the number of their corners."""
@@ -34,6 +31,8 @@ _FLAT = {
 """Shells and bars, by which Gmsh and others hand on surfaces and lines: without a property they only name."""
 _SECTIONS = re.compile("P(BAR|BEAM|BCOMP|COMP|LPLANE|ROD|SHEAR|SHELL|TUBE)[GL]?")
 _SYSTEM = re.compile(r"CORD([12])([RCS])")
+_COMMENT = re.compile(r"\$.*")
+_INCLUDE = re.compile(r"\s*INCLUDE\b(.*)", re.IGNORECASE)
 _BEGIN = re.compile(r"\s*BEGIN\b", re.IGNORECASE)
 _MARKER = re.compile(r"\+(?![\d.])")
 _DEEPEST = 50
@@ -69,7 +68,7 @@ def read_nastran(path: Path) -> Deck:
     """
     deck = Deck(path, words_of("nastran"))
     points = _Points()
-    for card in cards((path,)):
+    for card in cards(path):
         word = card.word
         if word == "GRID":
             if points.grids.setdefault(card.whole(0), card).fields != card.fields:
@@ -140,34 +139,24 @@ class _Points:
         return self._found[number]
 
 
-def cards(files: tuple[Path, ...]) -> Iterator[_Card]:
-    """Yield the words of the bulk data of the last of files that include one another."""
-    lines = read_text(files[-1], MeshError, what="mesh file", otherwise="latin-1").splitlines()
-    start = next((number for number, line in enumerate(lines, start=1) if _BEGIN.match(line)), 0)
-    card: _Card | None = None
+def cards(path: Path) -> list[_Card]:
+    """Return the words of the bulk data of a file."""
+    lines = [*lines_of((path,), _COMMENT, _INCLUDE)]
+    start = next((number for number, (_, text) in enumerate(lines, start=1) if _BEGIN.match(text)), 0)
+    found: list[_Card] = []
     marker = ""
-    for number, line in enumerate(lines[start:], start=start + 1):
-        where = f"{files[-1]}, line {number}"
-        text = line.partition("$")[0].expandtabs(8).rstrip()
-        if not text:
-            continue
-        if text.strip().upper().startswith("INCLUDE"):
-            yield from cards(included(where, files, text.strip()[7:].strip(" '\"")))
-            continue
-        head, *fields, end = _fields(where, text)
-        if not head or head[0] in "+*":
-            if card is None or (len(head) > 1 and marker and head[1:] != marker):
-                fail(where, f"the continuation {shown(head)} stands behind no line that it continues.")
-            card.fields.extend(fields)
+    for where, text in lines[start:]:
+        head, *fields, end = _fields(where, text.expandtabs(8))
+        if head and head[0] not in "+*":
+            found.append(_Card(head.upper().rstrip("*_"), where, fields))  # meshio writes CTETRA_
+            if found[-1].word.startswith("ENDDATA"):
+                return found[:-1]
+        elif not found or (len(head) > 1 and marker and head[1:] != marker):
+            fail(where, f"the continuation {shown(head)} stands behind no line that it continues.")
         else:
-            if card is not None:
-                yield card
-            card = _Card(head.upper().rstrip("*_"), where, fields)  # meshio writes CTETRA_
-            if card.word.startswith("ENDDATA"):
-                return
+            found[-1].fields.extend(fields)
         marker = end.lstrip("+*")
-    if card is not None:
-        yield card
+    return found
 
 
 def _fields(where: str, text: str) -> list[str]:

@@ -1,7 +1,6 @@
 """The tables that every structure file has, whether its structure comes from a mesh or from matrices."""
 
-import itertools
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
@@ -26,14 +25,14 @@ class Part(Section):
     @model_validator(mode="before")
     @classmethod
     def _lists_as_tuples(cls, content: object) -> object:
-        return _tuples(content) if isinstance(content, dict) else content
-
-
-def _tuples(content: Any) -> Any:
-    """Return the content of a file with its lists as the tuples that a strict section takes."""
-    if isinstance(content, dict):
+        if not isinstance(content, dict):
+            return content
         return {key: _tuples(item) for key, item in content.items()}
-    return tuple(_tuples(item) for item in content) if isinstance(content, list | tuple) else content
+
+
+def _tuples(item: object) -> object:
+    """Return the lists of a file as the tuples that a strict section takes."""
+    return tuple(map(_tuples, item)) if isinstance(item, list) else item
 
 
 def _points_somewhere(vector: Vector) -> Vector:
@@ -213,16 +212,13 @@ class StructureDesign(Part):
             ("load",),
             *((key,) for key in self.own_names),
         ):
-            named = [
-                (f"{key}[{number}]", part.name)
-                for key in keys
-                for number, part in enumerate(getattr(self, key), start=1)
-            ]
-            for (first, one), (second, two) in itertools.combinations(named, 2):
-                if one == two:
-                    raise ValueError(
-                        f"{first} and {second} are both named {one!r}; give each a name of its own"
-                    )
+            first: dict[str, str] = {}
+            named = ((key, *item) for key in keys for item in enumerate(getattr(self, key), start=1))
+            for key, number, part in named:
+                place = f"{key}[{number}]"
+                if first.setdefault(part.name, place) != place:
+                    both = f"{first[part.name]} and {place} are both named {part.name!r}"
+                    raise ValueError(f"{both}; give each a name of its own")
         table = self.scaled_table
         self._check_ties(table, "scaled_by", "parameter", "is scaled by", f"scales no {table}")
         self._check_ties("load", "control", "control", "is tied to the control", "commands no load")

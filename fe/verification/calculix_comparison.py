@@ -1,6 +1,6 @@
 """Structures and the wing against CalculiX on the identical mesh: statics, modes and a ring-down."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,9 +15,9 @@ from fe.structure.field import natural_frequencies
 from fe.structure.operators import Structure
 from fe.wing.operators import AffineOperators
 
-from .calculix_deck import CalculixDeck
+from .calculix_deck import CalculixDeck, Step, number_line
 from .calculix_job import read_frequencies, read_tables, run_calculix
-from .calculix_models import gauge_cells, load_lines, structure_deck, wing_deck
+from .calculix_models import STATIC, gauge_cells, load_step, structure_deck, wing_deck
 
 TEST_FORCE = 10.0
 """Upward force of the static test and before the ring-down [N]."""
@@ -37,43 +37,21 @@ def _relative_each(theirs: FloatArray, ours: FloatArray) -> float:
 
 
 @dataclass(frozen=True)
-class LoadAgreement:
-    """Differences under one load, each relative.
-
-    Attributes
-    ----------
-    load : str
-        Its name.
-    field : float
-        Largest difference of a nodal displacement, over the largest displacement.
-    strain, output : float or None
-        Of the strains of the gauges and of displacement outputs, over the largest of their kind, or of a wing
-        each over its own; None where there are none.
-    tensor : float or None
-        Of a wing: largest difference of a strain component at the integration points of the cells with
-        gauges, over the largest strain there. CalculiX evaluates these strains itself.
-    """
-
-    load: str
-    field: float
-    strain: float | None
-    output: float | None
-    tensor: float | None = None
-
-
-@dataclass(frozen=True)
 class Agreement:
     """A model and CalculiX.
 
     Attributes
     ----------
-    loads : tuple of LoadAgreement
-        One for each load.
+    loads : dict of str to dict of str to float
+        Of each load the relative differences: of `nodal displacements`, over the largest; of `gauge strains`
+        and `displacement outputs`, where there are some, over the largest of their kind, or of a wing each
+        over its own; of a wing also of `strains at integration points` in the cells with gauges, which
+        CalculiX evaluates itself, over the largest.
     ours, calculix : (m,) Hz
         Lowest frequencies of both codes.
     """
 
-    loads: tuple[LoadAgreement, ...]
+    loads: dict[str, dict[str, float]]
     ours: FloatArray
     calculix: FloatArray
 
@@ -85,42 +63,43 @@ class Agreement:
 
 def _agreement(
     deck: CalculixDeck,
-    loads: Mapping[str, tuple[FloatArray, Iterable[str]]],
+    loads: Mapping[str, tuple[FloatArray, Step]],
     folder: Path,
     modes: int,
     relative: Callable[[FloatArray, FloatArray], float],
     tensor: Callable[[FloatArray], FloatArray] | None = None,
 ) -> Agreement:
-    """Solve loads (n,) [N], given with their lines, and the lowest modes by both codes.
+    """Solve loads (n,) [N], given with their steps, and the lowest modes by both codes.
 
     `relative` compares strains and outputs; `tensor` gives our strains (p, 6) in the cells EGAUGES.
     """
-    structure, prints = (
-        deck.structure,
-        () if tensor is None else ("*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E"),
-    )
-    text = deck.static_steps((lines for _, lines in loads.values()), prints)
+    structure = deck.structure
+    prints = ["*NODE PRINT, NSET=NALL", "U"]
+    prints += ["*NODE PRINT, NSET=NPROBES", "U"] if len(deck.probes) else []
+    prints += ["*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E"] if tensor else []
+    text = deck.text(*(step._replace(lines=[*step.lines, *prints]) for _, step in loads.values()))
     printed = read_tables(run_calculix(text, folder, "static")) if loads else {}
     if (count := len(printed.get("NALL", ()))) != len(loads):
         raise CalculixError(f"CalculiX printed {count} static solutions instead of {len(loads)}.")
     frequencies = natural_frequencies(structure, modes, deck.values)[0]
-    theirs = read_frequencies(run_calculix(deck.frequency_step(modes), folder, "modes"))
+    theirs = read_frequencies(run_calculix(deck.text(Step(("*FREQUENCY", f"{modes}"))), folder, "modes"))
     if len(theirs) < modes:
         raise CalculixError(f"CalculiX printed {len(theirs)} frequencies instead of {modes}.")
     solve = Factorisation(structure.at(deck.values)[0]).solve
-    parts = (slice(0, len(structure.gauges)), slice(len(structure.gauges), len(deck.probes)))
-    found = []
+    gauges, end = len(structure.gauges), len(deck.probes)
+    parts = {"gauge strains": slice(0, gauges), "displacement outputs": slice(gauges, end)}
+    differences = {}
     for number, (name, (load, _)) in enumerate(loads.items()):
-        displacement = solve(load)
-        ours = deck.probes @ displacement
-        probes = printed["NPROBES"][number][:, 1:].ravel() if len(ours) else ours
-        strain, output = (relative(probes[own], ours[own]) if len(ours[own]) else None for own in parts)
-        field = _relative(printed["NALL"][number][:, 1:], structure.full_displacement(displacement))
-        strains = (
-            None if tensor is None else _relative(printed["EGAUGES"][number][:, 2:], tensor(displacement))
-        )
-        found.append(LoadAgreement(name, field, strain, output, strains))
-    return Agreement(tuple(found), frequencies, theirs[:modes])
+        displacement, tables = solve(load), {key: rows[number] for key, rows in printed.items()}
+        ours, nodes = deck.probes @ displacement, structure.full_displacement(displacement)
+        found = differences[name] = {"nodal displacements": _relative(tables["NALL"][:, 1:], nodes)}
+        for what, own in parts.items():
+            if len(ours[own]):
+                found[what] = relative(tables["NPROBES"][:, 1:].ravel()[own], ours[own])
+        if tensor:
+            strains = tensor(displacement)
+            found["strains at integration points"] = _relative(tables["EGAUGES"][:, 2:], strains)
+    return Agreement(differences, frequencies, theirs[:modes])
 
 
 def structure_agreement(structure: Structure, folder: Path, modes: int = 6) -> Agreement:
@@ -141,7 +120,9 @@ def structure_agreement(structure: Structure, folder: Path, modes: int = 6) -> A
         If CalculiX is not there, fails, or has no such element.
     """
     deck = structure_deck(structure)
-    loads = {load.name: (structure.load(load.name), load_lines(deck, load)) for load in structure.design.load}
+    loads = {
+        load.name: (structure.load(load.name), load_step(structure, load)) for load in structure.design.load
+    }
     return _agreement(deck, loads, folder, modes, _relative)
 
 
@@ -170,7 +151,7 @@ def wing_agreement(
     loads = {"tip force": operators.turn(0.0, TEST_FORCE), "lift": operators.turn(lift.load_factor)}
     return _agreement(
         deck,
-        {name: (load, deck.force_lines(load)) for name, load in loads.items()},
+        {name: (load, Step(STATIC, load)) for name, load in loads.items()},
         folder,
         modes,
         _relative_each,
@@ -265,7 +246,17 @@ def ring_down_agreement(
     for step in range(steps):
         current = integrator.advance(current, increment, (0.0, 0.0))
         ours[step] = integrator.outputs(current)[-1]
-    text = wing_deck(operators, state).ring_down_steps(operators.turn(0.0, TEST_FORCE), increment, steps)
+    load = operators.turn(0.0, TEST_FORCE)
+    text = wing_deck(operators, state).text(
+        # CalculiX balances energy in a dynamic step and wants it asked for from the first step on.
+        Step(STATIC, load, ("*EL PRINT, ELSET=E0", "ENER")),
+        Step(
+            ("*DYNAMIC, DIRECT, ALPHA=0.", number_line([increment, increment * steps])),
+            0.0 * load,
+            ("*NODE PRINT, NSET=NPROBES, FREQUENCY=1", "U"),
+            steps + 10,
+        ),
+    )
     tables, tip = read_tables(run_calculix(text, folder, "ring_down")), len(operators.gauges)
     theirs = np.array([rows[:, 1:].ravel()[tip] for rows in tables.get("NPROBES", ())])
     if len(theirs) != steps:

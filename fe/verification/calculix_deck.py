@@ -10,19 +10,43 @@ strain or displacement, by an equation, because printed displacements hold seven
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from numpy.typing import ArrayLike
 
 from fe.elements.cells import CellMesh
 from fe.elements.kinds import HEXAHEDRA_20
-from fe.runtime.arrays import FloatArray
+from fe.runtime.arrays import FloatArray, IntArray
 from fe.structure.affine import AffineStructure
-from fe.structure.supports import RigidSet, SupportedUnknowns
+from fe.structure.supports import SupportedUnknowns
 
-_PER_LINE, _NODES_PER_LINE = 4, 12
 _BLOCK = 0.01  # side of the block that stands for a point mass [m]
+Term = tuple[int, int, float]
+"""A node, its direction from 1, and what stands with it: a force or a factor."""
+
+
+class CellMaterial(NamedTuple):
+    """What some cells are made of.
+
+    Attributes
+    ----------
+    courses : list of (float, (9,) Pa)
+        CalculiX's nine orthotropic constants at each of some temperatures.
+    density : float
+        kg/m^3.
+    axes : (2, 3)
+        Two vectors of the material's axes.
+    cells : (m,)
+        The cells.
+    """
+
+    courses: list[tuple[float, FloatArray]]
+    density: float
+    axes: FloatArray
+    cells: Iterable[int]
 
 
 class PointBlock(NamedTuple):
@@ -31,6 +55,27 @@ class PointBlock(NamedTuple):
     mass: float
     place: FloatArray
     shares: FloatArray
+
+
+class Step(NamedTuple):
+    """A step of a job.
+
+    Attributes
+    ----------
+    procedure : tuple of str
+        Lines that say what is solved.
+    force : (n,) N, optional
+        Nodal forces, in the place of those of the step before.
+    lines : iterable of str
+        Further loads, and what is printed.
+    increments : int
+        At most so many.
+    """
+
+    procedure: tuple[str, ...]
+    force: FloatArray | None = None
+    lines: Iterable[str] = ()
+    increments: int = 100
 
 
 @dataclass(frozen=True)
@@ -49,12 +94,18 @@ class CalculixDeck:
         Its mesh.
     supports : SupportedUnknowns
         What is held, sprung and rigid; the n free unknowns are in its order.
-    materials : tuple of str
-        Lines of materials, orientations and sections.
+    materials : tuple of CellMaterial
+        What the cells are made of.
     masses : tuple of PointBlock
         Point masses.
     probed : tuple of (n,)
         Rows on the free unknowns that are read behind the gauges and the displacement outputs.
+    gauge_cells : (m,)
+        Cells that are the set EGAUGES.
+    temperatures : (nodes,), optional
+        Temperatures of the nodes, where constants of materials depend on them.
+    damping : (float, float)
+        Rayleigh damping [1/s] and [s] of a step in time.
     """
 
     title: str
@@ -62,9 +113,12 @@ class CalculixDeck:
     values: Mapping[str, float]
     mesh: CellMesh
     supports: SupportedUnknowns
-    materials: tuple[str, ...]
+    materials: tuple[CellMaterial, ...]
     masses: tuple[PointBlock, ...]
     probed: tuple[FloatArray, ...] = ()
+    gauge_cells: IntArray | tuple[()] = ()
+    temperatures: FloatArray | None = None
+    damping: tuple[float, float] = (0.0, 0.0)
 
     @cached_property
     def probes(self) -> FloatArray:
@@ -72,188 +126,96 @@ class CalculixDeck:
         own = (self.structure.gauge_output.toarray(), self.structure.displacement_output.toarray())
         return np.vstack((*own, *self.probed))
 
-    def definition(self) -> Iterator[str]:
-        """Yield the lines of the model definition, before the first step."""
-        yield "*HEADING"
-        yield f"{self.title} {self.structure.design_hash[:12]}"
-        yield "*NODE, NSET=NALL"
-        for number, point in enumerate(self.mesh.points, start=1):
-            yield f"{number},{number_line(point)}"
-        yield f"*ELEMENT, TYPE={self.mesh.kind.calculix}, ELSET=EALL"
-        for number, nodes in enumerate(self.mesh.cells + 1, start=1):
-            yield from wrapped([str(value) for value in (number, *nodes)], _NODES_PER_LINE, end=",")
-        yield from self.materials
-        elements = itertools.count(len(self.mesh.cells) + 1)
-        yield from self._supports(elements)
-        yield from self._masses(elements)
-        first = self._node_count + 8 * len(self.masses) + 1
-        if len(self.probes):
-            yield "*NODE, NSET=NPROBES"
-        for node in range(first, first + (len(self.probes) + 2) // 3):
-            yield f"{node},0.,0.,0."
+    def text(self, *steps: Step) -> str:
+        """Input of a job: the model, then its steps."""
+        held, motions = self.supports, self._motions
+        springs = [(*_place(own), held.springs[own]) for own in np.flatnonzero(held.springs).tolist()]
+        fixed = [*map(_place, np.flatnonzero(held.held).tolist())]
+        for places, body in zip(motions, held.rigid, strict=True):
+            springs += [(*places[own], body.springs[own]) for own in np.flatnonzero(body.springs)]
+            fixed += [places[own] for own in np.flatnonzero(body.held)]
+        # Behind the nodes of the mesh: two of each rigid set, eight of each point mass, then the probes.
+        heavy = [block for block in self.masses if block.mass > 0.0]
+        first = len(self.mesh.points) + 2 * len(motions) + 1
+        corners = np.arange(first, first + 8 * len(heavy)).reshape(-1, 8).tolist()
+        first_probe = first + 8 * len(heavy)
+        blocks = [*zip(heavy, corners, strict=True)]
+        return _template().render(
+            deck=self,
+            cells=np.column_stack((np.arange(len(self.mesh.cells)), self.mesh.cells)) + 1,
+            rigid_nodes=[
+                (places[motion][0], body.point)
+                for places, body in zip(motions, held.rigid, strict=True)
+                for motion in (0, 3)
+            ],
+            held=fixed,
+            springs=springs,
+            blocks=[
+                (block.mass, [*zip(nodes, block.place + HEXAHEDRA_20.places[:8] * _BLOCK, strict=True)])
+                for block, nodes in blocks
+            ],
+            block_side=_BLOCK,
+            probe_nodes=range(first_probe, first_probe + -(-len(self.probes) // 3)),
+            equations=self._equations(blocks, first_probe),
+            steps=steps,
+        )
+
+    def _equations(
+        self, blocks: Iterable[tuple[PointBlock, list[int]]], first_probe: int
+    ) -> Iterator[list[Term]]:
+        """Yield sums that are zero, of which the first term depends on the others."""
+        for places, body in zip(self._motions, self.supports.rigid, strict=True):
+            for row, shares in enumerate(body.motions.tolist()):
+                moved = [(*place, share) for place, share in zip(places, shares, strict=True) if share]
+                yield [(int(body.nodes[row // 3]) + 1, row % 3 + 1, -1.0), *moved]
+        for block, nodes in blocks:
+            shares = [(own + 1, float(block.shares[own])) for own in np.flatnonzero(block.shares).tolist()]
+            for node, component in itertools.product(nodes, (1, 2, 3)):
+                yield [(node, component, -1.0), *((own, component, share) for own, share in shares)]
         for number, row in enumerate(self.probes):
-            yield from equation_lines([(first + number // 3, number % 3 + 1, -1.0), *self._terms(row)])
-
-    def static_steps(self, loads: Iterable[Iterable[str]], prints: Iterable[str] = ()) -> str:
-        """Input of one linear static step for each load, which prints all nodes, the probes, and `prints`."""
-        lines = [*self.definition()]
-        for load in loads:
-            lines += ["*STEP", "*STATIC", *load, "*NODE PRINT, NSET=NALL", "U"]
-            if len(self.probes):
-                lines += ["*NODE PRINT, NSET=NPROBES", "U"]
-            lines += [*prints, "*END STEP"]
-        return "\n".join(lines) + "\n"
-
-    def frequency_step(self, count: int) -> str:
-        """Input of the lowest undamped modes."""
-        return "\n".join([*self.definition(), "*STEP", "*FREQUENCY", str(count), "*END STEP"]) + "\n"
-
-    def ring_down_steps(self, load: FloatArray, increment: float, steps: int) -> str:
-        """Input of a static load (n,) and its sudden removal: direct integration by the trapezoidal rule.
-
-        Parameters
-        ----------
-        load : (n,) N
-            Load that is removed at time zero.
-        increment : float
-            Fixed time increment [s].
-        steps : int
-            Number of increments.
-        """
-        lines = [*self.definition(), "*STEP", "*STATIC", *self.force_lines(load)]
-        # CalculiX balances energy in a dynamic step and wants it asked for from the first step on.
-        lines += ["*EL PRINT, ELSET=E0", "ENER", "*END STEP"]
-        lines += [f"*STEP, INC={steps + 10}", "*DYNAMIC, DIRECT, ALPHA=0."]
-        lines += [f"{increment:.12E},{increment * steps:.12E}"]
-        lines += [*self.force_lines(0.0 * load), "*NODE PRINT, NSET=NPROBES, FREQUENCY=1", "U", "*END STEP"]
-        return "\n".join(lines) + "\n"
-
-    def force_lines(self, load: FloatArray) -> Iterator[str]:
-        """Yield nodal forces (n,) in the place of those of the step before."""
-        yield "*CLOAD, OP=NEW"
-        yield f"{self._places[0][0]},{self._places[0][1]},0."
-        for node, direction, value in self._terms(load):
-            yield f"{node},{direction},{value:.13E}"
-
-    @property
-    def _node_count(self) -> int:
-        """Nodes of the mesh, then two of each rigid set: what these move is its shift and its turn."""
-        return len(self.mesh.points) + 2 * len(self.supports.rigid)
-
-    def _motion_places(self, number: int) -> list[tuple[int, int]]:
-        """Node and direction of the six motions of a rigid set."""
-        first = len(self.mesh.points) + 1 + 2 * number
-        return [(first + motion // 3, motion % 3 + 1) for motion in range(6)]
+            yield [(first_probe + number // 3, number % 3 + 1, -1.0), *self.terms(row)]
 
     @cached_property
-    def _places(self) -> list[tuple[int, int]]:
+    def _motions(self) -> list[list[tuple[int, int]]]:
+        """Node and direction of the six motions of each rigid set: shifts of one node, turns as another's."""
+        first = 3 * len(self.mesh.points)
+        return [
+            [_place(first + 6 * number + motion) for motion in range(6)]
+            for number in range(len(self.supports.rigid))
+        ]
+
+    @cached_property
+    def places(self) -> list[tuple[int, int]]:
         """Node and direction of each free unknown."""
-        found = [(unknown // 3 + 1, unknown % 3 + 1) for unknown in self.supports.alone.tolist()]
-        for number, body in enumerate(self.supports.rigid):
-            motions = self._motion_places(number)
-            found += [motions[motion] for motion in np.flatnonzero(~body.held)]
+        found = [*map(_place, self.supports.alone.tolist())]
+        for places, body in zip(self._motions, self.supports.rigid, strict=True):
+            found += [places[motion] for motion in np.flatnonzero(~body.held)]
         return found
 
-    def _terms(self, values: FloatArray) -> Iterator[tuple[int, int, float]]:
-        """Yield (node, direction, value) of the values (n,) that are not zero."""
+    def terms(self, values: FloatArray) -> Iterator[Term]:
+        """Yield node, direction and value of the values (n,) that are not zero."""
         for unknown in np.flatnonzero(values).tolist():
-            yield (*self._places[unknown], float(values[unknown]))
-
-    def _supports(self, elements: Iterator[int]) -> Iterator[str]:
-        held = self.supports
-        yield "*BOUNDARY"
-        for unknown in np.flatnonzero(held.held).tolist():
-            yield f"{unknown // 3 + 1},{unknown % 3 + 1}"
-        for unknown in np.flatnonzero(held.springs > 0.0).tolist():
-            place = (unknown // 3 + 1, unknown % 3 + 1)
-            yield from spring_lines(next(elements), place, held.springs[unknown])
-        for number, body in enumerate(held.rigid):
-            yield from self._rigid_lines(self._motion_places(number), body, elements)
-
-    def _rigid_lines(
-        self, places: list[tuple[int, int]], body: RigidSet, elements: Iterator[int]
-    ) -> Iterator[str]:
-        """Yield the motions of a rigid set, what holds and springs them, and the nodes that follow them."""
-        yield "*NODE"
-        for node in (places[0][0], places[3][0]):
-            yield f"{node},{number_line(body.point)}"
-        yield "*BOUNDARY"
-        for motion in np.flatnonzero(body.held).tolist():
-            yield "{},{}".format(*places[motion])
-        for motion in np.flatnonzero(body.springs > 0.0).tolist():
-            yield from spring_lines(next(elements), places[motion], body.springs[motion])
-        for row, shares in enumerate(body.motions.tolist()):
-            moved = [(*place, share) for place, share in zip(places, shares, strict=True) if share]
-            yield from equation_lines([(int(body.nodes[row // 3]) + 1, row % 3 + 1, -1.0), *moved])
-
-    def _masses(self, elements: Iterator[int]) -> Iterator[str]:
-        yield "*ELSET, ELSET=EHEAVY"
-        yield "EALL"
-        for number, block in enumerate(self.masses):
-            if block.mass > 0.0:
-                yield from mass_block_lines(number, block, self._node_count + 1 + 8 * number, next(elements))
-                yield "*ELSET, ELSET=EHEAVY"
-                yield f"MASS{number}"
+            yield (*self.places[unknown], float(values[unknown]))
 
 
-def wrapped(parts: list[str], count: int, end: str = "") -> Iterator[str]:
-    """Yield lines of `count` parts each; all but the last end in `end`."""
-    for start in range(0, len(parts), count):
-        rest = end if start + count < len(parts) else ""
-        yield ",".join(parts[start : start + count]) + rest
+def _place(unknown: int) -> tuple[int, int]:
+    """Return node and direction, both from 1, of an unknown."""
+    return unknown // 3 + 1, unknown % 3 + 1
 
 
-def spring_lines(element: int, place: tuple[int, int], stiffness: float) -> Iterator[str]:
-    """Yield a spring [N/m] to the ground of a node along a direction."""
-    node, direction = place
-    yield f"*ELEMENT, TYPE=SPRING1, ELSET=SPRING{element}"
-    yield f"{element},{node}"
-    yield f"*SPRING, ELSET=SPRING{element}"
-    yield str(direction)
-    yield number_line([stiffness])
+@cache
+def _template() -> Template:
+    environment = Environment(
+        loader=PackageLoader("fe.verification"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters["numbers"] = number_line
+    return environment.get_template("calculix.inp.jinja")
 
 
-def number_line(values: Iterable[float]) -> str:
+def number_line(values: ArrayLike) -> str:
     """Return numbers with the digits of a double, at most 20 characters each, as CalculiX reads them."""
-    return ",".join(f"{value:.13E}" for value in values)
-
-
-def equation_lines(terms: Iterable[tuple[int, int, float]]) -> Iterator[str]:
-    """Yield an equation: the terms (node, direction, factor) are zero together, the first one depends."""
-    text = [f"{node},{direction},{value:.13E}" for node, direction, value in terms]
-    yield "*EQUATION"
-    yield str(len(text))
-    yield from wrapped(text, _PER_LINE)
-
-
-def mass_block_lines(number: int, block: PointBlock, node: int, element: int) -> Iterator[str]:
-    """Yield a point mass [kg] as a block that moves with the weighted mean of nodes, as element set MASSn.
-
-    The block only translates, so that its elasticity does not count. CalculiX 2.20 ends with an error in
-    `add_sm_st` when an element of type MASS sits on a node that depends on others.
-
-    Parameters
-    ----------
-    number : int
-        Number n of the mass.
-    block : PointBlock
-        The mass.
-    node, element : int
-        The first of its eight nodes, and its element, as numbers that are free.
-    """
-    yield "*NODE"
-    for corner, local in enumerate(HEXAHEDRA_20.places[:8] * _BLOCK):
-        yield f"{node + corner},{number_line(block.place + local)}"
-    yield f"*ELEMENT, TYPE=C3D8, ELSET=MASS{number}"
-    yield ",".join(str(n) for n in (element, *range(node, node + 8)))
-    yield f"*MATERIAL, NAME=MASS{number}"
-    yield "*ELASTIC"
-    yield "1.E6,0."
-    yield "*DENSITY"
-    yield f"{block.mass / _BLOCK**3:.13E}"
-    yield f"*SOLID SECTION, ELSET=MASS{number}, MATERIAL=MASS{number}"
-    shares = [(other + 1, float(block.shares[other])) for other in np.flatnonzero(block.shares).tolist()]
-    for own in range(node, node + 8):
-        for component in (1, 2, 3):
-            moved = [(other, component, share) for other, share in shares]
-            yield from equation_lines([(own, component, -1.0), *moved])
+    return ",".join(f"{value:.13E}" for value in np.asarray(values).ravel().tolist())

@@ -1,12 +1,12 @@
 """A structure, and the wing, as input for CalculiX."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
 from fe.elements.cells import rotate_elasticity
 from fe.elements.kinds import WEDGES_6
-from fe.runtime.arrays import FloatArray, IntArray
+from fe.runtime.arrays import IntArray
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
 from fe.structure.design import Load
@@ -22,11 +22,12 @@ from fe.wing.operators import (
 )
 from fe.wing.responses import wing_values
 
-from .calculix_deck import CalculixDeck, PointBlock, number_line
+from .calculix_deck import CalculixDeck, CellMaterial, PointBlock, Step, number_line
 
+STATIC = ("*STATIC",)
 NOT_COMPARABLE = (WEDGES_6,)
 """Kinds that CalculiX integrates otherwise (C3D6 at two points)."""
-ORTHOTROPIC = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (5, 5), (4, 4), (3, 3))
+ORTHOTROPIC = ([0, 0, 1, 0, 1, 2, 5, 4, 3], [0, 1, 1, 2, 2, 2, 5, 4, 3])
 """Rows and columns of an elasticity in the order of CalculiX's nine orthotropic constants."""
 
 
@@ -48,44 +49,32 @@ def structure_deck(structure: Structure) -> CalculixDeck:
         PointBlock(part.mass, mesh.unit * np.asarray(part.point), point_shares(mesh, part.point, part.name))
         for part in design.mass
     )
+    materials = []
+    for number, part in enumerate(design.material):
+        factor = structure.parameters.get(part.scaled_by or "", 1.0)
+        constants = np.asarray(factor * np.linalg.inv(part.compliance)[ORTHOTROPIC], dtype=np.float64)
+        cells, axes = np.flatnonzero(structure.material_of == number), np.array(part.axes or np.eye(3)[:2])
+        materials.append(CellMaterial([(0.0, constants)], part.density, axes, cells))
     return CalculixDeck(
-        "structure",
-        structure,
-        {},
-        mesh,
-        structure.unknowns_held,
-        tuple(_structure_materials(structure)),
-        tuple(masses),
+        "structure", structure, {}, mesh, structure.unknowns_held, tuple(materials), tuple(masses)
     )
 
 
-def _structure_materials(structure: Structure) -> Iterator[str]:
-    for number, part in enumerate(structure.design.material):
-        factor = structure.parameters.get(part.scaled_by or "", 1.0)
-        local = factor * np.linalg.inv(part.compliance)
-        yield from material_lines(number, [(0.0, np.array([local[p] for p in ORTHOTROPIC]))], part.density)
-        axes = np.array(part.axes or np.eye(3)[:2])
-        yield from section_lines(number, axes, np.flatnonzero(structure.material_of == number))
-
-
-def load_lines(deck: CalculixDeck, load: Load) -> Iterator[str]:
-    """Yield the lines of a load of a structure, its control at the nominal value."""
-    structure = deck.structure
-    assert isinstance(structure, Structure)
+def load_step(structure: Structure, load: Load) -> Step:
+    """Return the static step of a load of a structure, its control at the nominal value."""
     factor = 1.0 if load.control is None else structure.controls[load.control]
-    force = structure.load(load.name)
-    yield from deck.force_lines(0.0 * force if load.force is None else force)
-    yield "*DLOAD, OP=NEW"
+    force, lines = structure.load(load.name), ["*DLOAD, OP=NEW"]
     if load.acceleration is not None:
         size = float(np.linalg.norm(load.acceleration))
         direction = np.sign(factor) * np.asarray(load.acceleration) / size
-        yield f"EHEAVY,GRAV,{number_line([abs(factor) * size, *direction])}"
+        lines.append(f"EHEAVY,GRAV,{number_line([abs(factor) * size, *direction])}")
     elif load.pressure is not None and load.set is not None:
         surface = structure.mesh.faces_of(load.set, load.name)
         for cell, face in zip(surface.cell, surface.face, strict=True):
-            yield f"{cell + 1},P{face + 1},{factor * load.pressure:.13E}"
+            lines.append(f"{cell + 1},P{face + 1},{number_line([factor * load.pressure])}")
     else:
-        yield "EALL,GRAV,0.,0.,0.,1."
+        lines.append("EALL,GRAV,0.,0.,0.,1.")
+    return Step(STATIC, force if load.force is not None else 0.0 * force, lines)
 
 
 def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
@@ -102,15 +91,20 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
         )
         for place in mesh.design.point_masses
     )
+    # The station of a node stands as its temperature, on which the constants of a graded skin depend.
+    stations = mesh.points[:, 1] / mesh.design.planform.semi_span if mesh.design.skin.stations else None
     return CalculixDeck(
         "wing, design",
         operators,
         wing_values(operators, stiffness_loss=state.stiffness_loss, **state.values),
         mesh,
         root_support(mesh),
-        (*_wing_materials(operators, state), *cell_set("EGAUGES", gauge_cells(operators))),
+        tuple(_wing_materials(operators, state)),
         tuple(masses),
         (operators.load_tip,),
+        gauge_cells(operators),
+        stations,
+        (state.damping_alpha, state.damping_beta),
     )
 
 
@@ -125,58 +119,21 @@ def gauge_cells(operators: AffineOperators) -> IntArray:
     return np.unique(cells)
 
 
-def _wing_materials(operators: AffineOperators, state: DigitalState) -> Iterator[str]:
-    mesh = operators.wing_mesh
+def _wing_materials(operators: AffineOperators, state: DigitalState) -> Iterator[CellMaterial]:
+    mesh, skin = operators.wing_mesh, operators.wing_mesh.design.skin
     axes = cell_axes(mesh)
     # Constants in the cell's own axes; CalculiX turns them by the orientation.
     local = rotate_elasticity(cell_elasticity(mesh), np.swapaxes(axes, 1, 2))
     parameters = {"young_modulus_factor": state.young_modulus_factor}
     factor = operators.theta(parameters, state.stiffness_loss)[mesh.stiffness_term]
-    constants = np.column_stack([local[:, row, column] for row, column in ORTHOTROPIC])
-    constants *= factor[:, None]
-    density = cell_density(mesh)
+    constants, density = factor[:, None] * local[:, *ORTHOTROPIC], cell_density(mesh)
     # Whether Young's modulus changes inside a cell.
-    graded = (mesh.web < 0) & (mesh.rib < 0) & bool(mesh.design.skin.stations)
+    graded = (mesh.web < 0) & (mesh.rib < 0) & bool(skin.stations)
     if graded.any():
-        centre = mesh.design.skin.young_modulus(mesh.centres[graded, 1] / mesh.design.planform.semi_span)
+        centre = skin.young_modulus(mesh.centres[graded, 1] / mesh.design.planform.semi_span)
         constants[graded] /= centre[:, None]
-    damping = f"*DAMPING, ALPHA={state.damping_alpha:.12E}, BETA={state.damping_beta:.12E}"
-    course = [(place.station, place.young_modulus) for place in mesh.design.skin.stations]
+    course = [(place.station, place.young_modulus) for place in skin.stations]
     for cell, own in enumerate(constants):
         moduli = course if graded[cell] else [(0.0, 1.0)]
         rows = [(temperature, modulus * own) for temperature, modulus in moduli]
-        yield from material_lines(cell, rows, float(density[cell]))
-        if state.damping_alpha or state.damping_beta:
-            yield damping
-        yield from section_lines(cell, axes[cell, :2], [cell])
-    if graded.any():
-        # The station of a node stands as its temperature, on which the skin's constants depend.
-        yield "*INITIAL CONDITIONS, TYPE=TEMPERATURE"
-        span = mesh.design.planform.semi_span
-        for node, place in enumerate(mesh.points[:, 1] / span, start=1):
-            yield f"{node},{place:.13E}"
-
-
-def material_lines(number: int, courses: Iterable[tuple[float, FloatArray]], density: float) -> Iterator[str]:
-    """Yield a material: nine orthotropic constants [Pa] at each of some temperatures, density [kg/m^3]."""
-    yield f"*MATERIAL, NAME=M{number}"
-    yield "*ELASTIC, TYPE=ORTHO"
-    for temperature, constants in courses:
-        yield number_line(constants[:8])
-        yield number_line((constants[8], temperature))
-    yield "*DENSITY"
-    yield number_line([density])
-
-
-def section_lines(number: int, axes: FloatArray, cells: Iterable[int]) -> Iterator[str]:
-    """Yield which cells are of the material of a number, in axes by two vectors (2, 3)."""
-    yield f"*ORIENTATION, NAME=O{number}, SYSTEM=RECTANGULAR"
-    yield number_line(axes.ravel())
-    yield from cell_set(f"E{number}", cells)
-    yield f"*SOLID SECTION, ELSET=E{number}, MATERIAL=M{number}, ORIENTATION=O{number}"
-
-
-def cell_set(name: str, cells: Iterable[int]) -> Iterator[str]:
-    """Yield a set of cells, which count from 0."""
-    yield f"*ELSET, ELSET={name}"
-    yield from (str(cell + 1) for cell in cells)
+        yield CellMaterial(rows, float(density[cell]), axes[cell, :2], [cell])

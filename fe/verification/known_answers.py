@@ -4,12 +4,12 @@ The patch test, the rigid-body modes and the cantilever check the element and th
 their own; the balance and the mesh convergence check the wing itself.
 """
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import sparse
-from scipy.optimize import brentq
 
 from fe.elements.cells import CellMesh, centre_strains, gradients, hexahedra_20, isotropic_compliance
 from fe.elements.kinds import HEXAHEDRA_20, gauss_points
@@ -27,7 +27,7 @@ _PATCH_GRADIENT = np.array([[1.0, -0.4, 0.3], [0.2, -0.7, 0.5], [-0.6, 0.1, 0.8]
 
 
 def brick(
-    lengths: tuple[float, float, float], cells: tuple[int, int, int], distortion: float = 0.0, seed: int = 0
+    lengths: tuple[float, float, float], cells: tuple[int, int, int], distortion: float = 0.0
 ) -> CellMesh:
     """Brick of 20-node hexahedra with positive Jacobians.
 
@@ -39,14 +39,12 @@ def brick(
         Number of cells along each edge.
     distortion : float
         Interior vertices move by up to this fraction of a cell.
-    seed : int
-        Of the distortion.
     """
     grid = np.indices([n + 1 for n in cells]).reshape(3, -1).T / np.array(cells)
     corner = np.indices(cells).reshape(3, -1).T[:, None] + np.array(HEXAHEDRA_20.corners)
     numbers = np.ravel_multi_index(tuple(np.moveaxis(corner, 2, 0)), tuple(n + 1 for n in cells))
     inside = np.all((grid > 1e-9) & (grid < 1.0 - 1e-9), axis=1)
-    shift = np.random.default_rng(seed).uniform(-distortion, distortion, grid.shape) / np.array(cells)
+    shift = np.random.default_rng(0).uniform(-distortion, distortion, grid.shape) / np.array(cells)
     points = (grid + shift * inside[:, None]) * np.array(lengths)
     return hexahedra_20(points, numbers)
 
@@ -193,39 +191,21 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[s
     }
 
 
-class ConvergenceRow(NamedTuple):
-    """Results of the healthy wing at e = 1 on one mesh.
+def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> dict[str, FloatArray]:
+    """Results of the healthy wing at e = 1 on a sequence of meshes; nothing is refitted.
 
-    Attributes
-    ----------
-    unknowns : int
-        Free unknowns.
-    tip_stiffness : float
-        N/m.
-    first_bending, second_bending : float
-        Flapwise bending frequencies at the design's nominal masses [Hz].
-    strain : (gauges,) dimensionless
-        Gauge strains at the load factor of the design's lift.
-    """
-
-    unknowns: int
-    tip_stiffness: float
-    first_bending: float
-    second_bending: float
-    strain: FloatArray
-
-
-def mesh_convergence(
-    design: WingDesign, refinements: Sequence[float] = (0.5, 1.0, 1.5, 2.0)
-) -> tuple[ConvergenceRow, ...]:
-    """Results of the same wing on a sequence of meshes; nothing is refitted.
+    Returns
+    -------
+    dict of str to (meshes, ...)
+        Free `unknowns`; `tip stiffness` [N/m]; frequencies of `first bending` and `second bending` at the
+        design's nominal masses [Hz]; `strain` (meshes, gauges) at the load factor of the design's lift.
 
     Raises
     ------
     InvalidDesignError
         If a refinement lies outside the range of the design.
     """
-    rows = []
+    found: dict[str, list[Any]] = {}
     for refinement in refinements:
         operators = assemble(design.changed(mesh={"refinement": refinement}))
         loads = np.column_stack((operators.turn(design.lift.load_factor), operators.load_tip))
@@ -233,30 +213,25 @@ def mesh_convergence(
         masses = point_masses(design.masses.servo, design.masses.pitot)
         frequency, shapes = natural_frequencies(operators, 4, masses)
         first, second = frequency[most_moved(operators.load_tip, frequency**2, shapes)].tolist()
-        stiffness = 1.0 / float(operators.load_tip @ bent)
-        rows.append(
-            ConvergenceRow(operators.unknowns, stiffness, first, second, operators.gauge_output @ turn)
-        )
-    return tuple(rows)
+        for name, value in (
+            ("unknowns", operators.unknowns),
+            ("tip stiffness", 1.0 / float(operators.load_tip @ bent)),
+            ("first bending", first),
+            ("second bending", second),
+            ("strain", operators.gauge_output @ turn),
+        ):
+            found.setdefault(name, []).append(value)
+    return {name: np.array(values) for name, values in found.items()}
 
 
-def observed_order(refinements: Sequence[float], values: Sequence[float]) -> float:
-    """Order p of v = v_0 + c refinement^-p through the last three of a sequence of meshes.
+def observed_order(ratio: float, values: Sequence[float]) -> float:
+    """Order p of v = v_0 + c h^p through the last three of values on meshes, h each `ratio` times less.
 
     Returns
     -------
     float
         The order; NaN where the values do not approach a limit from one side with an order of 0.05 to 12.
     """
-    coarse, middle, fine = (1.0 / refinement for refinement in refinements[-3:])
     first, second = values[-2] - values[-3], values[-1] - values[-2]
-    if first * second <= 0.0:
-        return float("nan")
-
-    def mismatch(order: float) -> float:
-        return float((coarse**order - middle**order) * second - (middle**order - fine**order) * first)
-
-    ends = 0.05, 12.0
-    if mismatch(ends[0]) * mismatch(ends[1]) > 0.0:
-        return float("nan")
-    return float(brentq(mismatch, *ends))
+    order = math.log(first / second) / math.log(ratio) if first * second > 0.0 else math.nan
+    return order if 0.05 < order < 12.0 else math.nan

@@ -1,29 +1,25 @@
-"""A small wing of springs and masses with the interface of the real one, packed as an FMU once."""
+"""Our FMUs and others', packed once; a small wing of springs and masses stands for the real one."""
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.companions import COMPANION_NAMES
-from fmu_asset.companions.build import companion_bytes
-from fmu_asset.door.binding import Binding, load_binding, parse_binding
-from fmu_asset.packing.structure_fmu import build_fmu
-from reporting.files import atomic_write_bytes
-
-ROOT = Path(__file__).parents[2]
-NODES = 16
-GAUGES = 24
+from fmu_asset.compiled.compiler import find_compiler
+from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.errors import FmuBuildError
+from scenarios import binding_files
+from tests.conftest import BEAM
+from tests.fmu_asset.chain import chain_arrays, chain_model
+from tests.fmu_asset.making import bound, with_dependencies
+from tests.fmu_asset.ours import OurFmus, three_regions
+from tests.kept import FE, kept
 
 
 @pytest.fixture
@@ -36,68 +32,19 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-PLACES = (slice(3, 6), slice(9, 12), slice(6, 8), slice(13, 15))
-"""Springs of the chain that may lose stiffness."""
+@pytest.fixture(params=[True, False], ids=["worker", "in process"])
+def isolated(request: pytest.FixtureRequest) -> bool:
+    """Whether FMUs run in a process of their own: each test that asks for it is run in both ways."""
+    return bool(request.param)
 
 
-def chain_model(stiffness: float = 9.0e4, regions: tuple[str, ...] = ("z1", "z2")) -> ReducedModel:
-    """Return a chain of 16 springs and masses as a reduced model: exact, so its error bound is zero."""
-    difference = np.eye(NODES) - np.eye(NODES, k=-1)
-    count = len(regions)
-    region = np.zeros((count + 2, NODES))
-    for number, place in enumerate(PLACES[:count], start=1):
-        region[number, place] = 1.0
-    region[0] = 1.0 - region[1:-1].sum(axis=0)
-    region[-1] = 0.05
-    terms = np.stack([difference.T @ np.diag(stiffness * row) @ difference for row in region])
-    mass = np.stack([0.06 * np.eye(NODES), np.zeros((NODES, NODES)), np.zeros((NODES, NODES))])
-    mass[1, 10, 10] = mass[1, 14, 14] = mass[2, 15, 15] = 1.0
-    load = np.stack([np.linspace(12.0, 2.0, NODES), np.eye(NODES)[-2]])
-    gauge = difference[np.arange(GAUGES) % NODES] * np.linspace(0.3, 0.6, GAUGES)[:, np.newaxis]
-    output = np.vstack((gauge, np.eye(NODES)[-1]))
-    outputs = GAUGES + 1
-    _, shapes = np.linalg.eigh(terms.sum(axis=0))
-    # The chain is exact: whatever the model allows for rounding and truncation is zero.
-    allowances = {item.name: 0.0 for item in fields(ReducedModel) if item.name.endswith("_allowance")}
-    return ReducedModel(
-        design_hash="chain",
-        name="uav_wing",
-        region_names=" ".join(regions),
-        parameter_names="young_modulus_factor",
-        mass_names="servo_mass pitot_mass",
-        control_names="load_factor tip_force",
-        control_units="1 N",
-        gauge_names=" ".join(f"gauge_{number}" for number in range(1, GAUGES + 1)),
-        displacement_names="tip",
-        acceleration_names="",
-        nominal=np.array((1.0, *(0.0,) * count, 0.169, 0.134, 1.0, 0.0)),
-        damping=np.array((1.0735, 7.3124e-4)),
-        stiffness_factors=np.array([(1, 0), *((0, number + 1) for number in range(count)), (0, 0)]),
-        load_factors=np.array([(1, 0), (2, 0)]),
-        validity_box=np.array(
-            [[0.85, 1.15], *[[0.0, 0.85]] * count, [0.1, 0.25], [0.1, 0.2], [-1.0, 4.0], [-20.0, 20.0]]
-        ),
-        static_stiffness=terms,
-        static_load=load,
-        static_output=output,
-        bound_reference=np.ones(count + 1),
-        residual_load=np.zeros((32, 2)),
-        residual_stiffness=np.zeros((32, count + 2, NODES)),
-        dual_counts=np.full(count, 2),
-        dual_split=np.full(count, 0.4),
-        dual_correction=np.zeros((2**count, outputs, 32)),
-        dual_residual=np.zeros((2**count, outputs, count + 2, count + 2)),
-        dual_stiffness=np.empty((outputs, count + 2, 0, 0)),
-        dual_output=np.empty((outputs, 0)),
-        modal_stiffness=terms,
-        modal_mass=mass,
-        modal_load=load,
-        modal_output=output,
-        cross_mass=mass,
-        followed_shapes=shapes[:, :2].T.copy(),
-        mode_count=8,
-        **allowances,
-    )
+@pytest.fixture(scope="session")
+def compiler() -> list[str]:
+    """The command of the C compiler; skips where there is none."""
+    try:
+        return find_compiler()
+    except FmuBuildError as error:
+        pytest.skip(f"no C compiler: {error}")
 
 
 @pytest.fixture(scope="session")
@@ -111,115 +58,81 @@ def model() -> ReducedModel:
 
 
 @pytest.fixture(scope="session")
-def fmu(model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_fmu(model, tmp_path_factory.mktemp("fmu") / "wing.fmu").path
+def arrays(model: ReducedModel) -> PatchArrays:
+    return chain_arrays(model)
+
+
+@pytest.fixture(scope="session")
+def beam_model(request: pytest.FixtureRequest) -> ReducedModel:
+    """The beam of the tests, reduced."""
+    return kept("beam", lambda: request.getfixturevalue("beam_reduction").model, FE, BEAM)
+
+
+@pytest.fixture(scope="session")
+def ours(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> OurFmus:
+    """Pack our own FMUs: `ours("compiled")` is a path."""
+    models = {
+        "chain": chain_model,
+        "regions": three_regions,
+        "beam": lambda: request.getfixturevalue("beam_model"),
+    }
+    return OurFmus(tmp_path_factory.mktemp("ours"), models)
+
+
+@pytest.fixture(scope="session")
+def fmu(ours: OurFmus) -> Path:
+    return ours("python")
+
+
+@pytest.fixture(scope="session")
+def compiled_fmu(ours: OurFmus) -> Path:
+    return ours("compiled")
+
+
+@pytest.fixture(scope="session")
+def compiled_beam(ours: OurFmus) -> Path:
+    return ours("compiled_beam")
+
+
+@pytest.fixture(scope="session")
+def spring_mass(ours: OurFmus) -> Path:
+    return ours("spring_mass")
+
+
+@pytest.fixture(scope="session")
+def companions(ours: OurFmus) -> dict[str, Path]:
+    """The companion FMUs."""
+    return {name: ours(name) for name in COMPANION_NAMES}
 
 
 @pytest.fixture(scope="session")
 def binding() -> Binding:
-    return load_binding(ROOT / "scenarios" / "bindings" / "uav_wing.toml")
-
-
-@pytest.fixture(scope="session")
-def companions(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The companion FMUs."""
-    folder = tmp_path_factory.mktemp("companions")
-    return {
-        name: atomic_write_bytes(folder / f"{name}.fmu", companion_bytes(name)) for name in COMPANION_NAMES
-    }
-
-
-SPRING_MASS = {
-    "binding": {"name": "spring_mass", "step_size": 0.1, "start_time": 2.0},
-    "control": {"push": {"variable": "force", "unit": "N"}},
-    "health": {"spring": {"variable": "stiffness", "unit": "N/m"}},
-    "load": {
-        "lock": {"variable": "locked", "unit": "1"},
-        "misbehaviour": {"variable": "misbehaviour", "unit": "1"},
-    },
-    "observation": {"motion": {"variables": ["velocity", "position"], "unit": "m"}},
-    "monitor": {"steps": {"variable": "steps", "unit": "1"}},
-}
-
-
-@pytest.fixture(scope="session")
-def spring_mass(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An FMU of another maker, as pythonfmu's own builder exports it."""
-    folder = tmp_path_factory.mktemp("spring_mass")
-    shutil.copy(Path(__file__).with_name("spring_mass.py"), folder / "SpringMass.py")
-    subprocess.run(
-        [sys.executable, "-m", "pythonfmu", "build", "-f", "SpringMass.py"],
-        cwd=folder,
-        check=True,
-        capture_output=True,
-    )
-    return folder / "SpringMass.fmu"
+    return load_binding(binding_files()["uav_wing"])
 
 
 @pytest.fixture(scope="session")
 def spring_binding() -> Binding:
-    return parse_binding(SPRING_MASS)
-
-
-def chain_arrays(model: ReducedModel, span: float = 1.6) -> PatchArrays:
-    """Return the same chain in the form that carries patches, exact: its basis is the chain itself."""
-    stations = span * np.arange(NODES + 1) / NODES
-    place = np.vstack((np.zeros(NODES), np.eye(NODES)))
-    difference = np.eye(NODES) - np.eye(NODES, k=-1)
-    spring = float(model.static_stiffness[-1, -1, -1]) / 0.05
-    region = np.zeros(NODES, dtype=int)
-    for number, place_of in enumerate(PLACES[: len(model.regions)], start=1):
-        region[place_of] = number
-    parts, strip_of, term_of = [], [], []
-    for strip in range(4):
-        for term in range(len(model.regions) + 1):
-            inside = (np.arange(NODES) // 4 == strip) & (region == term)
-            if inside.any():
-                matrix = difference.T @ np.diag(spring * inside) @ difference
-                parts.append(matrix[np.tril_indices(NODES)])
-                strip_of.append(strip)
-                term_of.append(term)
-    gauges = model.static_output[:-1]
-    bending = np.diff(gauges, axis=1, append=0.0)
-    zero = np.zeros_like(place)
-    weight = -9.81 * model.modal_mass[0].diagonal()
-    shares = np.arange(NODES + 1, 0.0, -1.0)
-    return PatchArrays(
-        design_hash=model.design_hash,
-        region_names=model.region_names,
-        validity_box=model.validity_box,
-        largest_loss=0.7,
-        largest_compliance=1e-3,
-        largest_mass=0.5,
-        stiffness=model.static_stiffness,
-        mass=model.modal_mass,
-        strip_lines=np.linspace(0.0, span, 5),
-        strip_stiffness=np.array(parts, dtype=np.float32),
-        strip_of=np.array(strip_of),
-        term_of=np.array(term_of),
-        flap_row=np.eye(NODES)[0],
-        flap_spring=0.05 * spring,
-        semi_span=span,
-        root_chord=0.4,
-        tip_chord=0.3,
-        straight_chord_line=0.25,
-        load_place=float(stations[-2]),
-        stations=stations,
-        line_chord=np.array([0.25, 0.6]),
-        line_rows=np.stack((zero, zero, place, 0.9 * place)),
-        station_weights=shares / shares.sum(),
-        load_tip=model.static_load[1],
-        load_lift=model.static_load[0],
-        lift_rows=place * (model.static_load[0] - weight),
-        weight=weight,
-        strain_rows=np.stack((gauges, -0.3 * gauges, bending)),
-        gauge_stations=span * np.abs(gauges).argmax(axis=1) / NODES,
-        gauge_length=0.0,
-        tip_row=model.static_output[-1],
-        start_shapes=np.linalg.eigh(model.static_stiffness.sum(axis=0))[1][:, :8].copy(),
-    )
+    return bound(
+        0.1, {"motion": (["velocity", "position"], "m")}, header={"name": "spring_mass", "start_time": 2.0},
+        control={"push": ("force", "N")}, health={"spring": ("stiffness", "N/m")},
+        load={"lock": ("locked", "1"), "misbehaviour": ("misbehaviour", "1")},
+        monitor={"steps": ("steps", "1")},
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="session")
-def arrays(model: ReducedModel) -> PatchArrays:
-    return chain_arrays(model)
+def linear_fmu(ours: OurFmus) -> Path:
+    """The linear system as pythonfmu exports it: it declares no dependencies, so all outputs have all."""
+    return ours("linear")
+
+
+@pytest.fixture(scope="session")
+def state_fmu(linear_fmu: Path) -> Path:
+    """The same, declaring that no output depends on an input directly."""
+    return with_dependencies(linear_fmu, linear_fmu.with_name("state.fmu"), {"y1": [], "y2": []})
+
+
+@pytest.fixture(scope="session")
+def crossed_fmu(linear_fmu: Path) -> Path:
+    """The same, declaring that y1 depends on u1 and y2 on u2."""
+    return with_dependencies(linear_fmu, linear_fmu.with_name("crossed.fmu"), {"y1": ["u1"], "y2": ["u2"]})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import zipfile
@@ -47,6 +48,19 @@ def edited(fmu: Path, target: Path, *changes: tuple[str, str], entry: str = DESC
         assert old in text
         text = text.replace(old, new)
     return archive_of(target, contents | {entry: text.encode()})
+
+
+def with_dependencies(fmu: Path, target: Path, dependencies: Mapping[str, Sequence[str]]) -> Path:
+    """Copy an FMU and write which inputs each of its outputs depends on."""
+    text = members(fmu)[DESCRIPTION].decode()
+    names = re.findall(r'<ScalarVariable[^>]*?\bname="([^"]+)"', text)
+    outputs = text[text.index("<Outputs>") : text.index("</Outputs>")]
+    told = outputs
+    for output, inputs in dependencies.items():
+        index, value = names.index(output) + 1, " ".join(str(names.index(name) + 1) for name in inputs)
+        assert f'<Unknown index="{index}"' in told
+        told = told.replace(f'<Unknown index="{index}"', f'<Unknown index="{index}" dependencies="{value}"')
+    return edited(fmu, target, (outputs, told))
 
 
 def run_python(program: str, *arguments: object, **options: Any) -> str:

@@ -3,14 +3,11 @@
 import json
 from pathlib import Path
 
-from pydantic import Field
-
 from fe.runtime.errors import InvalidDesignError
-from fe.structure.design import Gauge, MeshDesign, load_structure, parse_structure, with_rosettes
+from fe.structure.design import Gauge, Gauged, MeshDesign, load_structure, parse_structure
 from fe.structure.gauges import gauge_rows, spread_rosettes
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
-from fe.structure.tables import Part
 from reporting.section import checked
 from reporting.toml_file import read_toml
 from twin_master.assets.asset_source import keep_files, read_files
@@ -19,10 +16,6 @@ from twin_master.errors import MissionInputError
 from twin_master.scenario.schema import Scenario
 
 __all__ = ["with_candidates"]
-
-
-class _Gauges(Part):
-    gauge: tuple[Gauge, ...] = Field(min_length=1)
 
 
 def with_candidates(scenario: Scenario, candidates: str, folder: Path) -> Scenario:
@@ -102,6 +95,9 @@ def _joined(file: Path, candidates: str) -> MeshDesign:
 def _gauges(candidates: str, mesh: StructureMesh) -> tuple[Gauge, ...]:
     if candidates.isdecimal():
         spread = spread_rosettes(mesh, int(candidates))
-        return tuple(Gauge(**gauge) for one in spread for gauge in one.gauges())
-    content = with_rosettes(read_toml(candidates, InvalidDesignError), candidates)
-    return checked(_Gauges, content, candidates, InvalidDesignError, what="a file of gauges").gauge
+        return tuple(gauge for one in spread for gauge in one.gauges())
+    content = read_toml(candidates, InvalidDesignError)
+    found = checked(Gauged, content, candidates, InvalidDesignError, what="a file of gauges").gauge
+    if not found:
+        raise InvalidDesignError(f"{candidates}: a table [[gauge]] or [[rosette]] is expected.")
+    return found

@@ -17,8 +17,10 @@ from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.laws.micro_slip import slip_displacements
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import ModalMotion, laws_of, simulate
+from fe.runtime.motion import laws_of
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
+from fe.runtime.stepwise import ModalMotion
+from tests.fe.runtime.stepping import simulate
 
 FloatArray = NDArray[np.float64]
 

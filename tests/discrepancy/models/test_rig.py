@@ -25,7 +25,7 @@ from discrepancy.campaign.records import (
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Course, Drive
+from discrepancy.models.acting import Course
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.natural_scales import FORCES
@@ -464,7 +464,8 @@ def test_the_same_record_is_one_course_to_the_last_bit() -> None:
     between = np.linspace(time[0], time[-1], 91)
     for values in (np.sin(time), np.cos(time), np.sin(time)):  # computed, then kept
         for order in range(3):
-            kept, fresh = Drive.of(time.copy(), values.copy(), 1), Drive(time, values, 1)
+            kept = Course.of(time.copy(), values.copy(), Hold.SMOOTH, 1)
+            fresh = Course(time, values, Hold.SMOOTH, 1)
             assert np.array_equal(kept.at(between, order), fresh.at(between, order))
         for hold in (Hold.LINEAR, Hold.SMOOTH):
             course, fresh = Course.of(time.copy(), values.copy(), hold), Course(time, values, hold)

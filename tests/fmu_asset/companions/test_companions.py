@@ -21,7 +21,7 @@ from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.companions.build import companion_bytes
 from fmu_asset.companions.damage_growth import DamageGrowth
 from fmu_asset.companions.strain_gauges import StrainGauges, normal
-from fmu_asset.door.binding import Binding, parse_binding
+from fmu_asset.door.binding import parse_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError
 from fmu_asset.folders import scratch_folder
@@ -201,35 +201,6 @@ def test_a_companion_is_a_sound_fmu(fmus: dict[str, Path], name: str) -> None:
 def test_equal_input_gives_equal_bytes(fmus: dict[str, Path]) -> None:
     for name, path in fmus.items():
         assert companion_bytes(name) == path.read_bytes()
-
-
-def damage_binding(**values: float) -> Binding:
-    return parse_binding(
-        {
-            "binding": {"name": "damage", "step_size": 1.0},
-            "control": {"load_factor": {"variable": "load_factor", "unit": "1"}},
-            "parameter": {
-                name.replace(".", "_"): {"variable": name, "unit": "1", "value": value}
-                for name, value in values.items()
-            },
-            "observation": {"z": {"variables": ["z1", "z2"], "unit": "%"}},
-        }
-    )
-
-
-def test_the_fmu_does_what_its_behaviour_does_and_resumes_in_another_process(fmus: dict[str, Path]) -> None:
-    values = {"probability.z1": 0.4, "probability.z2": 0.3, "seed": 11.0}
-    behaviour, _ = damage(**values)
-    expected = [behaviour.advance(float(step), 1.0, [3.0]) for step in range(12)]
-    binding = damage_binding(**values)
-    with FmiAsset(fmus["damage_growth"], binding) as asset:
-        seen = [asset.step({"load_factor": 3.0}).values / 100.0 for _ in range(6)]
-        assert asset.state_method == "serialised"
-        state = asset.save_state()
-    with FmiAsset(fmus["damage_growth"], binding) as asset:
-        asset.restore_state(state)
-        seen += [asset.step().values / 100.0 for _ in range(6)]
-    np.testing.assert_allclose(seen, expected, rtol=1e-14)
 
 
 def test_refusals_leave_the_state(fmus: dict[str, Path]) -> None:

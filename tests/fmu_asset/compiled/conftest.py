@@ -21,29 +21,9 @@ from fmpy.fmi2 import (
 )
 from fmpy.logging import addLoggerProxy
 
-from fe.reduction.reduced_basis import Reduction
-from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
-from fmu_asset.compiled.compiler import find_compiler
-from fmu_asset.errors import FmuBuildError
-from fmu_asset.packing.structure_fmu import build_fmu
-from tests.kept import compiled_wing
 
 OK, DISCARD, ERROR = 0, 2, 3
-
-
-@pytest.fixture(scope="session")
-def compiler() -> list[str]:
-    """The command of the C compiler; skips where there is none."""
-    try:
-        return find_compiler()
-    except FmuBuildError as error:
-        pytest.skip(f"no C compiler: {error}")
-
-
-@pytest.fixture(scope="session")
-def compiled_fmu(compiler: list[str], model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return compiled_wing(model, tmp_path_factory.mktemp("compiled"))
 
 
 # fmpy's native proxy, which formats messages, knows one logger in a process: it finds the log by the name.
@@ -165,11 +145,3 @@ def other_slave(compiled_fmu: Path) -> Iterator[Slave]:
 @pytest.fixture
 def python_slave(fmu: Path) -> Iterator[Slave]:
     yield from opened(fmu)
-
-
-@pytest.fixture(scope="session")
-def compiled_beam(
-    compiler: list[str], beam_reduction: Reduction, tmp_path_factory: pytest.TempPathFactory
-) -> Path:
-    """A structure from a mesh, compiled."""
-    return build_fmu(beam_reduction.model, tmp_path_factory.mktemp("beam") / "beam.fmu", kind="compiled").path

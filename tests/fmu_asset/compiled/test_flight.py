@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fmu_asset.door.binding import Binding
-from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.variables import (
     STATUS_BAD_CALL,
@@ -247,24 +245,6 @@ def test_the_past_of_an_instance_does_not_show(slave: Any, other_slave: Any) -> 
         for index in range(10):
             assert one.step([2.0, 0.1 * (index // 3), 0.0, 0.0], 0.1 * index, 0.1) == OK
     assert slave.everything() == other_slave.everything()
-
-
-def test_a_state_survives_its_process(compiled_fmu: Path, binding: Binding) -> None:
-    with (
-        FmiAsset(compiled_fmu, binding) as first,
-        FmiAsset(compiled_fmu, binding) as second,
-        FmiAsset(compiled_fmu, binding, isolated=False) as third,
-    ):
-        assert first.worker_process_id != second.worker_process_id
-        for z1 in (0.1, 0.2):
-            first.step({"load_factor": 3.0}, {"z1": z1})
-        saved = first.save_state()
-        second.restore_state(saved)
-        third.restore_state(saved)
-        seen = [a.step({"load_factor": 2.0}, {"z2": 0.3}) for a in (first, second, third)]
-        for other in seen[1:]:
-            np.testing.assert_array_equal(other.values, seen[0].values)
-            assert other.extra == seen[0].extra
 
 
 def test_states_of_something_else_are_refused(slave: Any, python_slave: Any) -> None:

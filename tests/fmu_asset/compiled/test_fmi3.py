@@ -21,7 +21,6 @@ from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.check import check_fmu
 from fmu_asset.door.binding import load_binding
-from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.structure_fmu import build_fmu, recorded_content_hash
 from scenarios import binding_files
@@ -122,22 +121,6 @@ def test_nothing_is_found_to_complain_of(fmi3: Path) -> None:
     check = check_fmu(fmi3, binding=load_binding(binding_files()["uav_wing_fmi3"]), cycles=20)
     assert check.passed, check.problems
     assert "warning" not in {finding.verdict for finding in check.findings}
-
-
-def test_our_door_flies_it_as_it_flies_that_of_fmi_2(fmi3: Path, compiled_fmu: Path) -> None:
-    files = binding_files()
-    with (
-        FmiAsset(fmi3, load_binding(files["uav_wing_fmi3"])) as three,
-        FmiAsset(compiled_fmu, load_binding(files["uav_wing"])) as two,
-    ):
-        for load_factor, loss in ((1.0, 0.0), (3.0, 0.4)):
-            ours, theirs = (wing.step({"load_factor": load_factor}, {"z1": loss}) for wing in (three, two))
-            np.testing.assert_array_equal(ours.values, theirs.values)
-            assert ours.extra == theirs.extra
-        kept = three.save_state()
-        ahead = three.step({"load_factor": 2.0}).values
-        three.restore_state(kept)
-        np.testing.assert_array_equal(three.step({"load_factor": 2.0}).values, ahead)
 
 
 def test_the_sources_are_clean_and_export_all_of_fmi_3(

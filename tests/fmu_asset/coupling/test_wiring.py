@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,68 +12,69 @@ from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component, Connection, Connector, Setting, SystemStructure
 from fmu_asset.coupling.structure import expand_connection as expand
 from fmu_asset.coupling.wiring import Wiring
-from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.errors import CouplingError, FmuFileError
+from tests.fmu_asset.making import bound
+from tests.fmu_asset.ours import OurFmus
 
-from .conftest import watch
+FILES = {"damage": "damage_growth", "wing": "python", "gauges": "strain_gauges", "spring": "spring_mass"}
 
 
 @pytest.fixture(scope="module")
-def base(companions: dict[str, Path], fmu: Path, spring_mass: Path) -> SystemStructure:
-    return SystemStructure(
-        "base",
-        (
-            Component("damage", companions["damage_growth"]),
-            Component("wing", fmu),
-            Component("gauges", companions["strain_gauges"]),
-            Component("spring", spring_mass),
+def base(ours: OurFmus) -> SystemStructure:
+    ends = Connector("push", "input"), Connector("seen", "output"), Connector("percent", "output", "%")
+    return SystemStructure("base", tuple(Component(name, ours(file)) for name, file in FILES.items()), ends)
+
+
+def link(source: str, target: str, **options: Any) -> Connection:
+    return replace(expand(source, target, tuple(FILES))[0], **options)
+
+
+UNJOINED: list[tuple[list[tuple[str, str]], str]] = [
+    ([("damage.z3", "wing.health.z1")], r"'damage' \(damage_growth.fmu\) has no variable 'z3'\."),
+    ([("damage.z1", "wing.helth.z1")], r"no variable 'helth.z1'; did you mean 'health.z1'"),
+    ([("pull", "wing.load_factor")], "no connector 'pull'; it has push, seen, percent"),
+    ([("seen", "wing.load_factor")], "connector 'seen' of the system is of the kind output"),
+    ([("push", "seen")], "joins two connectors of the system"),
+    ([("wing.load_factor", "damage.load_factor")], "factor cannot be the source.*declared as input"),
+    ([("damage.z1", "wing.strain[1]")], r"wing.strain\[1\] cannot be the target.*declared as output"),
+    ([("push", "wing.young_modulus_factor")], "as parameter.*a single number is needed as input"),
+    (
+        [("damage.z1", "wing.health.z1"), ("damage.z2", "wing.health.z1")],
+        "wing.health.z1 has two sources, damage.z1 and damage.z2",
+    ),
+    ([("gauges.received[1]", "wing.load_factor")], "type Boolean and cannot feed.*of the type Real"),
+    ([("wing.tip_displacement", "wing.load_factor")], "in 'm' and wing.load_factor in '1'.*no conversion"),
+    ([("damage.status", "wing.load_factor")], "of the type Enumeration and cannot feed.*Real"),
+]
+UNSET: list[tuple[str, dict[str, Setting], str]] = [
+    ("damage", {"rate.z9": Setting(1.0)}, "no variable 'rate.z9'"),
+    ("damage", {"z1": Setting(1.0)}, "damage.z1 cannot be set: it is declared as output"),
+    ("damage", {"seed": Setting(1.5)}, "damage.seed cannot be set to 1.5: it is of the type Integer"),
+    ("damage", {"seed": Setting(True)}, "cannot be set to True"),
+    ("damage", {"level": Setting(float("nan"))}, "cannot be set to nan"),
+    ("damage", {"period": Setting(1.0, "m")}, "is given in 'm', but it is in 's'"),
+    ("wing", {"response": Setting("quick")}, "with the items quasi_static, transient"),
+    ("wing", {"mass.servo": Setting("heavy")}, "a number is needed"),
+]
+
+
+def test_what_does_not_fit_is_one_sentence(base: SystemStructure, tmp_path: Path) -> None:
+    first = base.components[0]
+    refused: list[tuple[dict[str, Any], type[Exception], str]] = [
+        *(({"connections": tuple(link(*pair) for pair in ends)}, CouplingError, w) for ends, w in UNJOINED),
+        *(
+            ({"components": (replace(base.component(name), settings=given),)}, CouplingError, words)
+            for name, given, words in UNSET
         ),
-        (Connector("push", "input"), Connector("seen", "output"), Connector("percent", "output", "%")),
-    )
-
-
-def link(source: str, target: str, **options: object) -> Connection:
-    names = ("damage", "wing", "gauges", "spring")
-    return replace(expand(source, target, names)[0], **options)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("connections", "words"),
-    [
-        ([("damage.z3", "wing.health.z1")], r"'damage' \(damage_growth.fmu\) has no variable 'z3'\."),
-        ([("damage.z1", "wing.helth.z1")], r"no variable 'helth.z1'; did you mean 'health.z1'"),
-        ([("pull", "wing.load_factor")], "no connector 'pull'; it has push, seen, percent"),
-        ([("seen", "wing.load_factor")], "connector 'seen' of the system is of the kind output"),
-        ([("push", "seen")], "joins two connectors of the system"),
-        ([("wing.load_factor", "damage.load_factor")], "factor cannot be the source.*declared as input"),
-        ([("damage.z1", "wing.strain[1]")], r"wing.strain\[1\] cannot be the target.*declared as output"),
-        ([("push", "wing.young_modulus_factor")], "as parameter.*a single number is needed as input"),
-        (
-            [("damage.z1", "wing.health.z1"), ("damage.z2", "wing.health.z1")],
-            "wing.health.z1 has two sources, damage.z1 and damage.z2",
-        ),
-        ([("gauges.received[1]", "wing.load_factor")], "type Boolean and cannot feed.*of the type Real"),
-        (
-            [("wing.tip_displacement", "wing.load_factor")],
-            "in 'm' and wing.load_factor in '1'.*no conversion",
-        ),
-        ([("damage.status", "wing.load_factor")], "of the type Enumeration and cannot feed.*Real"),
-    ],
-)
-def test_connections_that_do_not_fit(
-    base: SystemStructure, connections: list[tuple[str, str]], words: str
-) -> None:
-    with pytest.raises(CouplingError, match=words) as caught:
-        Wiring(replace(base, connections=tuple(link(*pair) for pair in connections)))
-    assert "\n" not in str(caught.value)
-
-
-def test_enumerations_and_integers_feed_each_other(base: SystemStructure) -> None:
-    joined = Wiring(replace(base, connections=(link("damage.status", "spring.misbehaviour"),)))
-    assert next(iter(joined.feeds.values())).conversion == (1.0, 0.0)
-
-
-def test_ends_and_patterns_that_cannot_be_read() -> None:
+        ({"components": ()}, CouplingError, "has no component"),
+        ({"components": (*base.components, first)}, CouplingError, "two components named 'damage'"),
+        ({"components": (Component("a", tmp_path / "none.fmu"),)}, FmuFileError, r"no FMU .*none\.fmu"),
+        ({"components": (replace(first, substeps=0),)}, CouplingError, "at least one step"),
+    ]
+    for changes, kind, words in refused:
+        with pytest.raises(kind, match=words) as caught:
+            Wiring(replace(base, **changes))
+        assert "\n" not in str(caught.value)
     for source, target, sentence in (
         ("wnig.strain", "a.x", r"'wnig\.strain' begins with no component; the components are a, b"),
         ("a.x[{1..3}]", "b.y[{1..2}]", "joins 3 ends to 2"),
@@ -82,47 +84,8 @@ def test_ends_and_patterns_that_cannot_be_read() -> None:
             expand(source, target, ["a", "b"])
 
 
-def test_components_that_do_not_fit(base: SystemStructure, tmp_path: Path) -> None:
-    first = base.components[0]
-    for components, kind, words in (
-        ((), CouplingError, "has no component"),
-        ((*base.components, first), CouplingError, "two components named 'damage'"),
-        ((Component("a", tmp_path / "none.fmu"),), FmuFileError, r"There is no FMU .*none\.fmu"),
-        ((replace(first, substeps=0),), CouplingError, "at least one step"),
-    ):
-        with pytest.raises(kind, match=words):
-            Wiring(replace(base, components=components))
-
-
-@pytest.mark.parametrize(
-    ("component", "settings", "words"),
-    [
-        ("damage", {"rate.z9": Setting(1.0)}, "no variable 'rate.z9'"),
-        ("damage", {"z1": Setting(1.0)}, "damage.z1 cannot be set: it is declared as output"),
-        ("damage", {"seed": Setting(1.5)}, "damage.seed cannot be set to 1.5: it is of the type Integer"),
-        ("damage", {"seed": Setting(True)}, "cannot be set to True"),
-        ("damage", {"level": Setting(float("nan"))}, "cannot be set to nan"),
-        ("damage", {"period": Setting(1.0, "m")}, "is given in 'm', but it is in 's'"),
-        ("wing", {"response": Setting("quick")}, "with the items quasi_static, transient"),
-        ("wing", {"mass.servo": Setting("heavy")}, "a number is needed"),
-    ],
-)
-def test_settings_that_do_not_fit(
-    base: SystemStructure, component: str, settings: dict[str, Setting], words: str
-) -> None:
-    changed = replace(base.component(component), settings=settings)
-    with pytest.raises(CouplingError, match=words):
-        Wiring(replace(base, components=(changed,)))
-
-
-def test_settings_are_converted(base: SystemStructure) -> None:
-    given = {"mass.servo": Setting(150.0, "g"), "response": Setting("transient"), "health.z1": Setting(0.2)}
-    wiring = Wiring(replace(base, components=(replace(base.component("wing"), settings=given),)))
-    assert wiring.settings["wing"] == {"mass.servo": pytest.approx(0.15), "response": 2.0, "health.z1": 0.2}
-
-
-def test_units_of_connections_are_converted(base: SystemStructure) -> None:
-    """The value is converted first, and transformed in the unit of the target."""
+def test_units_and_types_are_converted(base: SystemStructure) -> None:
+    """The value of a connection is converted first, and transformed in the unit of the target."""
     seen = link("wing.tip_displacement", "seen", factor=2.0, offset=0.5)
     for options, conversion in (
         ({}, (100.0, 0.0)),
@@ -134,50 +97,54 @@ def test_units_of_connections_are_converted(base: SystemStructure) -> None:
         assert wiring.ends["percent"][0].conversion == conversion
         assert next(iter(wiring.feeds.values())).conversion == (1.0, 0.0)
         assert (wiring.ends["seen"][0].conversion, wiring.units["seen"]) == ((2.0, 0.5), "m")
+    given = {"mass.servo": Setting(150.0, "g"), "response": Setting("transient"), "health.z1": Setting(0.2)}
+    wiring = Wiring(replace(base, components=(replace(base.component("wing"), settings=given),)))
+    assert wiring.settings["wing"] == {"mass.servo": pytest.approx(0.15), "response": 2.0, "health.z1": 0.2}
+    # An enumeration and an integer feed each other.
+    joined = Wiring(replace(base, connections=(link("damage.status", "spring.misbehaviour"),)))
+    assert next(iter(joined.feeds.values())).conversion == (1.0, 0.0)
 
 
 def test_an_input_that_is_only_set_keeps_its_value(base: SystemStructure) -> None:
     """A start value of an input that nothing feeds holds; without one it is the FMU's own."""
-    wing = replace(base.component("wing"), settings={"health.z1": Setting(0.4)})
-    binding = watch("wing.tip_displacement")
-    binding = binding.model_copy(
-        update={"observation": {"tip": binding.observation["all"].model_copy(update={"unit": "mm"})}}
-    )
-    with CoupledAsset(replace(base, components=(wing,)), binding, isolated=False) as asset:
-        damaged = [asset.observe().values[0], asset.step().values[0]]
-    with CoupledAsset(replace(base, components=(base.component("wing"),)), binding, isolated=False) as asset:
-        sound = asset.step().values[0]
-    assert damaged[0] == damaged[1]
-    assert damaged[1] > 1.05 * sound
+    wing, shown = base.component("wing"), []
+    for given in ({"health.z1": Setting(0.4)}, {}):
+        structure = replace(base, components=(replace(wing, settings=given),))
+        binding = bound(1.0, {"tip": ("wing.tip_displacement", "mm")})
+        with CoupledAsset(structure, binding, isolated=False) as asset:
+            shown.append((asset.observe().values[0], asset.step().values[0]))
+    assert shown[0][0] == shown[0][1]
+    assert shown[0][1] > 1.05 * shown[1][1]
+
+
+UNBOUND: list[tuple[str, tuple[str, str], str]] = [
+    ("control", ("pull", "1"), "'pull', which is not a variable of the system base"),
+    ("control", ("percent", "1"), "of causality input, but 'percent' is declared as output"),
+    ("control", ("wing.health.z1", "1"), "is declared as an input that is fed by a connection already"),
+    ("control", ("wing.strain[1]", "1"), "declared as output"),
+    ("control", ("push", "m"), "control.x is in 'm', but the FMU has 'push' in '1'"),
+    ("observation", ("seen", "1"), "'seen' is declared as connected to nothing"),
+    ("observation", ("wing.load_factor", "1"), "declared as input"),
+    ("observation", ("percent", "s"), "and there is no conversion"),
+    ("parameter", ("push", "1"), "of causality parameter, but 'push' is declared as input"),
+    ("parameter", ("wing.load_factor", "1"), "parameter, but 'wing.load_factor' is declared as input"),
+    ("monitor", ("wing.load", "1"), "which is not a variable of the system base; did you mean"),
+]
 
 
 def test_bindings_that_do_not_fit(base: SystemStructure) -> None:
     ends = ("push", "wing.load_factor"), ("damage.z1", "wing.health.z1"), ("damage.z1", "percent")
     wiring = Wiring(replace(base, connections=tuple(link(*pair) for pair in ends)))
-
-    def bound(role: str, variable: str, unit: str = "1") -> Binding:
-        table = {"observation": {"x": {"variables": ["damage.z1"], "unit": "1"}}}
-        key = "variables" if role == "observation" else "variable"
-        return parse_binding(
-            {"binding": {"name": "b", "step_size": 1.0}, **table, role: {"x": {key: variable, "unit": unit}}}
+    observed = {"y": ("damage.z1", "1")}
+    for role, end, words in UNBOUND:
+        given = (
+            {"observation": {"x": end}}
+            if role == "observation"
+            else {"observation": observed, role: {"x": end}}
         )
-
-    for role, variable, unit, words in (
-        ("control", "pull", "1", "'pull', which is not a variable of the system base"),
-        ("control", "percent", "1", "of causality input, but 'percent' is declared as output"),
-        ("control", "wing.health.z1", "1", "is declared as an input that is fed by a connection already"),
-        ("control", "wing.strain[1]", "1", "declared as output"),
-        ("control", "push", "m", "control.x is in 'm', but the FMU has 'push' in '1'"),
-        ("observation", "seen", "1", "'seen' is declared as connected to nothing"),
-        ("observation", "wing.load_factor", "1", "declared as input"),
-        ("observation", "percent", "s", "and there is no conversion"),
-        ("parameter", "push", "1", "of causality parameter, but 'push' is declared as input"),
-        ("parameter", "wing.load_factor", "1", "parameter, but 'wing.load_factor' is declared as input"),
-        ("monitor", "wing.load", "1", "which is not a variable of the system base; did you mean"),
-    ):
         with pytest.raises(ValueError, match=words):
-            CoupledAsset(wiring, bound(role, variable, unit))
-    right = bound("control", "push")
+            CoupledAsset(wiring, bound(1.0, **given))
+    right = bound(1.0, observed, control={"x": ("push", "1")})
     with pytest.raises(ValueError, match="has no parameter 'q'"):
         CoupledAsset(wiring, right, parameters={"q": 1.0})
     with pytest.raises(ValueError, match="algorithm must be one of gauss_seidel, jacobi"):

@@ -1,4 +1,4 @@
-"""Inputs that move in straight lines between communication points, against closed forms."""
+"""Inputs that move in straight lines: where they begin, what stays, what cannot follow; of systems, too."""
 
 from __future__ import annotations
 
@@ -6,95 +6,52 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
+from scipy.linalg import expm
 
-from fmu_asset.door.binding import Binding, parse_binding
+from fmu_asset.coupling.asset import CoupledAsset
+from fmu_asset.coupling.structure import Component, Connection, Endpoint, Setting, SystemStructure
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuInputError
+from tests.fmu_asset.door.kinds import KINDS, LINE
+from tests.fmu_asset.making import bound, changed, linear, system, watch
 
-from .conftest import bound
-
-STEP = 0.25
-COURSE = np.array([0.5, 2.0, -1.0, -1.0, 3.0, 3.5, 0.0])
-QUARTERS = {"step_size": STEP / 4, "decimation": 4}
-EXCHANGED = {"interface": "model-exchange", "tolerance": 1e-11}
-
-
-def followed(**header: object) -> Binding:
-    """Return a binding of x' = u - x with linear inputs."""
-    roles = {"control": {"u": ("u", "1")}, "monitor": {"seen": ("seen", "1")}}
-    return bound(STEP, {"x": ("x", "1")}, header={"interpolation": "linear", **header}, **roles)
-
-
-def exact(course: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return x at the end of each step of x' = u - x, x(0) = 0, along straight lines."""
-    x, values, lost = 0.0, [], 1.0 - np.exp(-STEP)
-    for first, last in pairwise(course):
-        x += lost * (first - x) + (last - first) / STEP * (STEP - lost)
-        values.append(x)
-    return np.array(values)
-
-
-@pytest.mark.parametrize(
-    ("model", "header", "tolerance"),
-    [
-        ("follow1", {}, 1e-13),
-        ("follow2", {}, 1e-13),
-        ("follow2", QUARTERS, 1e-13),
-        ("follow2", EXCHANGED, 1e-8),
-        ("follow2", EXCHANGED | QUARTERS, 1e-8),
-    ],
-)
-def test_straight_lines_are_followed(
-    foreign_fmu: Any, model: str, header: dict[str, object], tolerance: float
-) -> None:
-    with FmiAsset(foreign_fmu(model), followed(**header), isolated=False) as asset:
-        asset.reset(control={"u": COURSE[0]})
-        history = asset.simulate({"u": COURSE[1:]})
-        np.testing.assert_allclose(history.values[:, 0], exact(COURSE), rtol=0.0, atol=tolerance)
-        if model == "follow2" and "interface" not in header:
-            quarter = 0.75 if "decimation" in header else 0.0
-            begins = COURSE[:-1] + quarter * np.diff(COURSE)
-            np.testing.assert_allclose(history.extra["seen"], begins, rtol=1e-15)
-        stepped = asset.sibling()
-        stepped.reset(control={"u": COURSE[0]})
-        single = np.array([stepped.step({"u": value}).values for value in COURSE[1:].tolist()])
-        stepped.close()
-        assert single.tobytes() == history.values.tobytes()
+LINES = KINDS["lines"].binding
 
 
 @pytest.mark.parametrize(("state", "isolated"), [("serialised", True), ("replay", False)])
-def test_a_restored_state_goes_on_along_the_same_lines(foreign_fmu: Any, state: str, isolated: bool) -> None:
-    """A worker is told the lines with each request; an input may jump before the state is kept."""
-    with FmiAsset(foreign_fmu("follow2"), followed(state=state), isolated=isolated) as asset:
-        asset.simulate({"u": COURSE[:3]})
-        asset.hold({"u": -2.0})
+def test_an_input_may_jump_before_the_state_is_kept(foreign_fmu: Any, state: str, isolated: bool) -> None:
+    """A worker is told the lines with each request."""
+    with FmiAsset(
+        foreign_fmu("follow2"), changed(LINES, header={"state": state}), isolated=isolated
+    ) as asset:
+        asset.simulate({"u": LINE[:3]})
+        asset.hold({"u": 3.0})
+        with pytest.raises(FmuInputError, match="outside the range"):
+            asset.hold({"u": 1000.0})
         kept = asset.save_state()
-        there = asset.simulate({"u": COURSE[3:]})
-        assert there.extra["seen"][0] == -2.0
+        there = asset.simulate({"u": LINE[3:]})
+        assert there.extra["seen"][0] == 3.0
         with asset.sibling() as other:
             other.restore_state(kept)
-            assert other.simulate({"u": COURSE[3:]}).values.tobytes() == there.values.tobytes()
+            assert other.simulate({"u": LINE[3:]}).values.tobytes() == there.values.tobytes()
 
 
 @pytest.mark.parametrize("interface", ["co-simulation", "model-exchange"])
 def test_an_input_that_stays_is_held_to_the_bit(foreign_fmu: Any, interface: str) -> None:
-    binding, seen = followed(interface=interface, step_size=0.1, decimation=3), []
+    binding, seen = changed(LINES, header={"interface": interface, "step_size": 0.1, "decimation": 3}), []
     for kind in ("zero-order", "linear"):
-        with FmiAsset(
-            foreign_fmu("follow2"), binding.with_header(interpolation=kind), isolated=False
-        ) as asset:
+        held = binding.with_header(interpolation=kind)
+        with FmiAsset(foreign_fmu("follow2"), held, isolated=False) as asset:
             asset.reset(control={"u": 0.7})
             seen.append(asset.simulate(steps=5).values.tobytes())
     assert seen[0] == seen[1]
 
 
 def test_a_line_that_goes_on_is_no_event(foreign_fmu: Any) -> None:
-    binding = followed(interface="model-exchange").model_dump(exclude_none=True)
-    binding["load"] = {"mode": {"variable": "mode", "unit": "1"}}
-    binding["record"] = {"variables": ["events"]}
-    with FmiAsset(foreign_fmu("follow2"), parse_binding(binding), isolated=False) as asset:
+    mode, record = {"mode": {"variable": "mode", "unit": "1"}}, {"variables": ["events"]}
+    binding = changed(LINES, header={"interface": "model-exchange"}, load=mode, record=record)
+    with FmiAsset(foreign_fmu("follow2"), binding, isolated=False) as asset:
         asset.reset({}, control={"u": 0.0}, load={"mode": 0})
         smooth = asset.simulate({"u": [0.3, 0.1, 0.4]}).extra["events"]
         assert len(set(smooth.tolist())) == 1
@@ -109,17 +66,83 @@ def test_a_line_that_goes_on_is_no_event(foreign_fmu: Any) -> None:
         ("follow2", ("mode", "1"), ("x", "1"), "none of them is a continuous real number"),
     ],
 )
-def test_what_cannot_follow_is_refused(
-    foreign_fmu: Any, model: str, taken: tuple[str, str], given: tuple[str, str], sentence: str
-) -> None:
+def test_what_cannot_follow_is_refused(foreign_fmu, model, taken, given, sentence) -> None:
     binding = bound(1.0, {"y": given}, load={"u": taken}, header={"interpolation": "linear"})
     with pytest.raises(BindingError, match=sentence):
         FmiAsset(foreign_fmu(model), binding)
 
 
-def test_what_is_held_is_checked(foreign_fmu: Any) -> None:
-    with FmiAsset(foreign_fmu("follow2"), followed(), isolated=False) as asset:
-        asset.hold({"u": 3.0})
-        with pytest.raises(FmuInputError, match="outside the range"):
-            asset.hold({"u": 1000.0})
-        assert asset.step().extra["seen"] == 3.0
+# ---------------------------------------------------------------------- systems: of second order
+
+END = 2.0
+# x1' = -x1 - 2 x2, x2' = 1.5 x1 - x2: a circle.
+EXACT = expm(np.array([[-1.0, -2.0], [1.5, -1.0]]) * END) @ [1.0, 0.0]
+
+
+def circle(fmu: Any, *, exchange: bool = False, delayed: bool = False, substeps: int = 1) -> SystemStructure:
+    """Return two followers x' = u - x that feed each other."""
+    joined = (
+        Connection(Endpoint("first", "x"), Endpoint("second", "u"), factor=1.5),
+        Connection(Endpoint("second", "x"), Endpoint("first", "u"), factor=-2.0, delayed=delayed),
+    )
+    second = Component("second", fmu, {}, substeps, "model-exchange" if exchange else "co-simulation")
+    first = Component("first", fmu, {"start": Setting(1.0)}, interface="co-simulation")
+    return SystemStructure("circle", (first, second), (), joined)
+
+
+def watched(step: float, kind: str) -> Any:
+    """Return a binding of both states."""
+    return watch("first.x", "second.x", step_size=step, interpolation=kind, tolerance=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("system_options", "asset_options"),
+    [
+        ({}, {}),
+        ({"exchange": True}, {}),
+        ({"substeps": 3}, {}),
+        ({"exchange": True, "substeps": 3}, {"algorithm": "jacobi"}),
+        ({"delayed": True}, {}),
+        ({}, {"algorithm": "jacobi"}),
+    ],
+)
+def test_the_error_of_a_system_falls_with_the_square_of_the_step(
+    foreign_fmu: Any, system_options: dict[str, Any], asset_options: dict[str, Any]
+) -> None:
+    structure, errors = circle(foreign_fmu("follow2"), **system_options), {}
+    for kind in ("zero-order", "linear"):
+        for steps in (20, 40):
+            binding = watched(END / steps, kind)
+            with CoupledAsset(structure, binding, isolated=False, **asset_options) as asset:
+                seen = asset.simulate(steps=steps).values[-1]
+            errors[kind, steps] = np.abs(seen - EXACT).max()
+    assert 1.7 < errors["zero-order", 20] / errors["zero-order", 40] < 2.4
+    assert 3.3 < errors["linear", 20] / errors["linear", 40] < 4.8
+    assert errors["linear", 40] < 0.3 * errors["zero-order", 40]
+
+
+def test_iterations_make_lines_between_both_ends(foreign_fmu: Any) -> None:
+    """Settled, each input is the line between the other's states: no extrapolation is left in it."""
+    options = {"isolated": False, "iterations": 50, "tolerance": 1e-13}
+    with CoupledAsset(circle(foreign_fmu("follow2")), watched(0.1, "linear"), **options) as asset:
+        seen = [asset.observe().values, *(asset.step().values for _ in range(3))]
+    lost = 1.0 - np.exp(-0.1)
+    for before, after in pairwise(seen):
+        for own, factor in ((0, -2.0), (1, 1.5)):
+            u, slope = factor * before[1 - own], factor * (after - before)[1 - own] / 0.1
+            expected = before[own] + lost * (u - before[own]) + slope * (0.1 - lost)
+            assert abs(after[own] - expected) < 1e-11
+
+
+def test_a_system_with_lines_is_restored_or_refused(foreign_fmu: Any, state_fmu: Any) -> None:
+    structure = circle(foreign_fmu("follow2"), exchange=True)
+    with CoupledAsset(structure, watched(0.1, "linear"), isolated=False) as asset:
+        asset.simulate(steps=3)
+        kept = asset.save_state()
+        there = [asset.step().values.tobytes() for _ in range(3)]
+        asset.restore_state(kept)
+        assert [asset.step().values.tobytes() for _ in range(3)] == there
+        assert asset.describe()["linear"] == ["first", "second"]
+    pair = [linear("a", state_fmu, c=np.eye(2)), linear("b", state_fmu, c=np.eye(2))]
+    with pytest.raises(BindingError, match=r"no component of the system test has a continuous input and"):
+        CoupledAsset(system(pair, [("a.y1", "b.u1")]), watch("b.y1", interpolation="linear"))

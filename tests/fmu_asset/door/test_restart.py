@@ -1,4 +1,4 @@
-"""A start is a start: a reset that does nothing is not believed, and the FMU's tolerance reaches it."""
+"""A start is a start: a reset that does nothing is not believed; many instances share one extracted FMU."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.check import check_fmu
 from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.coupling.structure import Component, SystemStructure
+from fmu_asset.coupling.structure import Component
+from fmu_asset.door import placement
 from fmu_asset.door.session import FmiAsset
+from fmu_asset.errors import FmuStateError
+from tests.fmu_asset.door.kinds import HOSTILE
+from tests.fmu_asset.making import bound, system
 from twin_master.library.grid import GridSampler, SamplingGrid
 
-from .conftest import bound
-
-BOTH = pytest.mark.parametrize("isolated", [True, False], ids=["worker", "in process"])
-SPRING = bound(0.1, {"motion": (["position", "velocity"], ["m", "m/s"])}, control={"push": ("force", "N")})
-HOSTILE = bound(1.0, {"y": ("y", "m")}, control={"u": ("u", "m/s")})
+PUSH = {"push": ("force", "N")}
+SPRING = bound(0.1, {"motion": (["position", "velocity"], ["m", "m/s"])}, control=PUSH)
 BINDING = """
 [binding]
 name = "spring"
@@ -46,7 +48,6 @@ def motion(pushes: list[float]) -> list[float]:
     return [position, velocity]
 
 
-@BOTH
 @pytest.mark.parametrize("what", [(), ("RESET_DOES_NOTHING",)], ids=["sound", "does nothing"])
 def test_every_start_is_the_same(
     foreign_fmu: Any, isolated: bool, what: tuple[str, ...], caplog: pytest.LogCaptureFixture
@@ -65,11 +66,9 @@ def test_every_start_is_the_same(
             np.testing.assert_allclose(other.step({"push": 1.0}).values, motion([1.0]), rtol=1e-12)
         assert asset.worker_process_id == process
         assert asset.reset_trial.works is (not what)
-    said = [record.getMessage() for record in caplog.records]
-    assert len(said) == len(what)
-    assert all(
-        f"{fmu}: Its reset returns OK and does not bring it back to its start" in text for text in said
-    )
+    assert len(caplog.messages) == len(what)
+    sentence = f"{fmu}: Its reset returns OK and does not bring it back to its start"
+    assert all(sentence in text for text in caplog.messages)
 
 
 def test_a_start_at_rest_shows_nothing_and_is_right_all_the_same(foreign_fmu: Any) -> None:
@@ -90,14 +89,7 @@ CLOCKS = [("INSTANCE_CLOCK", True), ("INSTANCE_CLOCK", False), ("process_clock",
 @pytest.mark.parametrize(("clock", "isolated"), CLOCKS, ids=["instance", "in process", "process"])
 @pytest.mark.parametrize("in_one_go", [False, True], ids=["steps", "run"])
 @pytest.mark.parametrize("lengths", [(3, 7, 7), (1, 1, 1, 1, 1, 1, 1), (4, 1, 7, 1), (2, 3, 1, 6)], ids=str)
-def test_a_hidden_clock_shows_at_no_start(
-    foreign_fmu: Any,
-    clock: str,
-    isolated: bool,
-    in_one_go: bool,
-    lengths: tuple[int, ...],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_hidden_clock_shows_at_no_start(foreign_fmu, clock, isolated, in_one_go, lengths, caplog) -> None:
     """The clock adds 1 from its sixth step on: where the first reset is looked at, nothing is to be seen."""
     case = f"CASE={sum(lengths)}{len(lengths)}{isolated}{in_one_go}"  # what is wrong is said once for a file
     fmu = foreign_fmu("hostile2", f"CLOCK={clock}", "STAYS_LOADED", case)
@@ -122,14 +114,12 @@ def test_a_hidden_clock_shows_at_no_start(
 def test_what_never_starts_alike_is_not_started_in_ever_new_processes(foreign_fmu: Any) -> None:
     fmu = foreign_fmu("hostile2", "NOT_DETERMINISTIC", "STAYS_LOADED", "CLOCK=process_clock")
     with FmiAsset(fmu, HOSTILE) as asset:
-        for _ in range(8):
+        seen = []
+        for _ in range(11):
             asset.reset()
             asset.step()
-        process = asset.worker_process_id
-        for _ in range(3):
-            asset.reset()
-            asset.step()
-        assert asset.worker_process_id == process
+            seen.append(asset.worker_process_id)
+        assert len(set(seen[7:])) == 1
 
 
 def test_a_library_is_sampled_from_fresh_starts(foreign_fmu: Any, tmp_path: Path) -> None:
@@ -149,25 +139,20 @@ def test_a_library_is_sampled_from_fresh_starts(foreign_fmu: Any, tmp_path: Path
     np.testing.assert_allclose(found, [0.5, 1.0, 0.4, 0.8, 0.25, 0.5], rtol=1e-9)
 
 
-def test_components_of_a_coupled_asset_start_anew(foreign_fmu: Any) -> None:
+def test_a_check_names_it_and_components_of_a_system_start_anew(foreign_fmu: Any) -> None:
     fmu = foreign_fmu("spring2", "RESET_DOES_NOTHING")
-    structure = SystemStructure(name="one", components=(Component("spring", fmu),))
     described = bound(0.1, {"x": ("spring.position", "m")}, control={"push": ("spring.force", "N")})
-    with CoupledAsset(structure, described) as asset:
+    with CoupledAsset(system([Component("spring", fmu)], []), described) as asset:
         for push in (1.0, 2.0):
             asset.reset()
             asset.step({"push": push})
             seen = asset.step({"push": push}).values[0]
             assert seen == pytest.approx(motion([push, push])[0], rel=1e-12)
-
-
-def test_the_check_names_it(foreign_fmu: Any) -> None:
-    (problem,) = check_fmu(foreign_fmu("spring2", "RESET_DOES_NOTHING"), step_size=0.1).problems
+    (problem,) = check_fmu(fmu, step_size=0.1).problems
     assert problem.startswith("Its reset returns OK and does not bring it back to its start")
     assert check_fmu(foreign_fmu("hostile2", "NEGATIVE_ZERO_AFTER_RESET")).passed
 
 
-@BOTH
 def test_the_tolerance_is_that_of_the_fmu_unless_the_binding_says_otherwise(
     foreign_fmu: Any, isolated: bool
 ) -> None:
@@ -175,3 +160,89 @@ def test_the_tolerance_is_that_of_the_fmu_unless_the_binding_says_otherwise(
         chosen = bound(0.1, {"tolerance": ("tolerance", "1")}, header=header)
         with FmiAsset(foreign_fmu("spring2"), chosen, isolated=isolated) as asset:
             assert asset.observe().values[0] == expected
+
+
+# ---------------------------------------------------------------------- many instances of one FMU
+
+
+@pytest.fixture
+def extractions(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """Return the folders into which FMUs are extracted during the test."""
+    made: list[Path] = []
+    extract = placement.extract_fmu
+
+    def counting(description: FmuDescription) -> Path:
+        made.append(extract(description))
+        return made[-1]
+
+    monkeypatch.setattr(placement, "extract_fmu", counting)
+    return made
+
+
+def test_copies_share_the_extracted_fmu_until_the_last_is_closed(
+    foreign_fmu: Any, extractions: list[Path], isolated: bool
+) -> None:
+    with pytest.raises(FmuStateError, match="no state to save"):
+        FmiAsset(foreign_fmu("hostile2"), HOSTILE).fork()
+    with FmiAsset(foreign_fmu("hostile2"), HOSTILE, isolated=isolated) as asset:
+        asset.step({"u": 2.0})
+        forks = [asset.fork() for _ in range(3)]
+        for number, fork in enumerate(forks):
+            assert (fork.time, fork.step_index) == (1.0, 1)
+            assert fork.step({"u": float(number)}).values[0] == 2.0 + number
+        # An input that is not given keeps the value that it had at the fork.
+        with asset.fork() as held:
+            assert held.step().values[0] == asset.step().values[0] == 4.0
+        forks[0].close()
+        process = asset.worker_process_id
+        for _ in range(20):
+            asset.renew()
+            assert asset.step({"u": 3.0}).values[0] == 3.0
+        assert asset.worker_process_id == process
+    assert not isolated or not (Path("/proc") / str(process)).exists()  # gone at once
+    assert len(extractions) == 1
+    assert extractions[0].is_dir()
+    assert [fork.step().values[0] for fork in forks[1:]] == [4.0, 6.0]
+    for fork in forks:
+        fork.close()
+    assert not extractions[0].exists()
+
+
+def test_siblings_have_parameters_of_their_own(foreign_fmu: Any, extractions: list[Path]) -> None:
+    roles = {"control": {"u": ("In1 (rad/s)", "1")}, "parameter": {"gain": ("Lag/Gain [K]", "1")}}
+    binding = bound(0.5, {"y": ("Out1", "1")}, **roles)
+    with FmiAsset(foreign_fmu("lag1"), binding, parameters={"gain": 1.0}) as first:
+        others = [first.sibling({"gain": float(gain)}) for gain in (2, 3)]
+        values = [asset.step({"u": 1.0}).values[0] for asset in (first, *others)]
+        np.testing.assert_allclose(values, (1.0 - np.exp(-1.0)) * np.array([1.0, 2.0, 3.0]), rtol=1e-12)
+        for other in others:
+            other.close()
+    assert len(extractions) == 1
+
+
+def test_after_a_crash_the_files_are_extracted_again(foreign_fmu: Any, extractions: list[Path]) -> None:
+    with FmiAsset(foreign_fmu("hostile2", "ABORT"), HOSTILE) as asset, asset.fork() as fork:
+        asset.step(), asset.step()
+        saved = asset.save_state()
+        with pytest.raises(Exception, match="SIGABRT"):
+            asset.step()
+        asset.restore_state(saved)
+        assert len(extractions) == 2
+        assert fork.step().values[0] == 1.0
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_three_hundred_cycles_leave_nothing(foreign_fmu: Any, scratch: Path) -> None:
+    """Create, run and free in this process: neither memory nor folders nor descriptors grow."""
+    pages, descriptors = [], []
+    with FmiAsset(foreign_fmu("hostile2"), HOSTILE, isolated=False) as first:
+        for number in range(300):
+            with first.sibling() as asset:
+                asset.step()
+            if number in (99, 299):
+                pages.append(int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]))
+                descriptors.append(len(list(Path("/proc/self/fd").iterdir())))
+    assert pages[1] - pages[0] < 200  # 4 KiB for each cycle would be 200 pages
+    assert descriptors[0] == descriptors[1]
+    assert not list(scratch.iterdir())

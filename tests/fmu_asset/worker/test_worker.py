@@ -17,7 +17,7 @@ import pytest
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import FmuCallError, FmuError, FmuOutputError, FmuStateError, FmuWorkerError
+from fmu_asset.errors import FmuCallError, FmuError, FmuOutputError, FmuWorkerError
 from fmu_asset.packing.structure_fmu import build_fmu
 
 ROOT = Path(__file__).parents[3]
@@ -32,37 +32,6 @@ def spring(force: float, stiffness: float, steps: int) -> tuple[float, float]:
         velocity += (force - stiffness * position) * 0.001
         position += velocity * 0.001
     return velocity, position
-
-
-@BOTH
-def test_another_asset_flies_with_its_own_binding(
-    spring_mass: Path, spring_binding: Binding, isolated: bool
-) -> None:
-    with FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset:
-        asset.step({"push": 1.0}, {"spring": 2.0})
-        seen = asset.step()
-        np.testing.assert_allclose(seen.values, spring(1.0, 2.0, 2), rtol=1e-12)
-        assert seen.time == 2.0 + 2 * 0.1
-        assert seen.extra == {"steps": 2.0}
-        locked = asset.step(load={"lock": True})
-        np.testing.assert_array_equal(locked.values, seen.values)
-
-
-@BOTH
-def test_state_is_replayed_where_the_fmu_cannot_save_it(
-    spring_mass: Path, spring_binding: Binding, isolated: bool
-) -> None:
-    with FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset:
-        assert asset.state_method == "replay"
-        for push in (1.0, -2.0, 3.0):
-            asset.step({"push": push})
-        saved = asset.save_state()
-        expected = [asset.step({"push": 0.5}).values.tobytes(), asset.step().values.tobytes()]
-    with FmiAsset(spring_mass, spring_binding, isolated=isolated) as other:
-        other.restore_state(saved)
-        assert other.step_index == 3
-        assert other.save_state() == saved
-        assert [other.step({"push": 0.5}).values.tobytes(), other.step().values.tobytes()] == expected
 
 
 @BOTH
@@ -131,19 +100,6 @@ def test_an_interruption_leaves_no_stale_answer(
         np.testing.assert_allclose(asset.step({"push": 1.0}).values, spring(1.0, 4.0, 1), rtol=1e-12)
 
 
-def test_a_closed_asset_is_not_started_again_unasked(spring_mass: Path, spring_binding: Binding) -> None:
-    asset = FmiAsset(spring_mass, spring_binding)
-    assert asset.step().time == 2.0 + 0.1
-    asset.close()
-    with pytest.raises(FmuStateError, match="closed; reset"):
-        asset.step()
-    with pytest.raises(FmuStateError, match="no state to save"):
-        asset.save_state()
-    asset.reset()
-    assert asset.observe().time == 2.0
-    del asset
-
-
 def test_chatter_of_the_fmu_does_not_reach_the_pipes(
     spring_mass: Path, spring_binding: Binding, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -176,19 +132,6 @@ def test_an_fmu_in_this_process_leaves_no_modules(
     assert sys.path == path
     assert "SpringMass" not in sys.modules
     assert not [name for name in set(sys.modules) - modules if name.startswith("uav_wing_")]
-
-
-def test_nothing_is_left_behind(spring_mass: Path, spring_binding: Binding, scratch: Path) -> None:
-    path, descriptors = list(sys.path), len(list(Path("/proc/self/fd").iterdir()))
-    for isolated in (True, False):
-        with FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset:
-            for _ in range(3):
-                asset.reset()
-                asset.step()
-        asset.close()
-    assert not list(scratch.iterdir())
-    assert len(list(Path("/proc/self/fd").iterdir())) == descriptors
-    assert sys.path == path
 
 
 @pytest.mark.long

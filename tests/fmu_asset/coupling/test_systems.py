@@ -1,0 +1,214 @@
+"""Coupled systems against closed forms; the contract of all assets has their recursion written by hand."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fmu_asset.coupling.asset import Algorithm, CoupledAsset
+from fmu_asset.coupling.structure import Component, Setting, SystemStructure
+from fmu_asset.errors import (
+    AlgebraicLoopError,
+    BindingError,
+    CouplingError,
+    FmuInputError,
+    FmuOutputError,
+    FmuStateError,
+    FmuUnsupportedError,
+    FmuWorkerError,
+    IterationError,
+)
+from tests.fmu_asset.coupling.systems import oscillator, three
+from tests.fmu_asset.door.kinds import A1, A2, B1, B2, C2, D2, OSCILLATOR, SYSTEM_OF_THREE, held
+from tests.fmu_asset.making import bound, changed, linear, system, watch
+from tests.fmu_asset.ours import OurFmus
+
+NAN, DIE = 1.0, 3.0
+
+
+def flown(
+    structure: SystemStructure, *ends: str, steps: int = 1, step_size: float = 1.0, **options: Any
+) -> Any:
+    """Return what ends of a system without inputs show at the start and after each step."""
+    with CoupledAsset(structure, watch(*ends, step_size=step_size), isolated=False, **options) as asset:
+        return np.array([asset.observe().values, *(asset.step().values for _ in range(steps))])
+
+
+def test_the_order_follows_from_the_dependencies(state_fmu: Path, linear_fmu: Path) -> None:
+    asset = CoupledAsset(oscillator(state_fmu, linear_fmu), watch("first.y1"), isolated=False)
+    assert asset.schedule.order == ("first", "second")
+    assert asset.schedule.loops == ()
+    # With inputs held, an exact component comes to the same place in one step and in four.
+    one, four = (
+        flown(oscillator(state_fmu, linear_fmu, substeps), "first.y1", steps=10, step_size=0.1)
+        for substeps in (1, 4)
+    )
+    np.testing.assert_allclose(one, four, rtol=1e-12)
+
+
+def test_the_face_is_that_of_one_fmu(linear_fmu: Path) -> None:
+    one = system([linear("one", linear_fmu, d=[[2.0, 0.0], [0.0, 1.0]])], [("push", "one.u1")])
+    with CoupledAsset(one, watch("one.y1", inputs=["push"], step_size=0.1), isolated=False) as asset:
+        assert asset.describe()["order"] == ["one"]
+        for steps in (0, -1):
+            with pytest.raises(FmuInputError, match=f"steps must be at least 1, but is {steps}"):
+                asset.simulate(steps=steps)
+        assert asset.simulate({"push": 3.0}, steps=1).values.tolist() == [[6.0]]
+        with pytest.raises(TypeError, match="Inputs are control, health, load, port, and 'contrl' came"):
+            asset.reset(contrl={})
+        assert asset.step_index == 1
+        asset.reset(control={"push": 1.0})
+        assert asset.observe().values.tolist() == [2.0]
+
+
+def test_a_chain_gives_in_one_step_what_one_system_would(linear_fmu: Path) -> None:
+    """Direct feedthrough through three FMUs, written backwards, arrives in the same step."""
+    gains = {"third": 5.0, "second": 3.0, "first": 2.0}
+    parts = [linear(name, linear_fmu, d=np.diag([gain, 1.0])) for name, gain in gains.items()]
+    ends = [("push", "first.u1"), ("first.y1", "second.u1"), ("second.y1", "third.u1"), ("third.y1", "out")]
+    chain, binding = system(parts, ends), watch("out", inputs=["push"])
+    with CoupledAsset(chain, binding, isolated=False) as asset:
+        assert asset.schedule.order == ("first", "second", "third")
+        assert asset.step({"push": 0.7}).values[0] == 2.0 * 0.7 * 3.0 * 5.0
+    with CoupledAsset(chain, binding, algorithm="jacobi", isolated=False) as asset:
+        seen = [asset.step({"push": 0.7}).values[0] for _ in range(3)]
+    np.testing.assert_allclose(seen, [0.0, 0.0, 21.0])  # one FMU further in each step
+
+
+def loop_of(linear_fmu: Path, gain: float) -> SystemStructure:
+    """y = gain u' + 1 and u' = -0.3 y + 2: the constants are states that do not move."""
+    first = np.diag([1.0, 0.0])
+    left = linear("left", linear_fmu, c=first, d=gain * first, initial=(1.0, 0.0))
+    right = linear("right", linear_fmu, c=first, d=-0.3 * first, initial=(2.0, 0.0))
+    return system([left, right], [("left.y1", "right.u1"), ("right.y1", "left.u1")])
+
+
+def test_an_algebraic_loop_is_reported_and_broken_by_a_delay_or_by_jacobi(linear_fmu: Path) -> None:
+    """y = 0.5 u + 1, u of the last step; u = 2 - 0.3 y, y of this step, but of the last one by Jacobi."""
+    loop = loop_of(linear_fmu, 0.5)
+    with pytest.raises(AlgebraicLoopError) as caught:
+        CoupledAsset(loop, watch("left.y1"))
+    assert "left.y1 -> right.u1 -> right.y1 -> left.u1" in str(caught.value)
+    words = "delay one of its connections, allow iterations, or take the algorithm jacobi"
+    assert words in str(caught.value)
+    for structure, algorithm, lag in ((loop.delayed(["left.u1"]), "gauss_seidel", 0), (loop, "jacobi", 1)):
+        seen = flown(structure, "left.y1", "right.y1", steps=5, algorithm=algorithm)
+        for (before_y, before_u), (y, u) in itertools.pairwise(seen):
+            np.testing.assert_allclose([y, u], [1.0 + 0.5 * before_u, 2.0 - 0.3 * (before_y if lag else y)])
+    with pytest.raises(CouplingError, match=r"ends at left\.u2.*connections end at right\.u1, left\.u1"):
+        loop.delayed(["left.u2"])
+
+
+@pytest.mark.parametrize("algorithm", ["gauss_seidel", "jacobi"])
+def test_iterations_solve_an_algebraic_loop_and_make_the_coupling_implicit(
+    state_fmu: Path, linear_fmu: Path, algorithm: Algorithm
+) -> None:
+    """Settled, each FMU has the other's values of the end of the step, whichever algorithm led there."""
+    settled = {"algorithm": algorithm, "iterations": 80, "tolerance": 1e-13}
+    y = (1.0 + 0.5 * 2.0) / (1.0 + 0.5 * 0.3)
+    seen = flown(loop_of(linear_fmu, 0.5), "left.y1", "right.y1", **settled)[1]
+    np.testing.assert_allclose(seen, [y, 2.0 - 0.3 * y], rtol=1e-11)
+    pair, ends = oscillator(state_fmu, linear_fmu), ("first.y1", "first.y2", "second.y1")
+    (p1, q1), (p2, q2) = held(A1, B1, 0.1), held(A2, B2, 0.1)
+    x, z = OSCILLATOR[:2], OSCILLATOR[2:]
+    for row in flown(pair, *ends, steps=5, step_size=0.1, **settled)[1:]:
+        # x' = P1 x + q F', z' = P2 z + Q2 x', F' = C z' + D x': a linear system for F'.
+        free = C2[0] @ (p2 @ z + q2 @ p1 @ x) + D2[0] @ p1 @ x
+        force = free / (1.0 - (C2[0] @ q2 + D2[0]) @ q1[:, 0])
+        x = p1 @ x + q1[:, 0] * force
+        z = p2 @ z + q2 @ x
+        np.testing.assert_allclose(row, [*x, force], rtol=1e-9)
+
+
+def test_iterations_that_do_not_settle_or_cannot_be_made(spring_mass: Path, linear_fmu: Path) -> None:
+    with pytest.raises(IterationError, match=r"left, right did not settle in 8 iterations.*still changes by"):
+        flown(loop_of(linear_fmu, -7.0), "left.y1", iterations=8)
+    parts = [Component("spring", spring_mass), linear("law", linear_fmu, d=np.eye(2))]
+    joined = system(parts, [("spring.position", "law.u1"), ("law.y1", "spring.force")])
+    with pytest.raises(CouplingError, match="component 'spring' cannot save and restore its state"):
+        CoupledAsset(joined, watch("law.y1"), iterations=3)
+
+
+def test_components_in_a_circle_without_a_loop_of_variables(crossed_fmu: Path) -> None:
+    """Two FMUs that feed each other through different variables: no loop, but one value is a step old."""
+    parts = [linear("left", crossed_fmu, d=np.diag([2, 3])), linear("right", crossed_fmu, d=np.diag([5, 1]))]
+    joined = system(parts, [("push", "left.u1"), ("left.y1", "right.u1"), ("right.y1", "left.u2")])
+    with CoupledAsset(joined, watch("left.y2", inputs=["push"]), isolated=False) as asset:
+        assert asset.schedule.loops == ()
+        assert [str(link.source) for link in asset.schedule.held] == ["right.y1"]
+        assert [asset.step({"push": 1.0}).values[0] for _ in range(2)] == [0.0, 30.0]
+    with CoupledAsset(joined, watch("left.y2", inputs=["push"]), iterations=5, isolated=False) as asset:
+        assert asset.step({"push": 1.0}).values[0] == 30.0
+
+
+def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(
+    state_fmu: Path, linear_fmu: Path
+) -> None:
+    structure, push = oscillator(state_fmu, linear_fmu, pushed=True), {"push": ("push", "1", -1.0, 2.0)}
+    ranged = bound(1.0, {"y": ("first.y1", "1")}, control=push)
+    with CoupledAsset(structure, ranged, isolated=False) as asset:
+        before = asset.step({"push": 2.0}).values
+        with pytest.raises(FmuInputError, match=r"push = 2\.5 lies outside .* 'push', -1 to 2"):
+            asset.step({"push": 2.5})
+        assert asset.step_index == 1
+        np.testing.assert_array_equal(asset.observe().values, before)
+    with pytest.raises(BindingError, match="bound of several FMUs has a decimation"):
+        CoupledAsset(structure, changed(ranged, header={"decimation": 2}), isolated=False)
+
+
+def test_parameters_and_refusals_are_those_of_the_components(ours: OurFmus) -> None:
+    structure, seen = three(ours), []
+    for seed in (5.0, 6.0):
+        options = {"isolated": False, "parameters": {"seed": seed}}
+        with CoupledAsset(structure, SYSTEM_OF_THREE, **options) as asset:
+            assert asset.schedule.order == ("damage", "wing", "gauges")
+            seen.append(asset.simulate({"load_factor": 2.0}, steps=3).values)
+            state = asset.save_state()
+            with pytest.raises(FmuInputError, match=r"component (damage|wing): load.load_factor = 99"):
+                asset.step({"load_factor": 99.0})
+            with pytest.raises(FmuStateError, match="no longer stand at the same time"):
+                asset.step({"load_factor": 2.0})
+            asset.reset()
+            asset.step({"load_factor": 2.0})
+    assert not np.array_equal(*seen)
+    delayed = tuple(replace(c, delayed=bool(c.source.component)) for c in structure.connections)
+    with (
+        CoupledAsset(replace(structure, connections=delayed), SYSTEM_OF_THREE, isolated=False) as other,
+        pytest.raises(FmuStateError, match="another FMU than the system test"),
+    ):
+        other.restore_state(state)
+
+
+def test_what_an_fmu_does_wrong_names_its_component(spring_mass: Path, linear_fmu: Path) -> None:
+    law = linear("law", linear_fmu, d=np.eye(2))
+    joined = system([Component("spring", spring_mass), law], [("spring.position", "law.u1")])
+    binding = bound(0.1, {"y": ("law.y1", "1")}, load={"misbehaviour": ("spring.misbehaviour", "1")})
+    for behaviour, kind, words in (
+        (NAN, FmuOutputError, "component spring: .*not finite.*position"),
+        (DIE, FmuWorkerError, "component spring: .*ended by signal"),
+    ):
+        with CoupledAsset(joined, binding) as asset:
+            asset.step()
+            with pytest.raises(kind, match=words):
+                asset.step(load={"misbehaviour": behaviour})
+
+
+def test_fmus_of_model_exchange_are_solved_by_us_and_coupled_as_any(foreign_fmu: Any) -> None:
+    """x' = u - k x of FMI 1.0, the second fed by the first: exact between the moments of exchange."""
+    fmu, step, slow = foreign_fmu("decay1"), 0.25, 0.5
+    second = Component("second", fmu, {"k": Setting(slow)}, interface="model-exchange")
+    chain = system([Component("first", fmu), second], [("first.x", "second.u")])
+    x = y = 1.0
+    with CoupledAsset(chain, watch("first.x", "second.x", step_size=step, tolerance=1e-10)) as asset:
+        for _ in range(8):
+            x *= np.exp(-step)
+            y = y * np.exp(-slow * step) + x * (1.0 - np.exp(-slow * step)) / slow
+            np.testing.assert_allclose(asset.step().values, [x, y], rtol=1e-8)
+    only = Component("ball", foreign_fmu("ball2"), interface="co-simulation")
+    with pytest.raises(FmuUnsupportedError, match=r"offers model-exchange only, but .* for co-simulation"):
+        CoupledAsset(system([only], []), watch("ball.h"))

@@ -1,0 +1,533 @@
+"""Assets of every kind behind the one door: what each is flown with, and what it must show."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import expm
+
+from fe.runtime.state import TIP_FORCE
+from fe.runtime.transient import ModalIntegrator
+from fe.structure.design import parse_structure
+from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.companions.damage_growth import DamageGrowth
+from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.structures.binding import structure_binding
+from scenarios import binding_files
+from tests.conftest import BEAM
+from tests.fmu_asset.making import bound, changed, watch
+from tests.fmu_asset.ours import REGIONS, OurFmus
+
+Floats = npt.NDArray[np.float64]
+Inputs = Mapping[str, Mapping[str, Any]]
+Shown = tuple[Any, Mapping[str, Any]]
+"""Observations, a row for each step, and further outputs by name."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """An asset, its course and its oracle.
+
+    Attributes
+    ----------
+    file : str
+        A name of `ours`, a model of `foreign_fmu` or a system of `systems`.
+    binding : Binding
+        What it is flown through.
+    course : mapping
+        Inputs by role and name: one for each step, or one for all.
+    expected : callable, optional
+        What the course must show, from the kind and `ours`; without it, only what holds of every asset is
+        checked.
+    rtol, largest : float
+        How far from it: relative to each number, or to the largest observation. Both zero: to the bit.
+    atol : float
+        Absolute, of each number.
+    state : {"serialised", "replay"}
+        How its state is kept.
+    start : mapping
+        Inputs of the start.
+    parameters : mapping
+        Parameters by the binding's names.
+    arrays : tuple of str
+        Inputs that are whole arrays.
+    resets : bool
+        Whether the FMU's own reset is held to work; if not, each start takes a new instance.
+    """
+
+    file: str
+    binding: Binding
+    course: Inputs
+    expected: Callable[..., Shown] | None = None
+    rtol: float = 0.0
+    largest: float = 0.0
+    atol: float = 0.0
+    state: str = "replay"
+    start: Inputs = field(default_factory=dict)
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    arrays: tuple[str, ...] = ()
+    resets: bool = True
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of the course."""
+        histories = [values for names in self.course.values() for values in names.values()]
+        single = [len(values) for values in histories if np.ndim(values)]
+        return max(single, default=8)
+
+    def at(self, index: int) -> dict[str, dict[str, Any]]:
+        """Return the inputs of one step, as `step` takes them."""
+        return {
+            role: {
+                name: values[index] if np.ndim(values) > (name in self.arrays) else values
+                for name, values in histories.items()
+            }
+            for role, histories in self.course.items()
+        }
+
+
+# ---------------------------------------------------------------------- structures
+
+WING = load_binding(binding_files()["uav_wing"])
+QUASI_STATIC, TRANSIENT = 1.0, 2.0
+MOVING = {"response": TRANSIENT, "initial_tip_displacement": 0.03, "damping_alpha": 1.0, "damping_beta": 1e-4}
+
+
+def random_course(
+    roles: Mapping[str, Mapping[str, tuple[float, float]]], steps: int = 24
+) -> dict[str, dict[str, Floats]]:
+    """Return inputs at random within limits: a new one at every step, of health at every third."""
+    draw, held = np.random.default_rng(6), np.repeat(np.arange(0, steps, 3), 3)[:steps]
+    return {
+        role: {name: draw.uniform(*limits, steps)[held if role == "health" else slice(None)]
+               for name, limits in limited.items()}
+        for role, limited in roles.items()
+    }  # fmt: skip
+
+
+def wing_course(regions: tuple[str, ...] = ("z1", "z2")) -> Inputs:
+    """Return a course whose forces are whole numbers, which are sent as any number."""
+    course = random_course({
+        "control": {"load_factor": (-1.0, 4.0)}, "health": dict.fromkeys(regions, (0.0, 0.8)),
+        "load": {"tip_force": (-15.0, 15.0)},
+    })  # fmt: skip
+    return course | {"load": {"tip_force": np.round(course["load"]["tip_force"]).astype(int)}}
+
+
+def rows_of(kind: Kind) -> list[dict[str, Any]]:
+    """Return the inputs of each step, whatever their role."""
+    return [
+        {name: value for named in kind.at(index).values() for name, value in named.items()}
+        for index in range(kind.steps)
+    ]
+
+
+def statics(kind: Kind, ours: OurFmus) -> Shown:
+    """The static response to each row of inputs; accelerations are zero."""
+    model = ours.model(kind.file)
+    given = {name: value for name, value in kind.parameters.items() if name != "response"}
+    found = [model.static_response({**row, **given}) for row in rows_of(kind)]
+    bounds = {"strain_error_bound": [item.strain_error_bound for item in found]}
+    if model.name != WING.name:
+        return [[*item.strain, *item.displacement, 0.0] for item in found], bounds
+    tips = {"tip_displacement": [item.displacement[0] for item in found]}
+    return [item.strain for item in found], bounds | tips
+
+
+def motion(kind: Kind, ours: OurFmus) -> Shown:
+    """The modal integrator: a release, loads that jump, health that changes on the way."""
+    model, given = ours.model(kind.file), kind.parameters
+    damping = [given.get(f"damping_{name}", model.damping[k]) for k, name in enumerate(("alpha", "beta"))]
+    now = ModalIntegrator(model, model.nominal, *damping)
+    tip, at_start = given.get("initial_tip_displacement", 0.0), model.load_coefficients(model.nominal)
+    state = now.released(tip, at_start, TIP_FORCE) if tip else now.at_rest(at_start)
+    health, shown = dict.fromkeys(model.regions, 0.0), []
+    for row in rows_of(kind):
+        vector = model.vector(row)
+        if health != (health := {name: row[name] for name in model.regions}):
+            was, now = now, ModalIntegrator(model, vector, *damping)
+            state = now.take_over(state, was)
+        state = now.advance(state, kind.binding.step_size, model.load_coefficients(vector))
+        shown.append(now.outputs(state))
+    values = np.array(shown)
+    if model.name != WING.name:
+        return values, {}
+    return values[:, :-1], {"tip_displacement": values[:, -1]}
+
+
+def wing(file: str, response: float, **further: Any) -> Kind:
+    """A wing at rest or in motion."""
+    binding = load_binding(binding_files()["uav_wing_fmi3" if file == "fmi3" else "uav_wing"])
+    regions, start = ("z1", "z2"), {}
+    if file.endswith("regions"):
+        regions, start = REGIONS, {"health": dict.fromkeys(REGIONS, 0.0)}
+        binding = binding.with_regions(REGIONS)
+    if response == QUASI_STATIC:
+        still = {"response": QUASI_STATIC, "young_modulus_factor": 1.05}
+        return Kind(file, binding, wing_course(regions), statics, start=start, parameters=still, **further)
+    binding = changed(binding, header={"step_size": 0.005})
+    return Kind(file, binding, wing_course(regions), motion, start=start, parameters=MOVING, **further)
+
+
+def exchange(file: str, health: str, **header: object) -> Kind:
+    """A wing whose modes our solver moves; they are those of one that moves them itself."""
+    regions = {f"z{number}": {"variable": health.format(number), "unit": "1"} for number in (1, 2)}
+    binding = changed(WING, header={"step_size": 0.005, "tolerance": 1e-9, **header}, health=regions)
+    return Kind(file, binding, wing_course(), motion, largest=1e-6, parameters=MOVING)
+
+
+BEAM_BINDING = structure_binding(parse_structure(tomllib.loads(BEAM)))
+BEAM_COURSE = random_course({
+    "control": {"load_factor": (-4.0, 6.0), "push": (-50.0, 50.0)},
+    "health": {"z1": (0.0, 0.8), "z2": (0.0, 0.8)},
+})  # fmt: skip
+
+
+# ---------------------------------------------------------------------- others' FMUs
+
+SPRING = bound(
+    0.1, {"motion": (["velocity", "position"], "m")}, header={"name": "spring_mass", "start_time": 2.0},
+    control={"push": ("force", "N")}, health={"spring": ("stiffness", "N/m")},
+    load={"lock": ("locked", "1"), "misbehaviour": ("misbehaviour", "1")}, monitor={"steps": ("steps", "1")},
+)  # fmt: skip
+
+
+def spring(kind: Kind, _: OurFmus) -> Shown:
+    position, velocity, shown = 0.0, 0.0, []
+    for row in rows_of(kind):
+        for _ in range(0 if row["lock"] else 100):
+            velocity += (row["push"] - row["spring"] * position) * 0.001
+            position += velocity * 0.001
+        shown.append([velocity, position])
+    return shown, {"steps": np.arange(1.0, kind.steps + 1)}
+
+
+def lag(kind: Kind, _: OurFmus) -> Shown:
+    """Out1' = (K In1 - Out1) / T, exact for inputs that are held; `hold` stops it."""
+    out, shown, gain, constant = 0.0, [], kind.parameters["gain"], kind.parameters["time"]
+    for row in rows_of(kind):
+        if not row["hold"]:
+            out = gain * row["speed"] + (out - gain * row["speed"]) * math.exp(
+                -kind.binding.interval / constant
+            )
+        shown.append([out])
+    calls = kind.binding.binding.decimation * np.arange(1.0, kind.steps + 1)
+    return shown, {"count": calls}
+
+
+def room(kind: Kind, _: OurFmus) -> Shown:
+    """Half of the heater's power over 100 W/K, above what it is outside."""
+    warm, shown, rates = 20.0, [], []
+    for row in rows_of(kind):
+        power = 500.0 * row["power"] * row["on"]
+        steady = row["outside"] + power / 100.0
+        warm = steady + (warm - steady) * math.exp(-60.0 * 100.0 / 5e4)
+        shown.append([warm, warm])
+        rates.append((power - 100.0 * (warm - row["outside"])) / 5e4)
+    return shown, {"room.T": np.array(shown)[:, 0] + 273.15, "der(room.T)": rates}
+
+
+def fixed(kind: Kind, _: OurFmus) -> Shown:
+    steps = kind.binding.binding.decimation
+    return np.cumsum(kind.course["control"]["u"])[:, np.newaxis] * steps * 0.01, {
+        "calls": steps * np.arange(1.0, kind.steps + 1)
+    }
+
+
+def array(kind: Kind, _: OurFmus) -> Shown:
+    """The sum of gain A u + offset over the steps while active, in mm."""
+    matrix = np.arange(1.0, 7.0).reshape(2, 3)
+    for place, name in (((0, 0), "first"), ((1, 2), "corner")):
+        matrix[place] = kind.parameters.get(name, matrix[place])
+    matrix = np.reshape(kind.parameters.get("A", matrix), (2, 3))
+    total, shown, factor = np.zeros(2), [], kind.parameters.get("gain", 1.0)
+    for row in rows_of(kind):
+        u = row["u"] if "u" in row else np.array([row["first"], 0.0, row["third"]])
+        total = total + row.get("active", 1.0) * (factor * matrix @ u + row["offset"])
+        shown.append(total)
+    return 1e-3 * np.array(shown), {"calls": np.arange(1.0, kind.steps + 1)}
+
+
+def bounces(restitution: float, gravity: float, until: float) -> tuple[float, float, int]:
+    """Return height, velocity and number of bounces of a ball let go at 1 m."""
+    time, velocity = math.sqrt(2.0 / gravity), math.sqrt(2.0 * gravity)
+    if until < time:
+        return 1.0 - 0.5 * gravity * until**2, -gravity * until, 0
+    for count in range(1, 1000):
+        velocity *= restitution
+        left, flight = until - time, 2.0 * velocity / gravity
+        if left < flight:
+            return velocity * left - 0.5 * gravity * left**2, velocity - gravity * left, count
+        time += flight
+    raise AssertionError(until)
+
+
+def ball(kind: Kind, _: OurFmus) -> Shown:
+    moments = kind.binding.interval * np.arange(1, kind.steps + 1)
+    found = [bounces(kind.parameters.get("restitution", 0.7), 9.81, moment) for moment in moments]
+    return [[1e3 * height, speed] for height, speed, _ in found], {"bounces": [item[2] for item in found]}
+
+
+def decay(kind: Kind, _: OurFmus) -> Shown:
+    x, k, shown = 1.0, kind.parameters["k"], []
+    for row in rows_of(kind):
+        steady = (row["u"] + 273.15) / k
+        x = steady + (x - steady) * math.exp(-k * kind.binding.interval)
+        shown.append([x])
+    return shown, {}
+
+
+def swing(kind: Kind, _: OurFmus) -> Shown:
+    """x'' = -9 (x - a): a becomes 1 at t = 1."""
+    shown = []
+    for time in kind.binding.interval * np.arange(1, kind.steps + 1):
+        x, v = 0.5 * math.cos(3.0 * min(time, 1.0)), -1.5 * math.sin(3.0 * min(time, 1.0))
+        if time > 1.0:
+            c, s = math.cos(3.0 * (time - 1.0)), math.sin(3.0 * (time - 1.0))
+            x, v = 1.0 + (x - 1.0) * c + v / 3.0 * s, v * c - 3.0 * (x - 1.0) * s
+        shown.append([x, v, float(time > 1.0)])
+    return shown, {}
+
+
+LINE = np.array([0.5, 2.0, -1.0, -1.0, 3.0, 3.5, 0.0])
+
+
+def follower(kind: Kind, _: OurFmus) -> Shown:
+    """x' = u - x, x(0) = 0, u in straight lines; `seen` is u at the last call."""
+    x, shown, step = 0.0, [], kind.binding.interval
+    lost = 1.0 - math.exp(-step)
+    for first, last in pairwise(LINE):
+        x += lost * (first - x) + (last - first) / step * (step - lost)
+        shown.append([x])
+    if kind.file == "follow1" or kind.binding.binding.interface == "model-exchange":
+        return shown, {}
+    quarters = kind.binding.binding.decimation
+    return shown, {"seen": LINE[:-1] + (1.0 - 1.0 / quarters) * np.diff(LINE)}
+
+
+def following(file: str, *, quarters: bool = False, **header: object) -> Kind:
+    divided = {"step_size": 0.0625, "decimation": 4} if quarters else {}
+    binding = bound(
+        0.25, {"x": ("x", "1")}, control={"u": ("u", "1")}, monitor={"seen": ("seen", "1")},
+        header={"interpolation": "linear", **divided, **header},
+    )  # fmt: skip
+    exchanged = "interface" in header
+    return Kind(
+        file, binding, {"control": {"u": LINE[1:]}}, follower, atol=1e-8 if exchanged else 1e-13,
+        state="replay" if exchanged or file == "follow1" else "serialised", start={"control": {"u": LINE[0]}},
+        resets=not (exchanged and quarters),  # in this process the solver's last digits tell a reset apart
+    )  # fmt: skip
+
+
+EXCHANGED = {"interface": "model-exchange", "tolerance": 1e-11}
+HOSTILE = bound(1.0, {"y": ("y", "m")}, control={"u": ("u", "m/s")})
+
+
+def integral(kind: Kind, _: OurFmus) -> Shown:
+    return np.cumsum(kind.course["control"]["u"])[:, np.newaxis], {}
+
+
+DAMAGE_BINDING = bound(
+    1.0, {"z": (["z1", "z2"], "1")}, control={"load_factor": ("load_factor", "1")},
+    parameter={"p1": ("probability.z1", "1"), "p2": ("probability.z2", "1"), "seed": ("seed", "1")},
+)  # fmt: skip
+
+
+def damage(kind: Kind, ours: OurFmus) -> Shown:
+    """The behaviour that is packed, in this process."""
+    declared = read_fmu(ours(kind.file)).variables
+    values = {v.name: float(v.start or 0.0) for v in declared if v.causality == "parameter"}
+    values |= {kind.binding.parameter[name].variable: value for name, value in kind.parameters.items()}
+    behaviour = DamageGrowth()
+    behaviour.start(values, 0.0, [1.0])
+    loads = enumerate(kind.course["control"]["load_factor"])
+    return [behaviour.advance(float(time), 1.0, [load]) for time, load in loads], {}
+
+
+# ---------------------------------------------------------------------- systems
+
+M1, M2, K1, K2, KC, C1, CC = 1.0, 1.5, 4.0, 3.0, 2.0, 0.1, 0.2
+OSCILLATOR = np.array([1.0, 0.0, -0.5, 0.3])  # x1, v1, x2, v2 at the start
+# The first mass is pushed by a force, the second one feels where the first one is and answers with the force.
+A1, B1 = np.array([[0.0, 1.0], [-K1 / M1, -C1 / M1]]), np.array([[0.0, 0.0], [1.0 / M1, 1.0 / M1]])
+A2 = np.array([[0.0, 1.0], [-(K2 + KC) / M2, -CC / M2]])
+B2 = np.array([[0.0, 0.0], [KC / M2, CC / M2]])
+C2, D2 = np.array([[KC, CC], [0.0, 0.0]]), np.array([[-KC, -CC], [0.0, 0.0]])
+
+
+def held(matrix: Floats, inputs: Floats, step: float) -> tuple[Floats, Floats]:
+    """Return what moves states and held inputs over a step."""
+    block = np.zeros((4, 4))
+    block[:2, :2], block[:2, 2:] = matrix, inputs
+    whole = expm(block * step)
+    return whole[:2, :2], whole[:2, 2:]
+
+
+def recursion(kind: Kind, _: OurFmus) -> Shown:
+    """Positions and force of two masses, the coupling written out by hand."""
+    (p1, q1), (p2, q2) = (held(a, b, kind.binding.interval) for a, b in ((A1, B1), (A2, B2)))
+    x, z = OSCILLATOR[:2], OSCILLATOR[2:]
+    force, shown = (C2 @ z + D2 @ x)[0], []
+    for push in kind.course["control"]["push"]:
+        old, x = x, p1 @ x + q1 @ [force, push]
+        seen = old if kind.file.endswith("jacobi") else x
+        z = p2 @ z + q2 @ seen
+        force = (C2 @ z + D2 @ seen)[0]
+        shown.append([*x, force])
+    return shown, {}
+
+
+SYSTEM_OF_THREE = bound(
+    0.5,
+    {"strain": ("gauges.reading[{1..24}]", "microstrain"), "received": ("gauges.received[{1..24}]", "1")},
+    control={"load_factor": ("load_factor", "1")}, parameter={"seed": ("gauges.seed", "1")},
+    monitor={"z1": ("damage.z1", "%")}, record=["wing.tip_displacement", "damage.z2"],
+)  # fmt: skip
+OSCILLATOR_ENDS = watch("first.y1", "first.y2", "second.y1", step_size=0.05, inputs=["push"])
+PUSHED = {"control": {"push": np.sin(np.arange(24.0))}}
+SERIALISED = {"state": "serialised"}
+TURNS = np.arange(24)
+
+KINDS: dict[str, Kind] = {
+    "wing": wing("python", QUASI_STATIC, **SERIALISED),
+    "wing in motion": wing("python", TRANSIENT, **SERIALISED),
+    "compiled wing": wing("compiled", QUASI_STATIC, largest=1e-12, **SERIALISED),
+    "compiled wing in motion": wing("compiled", TRANSIENT, largest=1e-12, **SERIALISED),
+    "wing of FMI 3": wing("fmi3", QUASI_STATIC, largest=1e-12, **SERIALISED),
+    "wing of FMI 3 in motion": wing("fmi3", TRANSIENT, largest=1e-12, **SERIALISED),
+    "three regions": wing("regions", QUASI_STATIC, **SERIALISED),
+    "three regions in motion": wing("regions", TRANSIENT, **SERIALISED),
+    "three compiled regions": wing("compiled_regions", QUASI_STATIC, largest=1e-12, **SERIALISED),
+    "three compiled regions in motion": wing("compiled_regions", TRANSIENT, largest=1e-12, **SERIALISED),
+    "model exchange wing": exchange("exchange", "health.z{}"),
+    "model exchange wing of FMI 3": exchange("exchange3", "health[{}]", fmi_version="3.0"),
+    "beam": Kind(
+        "beam", BEAM_BINDING, BEAM_COURSE, statics, largest=1e-12, parameters={"e": 1.06, "pump": 0.03},
+        **SERIALISED,
+    ),
+    "beam in motion": Kind(
+        "beam", changed(BEAM_BINDING, header={"step_size": 1e-3}), BEAM_COURSE, motion, largest=1e-12,
+        parameters={"response": TRANSIENT}, **SERIALISED,
+    ),
+    "spring": Kind(
+        "spring_mass", SPRING,
+        {"control": {"push": np.sin(TURNS)}, "health": {"spring": 2.0}, "load": {"lock": TURNS % 7 == 6}},
+        spring, rtol=1e-12,
+    ),
+    "FMI 1": Kind(
+        "lag1",
+        bound(
+            0.05, {"out": ("Out1", "rad/s")},
+            header={"fmi_version": "1.0", "decimation": 3, "start_time": 1.0},
+            control={"speed": ("In1 (rad/s)", "rad/s", -2000.0, 2000.0)}, load={"hold": ("Hold", "1")},
+            parameter={"gain": ("Lag/Gain [K]", "1"), "time": ("Lag/Time const", "s")},
+            monitor={"count": ("Count", "1")},
+        ),
+        {"control": {"speed": np.linspace(-2.0, 2.0, 24)}, "load": {"hold": TURNS % 7 == 6}},
+        lag, rtol=1e-12, parameters={"gain": 3.0, "time": 0.4},
+    ),
+    "FMI 2 of a Modelica tool": Kind(
+        "room2",
+        bound(
+            60.0, {"room": (["room.T", "room.sensor.T"], "degC")}, control={"power": ("heater.u[1].P", "kW")},
+            load={"outside": ("ambient.T", "degC", -40.0, 50.0), "on": ("'heater is on'", "1")},
+            parameter={"mode": ("heater.mode", "1")}, record=["der(room.T)", "room.T"],
+        ),
+        {"control": {"power": np.linspace(0.0, 3.0, 24)},
+         "load": {"outside": np.linspace(-5.0, 9.0, 24), "on": TURNS % 5 != 4}},
+        room, rtol=1e-12, parameters={"mode": 2.0},
+    ),
+    "a fixed step": Kind(
+        "fixed2",
+        bound(
+            0.01, {"y": ("y", "1")}, control={"u": ("u", "1")}, monitor={"calls": ("calls", "1")},
+            header={"decimation": 100, "start_time": 5.0},
+        ),
+        {"control": {"u": np.linspace(3.0, -1.0, 8)}}, fixed, rtol=1e-12, **SERIALISED,
+    ),
+    "elements of arrays": Kind(
+        "array3",
+        bound(
+            1.0, {"y": ("y", "m")}, control={"first": ("u[1]", "1")},
+            load={"offset": ("offset", "1"), "active": ("active", "1"), "third": ("u[3]", "1")},
+            parameter={"gain": ("gain", "1"), "corner": ("A[2,3]", "1"), "first": ("A[1,1]", "1")},
+            monitor={"calls": ("calls", "1"), "y": ("y_alias", "mm")},
+        ),
+        {"control": {"first": np.cos(TURNS)},
+         "load": {"offset": TURNS % 5 - 3, "active": TURNS % 4 != 3, "third": np.sin(TURNS)}},
+        array, rtol=1e-12, parameters={"gain": 0.5, "corner": 10.0}, **SERIALISED,
+    ),
+    "whole arrays": Kind(
+        "array3",
+        bound(
+            1.0, {"y": ("y", "m")}, load={"u": ("u", "1"), "offset": ("offset", "1")},
+            parameter={"A": ("A", "1")}, monitor={"calls": ("calls", "1")},
+        ),
+        {"load": {"u": np.random.default_rng(2).normal(size=(12, 3)), "offset": np.arange(12) - 5}},
+        array, rtol=1e-12, parameters={"A": np.arange(6.0) ** 2}, arrays=("u",), **SERIALISED,
+    ),
+    "one array for all steps": Kind(
+        "array3",
+        bound(
+            1.0, {"y": ("y", "m")}, load={"u": ("u", "1"), "offset": ("offset", "1")},
+            monitor={"calls": ("calls", "1")},
+        ),
+        {"load": {"u": np.array([1.0, -2.0, 3.0]), "offset": np.zeros(4)}}, array, rtol=1e-12,
+        arrays=("u",), **SERIALISED,
+    ),
+    "model exchange of FMI 2 with state events": Kind(
+        "ball2",
+        bound(
+            0.05, {"ball": ("h", "mm"), "speed": ("v", "m/s")}, control={"gravity": ("g", "m/s2")},
+            parameter={"restitution": ("e", "1")}, monitor={"bounces": ("bounces", "1")},
+            header={"tolerance": 1e-8},
+        ),
+        {"control": {"gravity": np.full(30, 9.81)}}, ball, rtol=1e-5, atol=2e-3,
+        parameters={"restitution": 0.8},
+    ),
+    "model exchange of FMI 1": Kind(
+        "decay1",
+        bound(
+            0.5, {"x": ("x", "K")}, control={"u": ("u", "degC")}, parameter={"k": ("k", "1")},
+            header={"tolerance": 1e-9, "start_time": -1.0},
+        ),
+        {"control": {"u": np.array([0.0, 0.0, 4.0, 4.0, -2.0, -2.0]) - 273.15}}, decay, atol=1e-7,
+        start={"control": {"u": -273.15}}, parameters={"k": 2.0}, resets=False,
+    ),
+    "model exchange of FMI 3 with a time event": Kind(
+        "swing3",
+        bound(
+            0.3, {"x": (["x"], "1"), "a": ("a", "1")}, parameter={"w": ("w", "rad/s")},
+            header={"tolerance": 1e-9},
+        ),
+        {"load": {}, "control": {}}, swing, atol=1e-6, parameters={"w": 3.0},
+    ),
+    "lines of FMI 1": following("follow1"),
+    "lines": following("follow2"),
+    "lines in quarters": following("follow2", quarters=True),
+    "lines in model exchange": following("follow2", **EXCHANGED),
+    "lines in model exchange in quarters": following("follow2", quarters=True, **EXCHANGED),
+    "an integrator": Kind("hostile2", HOSTILE, {"control": {"u": TURNS / 4.0}}, integral, **SERIALISED),
+    "an integrator by replay": Kind(
+        "hostile2", changed(HOSTILE, header={"state": "replay"}), {"control": {"u": TURNS / 4.0}}, integral
+    ),
+    "damage": Kind(
+        "damage_growth", DAMAGE_BINDING, {"control": {"load_factor": 2.0 + TURNS % 2}}, damage,
+        parameters={"p1": 0.4, "p2": 0.3, "seed": 11.0}, **SERIALISED,
+    ),
+    "a system": Kind("oscillator", OSCILLATOR_ENDS, PUSHED, recursion, rtol=1e-12, atol=1e-13, **SERIALISED),
+    "a system by Jacobi": Kind(
+        "oscillator jacobi", OSCILLATOR_ENDS, PUSHED, recursion, rtol=1e-12, atol=1e-13, **SERIALISED
+    ),
+    "a system with a wing": Kind(
+        "three", SYSTEM_OF_THREE, {"control": {"load_factor": 2.0 + TURNS % 2}}, parameters={"seed": 5.0},
+        **SERIALISED,
+    ),
+}  # fmt: skip

@@ -1,0 +1,188 @@
+"""What holds of every asset behind the door, whatever its FMU is: of our own, of others, of systems."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fmu_asset.coupling.asset import CoupledAsset
+from fmu_asset.coupling.structure import SystemStructure
+from fmu_asset.door.layout import Observation
+from fmu_asset.door.saved_state import SavedState
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.errors import FmuInputError, FmuStateError
+from tests.fmu_asset.coupling.systems import oscillator, three
+from tests.fmu_asset.door.kinds import KINDS, Kind
+from tests.fmu_asset.ours import NAMES, OurFmus
+
+Open = Callable[..., FmiAsset]
+Systems = Callable[[str], SystemStructure]
+Bits = list[tuple[bytes, bytes, float]]
+
+
+@pytest.fixture
+def systems(ours: OurFmus, state_fmu: Path, linear_fmu: Path) -> Systems:
+    """Systems of FMUs by name."""
+    return lambda name: three(ours) if name == "three" else oscillator(state_fmu, linear_fmu, pushed=True)
+
+
+@pytest.fixture
+def open_asset(
+    request: pytest.FixtureRequest, ours: OurFmus, foreign_fmu: Any, scratch: Path
+) -> Iterator[Open]:
+    """Open an asset of a kind; of all of them nothing is left behind."""
+
+    def opened(kind: Kind, **options: Any) -> FmiAsset:
+        given = {"parameters": kind.parameters, **options}
+        if kind.file.startswith(("oscillator", "three")):
+            algorithm = {"algorithm": "jacobi"} if kind.file.endswith("jacobi") else {}
+            structure = request.getfixturevalue("systems")(kind.file)
+            return CoupledAsset(structure, kind.binding, **algorithm, **given)
+        return FmiAsset(
+            ours(kind.file) if kind.file in NAMES else foreign_fmu(kind.file), kind.binding, **given
+        )
+
+    def there() -> tuple[list[str], int, set[str]]:
+        modules = {
+            name for name in sys.modules if name.startswith(("uav_wing_", "SpringMass", "LinearSystem"))
+        }
+        return list(sys.path), len(list(Path("/proc/self/fd").iterdir())), modules
+
+    before = there()
+    yield opened
+    assert there() == before
+    assert not list(scratch.iterdir())
+
+
+def bits(seen: Observation) -> tuple[bytes, bytes, float]:
+    return seen.values.tobytes(), np.array(list(seen.extra.values())).tobytes(), seen.time
+
+
+def flown(asset: FmiAsset, kind: Kind, steps: range) -> Bits:
+    return [bits(asset.step(**kind.at(index))) for index in steps]
+
+
+every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+
+
+@every_kind
+def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(
+    open_asset: Open, ours: OurFmus, kind: Kind, isolated: bool
+) -> None:
+    with open_asset(kind, isolated=False) as one, open_asset(kind, isolated=isolated) as whole:
+        for asset in (one, whole):
+            asset.reset(**kind.start)
+        single = flown(one, kind, range(kind.steps))
+        history = whole.simulate(**kind.course, steps=kind.steps)
+        extra = np.array(list(history.extra.values())).reshape(-1, kind.steps).T
+        rows = zip(history.values, extra, history.time, strict=True)
+        assert [(row.tobytes(), more.tobytes(), time) for row, more, time in rows] == single
+        # Both are in the same state, and the inputs are held. An FMU may write addresses into its own.
+        ours_now, theirs = (SavedState.from_bytes(asset.save_state()) for asset in (whole, one))
+        assert (ours_now.index, ours_now.inputs) == (kind.steps, theirs.inputs)
+        assert ours_now.outputs == theirs.outputs
+        assert kind.state == "serialised" or ours_now.body == theirs.body
+        assert bits(whole.step()) == bits(one.step())
+        header = kind.binding.binding
+        moments = [header.start_time + k * kind.binding.interval for k in range(1, kind.steps + 1)]
+        assert history.time.tolist() == moments  # never accumulated
+    if kind.expected is None:
+        return
+    values, more = kind.expected(kind, ours)
+    within = {"rtol": kind.rtol, "atol": kind.atol + kind.largest * np.abs(values).max()}
+    np.testing.assert_allclose(history.values, values, **within)
+    for name, expected in more.items():
+        np.testing.assert_allclose(history.extra[name], expected, **within)
+
+
+@every_kind
+def test_a_state_goes_on_to_the_bit_and_copies_go_their_own_way(
+    open_asset: Open, kind: Kind, isolated: bool
+) -> None:
+    half, rest = range(kind.steps // 2), range(kind.steps // 2, kind.steps)
+    with (
+        open_asset(kind, isolated=isolated) as asset,
+        open_asset(kind, parameters={}, isolated=isolated) as other,
+    ):
+        assert asset.state_method == kind.state
+        asset.reset(**kind.start)
+        begin = flown(asset, kind, half)
+        saved = asset.save_state()
+        assert SavedState.from_bytes(asset.save_state()).outputs == SavedState.from_bytes(saved).outputs
+        fork, sibling = asset.fork(), asset.sibling()
+        there = flown(fork, kind, rest)
+        sibling.reset(**kind.start)
+        assert flown(sibling, kind, half) == begin
+        sibling.close()
+        assert flown(asset, kind, rest) == there
+        fork.close()
+        # Back in the same instance, and in another one, in another process where it is isolated.
+        other.step(**kind.at(1))
+        for one in (asset, other):
+            one.restore_state(saved)
+            assert one.step_index == len(half)
+            assert flown(one, kind, rest) == there
+        for again in (asset.reset, asset.reset, asset.renew):
+            again(**kind.start)
+            assert flown(asset, kind, half) == begin
+        assert asset.reset_trial.works is not False or not kind.resets
+        asset.close()
+        for refused, words in ((asset.step, "closed; reset"), (asset.save_state, "no state to save")):
+            with pytest.raises(FmuStateError, match=words):
+                refused()
+        asset.reset()
+        assert asset.observe().time == kind.binding.binding.start_time
+
+
+REFUSED: list[tuple[str, dict[str, Any], str]] = [
+    ("wing", {"control": {"load_factor": 9.0}}, r"load_factor = 9\.0 lies outside .*, -1 to 4;"),
+    ("wing", {"control": {"load_factor": float("nan")}}, r"control\.load_factor must be finite, but is nan"),
+    ("wing", {"control": {"load_factor": float("inf")}}, r"must be finite, but is inf"),
+    ("wing", {"health": {"z1": -0.1}}, r"health\.z1 = -0\.1 lies outside"),
+    ("wing", {"control": {"load_factor": "fast"}}, r"must be a number, but is 'fast'"),
+    ("FMI 2 of a Modelica tool", {"load": {"outside": -41.0}}, r"load\.outside = -41\.0 lies outside"),
+    ("FMI 2 of a Modelica tool", {"load": {"on": 2}}, r"load\.on = 2 lies outside .* 0 to 1"),
+    ("elements of arrays", {"load": {"offset": 200}}, r"load\.offset = 200 lies outside .* -128 to 127"),
+    ("elements of arrays", {"control": {"first": 11.0}}, r"control\.first = 11\.0 lies outside .* -10 to 10"),
+    ("whole arrays", {"load": {"u": 1.0}}, r"load\.u takes 3 values, but 1 came"),
+    ("whole arrays", {"load": {"u": [1.0, 2.0]}}, r"load\.u takes 3 values, but 2 came"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "inputs", "sentence"), REFUSED)
+def test_what_is_refused_is_not_sent(
+    open_asset: Open, name: str, inputs: dict[str, Any], sentence: str, isolated: bool
+) -> None:
+    kind = KINDS[name]
+    with open_asset(kind, isolated=isolated) as asset, open_asset(kind, isolated=False) as other:
+        for one in (asset, other):
+            one.step(**kind.at(0))
+        with pytest.raises(FmuInputError, match=sentence):
+            asset.step(**inputs)
+        assert asset.step_index == 1
+        assert asset.log == ()
+        assert bits(asset.step()) == bits(other.step())
+
+
+@pytest.mark.parametrize("name", ["wing", "spring", "a system with a wing"])
+def test_a_state_of_something_else_is_refused(open_asset: Open, name: str) -> None:
+    kind, foreign = KINDS[name], KINDS["spring" if name == "wing" else "wing"]
+    with open_asset(foreign, isolated=False) as other:
+        other.step(**foreign.at(0))
+        foreign_state = other.save_state()
+    with open_asset(kind, isolated=False) as asset:
+        asset.reset(**kind.start)
+        asset.step(**kind.at(0))
+        saved = asset.save_state()
+        for wrong in (b"", b"x" * 40, saved[:30], saved[:-1], b"x" + saved[1:]):
+            with pytest.raises(FmuStateError, match=r"not a state of .*, or it is damaged|is damaged"):
+                asset.restore_state(wrong)
+        with pytest.raises(FmuStateError, match="another FMU"):
+            asset.restore_state(foreign_state)
+        asset.restore_state(saved)
+        asset.step(**kind.at(1))
