@@ -34,6 +34,8 @@ class Inputs(Section):
         Applied force [N]; a table by the load places of the campaign.
     load_factor, z1, z2 : str, optional
         Load factor and stiffness losses [1].
+    health : table
+        Stiffness losses [1] by damage region; z1 and z2 can stand in it, too.
     temperature : str, optional
         Temperature less the reference [K], or the temperature itself [degC] with `temperature_reference`.
     temperature_reference : float, optional
@@ -48,8 +50,15 @@ class Inputs(Section):
     temperature_reference: Number | None = None
     z1: Name | None = None
     z2: Name | None = None
+    health: dict[Name, Name] = Field(default_factory=dict)
     bending_moment: Name | None = None
     torque: Name | None = None
+
+    @property
+    def regions(self) -> dict[str, str]:
+        """Inputs of stiffness losses by damage region."""
+        usual = {"z1": self.z1, "z2": self.z2}
+        return {name: value for name, value in usual.items() if value is not None} | self.health
 
     @property
     def forces(self) -> dict[str, str]:
