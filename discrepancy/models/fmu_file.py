@@ -1,7 +1,7 @@
 """An FMU as a model, described by a TOML file: which variables are parameters, inputs, outputs and ports."""
 
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -9,16 +9,13 @@ from discrepancy.campaign.records import Quantity
 from discrepancy.errors import ModelError
 from discrepancy.models.model_file import (
     ModelDescription,
-    Name,
     NamedSection,
-    Number,
     ParameterSection,
-    Positive,
     Section,
     check_unique,
 )
 from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
-from reporting.section import checked
+from reporting.section import Name, Number, Positive, checked
 from reporting.toml_file import read_toml
 
 CARRIED = tuple(item.kind for item in (*STRUCTURE, *LOADS, StiffnessDrift))
@@ -226,17 +223,6 @@ class FmuModelDescription(ModelDescription):
         return self
 
 
-def parse_fmu_model(content: dict[str, Any], source: str = "the FMU model") -> FmuModelDescription:
-    """Check the content of an FMU model's file.
-
-    Raises
-    ------
-    ModelError
-        One sentence that names `source`, the place, what came and what was expected.
-    """
-    return checked(FmuModelDescription, content, source, ModelError, what="an FMU model")
-
-
 def load_fmu_model(path: Path | str) -> FmuModelDescription:
     """Read an FMU model's file.
 
@@ -245,4 +231,5 @@ def load_fmu_model(path: Path | str) -> FmuModelDescription:
     ModelError
         If there is no such file, it is not TOML, or its content is no FMU model.
     """
-    return parse_fmu_model(read_toml(path, ModelError, what="FMU model"), str(path))
+    content = read_toml(path, ModelError, what="FMU model")
+    return checked(FmuModelDescription, content, str(path), ModelError, what="an FMU model")

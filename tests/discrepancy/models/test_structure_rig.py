@@ -120,7 +120,7 @@ def test_any_region_is_known_by_its_name(either: tuple[Model, ReducedModel]) -> 
     seen = own.respond(named, OUTPUTS[:1], ModelPatch(), Conditions(conditions, health=health)).values[-1]
     found = reduced.static_response({"load_factor": 0.0, "push": 200.0}, {"z1": 0.3, "z2": 0.2})
     np.testing.assert_allclose(seen, found.displacement, rtol=1e-10)
-    with pytest.raises(ModelError, match="a loss of the damage region 'other', but .*beam.* has z1, z2"):
+    with pytest.raises(ModelError, match=r"a loss of the damage region 'other', but .*beam.* has z1, z2"):
         own.respond(named, OUTPUTS[:1], ModelPatch(), Conditions(conditions, health=health[:, ::-1]))
 
 
