@@ -30,7 +30,7 @@ from fe.runtime.patch import (
 )  # fmt: skip
 from tests.discrepancy.asking import seen
 from tests.discrepancy.asking import trial as asked
-from tests.refusals import Inputs
+from tests.discrepancy.rigs import fmu_rig
 
 
 @dataclass
@@ -92,9 +92,8 @@ def kind(request, coarse_patch_arrays, foreign_fmu, tmp_path_factory) -> Iterato
             (0.0, 1.828), tuple(SHIPPED_PRIOR), quantities, set(PRIMITIVES) - {"port_load"},
         )  # fmt: skip
     else:
-        file, fmu = tmp_path_factory.mktemp("rig") / "rig.toml", str(foreign_fmu("rig2"))
-        file.write_text(Inputs(__file__).text("rig.toml", ("{fmu}", fmu)), encoding="utf-8")
-        model, quantities = FmuModel.load(file), {"leaf_strain": Quantity.STRAIN, "slide.position": None}
+        model = FmuModel.load(fmu_rig(tmp_path_factory.mktemp("rig"), foreign_fmu("rig2")))
+        quantities = {"leaf_strain": Quantity.STRAIN, "slide.position": None}
         names = ("stiffness_factor", "damping_factor")
         yield Kind(model, "mass", "displacement", ("slide",), (0.0, 0.4), names, quantities, FMU)
         model.close()

@@ -34,6 +34,7 @@ from fe.runtime.patch import (
 from tests.discrepancy.asking import FloatArray, campaign, integrated
 from tests.discrepancy.asking import seen as shown
 from tests.discrepancy.asking import trial as asked
+from tests.discrepancy.rigs import fmu_rig
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
@@ -72,10 +73,7 @@ def write(foreign_fmu, tmp_path_factory) -> Callable[..., Path]:
     """A writer of the rig's file, alone in a folder, with texts replaced."""
 
     def file(*changes: tuple[str, str], fmu: str = "") -> Path:
-        path = tmp_path_factory.mktemp("rig") / "rig.toml"
-        text = INPUTS.text("rig.toml", ("{fmu}", fmu or str(foreign_fmu("rig2"))), *changes)
-        path.write_text(text, encoding="utf-8")
-        return path
+        return fmu_rig(tmp_path_factory.mktemp("rig"), fmu or foreign_fmu("rig2"), *changes)
 
     return file
 
