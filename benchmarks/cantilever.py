@@ -255,7 +255,7 @@ def _motion(
     values = np.empty((len(force), len(rows)))
     for level in np.unique(modulus):
         chosen = modulus == level
-        values[chosen] = (_system(float(level), structural).static(loads, laws).values @ rows.T)[chosen]
+        values[chosen] = (_system(float(level), structural).static(loads, laws)[0] @ rows.T)[chosen]
     return values, None, behind * force
 
 
