@@ -278,9 +278,11 @@ class SystemModel(Model):
 
     # ------------------------------------------------------------ sizes
 
-    def state_sizes(self, campaign: Campaign, trial: Trial, conditions: Conditions) -> FloatArray:
+    def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of a state at the begin of a trial: of motion from rest, and of data."""
-        moved = self.moved(self.case(trial, conditions), self.laws(conditions.parameters), still=True)
+        parameters = prior_mean(campaign, self.declared)
+        case = self.case(trial, Conditions(parameters))
+        moved = self.moved(case, self.laws(parameters), still=True)
         rig = moved.system
         count, moving = len(rig.angular_frequency), rig.moving
         x, v = (np.max(np.abs(item[:, :count]), axis=0) for item in (moved.q, moved.velocity))
@@ -288,7 +290,7 @@ class SystemModel(Model):
         n, shapes = rig.displacements, rig.shapes
         channels = [campaign.channels[name] for name in trial.channels]
         outputs = tuple((channel.output, channel.quantity) for channel in channels)
-        shown = self.shown(self.case(trial, conditions), outputs, moved.acting)
+        shown = self.shown(case, outputs, moved.acting)
         for column, item in enumerate(shown):
             kept = trial.values[trial.used[:, column], column] - item.constant
             if item.reaction is not None or item.speed is not None or not kept.size:
@@ -331,7 +333,7 @@ class SystemModel(Model):
             except ModelError:
                 motion = self.moved(case, laws, still=True)
             if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
-                initial = self.state_sizes(campaign, trial, conditions)
+                initial = self.initial_sizes(campaign, trial)
                 motion = self.moved(self.case(trial, replace(conditions, initial=initial)), laws)
             pushes = [
                 float(np.max(np.abs(trial.values[trial.used[:, column], column]), initial=0.0))
