@@ -13,7 +13,7 @@ from calibration.result.record import STATE
 from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown, shown_rows
-from discrepancy.models.interface import ModelParameter, Outputs, Place, PortScale
+from discrepancy.models.interface import Outputs, Place, PortScale
 from discrepancy.models.linear_system import Resting, springs
 from discrepancy.models.memory import Memory
 from discrepancy.models.questions import check_outputs
@@ -90,13 +90,7 @@ class WingModel(StructuralModel):
         self.wing = wing = PatchedWing(arrays)
         prior = prior or SHIPPED_PRIOR
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
-        self.name, self.parameters = (
-            name,
-            tuple(
-                ModelParameter(item.name, item.mean, item.deviation, item.unit, item.low, item.high)
-                for item in wing_priors(box, **prior)
-            ),
-        )
+        self.name, self.parameters = name, wing_priors(box, **prior)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
         self.port_names = tuple(PORTS)
         self._stiffnesses, self._systems, self._rows = Memory(), Memory(), Memory()
