@@ -16,8 +16,9 @@ from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.catalogue.needs import NO_PORT
 from discrepancy.checks.fault import DataFault
-from discrepancy.checks.outliers import wrong_ends
-from discrepancy.checks.quality import check_against_model, check_data, mark_outliers
+from discrepancy.checks.model_check import check_against_model
+from discrepancy.checks.outliers import mark_outliers, wrong_ends
+from discrepancy.checks.quality import check_data
 from discrepancy.errors import CampaignDataError
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit
@@ -58,13 +59,8 @@ DRAWS = 400
 IMPLAUSIBLE = 4.0
 """Prior deviations from which on a parameter or a gain is remarked on."""
 NO_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
-OPEN_KINDS = (
-    VerdictKind.GROUP,
-    VerdictKind.UNEXPLAINED,
-    VerdictKind.FAMILY,
-    VerdictKind.NAMED_IN_PART,
-    VerdictKind.BELOW_LIMIT,
-)
+CLOSED_KINDS = (VerdictKind.NOTHING_MISSING, VerdictKind.NAMED, VerdictKind.DATA_ERROR)
+"""Verdicts after which no experiment is proposed."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +199,7 @@ def investigate(
         with stage("Proving on held-out trials", "prove"):
             proof = prove(before, after, seed=seed)
     experiments: tuple[Experiment, ...] = ()
-    if thorough and verdict.kind in OPEN_KINDS:
+    if thorough and verdict.kind not in CLOSED_KINDS:
         with stage("Looking for the next experiment", "next"):
             experiments = next_experiments(problem, open_hypotheses(search))
     verdict = replace(

@@ -1,7 +1,6 @@
 """The rules of a verdict where a right model leaves the recorded noise: the first that holds decides."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
 
@@ -230,60 +229,32 @@ class Case:
         return self.told.outcome(kind, sentence, probability, gates=gates, resembles=resembles)
 
 
-@dataclass(frozen=True)
-class Rule:
-    """When a verdict is reached, in words and as a question, and what makes it; None: the next decides."""
-
-    kind: str
-    when: str
-    holds: Callable[[Case], bool]
-    makes: Callable[[Case], Outcome | None]
-
-
-UNSURE = (
-    Rule(
-        "unexplained", "No effect has the evidence of a name, and the model leaves more than its noise.",
-        lambda case: not case.leads and case.none_gate.passed is False, Case.gap,
-    ),
-    Rule(
-        "below detectability, or a group", "Nor has any, but that nothing is missing is improbable.",
-        lambda case: not case.leads and bool(case.top) and case.p_none < SEARCH.unsure, Case.open,
-    ),
-    Rule(
-        "nothing missing", "No effect has the evidence of a name.",
-        lambda case: not case.leads, Case.nothing,
-    ),
-    Rule(
-        "named", "No set has the probability of a name, but what all probable ones hold has, alone too.",
-        lambda case: not case.is_sure, Case.shared,
-    ),
-    Rule(
-        "group, below detectability, or unexplained",
-        "No set has the probability of a name: those that fit are the group; with nothing missing among them "
-        "it is too small to tell, with none or too many of them it is unexplained.",
-        lambda case: not case.is_sure, Case.open,
-    ),
-)  # fmt: skip
+Rules = tuple[tuple[Callable[[Case], bool], Callable[[Case], Outcome | None]], ...]
+"""When each holds, and the verdict that it makes; None: the next decides. In words: `[[rule]]` of
+`sentences.toml`."""
+UNSURE: Rules = (
+    (lambda case: not case.leads and case.none_gate.passed is False, Case.gap),
+    (lambda case: not case.leads and bool(case.top) and case.p_none < SEARCH.unsure, Case.open),
+    (lambda case: not case.leads, Case.nothing),
+    (lambda case: not case.is_sure, Case.shared),
+    (lambda case: not case.is_sure, Case.open),
+)
 """Rules where no set of effects has the probability and evidence of a name."""
-SURE = (
-    Rule(
-        "family", "A law with a shape of its own has them, and passes absolute fit and consistency.",
-        lambda case: case.best.candidate.is_family and case.passes, Case.family,
-    ),
-    Rule("named", "A set of effects has them, and passes every gate.", lambda case: case.passes, Case.named),
-    Rule(
-        "family", "It fails by its shape alone: with that free, it passes absolute fit and consistency.",
+SURE: Rules = (
+    (lambda case: case.best.candidate.is_family and case.passes, Case.family),
+    (lambda case: case.passes, Case.named),
+    (
         lambda case: case.freed is not None and all(gate.passed is not False for gate in case.freed[1:]),
         Case.family,
     ),
-    Rule("unexplained", "It fails a gate.", lambda case: True, Case.unfit),
+    (lambda case: True, Case.unfit),
 )  # fmt: skip
 """Rules where one has."""
 
 
-def decided(case: Case, rules: Sequence[Rule] = (*UNSURE, *SURE)) -> Outcome:
+def decided(case: Case, rules: Rules = (*UNSURE, *SURE)) -> Outcome:
     """Return the verdict of the first rule that holds."""
-    made = (rule.makes(case) for rule in rules if rule.holds(case))
+    made = (makes(case) for holds, makes in rules if holds(case))
     return next(outcome for outcome in made if outcome is not None)
 
 

@@ -84,13 +84,6 @@ class Separability:
     distance: FloatArray
     groups: tuple[tuple[str, ...], ...]
 
-    def group_of(self, identifier: str) -> tuple[str, ...]:
-        """Return the confusion group of an effect, itself alone if it has none."""
-        for group in self.groups:
-            if identifier in group:
-                return group
-        return (identifier,)
-
 
 def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
     """Return the campaign with what the model predicts in the place of the data.
