@@ -15,6 +15,7 @@ from scipy.stats import f as fisher
 
 from discrepancy.campaign.noise import MAINS, line_near, without_lines
 from discrepancy.campaign.noise_records import repeat_record
+from discrepancy.campaign.noise_tests import lag_products
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, NoiseRecord, Trial
 from discrepancy.campaign.sampling import IntArray
 from discrepancy.checks.fault import DataFault, FaultKind, fault, place_of
@@ -85,8 +86,7 @@ def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:
 
 def _freedom(series: FloatArray) -> float:
     """Return the degrees of freedom of the variance of a series that is correlated in time."""
-    spectrum = np.abs(np.fft.rfft(series, 2 * len(series))) ** 2
-    correlation = np.fft.irfft(spectrum)[: len(series) // 4]
+    correlation = lag_products(series, len(series) // 4 - 1)[0]
     return float(len(series) / (2.0 * np.sum((correlation / max(correlation[0], 1e-300)) ** 2) - 1.0))
 
 
