@@ -19,14 +19,13 @@ from discrepancy.checks.fault import DataFault
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, wrong_ends
 from discrepancy.checks.quality import check_data
-from discrepancy.errors import CampaignDataError
+from discrepancy.errors import CampaignDataError, DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import solver_share
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.force_told import seen_force
 from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
@@ -40,7 +39,16 @@ from discrepancy.judgement.when import (
 )
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.shares import MissingForce
+from discrepancy.missing_force.hypotheses import key_of, sees_forces
+from discrepancy.missing_force.naming import Explained, ForceSearch
+from discrepancy.missing_force.shares import (
+    OF_PREDICTIONS,
+    ForceShares,
+    MissingForce,
+    Share,
+    missing_force,
+    told_force,
+)
 from discrepancy.missing_force.windows import gap_windows, residual_windows
 from discrepancy.model_choice import load_model
 from discrepancy.models.interface import Model
@@ -50,10 +58,72 @@ from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
-from discrepancy.verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
+from discrepancy.verdict import (
+    Experiment,
+    ForceAtPort,
+    GapWindow,
+    NotFitted,
+    Proof,
+    ShareOfForce,
+    Verdict,
+    VerdictKind,
+)
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, SilentProgress
 from reporting.words import be, brief, listing
+
+CANNOT = (DiscrepancyError, np.linalg.LinAlgError, ValueError)
+"""What keeps a picture or a share from being told: it is left out."""
+
+
+def seen_force(
+    problem: Problem, search: Search, fit: CandidateFit
+) -> tuple[MissingForce | None, ForceAtPort | None]:
+    """Return the missing force beside the fit of a verdict, its law drawn through it, and what is told of it.
+
+    None where no force can be seen. `search`: with its hypotheses along the missing force, if it has any.
+    """
+    terms = fit.candidate.terms
+    try:
+        ports = problem.model.ports()
+        if not sees_forces(problem) or (terms and not any(term.place in ports for term in terms)):
+            return None, None
+        force, found = _along(problem, search, fit)
+        missing = missing_force(force, force.whole if found is None else found)
+    except CANNOT:
+        return None, None
+    if missing is None:
+        return None, None
+    told = told_force(missing, problem.model)
+    laws = [(term.effect.name, term.place) for term in terms if term.place in ports]
+    if missing.law and len({place for _, place in laws}) > 1:
+        told = replace(told, law=" and ".join(f"{name} at {place}" for name, place in laws))
+    if not missing.law or found is None:
+        return missing, told
+    try:
+        shares = ForceShares(force)
+        outside = _share(shares.of(found, held_out=True)) if shares.has_held_out else None
+        return missing, replace(told, fitted=_share(shares.of(found, held_out=False)), held_out=outside)
+    except CANNOT:
+        return missing, told
+
+
+def _along(problem: Problem, search: Search, fit: CandidateFit) -> tuple[ForceSearch, Explained | None]:
+    """Return the missing force of a problem, and the hypothesis along it that a fit is."""
+    force, key = search.force, key_of(fit.candidate)
+    if force is None:
+        force = ForceSearch(problem)
+        force.locate()
+    found = next((item for item in search.forces if key_of(item.candidate) == key), None)
+    if found is None and fit.candidate.terms:
+        found = force.followed(force.whole, fit.candidate, fit.point.effect)
+    return force, found
+
+
+def _share(share: Share) -> ShareOfForce:
+    sizes = (share.value, *share.interval, share.left, share.whole)
+    return ShareOfForce(*sizes, ahead=share.of == OF_PREDICTIONS, trials=share.trials, tested=share.tested)
+
 
 DRAWS = 400
 IMPLAUSIBLE = 4.0

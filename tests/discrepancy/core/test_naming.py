@@ -12,8 +12,7 @@ from scipy.signal import lfilter
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import SHAPE_GAIN
-from discrepancy.judgement.naming import name
-from discrepancy.judgement.rules import SURE, UNSURE, Case
+from discrepancy.judgement.naming import SURE, UNSURE, Case, name
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import SENTENCES
 from discrepancy.verdict import VerdictKind
