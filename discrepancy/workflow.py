@@ -19,7 +19,7 @@ from discrepancy.checks.fault import DataFault
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, wrong_ends
 from discrepancy.checks.quality import check_data
-from discrepancy.errors import CampaignDataError, DiscrepancyError
+from discrepancy.errors import CampaignDataError
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
@@ -30,25 +30,10 @@ from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
-from discrepancy.judgement.when import (
-    acting_sentence,
-    begins_inside,
-    look_alike_remark,
-    when_sentence,
-    with_untested,
-)
+from discrepancy.judgement.when import NO_GAP, dated, look_alike_remark, with_untested
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.hypotheses import key_of, sees_forces
-from discrepancy.missing_force.naming import Explained, ForceSearch
-from discrepancy.missing_force.shares import (
-    OF_PREDICTIONS,
-    ForceShares,
-    MissingForce,
-    Share,
-    missing_force,
-    told_force,
-)
+from discrepancy.missing_force.shares import MissingForce, seen_force
 from discrepancy.missing_force.windows import gap_windows, residual_windows
 from discrepancy.model_choice import load_model
 from discrepancy.models.interface import Model
@@ -58,77 +43,14 @@ from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
-from discrepancy.verdict import (
-    Experiment,
-    ForceAtPort,
-    GapWindow,
-    NotFitted,
-    Proof,
-    ShareOfForce,
-    Verdict,
-    VerdictKind,
-)
+from discrepancy.verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, SilentProgress
 from reporting.words import be, brief, listing
 
-CANNOT = (DiscrepancyError, np.linalg.LinAlgError, ValueError)
-"""What keeps a picture or a share from being told: it is left out."""
-
-
-def seen_force(
-    problem: Problem, search: Search, fit: CandidateFit
-) -> tuple[MissingForce | None, ForceAtPort | None]:
-    """Return the missing force beside the fit of a verdict, its law drawn through it, and what is told of it.
-
-    None where no force can be seen. `search`: with its hypotheses along the missing force, if it has any.
-    """
-    terms = fit.candidate.terms
-    try:
-        ports = problem.model.ports()
-        if not sees_forces(problem) or (terms and not any(term.place in ports for term in terms)):
-            return None, None
-        force, found = _along(problem, search, fit)
-        missing = missing_force(force, force.whole if found is None else found)
-    except CANNOT:
-        return None, None
-    if missing is None:
-        return None, None
-    told = told_force(missing, problem.model)
-    laws = [(term.effect.name, term.place) for term in terms if term.place in ports]
-    if missing.law and len({place for _, place in laws}) > 1:
-        told = replace(told, law=" and ".join(f"{name} at {place}" for name, place in laws))
-    if not missing.law or found is None:
-        return missing, told
-    try:
-        shares = ForceShares(force)
-        outside = _share(shares.of(found, held_out=True)) if shares.has_held_out else None
-        return missing, replace(told, fitted=_share(shares.of(found, held_out=False)), held_out=outside)
-    except CANNOT:
-        return missing, told
-
-
-def _along(problem: Problem, search: Search, fit: CandidateFit) -> tuple[ForceSearch, Explained | None]:
-    """Return the missing force of a problem, and the hypothesis along it that a fit is."""
-    force, key = search.force, key_of(fit.candidate)
-    if force is None:
-        force = ForceSearch(problem)
-        force.locate()
-    found = next((item for item in search.forces if key_of(item.candidate) == key), None)
-    if found is None and fit.candidate.terms:
-        found = force.followed(force.whole, fit.candidate, fit.point.effect)
-    return force, found
-
-
-def _share(share: Share) -> ShareOfForce:
-    sizes = (share.value, *share.interval, share.left, share.whole)
-    return ShareOfForce(*sizes, ahead=share.of == OF_PREDICTIONS, trials=share.trials, tested=share.tested)
-
-
 DRAWS = 400
 IMPLAUSIBLE = 4.0
 """Prior deviations from which on a parameter or a gain is remarked on."""
-NO_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
 CLOSED_KINDS = (VerdictKind.NOTHING_MISSING, VerdictKind.NAMED, VerdictKind.DATA_ERROR)
 """Verdicts after which no experiment is proposed."""
 
@@ -264,7 +186,7 @@ def investigate(
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     if thorough and verdict.kind not in NO_GAP:
         with stage("Seeing the missing force", "force"):
-            missing, force = seen_force(problem, search, fit)
+            missing, force = seen_force(problem, search.force, search.forces, fit)
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
             proof = prove(before, after, seed=seed)
@@ -273,7 +195,7 @@ def investigate(
         with stage("Looking for the next experiment", "next"):
             experiments = next_experiments(problem, open_hypotheses(search))
     verdict = replace(
-        verdict, sentence=_dated(verdict, windows), remarks=tuple(remarks), next_experiments=experiments,
+        verdict, sentence=dated(verdict, windows), remarks=tuple(remarks), next_experiments=experiments,
         not_fitted=not_fitted(problem.setting, catalogue, search), windows=windows,
         parameters=calibrated_parameters(problem, fit), force=force,
     )  # fmt: skip
@@ -281,15 +203,6 @@ def investigate(
         campaign, model, faults, verdict, location, proof, before, after, problem, search, fit, seconds,
         missing,
     )  # fmt: skip
-
-
-def _dated(verdict: Verdict, windows: tuple[GapWindow, ...]) -> str:
-    """Return the sentence of a verdict, with when the gap is there where that tells something."""
-    when = acting_sentence(verdict.effects)
-    dated = begins_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED
-    if not when and verdict.kind not in NO_GAP and dated:
-        when = when_sentence(windows)
-    return f"{verdict.sentence} {when}".strip()
 
 
 def _remarks(

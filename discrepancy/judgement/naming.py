@@ -1,4 +1,4 @@
-"""From fitted candidates to a verdict: by rules, of which the first that holds decides, and what overrules them."""
+"""From fitted candidates to a verdict: the first rule that holds decides, and what overrules it."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace

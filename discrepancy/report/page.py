@@ -1,4 +1,4 @@
-"""The page: verdict first, then where the gap is, why this name, the proof, the limits, and what it rests on."""
+"""The page: verdict first, then where the gap is, why this name, the proof, and what all rests on."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -7,6 +7,7 @@ from math import isfinite, isnan, nan
 from discrepancy.campaign.units import UNITS
 from discrepancy.files.document import Origin
 from discrepancy.judgement.conclusion import calibrated_parameters, probability_text
+from discrepancy.judgement.when import NO_GAP
 from discrepancy.report import findings
 from discrepancy.report import text as words
 from discrepancy.report.check_tables import can_decide_rows, group_lines
@@ -266,7 +267,7 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
     if verdict.next_experiments:
         page.add_section("Next experiment")
         findings.add_next(page, investigation)
-    nothing = verdict.kind in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
+    nothing = verdict.kind in NO_GAP
     page.add_section("What the model leaves" if nothing else "Where the gap is")
     findings.add_location(page, investigation)
     show("residual_map", "residual_table", "time_line")
