@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import chdtr, chdtrc, fdtr, fdtrc, gammaincc
 
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import BoolArray, FloatArray
 
 SHORTEST_SERIES = 32
 """Fewest samples of a series whose whiteness is tested."""
@@ -48,7 +47,7 @@ def pooled_variance_p_value(p_values: FloatArray, freedom: FloatArray, noise_fre
 
 
 def ljung_box(
-    series: FloatArray, lags: int | None = None, used: NDArray[np.bool_] | None = None
+    series: FloatArray, lags: int | None = None, used: BoolArray | None = None
 ) -> tuple[float, float]:
     """Return Q and its p-value for a series that is white with mean zero under the null.
 
@@ -72,7 +71,9 @@ def ljung_box(
     kept = series if used is None else np.where(used, series, 0.0)
     if lags < 1 or not np.any(kept):
         return 0.0, 1.0
-    pairs = count - np.arange(1.0, lags + 1) if used is None else _products(used.astype(float), lags)[0, 1:]
+    pairs = (
+        count - np.arange(1.0, lags + 1) if used is None else lag_products(used.astype(float), lags)[0, 1:]
+    )
     statistic = float(_portmanteau(kept[np.newaxis], count, pairs)[0])
     mean, deviation, skewness = _portmanteau_moments(count, lags)
     # the standardised gamma distribution of this skewness (Pearson's type III)
@@ -81,7 +82,7 @@ def ljung_box(
     return statistic, float(gammaincc(shape, rate * ((statistic - mean) / deviation + shape / rate)))
 
 
-def _products(rows: FloatArray, lags: int) -> FloatArray:
+def lag_products(rows: FloatArray, lags: int) -> FloatArray:
     """Return the sums of products of samples 0 .. lags apart of each row, (M, lags + 1)."""
     rows = np.atleast_2d(rows)
     size = 2 * rows.shape[1]
@@ -91,7 +92,7 @@ def _products(rows: FloatArray, lags: int) -> FloatArray:
 
 def _portmanteau(rows: FloatArray, count: int, pairs: FloatArray) -> FloatArray:
     """Return Q of each row, of which `count` samples count in so many pairs of each lag (lags,)."""
-    products = _products(rows, len(pairs))
+    products = lag_products(rows, len(pairs))
     rho = products[:, 1:] / products[:, :1]
     return np.asarray(count * (count + 2) * np.sum(rho**2 / np.maximum(pairs, 1.0), axis=1))
 
@@ -174,7 +175,7 @@ def holm(p_values: Sequence[float], level: float) -> tuple[bool, ...]:
     return tuple(bool(value) for value in rejected)
 
 
-def benjamini_yekutieli(p_values: FloatArray, rate: float) -> NDArray[np.bool_]:
+def benjamini_yekutieli(p_values: FloatArray, rate: float) -> BoolArray:
     """Return which hypotheses are discoveries at a false discovery rate, under any dependence.
 
     Benjamini and Yekutieli 2001, Annals of Statistics 29, 1165-1188, theorem 1.3.

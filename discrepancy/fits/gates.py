@@ -3,13 +3,7 @@
 import numpy as np
 from scipy.stats import chi2
 
-from discrepancy.campaign.noise_tests import (
-    SHORTEST_SERIES,
-    combine,
-    ljung_box,
-    pooled_variance_p_value,
-    variance_p_value,
-)
+from discrepancy.campaign import noise_tests
 from discrepancy.campaign.records import FloatArray
 from discrepancy.verdict import Gate
 from fe.runtime.patch import ModelPatch
@@ -47,21 +41,16 @@ def absolute_gate(problem: Problem, fit: CandidateFit) -> Gate:
     known = any(name.startswith("variance") for name, _ in tests)
     recorded = bool(np.any(problem.freedom[problem.counts > 0.0] > 0.0))
     why = "Too few readings for the unknowns" if recorded else "No noise record"
+    name, least = min(tests, key=lambda test: test[1], default=("", np.nan))
+    statistic, passed = min(least * len(tests), 1.0), True if known else None
+    reason = "What is left agrees with the noise records."
     if not tests:
-        return Gate("absolute fit", None, np.nan, ABSOLUTE_LEVEL, f"{why}: the fit cannot be judged.")
-    name, least = min(tests, key=lambda test: test[1])
-    statistic = min(1.0, least * len(tests))
-    if statistic < ABSOLUTE_LEVEL:
-        reason = f"More is left than noise and priors allow: {name}."
-        return Gate("absolute fit", False, statistic, ABSOLUTE_LEVEL, reason)
-    if not known:
-        return Gate(
-            "absolute fit", None, statistic, ABSOLUTE_LEVEL,
-            f"{why}: only priors and the whiteness of what is left could be judged, and they agree.",
-        )  # fmt: skip
-    return Gate(
-        "absolute fit", True, statistic, ABSOLUTE_LEVEL, "What is left agrees with the noise records."
-    )
+        reason = f"{why}: the fit cannot be judged."
+    elif statistic < ABSOLUTE_LEVEL:
+        passed, reason = False, f"More is left than noise and priors allow: {name}."
+    elif not known:
+        reason = f"{why}: only priors and the whiteness of what is left could be judged, and they agree."
+    return Gate("absolute fit", passed, statistic, ABSOLUTE_LEVEL, reason)
 
 
 def absolute_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:
@@ -73,10 +62,10 @@ def absolute_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float
     p_values = []
     for number in known:
         square = fit.sums[number] / freedom[number] / samples[number]
-        p_values.append(variance_p_value(square, freedom[number], recorded[number]))
+        p_values.append(noise_tests.variance_p_value(square, freedom[number], recorded[number]))
         tests.append((f"variance of {problem.channel_names[number]}", p_values[-1]))
     if len(known) > 1:
-        together = pooled_variance_p_value(np.array(p_values), freedom[known], recorded[known])
+        together = noise_tests.pooled_variance_p_value(np.array(p_values), freedom[known], recorded[known])
         tests.append(("variance of all channels", together))
     return [*tests, *prior_tests(problem, fit), *whiteness_tests(problem, fit)]
 
@@ -117,15 +106,15 @@ def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, floa
     found: dict[str, list[float]] = {}
     coloured = _dependent(problem, fit) > 1.0
     for data, residual in zip(problem.trials, fit.residuals, strict=True):
-        if not data.trial.is_dynamic or len(residual) < SHORTEST_SERIES:
+        if not data.trial.is_dynamic or len(residual) < noise_tests.SHORTEST_SERIES:
             continue
         whole = bool(np.all(data.weight > 0.0))
         for column, name in enumerate(data.trial.channels):
             if coloured[data.groups[column]]:
                 continue
             used = None if whole else data.weight[:, column] > 0.0
-            found.setdefault(name, []).append(ljung_box(residual[:, column], used=used)[1])
-    return [(f"whiteness of {name}", combine(p_values)) for name, p_values in found.items()]
+            found.setdefault(name, []).append(noise_tests.ljung_box(residual[:, column], used=used)[1])
+    return [(f"whiteness of {name}", noise_tests.combine(p_values)) for name, p_values in found.items()]
 
 
 def shape_gate(named: CandidateFit, family: CandidateFit | None) -> Gate:

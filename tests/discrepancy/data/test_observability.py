@@ -8,8 +8,7 @@ import pytest
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign
 from discrepancy.checks.fault import FaultKind
-from discrepancy.checks.model_check import check_against_model
-from discrepancy.checks.observability import prior_left, unobservable
+from discrepancy.checks.model_check import check_against_model, prior_left, unobservable
 from discrepancy.models.lumped import LumpedModel
 from tests.discrepancy.rigs import model_of
 
@@ -89,8 +88,8 @@ def test_what_cannot_be_observed_is_said(tmp_path: Path) -> None:
     text = MODEL.replace("damping = { matrix = 0.5 }", "damping = { matrix = 1e-5 }")
     model = model_of(text)
     campaign = campaign_of(tmp_path)
-    sentence = unobservable(campaign, model)
-    assert "do not tell the calibrated parameter 'damping_factor' (100%)" in sentence
+    (found,) = unobservable(campaign, model)
+    assert "do not tell the calibrated parameter 'damping_factor' (100%)" in found.sentence
     faults = check_against_model(campaign, model)
     assert [fault.kind for fault in faults] == [FaultKind.UNOBSERVABLE]
     assert not faults[0].fatal

@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import norm
 
 from discrepancy.campaign.records import TrialKind
+from discrepancy.judgement.conclusion import probability_text
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
 from discrepancy.report.check_tables import (
     confused_lines,
@@ -23,14 +24,12 @@ from discrepancy.report.check_tables import (
 )
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.findings import add_verdict, closing_sentence
-from discrepancy.report.grounds import add_gates, add_not_compared, parameter_rows
-from discrepancy.report.page import render_report
+from discrepancy.report.page import add_gates, add_not_compared, parameter_rows, render_report
 from discrepancy.report.residual_figures import size_table
 from discrepancy.report.text import (
     headline,
     number,
     percent,
-    probability_text,
     remainders_sentence,
     residual_sizes,
     share_text,
