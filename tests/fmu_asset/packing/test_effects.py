@@ -18,6 +18,7 @@ from fmpy.validation import validate_fmu
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from discrepancy.models.high_pass import filtered_record
 from fe.runtime.patch import (
     Clock,
     DecayingLine,
@@ -185,7 +186,7 @@ def test_quasi_static_sensor_effects_are_those_of_whole_records(
         tuple(item for effect in parse_patch(content()).for_gauges(24).effects for item in effect.patch)
     )
     record = SensorRecord(CHANNELS, "flight", 0.05 * np.arange(1, 5), 0.0, np.zeros(4))
-    expected, _ = apply_sensors(whole, record, plain)
+    expected, _ = apply_sensors(whole, record, plain, filtered=filtered_record)
     np.testing.assert_allclose(shown, expected, rtol=1e-13, atol=0.0)
     assert not np.allclose(shown, plain)
 
@@ -212,7 +213,7 @@ def test_transient_sensor_effects_are_those_of_whole_records(
     )
     since = 0.05 * np.arange(steps + 1)
     seen = SensorRecord(CHANNELS, "ringdown", since, 2.0, np.zeros(steps + 1), release=0.03)
-    expected, _ = apply_sensors(whole, seen, plain)
+    expected, _ = apply_sensors(whole, seen, plain, filtered=filtered_record)
     scale = np.abs(expected).max(axis=0)
     np.testing.assert_allclose(shown / scale, expected / scale, rtol=0.0, atol=1e-12)
 
