@@ -5,8 +5,9 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, model_validator
 
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Quantity
-from discrepancy.models.interface import Model, ModelParameter
+from discrepancy.models.interface import Model
 from reporting.section import Name, NotNegative, Number
 
 
@@ -32,9 +33,9 @@ class ParameterSection(NamedSection):
     unit: str = "1"
 
     @property
-    def calibrated(self) -> ModelParameter:
+    def calibrated(self) -> ParameterPrior:
         """The parameter of the model."""
-        return ModelParameter(self.name, self.mean, self.deviation, self.unit, self.low, self.high)
+        return ParameterPrior(self.name, self.unit, self.mean, self.deviation, self.low, self.high)
 
     @model_validator(mode="after")
     def _in_range(self) -> Self:
