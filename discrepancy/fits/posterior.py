@@ -133,7 +133,7 @@ def ensemble(
             kept.append(walkers.copy())
         block = np.concatenate(kept)
         if len(before):
-            ends, others = (np.quantile(draws, (0.05, 0.95), axis=0) for draws in (before, block))
-            if np.all(np.abs(ends - others) <= SETTLED * (others[1] - others[0])):
+            old, new = (np.quantile(draws, (0.05, 0.95), axis=0) for draws in (before, block))
+            if np.all(np.abs(old - new) <= SETTLED * (new[1] - new[0])):
                 break
     return block
