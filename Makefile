@@ -50,9 +50,12 @@ fmu: $(VENV)/.runtime ## Build the wing as an FMU into runs/wing.fmu
 	@mkdir -p runs
 	$(BIN)/uav-twin fmu build --out runs/wing.fmu --replace
 
+NOTEBOOKS ?= force
+
 .PHONY: docs
-docs: $(DOCS_VENV)/.docs ## Run the notebooks and build the site of the documentation into build/docs; a warning is an error
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(DOCS_VENV)/bin/python -m sphinx -j 2 -q -W --keep-going -c docs/site -d build/doctrees docs build/docs
+docs: $(DOCS_VENV)/.docs ## Build the site of the documentation into build/docs; a warning is an error (NOTEBOOKS=off: without running them)
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(DOCS_VENV)/bin/python -m sphinx -j 2 -q -W --keep-going -D nb_execution_mode=$(NOTEBOOKS) \
+	  -c docs/site -d build/doctrees docs build/docs
 	@echo "The site is build/docs/index.html."
 
 .PHONY: lock

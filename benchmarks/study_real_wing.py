@@ -22,7 +22,7 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.models.wing import WingModel
-from discrepancy.report.force_figure import missing_force_figure
+from discrepancy.report.figures import missing_force_figure
 from discrepancy.sources.real_wing import SIGNAL, wing_campaign
 from discrepancy.workflow import Investigation, investigate
 

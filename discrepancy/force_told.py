@@ -7,10 +7,16 @@ import numpy as np
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.force import MissingForce, missing_force, told_force
 from discrepancy.missing_force.hypotheses import key_of, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
-from discrepancy.missing_force.shares import OF_PREDICTIONS, ForceShares, Share
+from discrepancy.missing_force.shares import (
+    OF_PREDICTIONS,
+    ForceShares,
+    MissingForce,
+    Share,
+    missing_force,
+    told_force,
+)
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import ForceAtPort, ShareOfForce
 

@@ -16,20 +16,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from discrepancy.campaign.records import Campaign
+from discrepancy.campaign.sampling import IntArray
 from discrepancy.catalogue.entry import Effect
+from discrepancy.errors import FitError, ModelError
 from discrepancy.files.document import Origin, plain
 from discrepancy.judgement.separability import usable
 from discrepancy.models.interface import Model
 from discrepancy.sources.simulated_campaigns import Hidden, Simulator
+from discrepancy.verdict import VerdictKind
+from discrepancy.workflow import checked, investigate
 from reporting.files import atomic_write_text
-
-from .errors import FitError, ModelError
-from .verdict import VerdictKind
-from .workflow import checked, investigate
 
 SELF_CALIBRATION_NAME = "self_calibration.json"
 SCHEMA = "uav-twin self calibration 1"
@@ -139,7 +138,7 @@ class SelfCalibration:
         inside = [item.inside for case in self.cases for item in case.covered]
         return wilson(sum(inside), len(inside))
 
-    def confusion(self) -> tuple[list[str], list[str], NDArray[np.int64]]:
+    def confusion(self) -> tuple[list[str], list[str], IntArray]:
         """Return what was hidden (rows), verdicts (columns), and counts."""
         rows = list(dict.fromkeys(case.hidden for case in self.cases))
         rows.sort(key=lambda name: (name != NOTHING, name))

@@ -5,9 +5,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from math import nan
 
+from discrepancy.document_types import Number, Patch
 from reporting.words import brief
-
-from .document_types import Number, Patch
 
 
 class VerdictKind(StrEnum):

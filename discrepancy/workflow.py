@@ -18,38 +18,41 @@ from discrepancy.catalogue.needs import NO_PORT
 from discrepancy.checks.fault import DataFault
 from discrepancy.checks.outliers import wrong_ends
 from discrepancy.checks.quality import check_against_model, check_data, mark_outliers
-from discrepancy.fits.candidate import Candidate
+from discrepancy.errors import CampaignDataError
+from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import solver_share
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
+from discrepancy.force_told import seen_force
 from discrepancy.judgement.conclusion import calibrated_parameters
-from discrepancy.judgement.look_alikes import look_alike_remark, with_untested
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
-from discrepancy.judgement.when import acting_sentence, begins_inside, when_sentence
+from discrepancy.judgement.when import (
+    acting_sentence,
+    begins_inside,
+    look_alike_remark,
+    when_sentence,
+    with_untested,
+)
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.force import MissingForce
+from discrepancy.missing_force.shares import MissingForce
 from discrepancy.missing_force.windows import gap_windows, residual_windows
+from discrepancy.model_choice import load_model
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.search.hypotheses import Tell
 from discrepancy.search.strategy import Search
+from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
+from discrepancy.verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, SilentProgress
 from reporting.words import be, brief, listing
-
-from .errors import CampaignDataError
-from .force_told import seen_force
-from .model_choice import load_model
-from .search_settings import SEARCH
-from .verdict import Experiment, GapWindow, NotFitted, Proof, Verdict, VerdictKind
 
 DRAWS = 400
 IMPLAUSIBLE = 4.0

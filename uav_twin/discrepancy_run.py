@@ -254,16 +254,16 @@ def _packing(choice: "ModelChoice", progress: "Progress") -> "Pack":
 
 def _show(found: "Investigation", folder: Path) -> None:
     from discrepancy.files.patch import PATCH_NAME, read_patch
+    from discrepancy.judgement.conclusion import probability_text
     from discrepancy.judgement.when import when_sentence
-    from discrepancy.report.sizes import size_sentence
     from discrepancy.report.text import (
         estimate_text,
         force_sentence,
         headline,
-        probability_text,
         remainders_sentence,
         rests_on_force,
         shares_sentence,
+        size_sentence,
         unit_text,
     )
     from discrepancy.verdict import VerdictKind

@@ -221,13 +221,10 @@ def verify(
 
 
 def _differences(agreement: "Agreement") -> Iterator[Check]:
-    for load in agreement.loads:
-        of = f"load {load.load}"
-        yield Check(of, "nodal displacements", load.field, DISPLACEMENT_LIMIT)
-        if load.output is not None:
-            yield Check(of, "displacement outputs", load.output, DISPLACEMENT_LIMIT)
-        if load.strain is not None:
-            yield Check(of, "gauge strains", load.strain, STRAIN_LIMIT)
+    for load, differences in agreement.loads.items():
+        for what, value in differences.items():
+            limit = STRAIN_LIMIT if what == "gauge strains" else DISPLACEMENT_LIMIT
+            yield Check(f"load {load}", what, value, limit)
     yield Check(f"{len(agreement.ours)} modes", "frequencies", agreement.modal, FREQUENCY_LIMIT)
 
 

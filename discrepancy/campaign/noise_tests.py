@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.special import chdtr, chdtrc, fdtr, fdtrc, gammaincc
 
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import BoolArray, FloatArray
 
 SHORTEST_SERIES = 32
 """Fewest samples of a series whose whiteness is tested."""
@@ -48,7 +47,7 @@ def pooled_variance_p_value(p_values: FloatArray, freedom: FloatArray, noise_fre
 
 
 def ljung_box(
-    series: FloatArray, lags: int | None = None, used: NDArray[np.bool_] | None = None
+    series: FloatArray, lags: int | None = None, used: BoolArray | None = None
 ) -> tuple[float, float]:
     """Return Q and its p-value for a series that is white with mean zero under the null.
 
@@ -174,7 +173,7 @@ def holm(p_values: Sequence[float], level: float) -> tuple[bool, ...]:
     return tuple(bool(value) for value in rejected)
 
 
-def benjamini_yekutieli(p_values: FloatArray, rate: float) -> NDArray[np.bool_]:
+def benjamini_yekutieli(p_values: FloatArray, rate: float) -> BoolArray:
     """Return which hypotheses are discoveries at a false discovery rate, under any dependence.
 
     Benjamini and Yekutieli 2001, Annals of Statistics 29, 1165-1188, theorem 1.3.

@@ -6,11 +6,11 @@ from math import inf
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from discrepancy.campaign.noise_records import pre_trigger_record, with_noise
 from discrepancy.campaign.records import (
     USUAL_REGIONS,
+    BoolArray,
     Campaign,
     Channel,
     Event,
@@ -262,7 +262,7 @@ def _measured(
 
 def _readings(
     channel: ChannelSection, section: TrialSection, table: TextTable, remarks: list[str]
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+) -> tuple[FloatArray, BoolArray]:
     """Return a channel's readings and which of them are used; an empty cell is bridged and left out."""
     values = _numbers(table, channel, f"the channel {channel.name!r}", empty_allowed=True)
     used = np.isfinite(values)
@@ -366,22 +366,13 @@ def _channels(
     channels = {}
     for item in section.channel:
         to_si = conversion_of(item.quantity, item.unit).to_si
-        channel = Channel(
-            name=item.name,
-            quantity=item.quantity,
-            output=item.output,
-            noise=None,
-            gain_deviation=inf if item.gain_deviation == "free" else item.gain_deviation,
-            offset_deviation=inf if item.offset_deviation == "free" else to_si(item.offset_deviation),
-            station=item.station,
-            chord=item.chord,
-            column=item.table_column,
-            unit=item.unit,
-        )
+        given = item.model_dump(exclude={"noise", "column", "offset_deviation"})
+        free = to_si(item.offset_deviation)
+        channel = Channel(**given, noise=None, offset_deviation=free, column=item.table_column)
         stated = None
         if item.noise is not None:
-            deviation = to_si(item.noise.standard_deviation)
-            stated = NoiseRecord(deviation, item.noise.degrees_of_freedom, source=item.noise.source)
+            stated = NoiseRecord(**item.noise.model_dump())
+            stated = replace(stated, standard_deviation=to_si(stated.standard_deviation))
         noise, remark = with_noise(channel, recorded, stated, trials)
         remarks += [remark] if remark else []
         channels[item.name] = replace(channel, noise=noise)

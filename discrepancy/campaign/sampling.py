@@ -9,6 +9,7 @@ from discrepancy.errors import CampaignDataError
 from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 EVEN = 1e-3
 """Largest departure of a sample from the even grid, as a share of the interval."""

@@ -51,16 +51,16 @@ from typing import Annotated
 from pydantic import ConfigDict, Field
 
 from discrepancy.campaign.records import TrialKind
-from discrepancy.catalogue.entry import Effect, EffectParameter, Number, Setting, ShapeParameter
-from discrepancy.catalogue.needs import NEEDS, USUAL, first_reason
-from discrepancy.catalogue.places import PLACES, Entry, Kinds, Target, targets_of
-from discrepancy.catalogue.scales import SCALES, Here, names_with
 from discrepancy.errors import CatalogueError
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.expression import RESERVED, Expression
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive, Window
 from reporting.section import Section, checked
 from reporting.toml_file import read_toml
+
+from .entry import Effect, EffectParameter, Number, Setting, ShapeParameter
+from .needs import NEEDS, PLACES, USUAL, Entry, Kinds, Target, first_reason, targets_of
+from .scales import SCALES, Here, names_with
 
 Text = Annotated[str, Field(min_length=0)]
 

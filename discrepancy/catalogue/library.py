@@ -8,11 +8,12 @@ from functools import cache, partial
 from importlib.metadata import entry_points
 from pathlib import Path
 
-from discrepancy.catalogue.effect_file import effects_of_file
-from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
-from discrepancy.catalogue.places import DYNAMIC
 from discrepancy.errors import CatalogueError
 from fe.runtime.patch import SENSORS, ModelPatch, Window
+
+from .effect_file import effects_of_file
+from .entry import Effect, EffectParameter, Setting, ShapeParameter
+from .needs import DYNAMIC
 
 THEMES = (
     "structure", "damping", "stiffness", "hysteresis", "outflow", "sensors", "loads", "clock_and_lines",

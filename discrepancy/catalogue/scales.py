@@ -16,11 +16,12 @@ from math import inf, pi
 from scipy.special import beta
 
 from discrepancy.campaign.records import TrialKind
-from discrepancy.catalogue.entry import Setting
-from discrepancy.catalogue.places import Kinds, Target, channels, largest_reading, trials
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import PortScale
 from fe.runtime.patch import EVERY_CHANNEL
+
+from .entry import Setting
+from .needs import Kinds, Target, channels, largest_reading, trials
 
 LARGEST_SHARE = 0.9
 """Largest share of a port's stiffness at rest that a force which does not fall with the speed may have."""

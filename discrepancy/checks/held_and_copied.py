@@ -8,7 +8,8 @@ from itertools import combinations
 import numpy as np
 
 from discrepancy.campaign.records import BoolArray, Campaign, FloatArray, Trial
-from discrepancy.checks.fault import DataFault, FaultKind, fault, place_of
+
+from .fault import DataFault, FaultKind, fault, place_of
 
 LEAST_HELD = 8
 """Fewest equal readings in a row that are looked at."""

@@ -8,17 +8,55 @@ from dataclasses import replace
 from math import pi
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from discrepancy.campaign.records import Campaign, FloatArray, Hold, Quantity, Trial, TrialKind
-from discrepancy.checks.fault import DataFault, FaultKind, fault
-from discrepancy.checks.observability import unobservable
-from discrepancy.checks.rest import rest_faults
-from discrepancy.checks.unit_slips import unit_slips
+from discrepancy.campaign.records import BoolArray, Campaign, FloatArray, Hold, Quantity, Trial, TrialKind
+from discrepancy.catalogue.entry import Setting
+from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.elimination import eliminated
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.problem import Problem
+from discrepancy.judgement.separability import begun
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
+from discrepancy.sentences import said
 from fe.runtime.patch import ModelPatch
+
+from .fault import DataFault, FaultKind, fault
+from .rest import rest_faults
+from .unit_slips import unit_slips
+
+LEFT = 0.9
+"""A parameter of whose prior deviation the records leave more than this share is not observable in them."""
+
+
+def prior_left(campaign: Campaign, model: Model) -> dict[str, float]:
+    """Return the share of its prior deviation that the fitted records leave to each calibrated parameter.
+
+    From the information matrix at the prior mean. What begins in an unknown state begins as the records say:
+    of a model at rest no parameter shows. Gains, zeros, initial states, constants of inputs and the other
+    parameters follow within their priors (what they can do as well is projected out).
+    """
+    problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
+    known, weights = len(problem.shared.parameter_mean), np.ones(len(problem.channel_names))
+    found = fit(problem, Candidate(), begun(problem), iterations=0, evidence=False)
+    matrix = eliminated(problem, found, Candidate(), weights).matrix
+    left = np.sqrt(np.diag(np.linalg.pinv(matrix, hermitian=True))[:known])
+    return {
+        item.name: float(value)
+        for item, value, scale in zip(model.parameters, left, problem.shared.parameter_scale, strict=True)
+        if scale > 0.0
+    }
+
+
+def unobservable(campaign: Campaign, model: Model) -> str | None:
+    """Return which calibrated parameters the records do not tell, in one sentence; None if they tell all."""
+    left = {name: share for name, share in prior_left(campaign, model).items() if share > LEFT}
+    if not left:
+        return None
+    names = ", ".join(f"{name!r} ({share:.0%})" for name, share in left.items())
+    return said("faults.unobservable", parameters="parameters" if len(left) > 1 else "parameter", names=names)
+
 
 LEAST_PERIODS = 3.0
 """Fewest periods of the first mode in a record in time."""
@@ -194,7 +232,7 @@ def _slope(data: FloatArray, model: FloatArray) -> float:
     return float(np.median((data[second] - data[first])[far] / run[far]))
 
 
-def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, used: NDArray[np.bool_]) -> float:
+def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, used: BoolArray) -> float:
     """Return the ratio of amplitudes, with the sign of their correlation at the start of a release."""
     centred = data - np.median(data)
     # Robust against outliers, but not against a decaying record whose quiet end is most of it.

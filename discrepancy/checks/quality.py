@@ -14,11 +14,12 @@ from scipy.stats import f as fisher
 
 from discrepancy.campaign.noise_records import repeat_record
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
-from discrepancy.checks.fault import DataFault, FaultKind, fault
-from discrepancy.checks.held_and_copied import copy_faults, held_faults, roughness
-from discrepancy.checks.model_check import check_against_model
-from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers, mark_outliers
-from discrepancy.checks.rest import rest_faults
+
+from .fault import DataFault, FaultKind, fault
+from .held_and_copied import copy_faults, held_faults, roughness
+from .model_check import check_against_model
+from .outliers import LARGEST_SHARE, find_outliers, mark_outliers
+from .rest import rest_faults
 
 __all__ = ["DataFault", "FaultKind", "check_against_model", "check_data", "mark_outliers"]
 

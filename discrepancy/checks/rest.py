@@ -9,7 +9,8 @@ from scipy.stats import f as fisher
 
 from discrepancy.campaign.noise import MAINS, line_near, without_lines
 from discrepancy.campaign.records import Campaign, FloatArray, NoiseRecord
-from discrepancy.checks.fault import DataFault, FaultKind, fault
+
+from .fault import DataFault, FaultKind, fault
 
 SHORTEST = 128
 """Fewest samples of a noise record that is judged."""

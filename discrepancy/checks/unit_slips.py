@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.campaign.units import STANDARD_GRAVITY, UNITS, conversion_of
-from discrepancy.checks.fault import DataFault, FaultKind, fault
+
+from .fault import DataFault, FaultKind, fault
 
 FOREIGN: Mapping[Quantity, Mapping[str, float]] = {
     Quantity.DISPLACEMENT: {"cm": 1e-2, "inch": 0.0254, "foot": 0.3048},

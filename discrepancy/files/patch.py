@@ -13,11 +13,12 @@ from pydantic import AfterValidator, Field, WithJsonSchema
 from discrepancy.campaign.records import Channel, Quantity
 from discrepancy.document_types import PRIMITIVE_UNITS, Number
 from discrepancy.errors import VerdictFileError
-from discrepancy.files.document import Origin, read_document, write_document
 from discrepancy.verdict import CalibratedParameter, NamedEffect, VerdictKind
 from fe.runtime.patch import ModelPatch
 from fmu_asset.packing.patch_file import FIRST_SCHEMA
 from fmu_asset.packing.patch_file import SCHEMA as PATCH_SCHEMA
+
+from .document import Origin, read_document, write_document
 
 PATCHED = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART, VerdictKind.FAMILY, VerdictKind.GROUP)
 """Verdicts that leave a patch."""

@@ -6,13 +6,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from discrepancy.files.document import Origin, read_document, write_document
-from discrepancy.files.patch import PATCH_NAME, read_patch
-from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.verdict import Proof, Verdict
 from fe.runtime.patch import ModelPatch
 from reporting.folders import restore_folder
+
+from .document import Origin, read_document, write_document
+from .patch import PATCH_NAME, read_patch
+from .residuals import RESIDUALS_NAME, read_residuals
 
 VERDICT_SCHEMA = "uav-twin verdict 4"
 """Value of the key `schema`; files of earlier numbers are read too."""

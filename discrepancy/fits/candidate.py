@@ -1,11 +1,11 @@
-"""A candidate explanation: no effect, one or several effects at given places, shapes fixed or free."""
+"""A candidate explanation: effects at given places, shapes fixed or free; where it stands, what it leaves."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray, TrialKind
+from discrepancy.campaign.records import BoolArray, FloatArray, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
 from fe.runtime.patch import ModelPatch
 
@@ -111,3 +111,132 @@ class Candidate:
     def without(self, index: int) -> "Candidate":
         """Return this set less one effect."""
         return Candidate(self.terms[:index] + self.terms[index + 1 :])
+
+
+PARAMETER_STEP = 1e-2
+"""Step of the differences in scaled variables."""
+LEAST_STEP = 1e-4
+"""Least step by effect parameters, above the rounding of the integration."""
+SHARED_STEP = 1e-3
+"""The same for calibrated parameters: what effects share with the stiffness must cancel to a thousandth."""
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Prediction of one trial and its derivatives, before gain and zero.
+
+    Attributes
+    ----------
+    response : (N, C) ndarray
+        Prediction without gain and zero.
+    parameters : (P, N, C) ndarray
+        Its derivatives by the scaled calibrated parameters.
+    local : (I, N, C) ndarray
+        By the scaled initial state, time zero and health.
+    effect : (E, N, C) ndarray
+        By the scaled effect parameters; empty without effect.
+    """
+
+    response: FloatArray
+    parameters: FloatArray
+    local: FloatArray
+    effect: FloatArray
+
+
+@dataclass(frozen=True)
+class Point:
+    """Values of all scaled variables.
+
+    Attributes
+    ----------
+    shared : (Q,) ndarray
+        Global unknowns.
+    local : tuple of (L_t,) ndarray
+        Of each trial.
+    effect : (E,) ndarray
+        Of the candidate.
+    """
+
+    shared: FloatArray
+    local: tuple[FloatArray, ...]
+    effect: FloatArray
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a candidate stands: a fit, or on the way to one.
+
+    Attributes
+    ----------
+    point : Point
+        Values of all unknowns.
+    objective : float
+        -ln posterior there, up to a constant shared by all candidates [nat].
+    residuals : tuple of (N, C) ndarray
+        Standardised, of each trial.
+    sums : (channels,) ndarray
+        Sum of squared residuals by channel.
+    linearisations : tuple of Linearisation
+        At the point (or older, after chord steps).
+    """
+
+    point: Point
+    objective: float
+    residuals: tuple[FloatArray, ...]
+    sums: FloatArray
+    linearisations: tuple[Linearisation, ...] = field(repr=False)
+
+    @property
+    def responses(self) -> tuple[FloatArray, ...]:
+        """Of each trial, (N, C), without gain and zero."""
+        return tuple(part.response for part in self.linearisations)
+
+
+@dataclass(frozen=True)
+class Base:
+    """Where the derivatives by shared and local unknowns were taken, for chord steps."""
+
+    point: Point
+    parts: tuple[Linearisation, ...]
+
+
+def moved(values: FloatArray, index: int, step: float = PARAMETER_STEP) -> FloatArray:
+    """Return the values with one of them a step further."""
+    changed = values.copy()
+    changed[index] += step
+    return changed
+
+
+@dataclass(frozen=True, eq=False)
+class Remainder:
+    """What is left in each channel of trials in motion.
+
+    Attributes
+    ----------
+    size : (channels,) ndarray
+        Standard deviation beside the noise, over that of the noise; nought where noise alone is left.
+    factor : (channels,) ndarray
+        Deviation of the noise that counts as many samples as are independent, over the recorded one.
+    time : (channels,) ndarray
+        Over which it forgets [s].
+    frequency : (channels,) ndarray
+        At which it swings [Hz]; nought if it does not.
+    of_noise : (channels,) ndarray of bool
+        Where it is the colour of the noise itself, as its record admits.
+    """
+
+    size: FloatArray
+    factor: FloatArray
+    time: FloatArray
+    frequency: FloatArray
+    of_noise: BoolArray
+
+    @property
+    def acts(self) -> bool:
+        """Whether anything but white noise is left."""
+        return bool(np.any(self.factor != 1.0))
+
+    @property
+    def is_noise(self) -> bool:
+        """Whether all that is left is the colour of the noise, as its records have it."""
+        return bool(np.all(self.of_noise | (self.factor == 1.0)))

@@ -1,21 +1,77 @@
-"""Normal equations of a fit; the trials' own unknowns are eliminated trial by trial (Schur complement)."""
+"""Normal equations of a fit; the trials' own unknowns are eliminated trial by trial (Schur complement).
+
+A factor of a curvature that is singular or not finite is a `FitError`, whatever made it so.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.sampling import IntArray
+from discrepancy.errors import FitError
 
-from .candidate import Candidate
-from .cholesky import Cholesky
-from .derivatives import TrialDerivatives
-from .linearisation import Linearisation, Point
+from .candidate import Candidate, State
 from .problem import Problem
+from .trial_data import TrialDerivatives
 
-IntArray = NDArray[np.int64]
+
+def finite(values: FloatArray) -> FloatArray:
+    """Return values as they are.
+
+    Raises
+    ------
+    FitError
+        If one of them is not finite.
+    """
+    if not np.all(np.isfinite(values)):
+        raise FitError("The model gives values or derivatives that are not finite where a fit has come to.")
+    return values
+
+
+@dataclass(frozen=True, eq=False)
+class Cholesky:
+    """A positive definite matrix by its factor, U^T U.
+
+    Attributes
+    ----------
+    upper : (n, n) ndarray
+        U; what stands below its diagonal means nothing.
+    """
+
+    upper: FloatArray
+
+    @classmethod
+    def of(cls, matrix: FloatArray) -> "Cholesky":
+        """Factorise a symmetric matrix (n, n).
+
+        Raises
+        ------
+        FitError
+            If it is not finite or not positive definite.
+        """
+        try:
+            return cls(cho_factor(finite(matrix), check_finite=False)[0])
+        except np.linalg.LinAlgError as cause:
+            raise FitError(
+                "The normal equations of a fit are singular; a parameter has no influence."
+            ) from cause
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return (U^T U)^-1 b for columns b (n, ...)."""
+        return np.asarray(cho_solve((self.upper, False), right, check_finite=False))
+
+    def half(self, right: FloatArray) -> FloatArray:
+        """Return U^-T b for columns b (n, ...), whose inner products are those by the matrix's inverse."""
+        return np.asarray(solve_triangular(self.upper, right, trans="T", check_finite=False))
+
+    @property
+    def log_determinant(self) -> float:
+        """Of the matrix, ln det."""
+        return 2.0 * float(np.log(np.diag(self.upper)).sum())
 
 
 @dataclass(frozen=True)
@@ -57,26 +113,10 @@ class TrialBlock:
         return self.shared_gradient - self.followed.T @ self.local_gradient
 
 
-class Fitted(Protocol):
-    """Where a candidate stands: a fit, or a state on the way to it."""
-
-    @property
-    def point(self) -> Point:
-        """Values of all unknowns."""
-
-    @property
-    def residuals(self) -> tuple[FloatArray, ...]:
-        """Of each trial, standardised."""
-
-    @property
-    def linearisations(self) -> tuple[Linearisation, ...]:
-        """Of each trial."""
-
-
 def trial_block(
     problem: Problem,
     number: int,
-    found: Fitted,
+    found: State,
     candidate: Candidate,
     precision: FloatArray,
     damping: float = 0.0,
@@ -123,7 +163,7 @@ class Eliminated(NamedTuple):
 
 def eliminated(
     problem: Problem,
-    found: Fitted,
+    found: State,
     candidate: Candidate,
     precision: FloatArray,
     *,
@@ -136,7 +176,7 @@ def eliminated(
     ----------
     problem : Problem
         Campaign and model.
-    found : Fitted
+    found : State
         Where they are taken.
     candidate : Candidate
         Its effect parameters are unknowns.

@@ -12,12 +12,9 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
 
-from .candidate import Candidate
-from .cholesky import Cholesky, finite
-from .elimination import eliminated
-from .linearisation import Base, Linearisation, Point
+from .candidate import Base, Candidate, Linearisation, Point, Remainder, State
+from .elimination import Cholesky, eliminated, finite
 from .problem import Problem
-from .remainder import Remainder
 
 LARGEST_EFFECT = 8.0
 """Effect parameters stay within this many prior deviations of their median."""
@@ -35,31 +32,19 @@ the one before it promised: close to the end, promises should fall fast."""
 
 
 @dataclass(frozen=True)
-class CandidateFit:
+class CandidateFit(State):
     """A fitted candidate.
 
     Attributes
     ----------
     candidate : Candidate
-        What was fitted.
-    point : Point
-        Maximum of the posterior.
-    objective : float
-        -ln posterior there, up to a constant shared by all candidates [nat].
+        What was fitted; the point is the maximum of the posterior.
     log_evidence : float
-        Laplace, up to the same constant [nat].
+        Laplace, up to the same constant as the objective [nat].
     covariance : (Q + E, Q + E) ndarray
         Of global unknowns and effect parameters (scaled), local ones marginalised.
-    residuals : tuple of (N, C) ndarray
-        Standardised.
-    responses : tuple of (N, C) ndarray
-        Without gain and zero.
-    sums : (channels,) ndarray
-        Sum of squared residuals by channel.
     spent : (channels,) ndarray
         Degrees of freedom that the unknowns took from each channel.
-    linearisations : tuple of Linearisation
-        At the point (or older, after chord steps).
     converged : bool
         Whether the last step was short enough.
     draws : (N, E) ndarray or None
@@ -69,15 +54,9 @@ class CandidateFit:
     """
 
     candidate: Candidate
-    point: Point
-    objective: float
     log_evidence: float
     covariance: FloatArray
-    residuals: tuple[FloatArray, ...]
-    responses: tuple[FloatArray, ...]
-    sums: FloatArray
     spent: FloatArray
-    linearisations: tuple[Linearisation, ...] = field(repr=False)
     converged: bool = True
     draws: FloatArray | None = field(default=None, repr=False)
     remainder: Remainder | None = field(default=None, repr=False)
@@ -209,16 +188,6 @@ def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
     return _Descent(problem, candidate, None, False).state(_bounded(point), derivatives=False).objective
 
 
-@dataclass(frozen=True)
-class _State:
-    point: Point
-    objective: float
-    residuals: tuple[FloatArray, ...]
-    responses: tuple[FloatArray, ...]
-    sums: FloatArray
-    linearisations: tuple[Linearisation, ...]
-
-
 @dataclass
 class _Descent:
     """What a descent needs at every point: problem, candidate, and the steps of its derivatives."""
@@ -232,11 +201,11 @@ class _Descent:
 
     def state(
         self, point: Point, *, derivatives: bool = True, known: tuple[Linearisation, ...] | None = None
-    ) -> _State:
+    ) -> State:
         """Return objective and derivatives at a point; `known` are derivatives by nuisances, near enough."""
         problem = self.problem
         parts: list[Linearisation] = []
-        residuals, responses = [], []
+        residuals = []
         for number in range(len(problem.trials)):
             part = problem.linearise(
                 number, point, self.candidate, self.base, derivatives=derivatives,
@@ -244,7 +213,6 @@ class _Descent:
                 central=self.central,
             )  # fmt: skip
             parts.append(part)
-            responses.append(part.response)
             residuals.append(problem.residual(number, point, part.response))
         sums = problem.group_sums(residuals)
         prior = 0.5 * float(problem.shared.precision @ point.shared**2)
@@ -253,9 +221,9 @@ class _Descent:
             prior += 0.5 * float(data.unknowns.precision @ u**2)
         objective = problem.misfit(sums) + prior
         objective = objective if np.isfinite(objective) else np.inf
-        return _State(point, objective, tuple(residuals), tuple(responses), sums, tuple(parts))
+        return State(point, objective, tuple(residuals), sums, tuple(parts))
 
-    def step(self, state: _State, damping: float) -> tuple[Point, float]:
+    def step(self, state: State, damping: float) -> tuple[Point, float]:
         """Return the step and the decrease it promises [nat], and keep the deviations of the effects."""
         problem, shared = self.problem, self.problem.shared.size
         blocks, matrix, gradient, prior = eliminated(
@@ -276,7 +244,7 @@ class _Descent:
             local_steps.append(np.asarray(own - block.followed @ step[block.index]))
         return Point(step[:shared], tuple(local_steps), step[shared:]), promised
 
-    def following(self, state: _State, step: Point, damping: float) -> _State | None:
+    def following(self, state: State, step: Point, damping: float) -> State | None:
         """Return the state after a step, or None if none better was found.
 
         Where the phases of a record bend the valley that the step follows, its end lies on the slope; a
@@ -300,7 +268,7 @@ class _Descent:
 
 
 def _finished(
-    problem: Problem, candidate: Candidate, state: _State, converged: bool, evidence: bool
+    problem: Problem, candidate: Candidate, state: State, converged: bool, evidence: bool
 ) -> CandidateFit:
     size = problem.shared.size + candidate.size
     covariance, log_evidence = np.zeros((size, size)), -state.objective
@@ -322,8 +290,8 @@ def _finished(
             leverage = block.derivatives.spread(block.products, block.precision, joint)
             np.add.at(spent, data.groups, leverage)
     return CandidateFit(
-        candidate, state.point, state.objective, log_evidence, covariance, state.residuals, state.responses,
-        state.sums, spent, state.linearisations, converged,
+        **vars(state), candidate=candidate, log_evidence=log_evidence, covariance=covariance, spent=spent,
+        converged=converged,
     )  # fmt: skip
 
 

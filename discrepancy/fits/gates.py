@@ -47,21 +47,16 @@ def absolute_gate(problem: Problem, fit: CandidateFit) -> Gate:
     known = any(name.startswith("variance") for name, _ in tests)
     recorded = bool(np.any(problem.freedom[problem.counts > 0.0] > 0.0))
     why = "Too few readings for the unknowns" if recorded else "No noise record"
+    name, least = min(tests, key=lambda test: test[1], default=("", np.nan))
+    statistic, passed = min(least * len(tests), 1.0), True if known else None
+    reason = "What is left agrees with the noise records."
     if not tests:
-        return Gate("absolute fit", None, np.nan, ABSOLUTE_LEVEL, f"{why}: the fit cannot be judged.")
-    name, least = min(tests, key=lambda test: test[1])
-    statistic = min(1.0, least * len(tests))
-    if statistic < ABSOLUTE_LEVEL:
-        reason = f"More is left than noise and priors allow: {name}."
-        return Gate("absolute fit", False, statistic, ABSOLUTE_LEVEL, reason)
-    if not known:
-        return Gate(
-            "absolute fit", None, statistic, ABSOLUTE_LEVEL,
-            f"{why}: only priors and the whiteness of what is left could be judged, and they agree.",
-        )  # fmt: skip
-    return Gate(
-        "absolute fit", True, statistic, ABSOLUTE_LEVEL, "What is left agrees with the noise records."
-    )
+        reason = f"{why}: the fit cannot be judged."
+    elif statistic < ABSOLUTE_LEVEL:
+        passed, reason = False, f"More is left than noise and priors allow: {name}."
+    elif not known:
+        reason = f"{why}: only priors and the whiteness of what is left could be judged, and they agree."
+    return Gate("absolute fit", passed, statistic, ABSOLUTE_LEVEL, reason)
 
 
 def absolute_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float]]:

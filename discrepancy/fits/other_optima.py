@@ -9,9 +9,8 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import EffectParameter, ShapeParameter
 from discrepancy.search_settings import SEARCH
 
-from .candidate import Candidate, Term
+from .candidate import Candidate, Point, Term
 from .fitting import CandidateFit, attempt
-from .linearisation import Point
 from .problem import Problem
 from .screening import is_magnitude
 

@@ -11,7 +11,6 @@ from dataclasses import replace
 from math import inf
 
 import numpy as np
-from numpy.typing import NDArray
 
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import Campaign, FloatArray, Trial
@@ -22,13 +21,8 @@ from discrepancy.models.memory import Memory
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
-from .candidate import Candidate
-from .derivatives import TrialDerivatives
-from .linearisation import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Base, Linearisation, Point, moved
-from .trial_data import TrialData, noise_models
-from .unknowns import GlobalUnknowns, global_unknowns
-
-IntArray = NDArray[np.int64]
+from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Base, Candidate, Linearisation, Point, moved
+from .trial_data import GlobalUnknowns, TrialData, TrialDerivatives, global_unknowns, noise_models
 
 KEPT = 2000
 """Responses that a problem keeps."""

@@ -25,8 +25,7 @@ from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch
 
 from .candidate import Candidate, Term
-from .cholesky import Cholesky, finite
-from .elimination import eliminated
+from .elimination import Cholesky, eliminated, finite
 from .fitting import LARGEST_EFFECT, CandidateFit
 from .problem import Problem
 

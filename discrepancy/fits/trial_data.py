@@ -1,19 +1,306 @@
-"""A trial ready to be compared: noise of its channels, own unknowns, samples that count."""
+"""A trial ready to be compared: noise of its channels, samples that count, unknowns and derivatives by them.
+
+Each unknown is a scaled variable u with prior N(0, 1), or flat where nothing is known; the value is
+centre + scale u. Global ones, which every hypothesis shares: calibrated parameters, gains of channels. Local
+to a trial: zeros of its channels, initial state and time zero of a ring-down, an unknown initial state and
+constants of inputs of a driven trial, health where it is uncertain.
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import isinf
 
 import numpy as np
-from numpy.typing import NDArray
 
 from discrepancy.campaign.noise import NoiseModel, noise_model
-from discrepancy.campaign.records import Campaign, FloatArray, Trial
-from discrepancy.models.interface import Model
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
+from discrepancy.campaign.sampling import IntArray
+from discrepancy.models.interface import Conditions, Model
 
-from .unknowns import LocalUnknowns, local_unknowns
+FREE_MOTION = 3.0
+"""Prior deviation of a free initial state, in units of the release displacement."""
+LEAST_LOSS, LARGEST_LOSS = -0.5, 0.95
+"""Limits of an uncertain stiffness loss. A loss below zero means nothing, but a limit at zero, where most of
+a flight is, would stop fits: half of the readings of a healthy wing pull below it."""
 
-IntArray = NDArray[np.int64]
+
+@dataclass(frozen=True)
+class GlobalUnknowns:
+    """Layout of the global unknowns.
+
+    Attributes
+    ----------
+    parameter_mean, parameter_scale, parameter_low, parameter_high : (P,) ndarray
+        Of the calibrated parameters.
+    gain_channels : tuple of str
+        Channels whose gain is unknown.
+    gain_centre, gain_scale, gain_precision : (G,) ndarray
+        Their gain errors; precision 1, or 0 for a flat prior.
+    fixed_gain : dict of str to float
+        Gain errors of signals that define the scale of the release amplitudes, which are not fitted.
+    """
+
+    parameter_mean: FloatArray
+    parameter_scale: FloatArray
+    parameter_low: FloatArray
+    parameter_high: FloatArray
+    gain_channels: tuple[str, ...]
+    gain_centre: FloatArray
+    gain_scale: FloatArray
+    gain_precision: FloatArray
+    fixed_gain: dict[str, float]
+
+    @property
+    def size(self) -> int:
+        """Number of global unknowns."""
+        return len(self.parameter_mean) + len(self.gain_channels)
+
+    @property
+    def precision(self) -> FloatArray:
+        """Prior precision of each scaled variable."""
+        return np.concatenate((np.ones_like(self.parameter_mean), self.gain_precision))
+
+    def parameters(self, u: FloatArray) -> FloatArray:
+        """Return the calibrated parameters, kept within the range of the model."""
+        values = self.parameter_mean + self.parameter_scale * u[: len(self.parameter_mean)]
+        return np.clip(values, self.parameter_low, self.parameter_high)
+
+    def gains(self, u: FloatArray, channels: tuple[str, ...]) -> FloatArray:
+        """Return the gain errors (C,) of channels."""
+        found = dict(self.fixed_gain)
+        values = self.gain_centre + self.gain_scale * u[len(self.parameter_mean) :]
+        found.update(zip(self.gain_channels, values, strict=True))
+        return np.array([found.get(name, 0.0) for name in channels])
+
+
+@dataclass(frozen=True)
+class LocalUnknowns:
+    """Layout of the unknowns of one trial: zeros, initial state, constants of inputs, time zero, health.
+
+    Attributes
+    ----------
+    zero_columns : (Z,) ndarray of int
+        Columns whose zero is unknown.
+    zero_scale, zero_precision : (Z,) ndarray
+        Scale and prior precision.
+    initial_shape : tuple of int
+        (R, 1) or (R, 2): entries of the initial state that are unknown.
+    initial_scale : float
+        Their prior deviation.
+    initial_sizes : (initials,) ndarray
+        Natural sizes of an unknown initial state of a driven trial; empty for ring-downs.
+    offset_scale : tuple of float
+        Prior deviations of the constants that the recorded inputs lack; zero where none is lacking.
+    time_zero_scale : float
+        Zero if it is known.
+    health_rows, health_columns : (H,) ndarray of int
+        Uncertain entries of the health, those of the first region first.
+    """
+
+    zero_columns: IntArray
+    zero_scale: FloatArray
+    zero_precision: FloatArray
+    initial_shape: tuple[int, int]
+    initial_scale: float
+    time_zero_scale: float
+    health_rows: IntArray
+    health_columns: IntArray
+    offset_scale: tuple[float, ...] = ()
+    initial_sizes: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def zeros(self) -> int:
+        """Number Z of unknown zeros."""
+        return len(self.zero_columns)
+
+    @property
+    def initials(self) -> int:
+        """Number of unknown initial entries, and after them of unknown constants of inputs."""
+        return self.initial_shape[0] * self.initial_shape[1] + self.offsets
+
+    @property
+    def offsets(self) -> int:
+        """Number of unknown constants of inputs."""
+        return sum(scale > 0.0 for scale in self.offset_scale)
+
+    @property
+    def size(self) -> int:
+        """Number of local unknowns."""
+        return self.zeros + self.initials + (self.time_zero_scale > 0.0) + len(self.health_rows)
+
+    @property
+    def precision(self) -> FloatArray:
+        """Prior precision of each scaled variable."""
+        return np.concatenate((self.zero_precision, np.ones(self.size - self.zeros)))
+
+    def zero(self, u: FloatArray, columns: int) -> FloatArray:
+        """Return the zeros (C,) of the trial's channels."""
+        values = np.zeros(columns)
+        values[self.zero_columns] = self.zero_scale * u[: self.zeros]
+        return values
+
+    def conditions(self, trial: Trial, parameters: FloatArray, u: FloatArray) -> Conditions:
+        """Return the conditions of the trial's response."""
+        at = self.zeros
+        initial = np.zeros((self.initial_shape[0], 2))
+        first = self.initials - self.offsets
+        if first:
+            entries = self.initial_scale * u[at : at + first]
+            if len(self.initial_sizes):
+                entries = entries * self.initial_sizes
+            initial[:, : self.initial_shape[1]] = entries.reshape(self.initial_shape)
+            at += first
+        offset = np.array(self.offset_scale)
+        if self.offsets:
+            offset[offset > 0.0] *= u[at : at + self.offsets]
+            at += self.offsets
+        time_zero = 0.0
+        if self.time_zero_scale > 0.0:
+            time_zero = self.time_zero_scale * float(u[at])
+            at += 1
+        health = trial.health[:1] if trial.is_dynamic else trial.health
+        if len(self.health_rows):
+            health = health.copy()
+            entry = (self.health_rows, self.health_columns)
+            health[entry] = np.clip(
+                health[entry] + trial.health_deviation[entry] * u[at:], LEAST_LOSS, LARGEST_LOSS
+            )
+        return Conditions(parameters, initial, (0.0, time_zero), health, tuple(offset.tolist()))
+
+
+def global_unknowns(
+    campaign: Campaign, model: Model, trials: tuple[Trial, ...], unit_responses: dict[str, float]
+) -> GlobalUnknowns:
+    """Return the layout of the global unknowns.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Its `parameters` replace priors of the model.
+    model : Model
+        With calibrated parameters.
+    trials : tuple of Trial
+        Trials that are fitted; only gains of channels in them are unknowns.
+    unit_responses : dict of str to float
+        For signals of unknown scale: data over model, as a first estimate of 1 + gain.
+    """
+    prior = [campaign.parameters.get(item.name, (item.mean, item.deviation)) for item in model.parameters]
+    used = {name for trial in trials for name in trial.channels}
+    gains: list[tuple[str, float, float, float]] = []  # channel, centre, scale, precision
+    fixed: dict[str, float] = {}
+    for name, channel in campaign.channels.items():
+        if name not in used:
+            continue
+        if isinf(channel.gain_deviation):
+            estimate = unit_responses.get(name, 1.0) - 1.0
+            if channel.quantity is Quantity.SIGNAL and not fixed:
+                fixed[name] = estimate  # it defines the scale of the release amplitudes
+                continue
+            gains.append((name, estimate, max(abs(1.0 + estimate), 1e-12), 0.0))
+        elif channel.gain_deviation > 0.0:
+            gains.append((name, 0.0, channel.gain_deviation, 1.0))
+    means, deviations = np.array(prior, dtype=np.float64).reshape(-1, 2).T
+    ranges = np.array([(item.low, item.high) for item in model.parameters], dtype=np.float64)
+    centre, scale, precision = np.array([item[1:] for item in gains], dtype=np.float64).reshape(-1, 3).T
+    names = tuple(name for name, *_ in gains)
+    low, high = ranges.reshape(-1, 2).T
+    return GlobalUnknowns(means, deviations, low, high, names, centre, scale, precision, fixed)
+
+
+def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray, model: Model) -> LocalUnknowns:
+    """Return the layout of the unknowns of one trial; `deviation` (C,) scales zeros nothing is known of."""
+    zero_scale = np.array([campaign.channels[name].offset_deviation for name in trial.channels])
+    columns = np.flatnonzero(zero_scale > 0.0)
+    free = np.isinf(zero_scale[columns])
+    release = trial.release if trial.kind is TrialKind.RINGDOWN else None
+    shape, scale, time_zero, sizes = (0, 1), 1.0, 0.0, np.zeros(0)
+    if release is not None:
+        shape = (release.mode_count, 1 if release.at_rest else 2)
+        scale = release.deviation if release.at_rest else FREE_MOTION
+        time_zero = release.time_zero_deviation
+    elif trial.begins is Start.UNKNOWN:
+        sizes = model.initial_sizes(campaign, trial)
+        shape, scale = (-(-len(sizes) // 2), 2), FREE_MOTION
+        sizes = np.pad(sizes, (0, len(sizes) % 2))
+    uncertain = trial.health_deviation[:1] if trial.is_dynamic else trial.health_deviation
+    of_health, rows = np.nonzero(uncertain.T)  # region by region, as their derivatives are taken
+    return LocalUnknowns(
+        zero_columns=columns,
+        zero_scale=np.where(free, deviation[columns], zero_scale[columns]),
+        zero_precision=np.where(free, 0.0, 1.0),
+        initial_shape=shape,
+        initial_scale=scale,
+        time_zero_scale=time_zero,
+        health_rows=rows,
+        health_columns=of_health,
+        initial_sizes=sizes,
+        offset_scale=tuple(item.offset_deviation for item in trial.inputs),
+    )
+
+
+@dataclass(frozen=True)
+class TrialDerivatives:
+    """Standardised derivatives of the prediction of a trial.
+
+    Attributes
+    ----------
+    rows : (C, M, N) ndarray
+        Of each channel, by the M unknowns that touch it.
+    owners : (C, M) ndarray of int
+        Whose derivatives the rows are: unknowns of the trial from 0, then the K shared ones and effect
+        parameters of `index`; the number after the last stands for none.
+    local_size : int
+        L, number of unknowns of the trial.
+    index : (K,) ndarray of int
+        Which shared unknowns (global ones first, then effect parameters) touch the trial.
+    """
+
+    rows: FloatArray
+    owners: IntArray
+    local_size: int
+    index: IntArray
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns that touch the trial, L + K."""
+        return self.local_size + len(self.index)
+
+    def products(self) -> FloatArray:
+        """Return the inner products (C, M, M) of the rows of each channel."""
+        return np.asarray(np.matmul(self.rows, self.rows.transpose(0, 2, 1)))
+
+    def normal(self, products: FloatArray, weights: FloatArray) -> FloatArray:
+        """Return J W J^T (L + K, L + K), from the products and the weights (C,) of the channels."""
+        count = self.size + 1
+        at = self.owners[:, :, np.newaxis] * count + self.owners[:, np.newaxis, :]
+        weighted = products * weights[:, np.newaxis, np.newaxis]
+        total = np.bincount(at.ravel(), weighted.ravel(), minlength=count * count)
+        return np.asarray(total.reshape(count, count)[:-1, :-1])
+
+    def onto(self, columns: FloatArray, channels: Sequence[int] | None = None) -> FloatArray:
+        """Return J d (L + K,) of readings d (C, N), or of some channels' only."""
+        rows, owners = self.rows, self.owners
+        if channels is not None:
+            rows, owners = rows[list(channels)], owners[list(channels)]
+        found = np.matmul(rows, columns[:, :, np.newaxis])[:, :, 0]
+        return np.asarray(np.bincount(owners.ravel(), found.ravel(), minlength=self.size + 1)[:-1])
+
+    def spread(self, products: FloatArray, weights: FloatArray, covariance: FloatArray) -> FloatArray:
+        """Return for each channel (C,) the trace of W J^T covariance J, of all L + K unknowns."""
+        padded = np.zeros((self.size + 1, self.size + 1))
+        padded[:-1, :-1] = covariance
+        chosen = padded[self.owners[:, :, np.newaxis], self.owners[:, np.newaxis, :]]
+        return np.asarray(weights * np.einsum("cij,cij->c", chosen, products))
+
+    def dense(self) -> tuple[FloatArray, FloatArray]:
+        """Return J by the trial's own unknowns (L, N C) and by the others (K, N C), as (N, C) is ordered."""
+        channels, _, samples = self.rows.shape
+        found = np.zeros((self.size + 1, samples, channels))
+        for channel in range(channels):
+            found[self.owners[channel], :, channel] = self.rows[channel]
+        whole = found[:-1].reshape(self.size, samples * channels)
+        return whole[: self.local_size], whole[self.local_size :]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,31 +9,36 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.wider_noise import noise_levels, refitted
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.force import missing_force, told_force
 from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.missing_force.naming import Explained, ForceSearch
-from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, ForceShares, Share
-from discrepancy.search.starting_points import are_related
+from discrepancy.missing_force.shares import (
+    OF_READINGS,
+    SHORTEST,
+    WINDOWS,
+    ForceShares,
+    Share,
+    missing_force,
+    told_force,
+)
+from discrepancy.search.honest_evidence import noise_levels, refitted
+from discrepancy.search.hypotheses import are_related
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 
 from .conclusion import sizes
-from .consistency_gate import consistency_gate
+from .consistency_gate import consistency_gate, sizes_by_trial
 from .court import Court
 from .proof import held_out_gate
-from .trial_by_trial import sizes_by_trial
 
 
 class ByForce(Court[Explained]):
@@ -198,7 +203,7 @@ class ByReadings(Court[CandidateFit]):
                 self._free[key_of(item.candidate)] = free
                 if free.log_evidence > best.log_evidence + SHAPE_GAIN:
                     joined[key_of(free.candidate)] = free
-        self.found.judge(joined)
+        self.found.judged = joined
 
     def freed(self, item: CandidateFit) -> CandidateFit | None:
         """Return a single law with a shape of its own, where that was compared."""

@@ -1,12 +1,16 @@
-"""What every verdict on a search says alike: hypotheses, estimates, and the fit that stands for it."""
+"""What every verdict on a search says alike, and what is too small to be a name.
+
+A gain of half a thousandth is a nuisance of instruments, not a cause.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from math import isnan
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.catalogue.entry import NINETY, EffectParameter, ShapeParameter
 from discrepancy.fits.candidate import FREE_SHAPE, Candidate
 from discrepancy.fits.fitting import CandidateFit
@@ -23,6 +27,7 @@ from discrepancy.verdict import (
     Verdict,
     VerdictKind,
 )
+from fe.runtime.patch import Clock, LoadGain, Primitive, SensorGain
 from reporting.words import listing
 
 
@@ -88,6 +93,16 @@ class Conclusion:
         alike = {"hypotheses": self.hypotheses, "inclusion": self.inclusion}
         verdict = Verdict(kind, sentence, probability, self.log_bayes_factor, **alike, **more)  # type: ignore[arg-type]
         return Outcome(verdict, self.found, self.found.none if fit is None else fit)
+
+    def named(self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...], **more: Any) -> Outcome:
+        """Return the verdict that names the effects of a fit; the first gate is that of absolute fit."""
+        named, limit = (
+            named_effects(self.found.problem, fit),
+            "" if gates[0].passed else f" {gates[0].reason}",
+        )
+        told = {"what": effects_text(named), "certain": probability_text(probability), "limit": limit}
+        more |= {"effects": named, "gates": gates}
+        return self.outcome(VerdictKind.NAMED, said("verdict.named", **told), probability, fit, **more)
 
     def family(self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...]) -> Outcome:
         """Return the verdict that names the family of a fit with a free shape."""
@@ -173,12 +188,68 @@ def effects_text(effects: Iterable[NamedEffect], joint: str = "and") -> str:
     return listing(dict.fromkeys(found), joint)
 
 
-def certain(probability: float) -> str:
-    """Return the probability of a name, which is never one."""
-    return "> 0.999" if probability > 0.9995 else f"{probability:.3f}"
+def probability_text(probability: float) -> str:
+    """Return a probability that is neither rounded to one nor to zero."""
+    if isnan(probability):
+        return "not known"
+    if probability > 0.9995:
+        return "> 0.999"
+    if probability < 5e-4:
+        return f"{probability:.0e}" if probability > 1e-99 else "< 1e-99"
+    return f"{probability:.3f}"
 
 
 def below_limit(names: Sequence[str], coloured: str = "") -> str:
     """Return the sentence on what is too small to tell from noise, and what is nearest to it."""
     nearest = f"; the nearest are {', '.join(names[:4])}" if names else ""
     return said("verdict.below_limit", coloured=coloured, nearest=nearest)
+
+
+LEAST_SIZE = 1e-3
+"""Size of a gain, tare or clock error over what it acts on, below which it is a nuisance and no name."""
+UNSTATED_GAIN = 1e-2
+"""The same of the gain of a channel of which no deviation is stated, beside a law that explains as much: a
+calibration that nobody stated is not exact."""
+
+
+def is_one_driven_channel(problem: Problem) -> bool:
+    """Whether a campaign is of driven trials and one channel: no error of it has a pattern of its own."""
+    driven = all(trial.kind in (TrialKind.DRIVEN, TrialKind.FORCED) for trial in problem.campaign.trials)
+    return driven and len(problem.channel_names) == 1
+
+
+def small_terms(
+    problem: Problem, found: CandidateFit, *, unstated: float = LEAST_SIZE
+) -> tuple[float | None, ...]:
+    """Return for each effect of a fit its size over what it acts on where that is too small, else None.
+
+    `unstated`: the least size of a gain of a channel of which no deviation is stated.
+    """
+    sizes: list[float | None] = []
+    for term, part in zip(found.candidate.terms, found.candidate.parts(found.point.effect), strict=True):
+        patch = Candidate((term,)).patch(problem.setting, part)
+        known = [_size(problem, item) for item in patch]
+        largest = max((size for size in known if size is not None), default=None)
+        least = max((_least(problem, item, unstated) for item in patch), default=LEAST_SIZE)
+        small = largest is not None and None not in known and largest < least
+        sizes.append(largest if small else None)
+    return tuple(sizes)
+
+
+def _least(problem: Problem, item: Primitive, unstated: float) -> float:
+    """Return the size from which an error of an instrument may be a name."""
+    if not isinstance(item, SensorGain) or item.channel not in problem.campaign.channels:
+        return LEAST_SIZE
+    return unstated if problem.campaign.channels[item.channel].gain_deviation == 0.0 else LEAST_SIZE
+
+
+def _size(problem: Problem, item: Primitive) -> float | None:
+    """Return the size of an error of an instrument over what it acts on, None of anything else."""
+    scales = problem.setting.scales
+    if isinstance(item, LoadGain):
+        return max(abs(item.gain), abs(item.tare) / scales.force if scales.force > 0.0 else 0.0)
+    if isinstance(item, SensorGain):
+        return abs(item.gain)
+    if isinstance(item, Clock):
+        return max(abs(item.rate), abs(item.zero) * scales.angular_frequency)
+    return None

@@ -21,7 +21,7 @@ from discrepancy.fits.gates import ABSOLUTE_LEVEL
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.missing_force.shares import Share
-from discrepancy.search.starting_points import acts_within
+from discrepancy.search.hypotheses import acts_within
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said

@@ -22,23 +22,25 @@ from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 from discrepancy.verdict import ExplainedShare, RemainderEstimate, Verdict, VerdictKind
-from reporting.words import counted, listing
+from reporting.words import capital, counted, listing
 
 from .comparison import ByForce, ByReadings
 from .conclusion import (
+    UNSTATED_GAIN,
     Conclusion,
     Outcome,
     below_limit,
-    certain,
     effects_text,
     hypothesis,
     inclusion,
+    is_one_driven_channel,
     named_effects,
     plain_names,
+    probability_text,
+    small_terms,
 )
 from .consistency_gate import consistency_gate
 from .court import Court, H, names, part, percent
-from .practical_size import UNSTATED_GAIN, is_one_driven_channel, small_terms
 from .proof import held_out_gate
 
 LEAST_SHOWN = 0.1
@@ -110,7 +112,7 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
             if court.against(item) or probability < SEARCH.sure:
                 return _unexplained(court, first, item, probability)
             return _in_part(court, item, probability)
-    found.judge({})
+    found.judged = {}
     return Outcome(first, found, fit)
 
 
@@ -137,10 +139,7 @@ def _beside_coloured_noise(court: ByReadings) -> Outcome | None:
     gates = (absolute_gate(problem, best), consistency_gate(problem, best), held_out)
     if probability < SEARCH.sure or any(gate.passed is False for gate in gates):
         return None
-    named = named_effects(problem, best)
-    sentence = said("verdict.named", what=effects_text(named), certain=certain(probability), limit="")
-    more = {"effects": named, "gates": gates, "remainders": remainder_estimates(problem, best)}
-    return told.outcome(VerdictKind.NAMED, sentence, probability, best, **more)
+    return told.named(best, probability, gates, remainders=remainder_estimates(problem, best))
 
 
 def _is_coloured(item: CandidateFit) -> bool:
@@ -171,7 +170,7 @@ def _in_part(court: Court[H], best: H, probability: float) -> Outcome:
     what = listing(filter(None, (named, said("verdict.family_in_part", family=family) if family else "")))
     inside = court.has_held_out and not share.held_out
     sentence = said(
-        "verdict.in_part", what=_capital(what), certain=certain(probability), part=part(share),
+        "verdict.in_part", what=capital(what), certain=probability_text(probability), part=part(share),
         where=_where(share), inside=said("verdict.hardly_any_force") if inside else "",
         left=court.left(best, share), shape=_shape(court, best),
     )  # fmt: skip
@@ -188,7 +187,7 @@ def _group(court: Court[H], members: Sequence[H], probability: float) -> Outcome
     common = set.intersection(*(names(item) for item in members))
     both = [effect for effect in effects[0] if (effect.identifier, effect.place) in common]
     if both:
-        sentence = f"{_capital(effects_text(both))} is missing. {sentence}"
+        sentence = f"{capital(effects_text(both))} is missing. {sentence}"
     more = {
         "effects": tuple(effect for own in effects for effect in own),
         "group": tuple(" + ".join(sorted(plain_names(item.candidate.identifiers))) for item in members),
@@ -279,10 +278,6 @@ def _where(share: Share) -> str:
     return (
         f"in {trials} that {'were' if share.trials > 1 else 'was'} {'not ' if share.held_out else ''}fitted"
     )
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def remainder_estimates(problem: Problem, found: CandidateFit) -> tuple[RemainderEstimate, ...]:

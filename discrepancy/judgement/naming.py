@@ -8,17 +8,15 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.search.hypotheses import Tell, in_silence
-from discrepancy.search.starting_points import acts_within
+from discrepancy.search.hypotheses import Tell, acts_within, in_silence
 from discrepancy.search.strategy import Search, search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 from discrepancy.verdict import Verdict, VerdictKind
 from fe.runtime.patch import SENSORS, LoadGain, SensorGain
 
-from .conclusion import Outcome, plain_names
+from .conclusion import LEAST_SIZE, Outcome, is_one_driven_channel, plain_names, small_terms
 from .in_part import judged_in_part, without_sliver
-from .practical_size import LEAST_SIZE, is_one_driven_channel, small_terms
 from .proof import held_out_gate
 from .rules import as_recorded
 

@@ -6,16 +6,15 @@ nuisances; the information is the mutual information of hypothesis and data, by 
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.cholesky import finite
+from discrepancy.fits.candidate import Point
+from discrepancy.fits.elimination import finite
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.sentences import SENTENCES
 from discrepancy.verdict import Experiment
@@ -179,11 +178,10 @@ def proposals(campaign: Campaign, problem: Problem, *, swings: bool = True) -> I
         largest = (min if row.get("of") == "smallest" else max)(done, key=_size)
         found = _changed(problem, largest, row["change"], row["by"])
         if found is not None:
-            top = _size(largest)
-            told = {"top": top, "most": abs(row["by"]) * top, "signed": row["by"] * top, "value": found.value}
-            trial = replace(found.trial, name=row["name"])
+            (trial, value, added), top = found, _size(largest)
+            told = {"top": top, "most": abs(row["by"]) * top, "signed": row["by"] * top, "value": value}
             description = row["description"].format(**told)
-            yield Proposal(trial, description, row["reason"], row["cost"], found.added)
+            yield Proposal(replace(trial, name=row["name"]), description, row["reason"], row["cost"], added)
 
 
 def _size(trial: Trial) -> float:
@@ -193,35 +191,30 @@ def _size(trial: Trial) -> float:
     return float(np.abs(trial.load_factor if trial.kind is TrialKind.FLIGHT else trial.force).max())
 
 
-class _Changed(NamedTuple):
-    """A trial as it would be, the new value of what is neither load nor release, what is added."""
+def _changed(problem: Problem, trial: Trial, what: str, by: float) -> tuple[Trial, float, ModelPatch] | None:
+    """Return a trial with something changed by so much; None where that cannot be, or shows nothing.
 
-    trial: Trial
-    value: float = 0.0
-    added: ModelPatch = ModelPatch()
-
-
-def _changed(problem: Problem, trial: Trial, what: str, by: float) -> _Changed | None:
-    """Return a trial with something changed by so much; None where that cannot be, or shows nothing."""
-    model, stations = problem.model, problem.model.stations()
+    Beside it the new value of what is neither load nor release, and what is added to the structure.
+    """
+    model, stations, nothing = problem.model, problem.model.stations(), ModelPatch()
     if what == "release" and trial.release is not None:
         release = replace(trial.release, displacement=by * trial.release.displacement)
-        return _Changed(replace(trial, release=release))
+        return replace(trial, release=release), 0.0, nothing
     if what in ("force", "load_factor"):
-        return _Changed(replace(trial, **{what: by * getattr(trial, what)}))
+        return replace(trial, **{what: by * getattr(trial, what)}), 0.0, nothing
     if what == "length":
         count = int(by) * len(trial.time)
         longer = {name: np.concatenate([getattr(trial, name)] * int(by)) for name in _BY_ROW}
         time = trial.time[0] + trial.interval * np.arange(count)
-        return _Changed(replace(trial, **longer, time=time), count * trial.interval)  # type: ignore[arg-type]
+        return replace(trial, **longer, time=time), count * trial.interval, nothing  # type: ignore[arg-type]
     if what == "place" and stations is not None:
         place = (round(stations[0] + by * (stations[1] - stations[0]), 3), 0.35)
-        return _Changed(replace(trial, load_place=place), place[0])
+        return replace(trial, load_place=place), place[0], nothing
     if what == "mass" and model.supports(PointMass):
         mass = by * problem.setting.scales.modal_mass
         at_tip = PointMass(mass, stations[1] if stations is not None else 0.0)
-        return _Changed(trial, 1e3 * mass, ModelPatch((at_tip,)))
+        return trial, 1e3 * mass, ModelPatch((at_tip,))
     known = problem.campaign.reference_temperature is not None
     if what == "temperature" and known and model.supports(ModulusTemperature):
-        return _Changed(replace(trial, temperature=trial.temperature + by))
+        return replace(trial, temperature=trial.temperature + by), 0.0, nothing
     return None

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from math import nan, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from discrepancy.campaign.noise_tests import SHORTEST_SERIES, ljung_box, variance_p_value
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.campaign.sampling import IntArray
 from discrepancy.errors import FitError
 from discrepancy.location.omnibus_tests import mean_square
 from discrepancy.location.residuals import FittedTrial, ResidualSet
@@ -151,9 +151,7 @@ def correlation_time(series: FloatArray) -> float:
     return max(1.0, 2.0 * float(pairs[:last].sum()) - 1.0)
 
 
-def _uniformity(
-    transforms: Sequence[FloatArray], used: Sequence[NDArray[np.bool_]], counts: NDArray[np.int64]
-) -> float:
+def _uniformity(transforms: Sequence[FloatArray], used: Sequence[BoolArray], counts: IntArray) -> float:
     """Return the p-value of Pearson's chi^2 over the bins, thinned by the correlation of |z|."""
     total, effective = 0, 0.0
     for values, use in zip(transforms, used, strict=True):

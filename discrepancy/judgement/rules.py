@@ -24,8 +24,6 @@ from .conclusion import (
     Conclusion,
     Outcome,
     below_limit,
-    certain,
-    effects_text,
     named_effects,
     plain_names,
 )
@@ -203,13 +201,7 @@ class Case:
 
     def named(self) -> Outcome:
         """Return the name."""
-        best, gate = with_draws(self.problem, self.best), self.gates[0]
-        named = named_effects(self.problem, best)
-        limit = "" if gate.passed else f" {gate.reason}"
-        told = {"what": " and ".join(effects_text([effect]) for effect in named), "limit": limit}
-        sentence = said("verdict.named", certain=certain(self.probability), **told)
-        more = {"effects": named, "gates": self.all_gates}
-        return self.told.outcome(VerdictKind.NAMED, sentence, self.probability, best, **more)
+        return self.told.named(with_draws(self.problem, self.best), self.probability, self.all_gates)
 
     def family(self) -> Outcome:
         """Return the family of the set, or of the set with its shape free."""

@@ -14,9 +14,8 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, NoiseRecord, Start, Trial
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, Term
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.linearisation import PARAMETER_STEP, Point
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen
 from discrepancy.fits.trial_data import stand_in

@@ -17,8 +17,9 @@ from discrepancy.campaign.noise_tests import (
     variance_p_value,
 )
 from discrepancy.campaign.records import FloatArray
-from discrepancy.location.residuals import ResidualSet, quadratic_moments
 from discrepancy.sentences import said
+
+from .residuals import ResidualSet, quadratic_moments
 
 NOISE_RECORD_LEVEL = 1e-3
 """p-value below which a noise record itself counts as not white, or as holding a line."""

@@ -11,16 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from .event_steps import Steps, joined, without
-from .filtered import Filtered, Process, discretised
-from .view import SIZE_DOUBT, TIME_DOUBT, View
+from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.campaign.sampling import IntArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from .event_steps import Steps, joined, without
+from .filtered import Filtered, Process
+from .kalman_kernels import discretised
+from .view import SIZE_DOUBT, TIME_DOUBT, View
 
 CHANGE_PRICE = 4.0
 """ln odds against a change, beside the choice of its place."""

@@ -2,33 +2,24 @@
 
 A force is a Gaussian process in time of deviation `size` and correlation time `time`: Matern 3/2, two
 states (Hartikainen and Sarkka 2010, IEEE Workshop on Machine Learning for Signal Processing), or 1/2.
+Unknowns that act in proportion follow from what whitened readings and columns share.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 
-from fe.compilation import callable_when_compiled, compiled
+from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.sampling import IntArray
 
 from . import kalman_kernels as kernels
 from .trial import SeenTrial
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-
 LATER = 200
 """Samples after which more of them tell nothing of a moment."""
-
-callable_when_compiled(kernels.is_steady)
-discretised = compiled(kernels.discretised)
-_covariances = compiled(kernels.covariances)
-_whitened = compiled(kernels.whitened)
-_smoothed = compiled(kernels.smoothed)
-_between = compiled(kernels.between)
-_variances = compiled(kernels.variances)
 
 
 @dataclass(frozen=True)
@@ -136,7 +127,7 @@ class Filtered:
 
     def _steps(self, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return transitions and noises (J, n, n) of steps (J,) [s]."""
-        return discretised(*self.system[:2], lengths)
+        return kernels.discretised(*self.system[:2], lengths)
 
     @cached_property
     def _passed(
@@ -145,7 +136,7 @@ class Filtered:
         lengths, which = self.trial.steps
         moves, noises = self._steps(lengths)
         _, _, rows, start = self.system
-        return moves, *_covariances(moves, noises, which, rows, self.trial.used, start)
+        return moves, *kernels.covariances(moves, noises, which, rows, self.trial.used, start)
 
     @property
     def is_sound(self) -> bool:
@@ -164,7 +155,7 @@ class Filtered:
         moves, slot, gains, sizes, _, _ = self._passed
         given = np.moveaxis(columns, 0, -1)
         given = np.ascontiguousarray(given * self.white[:, None] if self.trial.coloured else given)
-        found = _whitened(
+        found = kernels.whitened(
             moves, self.trial.steps[1], self.system[2], self.trial.used, slot, gains, sizes, given
         )
         return np.asarray(found.reshape(-1, found.shape[-1]))
@@ -175,10 +166,10 @@ class Filtered:
         lengths, which = self.trial.steps
         rows = self.system[2]
         seen = np.ascontiguousarray(readings * self.white)
-        means, later = _smoothed(moves, which, rows, self.trial.used, slot, gains, sizes, seen)
+        means, later = kernels.smoothed(moves, which, rows, self.trial.used, slot, gains, sizes, seen)
         parts = self.trial.parts
         fine = self._steps(lengths / parts)
-        found = _between(parts, *fine, which, slot, filtered, means, later)
+        found = kernels.between(parts, *fine, which, slot, filtered, means, later)
         sizes = np.array([one.size for one in self.processes.values()])
         forces = found[:, self._places].T * sizes[:, None]
         return np.asarray(found[:, : len(self._scale)] * self._scale), np.asarray(forces)
@@ -200,5 +191,90 @@ class Filtered:
         moves, slot, gains, sizes, predicted, _ = self._passed
         which, used = self.trial.steps[1][at], self.trial.used[at]
         rows = self.system[2]
-        found = _variances(moves, which, rows, used, slot[at], gains, sizes, predicted, shown[None])
+        found = kernels.variances(moves, which, rows, used, slot[at], gains, sizes, predicted, shown[None])
         return np.asarray(np.sqrt(found[:, 0]))
+
+
+ROUNDING = 1e-12
+"""Share of the squared size of a column that rounding may have made."""
+LEAST_PRECISION = 1e-10
+"""Of an unknown of which nothing is known before."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Unknowns given the readings: log evidence [nat, up to a constant], mean (K,) and covariance (K, K)."""
+
+    evidence: float
+    mean: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Products of the whitened residual (first) and K columns, summed over trials.
+
+    Attributes
+    ----------
+    products : (1 + K, 1 + K) ndarray
+        Unknowns of single trials are gone from it.
+    log_determinant : float
+        What the covariance of the readings and those unknowns take from the evidence [nat].
+    """
+
+    products: FloatArray
+    log_determinant: float
+
+    def solve(self, chosen: Sequence[int], precision: FloatArray) -> Solution:
+        """Return evidence and values of some of the columns (from 0), of given prior precisions (K,)."""
+        at = np.array([0, *(1 + k for k in chosen)])
+        part = self.products[np.ix_(at, at)]
+        prior = np.maximum(precision, LEAST_PRECISION)
+        size = 1.0 / np.sqrt(np.diag(part)[1:] + prior)  # columns may be of any scale, and nearly one another
+        scaled = (part[1:, 1:] + np.diag(prior)) * np.outer(size, size) + ROUNDING * np.eye(len(size))
+        factor = cho_factor(scaled)
+        mean = size * cho_solve(factor, size * part[1:, 0])
+        left = np.r_[1.0, -mean]
+        value = -0.5 * float(left @ part @ left + mean @ (prior * mean)) - self.log_determinant
+        value -= float(np.sum(np.log(np.diag(factor[0]) / size)) + 0.5 * np.sum(np.log(prior)))
+        return Solution(value, mean, np.outer(size, size) * cho_solve(factor, np.eye(len(prior))))
+
+
+def local_solution(
+    whitened: FloatArray, local: FloatArray, precision: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """Return how whitened columns (M, K) depend on unknowns of a trial (M, L), and what they take away.
+
+    Returns
+    -------
+    coefficients : (L, K) ndarray
+        Least squares with the prior.
+    products : (K, K) ndarray
+        Of the columns, these unknowns being gone.
+    half : float
+        Half the log determinant that they add [nat].
+    """
+    if not local.shape[1]:
+        return np.zeros((0, whitened.shape[1])), whitened.T @ whitened, 0.0
+    prior = np.maximum(precision, LEAST_PRECISION)
+    cross = local.T @ whitened
+    factor = cho_factor(local.T @ local + np.diag(prior))
+    coefficients = cho_solve(factor, cross)
+    half = float(np.sum(np.log(np.diag(factor[0])))) - 0.5 * float(np.sum(np.log(prior)))
+    return coefficients, whitened.T @ whitened - cross.T @ coefficients, half
+
+
+def regression(
+    filtered: Sequence[Filtered], residuals: Sequence[FloatArray], columns: Sequence[FloatArray]
+) -> Regression:
+    """Return the products of residuals (N, C) and columns (K, N, C), one of a trial each, whitened alike."""
+    total: FloatArray | float = 0.0
+    log_determinant = 0.0
+    for one, residual, given in zip(filtered, residuals, columns, strict=True):
+        trial = one.trial
+        whole = one.whitened(np.concatenate((residual[None], given, trial.local)))
+        split = 1 + len(given)
+        _, products, half = local_solution(whole[:, :split], whole[:, split:], trial.local_precision)
+        total = total + products
+        log_determinant += one.log_determinant + half
+    return Regression(np.asarray(total), log_determinant)

@@ -6,8 +6,8 @@ from itertools import product
 from math import comb, log
 
 import numpy as np
-from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Setting
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.gates import SHAPE_GAIN
@@ -17,7 +17,6 @@ from discrepancy.search_settings import SEARCH
 from .filtered import Process
 from .view import Processes
 
-FloatArray = NDArray[np.float64]
 Key = tuple[tuple[str, str], ...]
 
 LEVELS = (-1.3, -0.4, 0.4, 1.3)

@@ -8,11 +8,10 @@ Shapes: n states, c channels, N samples, K columns that are filtered alike, J di
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.campaign.sampling import IntArray
+from fe.compilation import callable_when_compiled, compiled
 
 SMALL_PART, ORDERS = 0.25, 12
 """Norm of what is summed as a series, and its orders: 1e-16 is left out."""
@@ -20,6 +19,17 @@ STEADY = 1e-9
 """A covariance that moves less than this, over the deviations that it holds, is steady."""
 
 
+@callable_when_compiled
+def is_steady(one: FloatArray, other: FloatArray) -> bool:
+    """Return whether two covariances (n, n) are the same within `STEADY`."""
+    for i in range(len(one)):
+        for j in range(len(one)):
+            if abs(one[i, j] - other[i, j]) > STEADY * np.sqrt(one[i, i] * one[j, j]):
+                return False
+    return True
+
+
+@compiled
 def discretised(
     generator: FloatArray, intensity: FloatArray, lengths: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -51,6 +61,7 @@ def discretised(
     return moves, noises
 
 
+@compiled
 def covariances(
     transitions: FloatArray, noises: FloatArray, which: IntArray, rows: FloatArray, used: BoolArray,
     start: FloatArray,
@@ -106,15 +117,7 @@ def covariances(
     )  # fmt: skip
 
 
-def is_steady(one: FloatArray, other: FloatArray) -> bool:
-    """Return whether two covariances (n, n) are the same within `STEADY`."""
-    for i in range(len(one)):
-        for j in range(len(one)):
-            if abs(one[i, j] - other[i, j]) > STEADY * np.sqrt(one[i, i] * one[j, j]):
-                return False
-    return True
-
-
+@compiled
 def whitened(
     transitions: FloatArray, which: IntArray, rows: FloatArray, used: BoolArray, slot: IntArray,
     gains: FloatArray, sizes: FloatArray, columns: FloatArray,
@@ -156,6 +159,7 @@ def whitened(
     return found
 
 
+@compiled
 def smoothed(
     transitions: FloatArray, which: IntArray, rows: FloatArray, used: BoolArray, slot: IntArray,
     gains: FloatArray, sizes: FloatArray, readings: FloatArray,
@@ -189,6 +193,7 @@ def smoothed(
     return means, later
 
 
+@compiled
 def between(
     parts: int, fine: FloatArray, fine_noise: FloatArray, which: IntArray, slot: IntArray,
     filtered: FloatArray, means: FloatArray, later: FloatArray,
@@ -222,6 +227,7 @@ def between(
     return found
 
 
+@compiled
 def variances(
     transitions: FloatArray, which: IntArray, rows: FloatArray, used: BoolArray, slot: IntArray,
     gains: FloatArray, sizes: FloatArray, predicted: FloatArray, shown: FloatArray,
@@ -246,6 +252,7 @@ def variances(
     return found
 
 
+@compiled
 def driven(
     parts: int, fine: FloatArray, begin: FloatArray, end: FloatArray, which: IntArray, start: FloatArray,
     course: FloatArray,

@@ -12,21 +12,17 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.fits.candidate import Candidate, Term
-from discrepancy.fits.linearisation import Point
+from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.problem import Problem
 
 from .columns import Columns
-from .filtered import Process
+from .filtered import Process, Solution
 from .hypotheses import Key, both_signs, key_of, log_prior, scaled, sized, stepped, variants
-from .regression import Solution
 from .trial import seen_trial
 from .view import SHARES, Column, Motion, Processes, View, combined
-
-FloatArray = NDArray[np.float64]
 
 NOTHING, NO_VALUES = Candidate(), np.zeros(0)
 WIDE = 3.0

@@ -1,7 +1,7 @@
 """A trial in which a missing force is looked for: what is left of its readings, and what unknowns do to them.
 
 Readings and columns are over the deviations of their noise. The unknowns are those of
-`fits.unknowns`, taken at their prior means; a calibrated parameter acts on the motion that the model has (a
+`fits.trial_data`, taken at their prior means; a calibrated parameter acts on the motion that the model has (a
 column) and on what the missing force adds to it (`slopes`), so that both together are exact along the motion
 that was.
 """
@@ -13,24 +13,19 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import NoiseModel
-from discrepancy.campaign.records import Quantity, Trial
-from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.linearisation import PARAMETER_STEP, Point, moved
+from discrepancy.campaign.records import BoolArray, FloatArray, Quantity, Trial
+from discrepancy.campaign.sampling import IntArray
+from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, moved
 from discrepancy.fits.problem import Problem
 from discrepancy.models.acting import refined
 from discrepancy.models.interface import PortedSystem
-from fe.compilation import compiled
 
-from . import kalman_kernels as kernels
+from .kalman_kernels import driven
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 Outputs = tuple[tuple[str, Quantity], ...]
 
 FINEST, COARSEST = 16, 4
@@ -43,8 +38,6 @@ SMALL = 1e-3
 """Step of the derivative of a system by a parameter, in prior deviations."""
 
 NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
-
-_driven = compiled(kernels.driven)
 
 
 class PortMotion(NamedTuple):
@@ -193,7 +186,7 @@ class SeenTrial:
         begins, ends = np.ascontiguousarray(begins @ directions), np.ascontiguousarray(ends @ directions)
         pushes = np.ascontiguousarray(pushes)
         which = self.steps[1] if which is None else which
-        return np.asarray(_driven(self.parts, moves, begins, ends, which, start, pushes))
+        return np.asarray(driven(self.parts, moves, begins, ends, which, start, pushes))
 
     def readings(self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES) -> FloatArray:
         """Return what readings (N, C) show of an added state (F, n), and at once of forces (F,) at ports."""

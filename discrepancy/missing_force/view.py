@@ -6,14 +6,13 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from .filtered import Filtered, Process
-from .regression import Regression, Solution, local_solution, regression
+from discrepancy.campaign.records import FloatArray
+
+from .filtered import Filtered, Process, Regression, Solution, local_solution, regression
 from .trial import SeenTrial
 
-FloatArray = NDArray[np.float64]
 Processes = Mapping[int, Process]
 """Missing forces by the numbers of their ports."""
 

@@ -10,9 +10,8 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import TrialKind
+from discrepancy.campaign.records import BoolArray, FloatArray, TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
@@ -23,13 +22,11 @@ from discrepancy.verdict import GapWindow, Moment
 
 from .events import GROUND, MOST_EVENTS, Events, changes, events
 from .filtered import Process
-from .force import of_nothing
 from .naming import Explained, ForceSearch, seen
+from .shares import of_nothing
 from .trial import SeenTrial
 from .view import View
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 IN_TIME = frozenset(TrialKind) - {TrialKind.STATIC}
 
 SHOWS = 0.2

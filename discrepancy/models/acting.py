@@ -93,19 +93,20 @@ class Course:
         inside = np.clip(time, self.time[0], self.time[-1]) if self.motion is None else time
         return np.asarray(self._splines[order](inside))
 
-    def ends(self, time: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def ends(self, time: FloatArray, order: int = 0) -> tuple[FloatArray, FloatArray]:
         """Return the values (K,) at the begin and at the end of the steps between times (K + 1,).
 
-        Of a spline those of straight lines that have its mean effect, to fourth order in the step.
+        Of a spline, or of a derivative of it, those of straight lines that have its mean effect, to fourth
+        order in the step.
         """
-        return self._known.get(("ends", time.tobytes()), lambda: self._ends(time))
+        return self._known.get((order, "ends", time.tobytes()), lambda: self._ends(time, order))
 
-    def _ends(self, time: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _ends(self, time: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
         if self.hold is Hold.ZERO_ORDER:
             held = self.at(0.5 * (time[1:] + time[:-1]))
             return held, held
-        found, bend = self.at(time), np.diff(time) ** 2 / 12.0
-        curve = self.at(time, 2) if self.is_smooth else np.zeros(len(time))
+        found, bend = self.at(time, order), np.diff(time) ** 2 / 12.0
+        curve = self.at(time, order + 2) if self.is_smooth and order < 2 else np.zeros(len(time))
         return found[:-1] - bend * curve[:-1], found[1:] - bend * curve[1:]
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
+from discrepancy.models.fmu_laws import FmuLaws
 from discrepancy.models.fmu_motion import FmuMotion
-from discrepancy.models.fmu_ports import SAFE_TURN
+from discrepancy.models.fmu_ports import FmuPorts
 from discrepancy.models.fmu_runs import FmuRuns, State
 from discrepancy.models.fmu_trials import Asked, FmuPatch, FmuTrials, sampled
 from discrepancy.models.interface import (
@@ -24,6 +25,7 @@ from discrepancy.models.interface import (
     Scales,
     campaign_sizes,
 )
+from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.port_system import PortSystem
 from discrepancy.models.questions import (
@@ -47,8 +49,10 @@ from fe.runtime.patch import (
 )
 from fmu_asset.errors import FmuError
 
-FINER = (1, 2, 4, 8, 16)
-"""Refinements of the step at which the system of the ports is looked for."""
+FINER = 2
+"""Steps under a recorded force are so many times smaller where laws act on the motion, too."""
+KEPT_SHOWN = 16
+"""Responses without laws that are kept while laws are tried."""
 
 
 class FmuModel(DescribedModel):
@@ -77,11 +81,14 @@ class FmuModel(DescribedModel):
         self.runs = FmuRuns(description, Path(folder))
         super().__init__(description, self.runs.quantities)
         self.length = description.scales.length
-        self._trials = FmuTrials(description, self.runs)
-        self._check_settings()
+        self._trials = FmuTrials(self.runs)
+        self._check_ranges()
         means = Conditions(np.array([item.mean for item in self.parameters]))
         nominal = self._trials.state(Asked(_any_trial(TrialKind.RINGDOWN, 1.0), means))
-        self.motion = FmuMotion(description, self.runs, nominal)
+        self._shown = Memory(KEPT_SHOWN)
+        self.motion = FmuMotion(self.runs)
+        self.fmu_ports = FmuPorts(self.motion, nominal)
+        self._laws = FmuLaws(self.fmu_ports)
 
     @classmethod
     def load(cls, path: Path | str) -> "FmuModel":
@@ -92,8 +99,8 @@ class FmuModel(DescribedModel):
         """End the FMU; it is opened again when it is needed."""
         self.runs.close()
 
-    def _check_settings(self) -> None:
-        """Refuse effects and parameters that the FMU does not have, and ranges wider than its own."""
+    def _check_ranges(self) -> None:
+        """Refuse ranges of parameters that are wider than those of the FMU."""
         asset = self.runs.asset
         for item in self.description.parameter:
             key = self.runs.parameter(item.variable or item.name)
@@ -105,25 +112,6 @@ class FmuModel(DescribedModel):
                         f"The FMU model {self.name!r}: [[parameter]] {item.name} has the range {item.low:g} "
                         f"to {item.high:g}, which the FMU {asset.description.path} cannot have: {cause}"
                     ) from cause
-        names = {
-            f"effects.{kind}": f"effect.{identifier}.active"
-            for kind, identifier in self.description.effects.items()
-        }
-        bound = asset.binding.parameter
-        for table in ("static", "motion"):
-            for name in getattr(self.description, table).parameters:
-                key = self.runs.parameter(name)
-                names[f"{table}.parameters.{name}"] = bound[key].variable if key in bound else key
-        for where, variable in names.items():
-            found = asset.description.variable(variable)
-            if found is None or found.causality != "parameter":
-                what = (
-                    "does not have" if found is None else f"declares as {found.causality}, not as parameter"
-                )
-                raise ModelError(
-                    f"The FMU model {self.name!r}: {where} needs {variable!r}, which the FMU "
-                    f"{asset.description.path} {what}."
-                )
 
     # ------------------------------------------------------------ what it is
 
@@ -146,12 +134,12 @@ class FmuModel(DescribedModel):
         largest = np.zeros(len(self.ports()))
         for trial in campaign.trials:
             if trial.is_dynamic:
-                moved = self.motion.free(self._trials.run(Asked(trial, conditions), self.motion, 1))
+                moved = self.motion.free(self._trials.run(Asked(trial, conditions), self.fmu_ports, 1))
             else:
                 moved = self._at_rest(Asked(trial, replace(conditions, health=trial.health)))
-            largest = np.maximum(largest, np.max(np.abs(moved[:, self.motion.ports.x]), axis=0))
+            largest = np.maximum(largest, np.max(np.abs(moved[:, self.fmu_ports.x]), axis=0))
         stiffness, frequency = self._stiffness(campaign, conditions)
-        forces = zip(self.motion.ports.forces, stiffness, strict=True)
+        forces = zip(self.fmu_ports.forces, stiffness, strict=True)
         pushed = [pair for force, pair in forces if force in self._trials.forces.values()]
         modal, tip = (pushed or stiffness or [(1.0, 1.0)])[0]
         frequency = given.angular_frequency or frequency or 1.0
@@ -175,17 +163,17 @@ class FmuModel(DescribedModel):
         for trial in campaign.trials:
             if trial.is_dynamic:
                 state = self._trials.state(Asked(trial, conditions))
-                step = self.motion.step(trial, 1)
-                found = [self.motion.ports.stiffness(number, state, step) for number in ports]
-                return found, given or self.motion.measured_frequency(trial, state)
+                step = self.fmu_ports.step(trial, 1)
+                found = [self.fmu_ports.stiffness(number, state, step) for number in ports]
+                return found, given or self.fmu_ports.measured_frequency(trial, state)
         still = campaign.trials[0] if campaign.trials else _any_trial(TrialKind.STATIC, 1.0)
         state = self._trials.state(Asked(still, replace(conditions, health=still.health)))
-        flexible = self.motion.flexibility(state)
+        flexible = self.fmu_ports.flexibility(state)
         frequency, interval = given, 0.01
         for _ in range(0 if campaign.trials or given else 3):  # until the interval suits the frequency
             trial = _any_trial(TrialKind.RINGDOWN, interval)
             state = self._trials.state(Asked(trial, conditions))
-            frequency = self.motion.measured_frequency(trial, state)
+            frequency = self.fmu_ports.measured_frequency(trial, state)
             interval = 0.3 / frequency
         return [(1.0 / float(flexible[port, port]),) * 2 for port in ports], frequency
 
@@ -211,14 +199,26 @@ class FmuModel(DescribedModel):
     def _moving(self, asked: Asked, columns: Sequence[int], orders: Sequence[int]) -> Response:
         """Return columns of the FMU's outputs at the samples of a dynamic trial, derived so many times."""
         trial, conditions, patch = asked
-        excite = partial(self._trials.run, asked, self.motion)
-        if len(patch.laws):
-            values, step = self.motion.with_laws(patch.laws, excite, trial, conditions.refinement, columns)
-        else:
-            run = excite(conditions.refinement)
-            values, step = self.motion.free(run), run.step
-        rate, zero = conditions.clock
-        return sampled(values[:, columns], step, (1.0 + rate) * trial.time + zero, orders)
+        excite = partial(self._trials.run, asked, self.fmu_ports)
+        laws, (rate, zero) = patch.laws, conditions.clock
+        finer = FINER if len(laws) and trial.kind is TrialKind.FORCED else 1
+        run = excite(conditions.refinement * finer)
+
+        def shown(values: FloatArray, step: float) -> Response:
+            return sampled(values, step, (1.0 + rate) * trial.time + zero, orders)
+
+        free = self.motion.free(run)
+        added = self._laws.added(laws, run, free, trial, columns) if len(laws) else None
+        if len(laws) and added is None:
+            return shown(*self._laws.stepped(laws, excite, trial, conditions.refinement, columns))
+        key = (*columns, *orders, rate, zero, trial.time.tobytes(), run.key)
+        found = self._shown.get(key, lambda: shown(free[:, columns], run.step))
+        if added is None:
+            return found
+        further = shown(*added)
+        assert found.rates is not None  # of a motion there are
+        assert further.rates is not None
+        return Response(found.values + further.values, found.rates + further.rates)
 
     # ------------------------------------------------------------ ports
 
@@ -232,29 +232,26 @@ class FmuModel(DescribedModel):
         """
         means = np.array([item.mean for item in self.declared])
         base, found = (self._port_system(trial, values) for values in (means, parameters))
-        if base is None or found is None or len(base.transition) != len(found.transition):
+        if base is None or found is None or len(base.push) != len(found.push):
             raise ModelError(
                 f"The FMU model {self.name!r} does not tell by its answers to single forces how its ports "
                 "move; it is not linear, or they are too few or too rough."
             )
-        shown = list(zip(self._columns(outputs), self._orders(outputs), strict=True))
-        return found.in_state_of(base).ported(self.ports(), self.motion.ports.x, self.motion.ports.v, shown)
+        found = found.in_state_of(base)
+        position, speed = np.split(found.of_ports(self.fmu_ports.x, self.fmu_ports.v).outputs, 2)
+        rows, at_once = found.rows(list(zip(self._columns(outputs), self._orders(outputs), strict=True)))
+        return PortedSystem(found.generator, self.ports(), found.push.T, position, speed, rows, at_once.T)
 
     def _port_system(self, trial: Trial, parameters: FloatArray) -> PortSystem | None:
-        """Return the system of the ports by steps so small that no mode turns by half a circle."""
+        """Return the system of the ports."""
         conditions = Conditions(parameters, health=trial.health[:1])
         state = self._trials.state(Asked(trial, conditions, self._parts(self.patch)))
-        for refinement in FINER:
-            step = self.motion.step(trial, refinement)
-            found = self.motion.ports.system(state, step, len(trial.time)) if self.ports() else None
-            if found is None or found.largest_turn <= SAFE_TURN:
-                return found
-        return None
+        return self.fmu_ports.system(state, self.fmu_ports.step(trial), len(trial.time))
 
     def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         asked = Asked(trial, conditions, self._parts(self.patch)._replace(laws=NO_LAWS))
-        found = self._moving(asked, self.motion.ports.x, [0] * len(self.ports()))
+        found = self._moving(asked, self.fmu_ports.x, [0] * len(self.ports()))
         assert found.rates is not None  # of a motion there are
         return found.values, found.rates
 
@@ -269,7 +266,7 @@ class FmuModel(DescribedModel):
             return np.stack(
                 [self._rest(trial, row, *held) for row, held in enumerate(zip(states, loads, strict=True))]
             )
-        return self.motion.rest_with_laws(trial.name, states, loads, patch.laws)
+        return self._laws.at_rest(trial.name, states, loads, patch.laws)
 
     def _rest(self, trial: Trial, row: int, state: State, loads: dict[str, float]) -> FloatArray:
         """Return all outputs (C,) of a row; what the FMU refuses is said with its place."""

@@ -16,6 +16,7 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.memory import Memory
+from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import Binding, Input, Parameter, Vector, expand, load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuError
@@ -80,6 +81,11 @@ class Run(NamedTuple):
     steps: int
     loads: Loads
 
+    @property
+    def key(self) -> Hashable:
+        """What tells it from others."""
+        return *self[:3], tuple((part.key, value) for part, value in self.loads)
+
 
 class FmuRuns:
     """An FMU with the variables that a model needs, in SI units.
@@ -108,11 +114,12 @@ class FmuRuns:
     """
 
     def __init__(self, description: FmuModelDescription, folder: Path) -> None:
-        self._description = description
+        self.description = description
         self._path = folder / description.fmu
         self._assets = Memory(MOST_INSTANCES, end=FmiAsset.close)
         self._kept = Memory(KEPT_BYTES, lambda found: found.nbytes)
         with self._refusals():
+            self._fmu = read_fmu(self._path)
             file = binding_file(description, folder)
             self._base = None if file is None else load_binding(file)
             self._binding = self._made_binding()
@@ -125,7 +132,7 @@ class FmuRuns:
         try:
             yield
         except FmuError as cause:
-            raise ModelError(f"The FMU model {self._description.name!r}: {cause}") from cause
+            raise ModelError(f"The FMU model {self.description.name!r}: {cause}") from cause
 
     # ------------------------------------------------------------ names
 
@@ -147,7 +154,7 @@ class FmuRuns:
         return next((key for key, item in self._base.parameter.items() if item.variable == name), name)
 
     def _made_binding(self) -> Binding:
-        given, base = self._description, self._base
+        given, base = self.description, self._base
         wanted = given.inputs
         self.input_factors: dict[str, float] = {}
         units: dict[str | None, str] = {
@@ -170,8 +177,11 @@ class FmuRuns:
             key: Parameter(variable=item.variable, unit=item.unit, value=item.value)
             for key, item in (base.parameter if base is not None else {}).items()
         }
+        effects = (f"effect.{identifier}.active" for identifier in given.effects.values())
+        further = (*given.static.parameters, *given.motion.parameters, *effects)
         own: list[tuple[str | None, str]] = [
-            (item.variable or item.name, item.unit) for item in given.parameter
+            *((name, self._own_unit(name)) for name in further if self.parameter(name) not in parameters),
+            *((item.variable or item.name, item.unit) for item in given.parameter),
         ]
         if given.release is not None:
             own += [(given.release.displacement, "m"), (given.release.velocity, "m/s")]
@@ -224,9 +234,7 @@ class FmuRuns:
         return Binding.model_validate(content)
 
     def _own_unit(self, variable: str) -> str:
-        from fmu_asset.archive.fmu_file import read_fmu
-
-        found = read_fmu(self._path).variable(variable)
+        found = self._fmu.variable(variable)
         return (found.unit if found is not None else None) or "1"
 
     # ------------------------------------------------------------ running
@@ -246,7 +254,7 @@ class FmuRuns:
 
         def opened() -> FmiAsset:
             binding = self._binding.with_header(step_size=step)
-            return FmiAsset(self._path, binding, isolated=self._description.isolated)
+            return FmiAsset(self._path, binding, isolated=self.description.isolated)
 
         return self._assets.get(step, opened)
 
@@ -287,7 +295,7 @@ class FmuRuns:
         return asset, self._settled(asset, step) if settle else values
 
     def _settled(self, asset: FmiAsset, step: float) -> FloatArray:
-        rest = self._description.static
+        rest = self.description.static
         largest = np.zeros(0)
         waited = 0.0
         while True:

@@ -10,8 +10,7 @@ from scipy.interpolate import CubicSpline
 from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course
-from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.fmu_motion import FmuMotion
+from discrepancy.models.fmu_ports import FmuPorts
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Run, State
 from discrepancy.models.interface import Conditions, Response
 from discrepancy.models.questions import LoadChange, place_among, release_of
@@ -63,10 +62,8 @@ class FmuTrials:
 
     Parameters
     ----------
-    description : FmuModelDescription
-        The model's file.
     runs : FmuRuns
-        Its FMU.
+        The FMU.
 
     Attributes
     ----------
@@ -74,28 +71,29 @@ class FmuTrials:
         The FMU's inputs of applied forces, by load place.
     """
 
-    def __init__(self, description: FmuModelDescription, runs: FmuRuns) -> None:
+    def __init__(self, runs: FmuRuns) -> None:
+        description = runs.description
         self._description, self._runs, self._name = description, runs, description.name
         self._keys = [runs.parameter(item.variable or item.name) for item in description.parameter]
         self.forces = {place: runs.variable(name) for place, name in description.inputs.forces.items()}
         self._inputs = {item.name: runs.variable(item.variable or item.name) for item in description.input}
 
-    def run(self, asked: Asked, motion: FmuMotion, refinement: int) -> Run:
+    def run(self, asked: Asked, ports: FmuPorts, refinement: int) -> Run:
         """Return the run by which the FMU follows a dynamic trial."""
         trial, conditions, _ = asked
-        step = motion.step(trial, refinement)
+        step = ports.step(trial, refinement)
         rate, zero = conditions.clock
         end = max((1.0 + rate) * float(trial.time[-1]) + zero, float(trial.time[-1]))
         # a little longer, so that a clock that is being fitted does not ask for another run
         steps = ceil(end / step * (1.0 + 2e-9) - 1e-6) + (0 if (rate, zero) == (0.0, 0.0) else 1)
         if trial.kind is TrialKind.RINGDOWN:
-            loads = self._release(trial, conditions, motion)
+            loads = self._release(trial, conditions, ports)
         else:
             loads = self._forced(asked, step, steps)
         return Run(self.state(asked), step, steps, loads)
 
     def _release(
-        self, trial: Trial, conditions: Conditions, motion: FmuMotion
+        self, trial: Trial, conditions: Conditions, ports: FmuPorts
     ) -> list[tuple[Excitation, float]]:
         release, way = release_of(trial), self._description.release
         if way is None:
@@ -114,7 +112,7 @@ class FmuTrials:
                 f"can follow only if [release] names parameters of displacement and velocity."
             )
         unit = release.displacement
-        speed = motion.angular_frequency(trial)
+        speed = ports.angular_frequency(trial)
         return [
             (Excitation("displacement"), unit * float(first[0])),
             (Excitation("velocity"), unit * speed * float(first[1])),

@@ -68,32 +68,29 @@ def held_forces(
 
 
 def couple(
-    system: tuple[FloatArray, ...], free: tuple[FloatArray, FloatArray], h: float, gain: FloatArray,
-    port_of: IntArray, ports: Ports, memory: FloatArray, states: FloatArray, applied: FloatArray,
+    system: tuple[FloatArray, ...], free: FloatArray, h: float, gain: FloatArray, port_of: IntArray,
+    ports: Ports, memory: FloatArray, last: FloatArray, states: FloatArray, applied: FloatArray,
 ) -> None:  # fmt: skip
-    """Couple the laws with a linear system; `states` (N + 1, n) and `applied` (N, P) are filled.
+    """Couple the laws with a linear system; fill `states` (N + 1, n), and add the forces to `applied` (N, P).
 
-    `system`: transition, drive, and the rows of the ports (P, n), (P, P), those of displacement and then of
-    velocity. `free`: displacement and velocity (N + 1, P) without the laws.
+    `system` holds transition, drive, and rows (2 P, n), (2 P, P) of the ports' displacements and speeds, to
+    which `free` (N + 1, 2 P) is added; `last` (J,) as in `held_forces`.
     """
-    transition, drive, x_rows, x_direct, v_rows, v_direct = system
-    free_x, free_v = free
+    transition, drive, seen, direct = system
     count, size = len(applied), len(ports.numbers)
     order, width = transition.shape[0], applied.shape[1]
-    rows = np.zeros((6, size))
-    x, v, last, forces, room = rows[0], rows[1], rows[2], rows[3], rows[4:]
-    for j in range(size):
-        last[j] = 2.0 * free_v[0, port_of[j]] - free_v[1, port_of[j]]
+    rows = np.zeros((5, size))
+    x, v, forces, room = rows[0], rows[1], rows[2], rows[3:]
     for k in range(count):
         for j in range(size):
             p = port_of[j]
-            x[j], v[j] = free_x[k, p], free_v[k, p]
+            x[j], v[j] = free[k, p], free[k, width + p]
             for n in range(order):
-                x[j] += x_rows[p, n] * states[k, n]
-                v[j] += v_rows[p, n] * states[k, n]
+                x[j] += seen[p, n] * states[k, n]
+                v[j] += seen[width + p, n] * states[k, n]
             for i in range(width if k > 0 else 0):
-                x[j] += x_direct[p, i] * applied[k - 1, i]
-                v[j] += v_direct[p, i] * applied[k - 1, i]
+                x[j] += direct[p, i] * applied[k - 1, i]
+                v[j] += direct[width + p, i] * applied[k - 1, i]
         held_forces(x, v, last, gain, h, ports, memory, forces, room)
         for j in range(size):
             applied[k, port_of[j]] -= forces[j]
@@ -134,31 +131,44 @@ def first_memory(internal: Laws, positions: FloatArray) -> FloatArray:
 
 
 def coupled_motion(
-    system: PortSystem, rows: tuple[FloatArray, ...], free_x: FloatArray, free_v: FloatArray,
+    system: PortSystem, step: float, start: FloatArray, forces: FloatArray, free: FloatArray,
     laws: Laws, port_of: list[int],
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Return states (N + 1, n) and applied forces (N, P) of a linear system with laws at its ports.
 
-    `rows` are the system's `port_rows`. Free motion (N + 1, P), displacement and velocity, is that without
-    the laws; `port_of` the port of each.
+    Parameters
+    ----------
+    system : PortSystem
+        Its outputs are those of `PortSystem.of_ports`.
+    step : float
+        [s].
+    start, forces : (n,), (N, P) ndarray
+        State at the begin, and forces over the steps beside those of the laws.
+    free : (N + 1, 2 P) ndarray
+        Displacement and velocity of the ports that are not those of the system.
+    laws : Laws
+        Internal forces.
+    port_of : list of int
+        Port of each law.
     """
-    index = np.array(port_of, dtype=np.int64)
-    steps, width = len(free_x) - 1, free_x.shape[1]
-    states, applied = np.zeros((steps + 1, len(system.transition))), np.zeros((steps, width))
-    gain = rows[2] @ system.drive + rows[3]
-    arrays = (system.transition, system.drive, *rows, free_x, free_v, gain[np.ix_(index, index)])
-    *given, free_x, free_v, gain = (np.ascontiguousarray(item, dtype=np.float64) for item in arrays)
+    index, (transition, drive) = np.array(port_of, dtype=np.int64), system.over(step)
+    speeds = len(system.outputs) // 2 + index
+    gain = (system.outputs[speeds] @ drive + system.direct[speeds])[:, index]
+    states, applied = np.zeros((len(forces) + 1, len(start))), forces.copy()
+    states[0] = start
+    arrays = (transition, drive, system.outputs, system.direct)
     _compiled(couple)(
-        tuple(given), (free_x, free_v), system.step, gain, index, _ports(laws),
-        first_memory(laws, free_x[0, index]), states, applied,
+        tuple(map(np.ascontiguousarray, arrays)), np.ascontiguousarray(free), step,
+        np.ascontiguousarray(gain), index, _ports(laws), first_memory(laws, free[0, index]),
+        2.0 * free[0, speeds] - free[1, speeds], states, applied,
     )  # fmt: skip
     return states, applied
 
 
 def stepper(
-    laws: Laws, port_of: list[int], gain: FloatArray, step: float, free_x: FloatArray, free_v: FloatArray
-) -> Callable[[FloatArray, FloatArray], FloatArray]:
-    """Return what gives the forces (P,) over the next step of an FMU, from how its ports are and move.
+    laws: Laws, port_of: list[int], gain: FloatArray, step: float, free: FloatArray
+) -> Callable[[FloatArray], FloatArray]:
+    """Return what gives the forces (P,) over the next step of an FMU, from how its ports are and move (2 P,).
 
     Parameters
     ----------
@@ -170,16 +180,17 @@ def stepper(
         Speed of each port after a step with a unit force at another.
     step : float
         [s].
-    free_x, free_v : (2, P) ndarray
+    free : (2, 2 P) ndarray
         Displacement and velocity of the ports without the laws, at the start and a step later.
     """
     index, ports = np.array(port_of, dtype=np.int64), _ports(laws)
+    speeds = len(gain) + index
     own = np.ascontiguousarray(gain[np.ix_(index, index)])
-    memory, last = first_memory(laws, free_x[0, index]), (2.0 * free_v[0] - free_v[1])[index]
+    memory, last = first_memory(laws, free[0, index]), 2.0 * free[0, speeds] - free[1, speeds]
     forces, room = np.zeros(len(laws)), np.zeros((2, len(laws)))
 
-    def forces_at(x: FloatArray, v: FloatArray) -> FloatArray:
-        _compiled(held_forces)(x[index], v[index], last, own, step, ports, memory, forces, room)
+    def forces_at(moving: FloatArray) -> FloatArray:
+        _compiled(held_forces)(moving[index], moving[speeds], last, own, step, ports, memory, forces, room)
         given = np.zeros(len(gain))
         np.subtract.at(given, index, forces)
         return given

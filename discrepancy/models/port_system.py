@@ -1,80 +1,61 @@
 """The ports of a linear FMU as a linear system, made from its answers to single forces."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from warnings import catch_warnings, simplefilter
 
 import numpy as np
-from scipy.linalg import expm, logm
+from scipy.linalg import logm
+from scipy.signal import cont2discrete
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.models.interface import PortedSystem
+from discrepancy.models.memory import Memory
 
+KEPT_STEPS = 16
 MOST_STATES = 40
 """Largest order of a linear system that is made from records."""
 HANKEL_ROWS = 160
 INDEPENDENT = 1e5
 """Condition up to which eigenvectors give the logarithm of a matrix, 20 times faster than `logm`."""
+LINEAR = 1e-6
+"""Largest deviation from superposition, as a share of the motion, of an FMU that is taken as linear."""
 FIT = 1e-7
 """Largest error of a linear system against the record that it is made of, as a share of the record."""
 
 
 @dataclass(frozen=True, eq=False)
 class PortSystem:
-    """What forces at P ports do to C outputs of a linear FMU, step by step, beside its free motion.
+    """What forces f at P ports do to C outputs of a linear FMU, beside its free motion.
 
-    s(k+1) = A s(k) + B f(k), y(k+1) = C s(k+1) + D f(k), f held over the step.
+    s' = G s + B f, y = C s + D f, f being that just before where it jumps.
 
     Attributes
     ----------
-    transition, drive, outputs, direct : ndarray
-        A (n, n), B (n, P), C (C, n), D (C, P).
-    step : float
-        [s].
+    generator, push, outputs, direct : ndarray
+        G (n, n) [1/s], B (n, P), C (C, n), D (C, P).
     """
 
-    transition: FloatArray
-    drive: FloatArray
+    generator: FloatArray
+    push: FloatArray
     outputs: FloatArray
     direct: FloatArray
-    step: float
-
-    @cached_property
-    def generator(self) -> FloatArray:
-        """Matrix (n, n) of the motion in time, s' = G s without forces [1/s]."""
-        values, shapes = np.linalg.eig(self.transition)
-        if np.linalg.cond(shapes) < INDEPENDENT:
-            logarithm = (shapes * np.log(values.astype(complex))) @ np.linalg.inv(shapes)
-            return np.asarray(np.real(logarithm) / self.step)
-        with catch_warnings():  # of rounding in what decays within a step
-            simplefilter("ignore", RuntimeWarning)
-            return np.asarray(np.real(logm(self.transition)) / self.step)
+    _steps: Memory = field(default_factory=lambda: Memory(KEPT_STEPS), init=False, repr=False)
 
     @property
-    def largest_turn(self) -> float:
-        """Largest turn of a mode in a step [rad]; beyond pi it would look like a smaller one."""
-        return float(np.max(np.abs(np.angle(np.linalg.eigvals(self.transition)))))
+    def fastest(self) -> float:
+        """Largest angular frequency of a mode [rad/s]."""
+        return float(np.max(np.abs(np.linalg.eigvals(self.generator).imag)))
 
-    @cached_property
-    def push(self) -> FloatArray:
-        """Matrix (n, P) by which forces act in time, s' = G s + push f."""
-        return np.asarray(np.linalg.solve(self._over(self.step)[1], self.drive))
+    def over(self, step: float) -> tuple[FloatArray, FloatArray]:
+        """Return A (n, n) and B (n, P) of s(k+1) = A s(k) + B f(k), f held over steps [s]."""
 
-    def _over(self, step: float) -> tuple[FloatArray, FloatArray]:
-        """Return the transition (n, n) of a step [s], and its integral over the step."""
-        order = len(self.transition)
-        block = np.zeros((2 * order, 2 * order))
-        block[:order, :order], block[:order, order:] = self.generator, np.eye(order)
-        whole = expm(block * step)
-        return whole[:order, :order], whole[:order, order:]
+        def found() -> tuple[FloatArray, FloatArray]:
+            transition, drive, *_ = cont2discrete(
+                (self.generator, self.push, self.outputs, self.direct), step
+            )
+            return transition, drive
 
-    def refined(self, parts: int) -> "PortSystem":
-        """Return the same system with steps that are so many times smaller."""
-        transition, integral = self._over(self.step / parts)
-        finer = PortSystem(transition, integral @ self.push, self.outputs, self.direct, self.step / parts)
-        vars(finer)["generator"] = self.generator  # the motion in time is the same
-        return finer
+        return self._steps.get(step, found)
 
     def in_state_of(self, base: "PortSystem") -> "PortSystem":
         """Return the same system in the state of another of its order.
@@ -87,36 +68,13 @@ class PortSystem:
         size[size == 0.0] = 1.0
         way = np.linalg.lstsq(mine / size, others / size, rcond=None)[0]
         back = np.linalg.inv(way)
-        found = PortSystem(
-            back @ self.transition @ way, back @ self.drive, self.outputs @ way, self.direct, self.step
-        )
-        vars(found)["generator"], vars(found)["push"] = back @ self.generator @ way, back @ self.push
-        return found
-
-    def ported(
-        self,
-        ports: tuple[str, ...],
-        at: Sequence[int],
-        speeds: Sequence[int],
-        shown: Sequence[tuple[int, int]],
-    ) -> PortedSystem:
-        """Return it as the system by which outputs see missing forces.
-
-        Parameters
-        ----------
-        ports : tuple of str
-            Names.
-        at, speeds : sequence of int
-            Columns of the ports' displacements and velocities; -1: there is no velocity.
-        shown : sequence of (int, int)
-            Columns of the outputs, and how often each is derived.
-        """
-        position, _, speed, _ = self.port_rows(at, speeds)
-        rows, at_once = self.rows(shown)
-        return PortedSystem(self.generator, ports, self.push.T, position, speed, rows, at_once.T)
+        return PortSystem(back @ self.generator @ way, back @ self.push, self.outputs @ way, self.direct)
 
     def rows(self, shown: Sequence[tuple[int, int]]) -> tuple[FloatArray, FloatArray]:
-        """Return what outputs, see `ported`, show of the state (K, n), and of forces at once (K, P)."""
+        """Return what outputs show of the state (K, n), and of forces at once (K, P).
+
+        `shown` holds their columns, and how often each is derived.
+        """
         rows, at_once = np.empty((len(shown), len(self.push))), np.empty((len(shown), self.push.shape[1]))
         for number, (column, times) in enumerate(shown):
             row, once = self.outputs[column], self.direct[column]
@@ -125,56 +83,42 @@ class PortSystem:
             rows[number], at_once[number] = row, once
         return rows, at_once
 
-    def port_rows(self, at: Sequence[int], speeds: Sequence[int]) -> tuple[FloatArray, ...]:
-        """Return what `rows` does of the ports' positions, then of their speeds; columns as in `ported`."""
-        moving = [(v, 0) if v >= 0 else (x, 1) for x, v in zip(at, speeds, strict=True)]
-        return *self.rows([(x, 0) for x in at]), *self.rows(moving)
+    def of_ports(self, x: Sequence[int], v: Sequence[int]) -> "PortSystem":
+        """Return it with 2 P outputs, displacements and speeds of the ports by their columns; -1: none."""
+        speeds = [(fast, 0) if fast >= 0 else (slow, 1) for slow, fast in zip(x, v, strict=True)]
+        rows, at_once = self.rows([*((column, 0) for column in x), *speeds])
+        return replace(self, outputs=rows, direct=at_once)
 
-    def motion(self, forces: FloatArray) -> FloatArray:
-        """Return the outputs (N + 1, C) under forces (N, P), from rest."""
-        states = np.zeros((len(forces) + 1, len(self.transition)))
+    def motion(self, forces: FloatArray, step: float) -> FloatArray:
+        """Return the outputs (N + 1, C) under forces (N, P) that are held over steps [s], from rest."""
+        states = np.zeros((len(forces) + 1, len(self.generator)))
+        transition, drive = self.over(step)
         for k, force in enumerate(forces):
-            states[k + 1] = self.transition @ states[k] + self.drive @ force
+            states[k + 1] = transition @ states[k] + drive @ force
         return self.seen(states, forces)
 
-    def seen(self, states: FloatArray, forces: FloatArray) -> FloatArray:
-        """Return the outputs (N + 1, C) of states (N + 1, n) and forces (N, P)."""
-        values = states @ self.outputs.T
-        values[1:] += forces @ self.direct.T
+    def seen(
+        self, states: FloatArray, forces: FloatArray, columns: Sequence[int] | slice = slice(None)
+    ) -> FloatArray:
+        """Return columns of the outputs (N + 1, L) of states (N + 1, n) and forces (N, P)."""
+        values = states @ self.outputs[columns].T
+        values[1:] += forces @ self.direct[columns].T
         return np.asarray(values)
 
-    def start_of(self, free: FloatArray, tolerance: float) -> FloatArray | None:
-        """Return the state (n,) from which the system moves as `free` (K, C), None if it does not.
-
-        The first row of `free` does not count: what holds the structure until then may act on outputs.
-        """
-        free = free[1:]
-        rows, power = (self.outputs @ self.transition)[np.newaxis], self.transition
-        while len(rows) < len(free):
+    def starting(self, shown: int, step: float, count: int) -> FloatArray:
+        """Return what tells the state (n, K * L) by L first outputs at the ends of K free steps [s]."""
+        transition, _ = self.over(step)
+        rows, power = (self.outputs[:shown] @ transition)[np.newaxis], transition
+        while len(rows) < count:
             rows, power = np.concatenate((rows, rows @ power)), power @ power
-        rows = rows[: len(free)]
-        size = np.max(np.abs(free), axis=0)
-        weight = 1.0 / np.where(size > 0.0, size, 1.0)
-        flat = (rows * weight[:, None]).reshape(-1, len(self.transition))
+        flat = rows[:count].reshape(-1, len(transition))
         unit = np.max(np.abs(flat), axis=0)
         unit[unit == 0.0] = 1.0
-        goal = (free * weight).ravel()
-        start = np.linalg.lstsq(flat / unit, goal, rcond=1e-14)[0]
-        if np.max(np.abs(flat / unit @ start - goal)) > tolerance:
-            return None
-        return np.asarray(start / unit)
-
-    def free(self, start: FloatArray, steps: int) -> FloatArray:
-        """Return the free motion (steps + 1, C) from a state (n,)."""
-        states, power = start[np.newaxis], self.transition
-        while len(states) <= steps:
-            states, power = np.concatenate((states, states @ power.T)), power @ power
-        return np.asarray(states[: steps + 1] @ self.outputs.T)
+        return np.asarray(np.linalg.pinv(flat / unit, rcond=1e-14) / unit[:, None])
 
     def gain(self) -> FloatArray:
         """Return the outputs (C, P) at rest under constant unit forces."""
-        still = np.linalg.solve(np.eye(len(self.transition)) - self.transition, self.drive)
-        return np.asarray(self.outputs @ still + self.direct)
+        return np.asarray(self.direct - self.outputs @ np.linalg.solve(self.generator, self.push))
 
     def most_flexible(self, column: int, port: int) -> tuple[float, float] | None:
         """Return the mode that gives an output the most at rest under a port's force; None if none vibrates.
@@ -204,6 +148,15 @@ def _largest(matrix: FloatArray, count: int) -> tuple[FloatArray, FloatArray, Fl
     image = np.linalg.qr(matrix @ random)[0]
     left, values, right = np.linalg.svd(image.T @ matrix, full_matrices=False)
     return image @ left, values, right
+
+
+def _logarithm(transition: FloatArray) -> FloatArray:
+    values, shapes = np.linalg.eig(transition)
+    if np.linalg.cond(shapes) < INDEPENDENT:
+        return np.asarray(np.real((shapes * np.log(values.astype(complex))) @ np.linalg.inv(shapes)))
+    with catch_warnings():  # of rounding in what decays within a step
+        simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.real(logm(transition)))
 
 
 def port_system(records: FloatArray, ports: list[int], step: float) -> PortSystem | None:
@@ -262,5 +215,7 @@ def port_system(records: FloatArray, ports: list[int], step: float) -> PortSyste
         rows = np.linalg.lstsq(flat / unit, goal, rcond=1e-14)[0].T / unit
         error = np.max(np.abs(goal - flat @ rows.T), axis=0)
         if np.all(error <= FIT * np.max(np.abs(goal), axis=0) + 1e-300):
-            return PortSystem(transition, drive, rows, records[0] - rows @ drive, step)
+            whole = np.block([[transition, drive], [np.zeros((inputs, order)), np.eye(inputs)]])
+            generator, push = np.split(_logarithm(whole)[:order] / step, [order], axis=1)
+            return PortSystem(generator, push, rows, records[0] - rows @ drive)
     return None

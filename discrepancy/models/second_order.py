@@ -8,19 +8,15 @@ it for a `Motion`, which says what outputs show. Between the stamps the linear p
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from discrepancy.campaign.records import FloatArray, Release, Start
-from discrepancy.campaign.sampling import is_even
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Response
 from discrepancy.models.linear_system import LinearSystem, solved
-from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import Laws
 from fe.runtime.motion_arrays import Steps
 from fe.runtime.stepwise import Begin, Boundaries, ModalMotion, advance, steps_under, substeps
@@ -198,19 +194,15 @@ class SecondOrderSystem(LinearSystem):
         if memory is not None and laws.spans:
             begin = begin._replace(memory=laws.filled(memory, acts))
         held = int(np.searchsorted(times, 0.0)) if release.at_rest else 0
-        stamps, at_first = times[held:], np.zeros(len(laws)) if begin.memory is None else begin.memory[:, 2]
-        if (laws.linear and not self.modal.coupled) or held == len(times):
-            none = np.zeros((len(stamps), len(laws)))
-            parts = [*free_motion(self.modal, q, v, stamps), none, none]
-        else:
-            if stamps[0] < 0.0:
-                begin = self._backwards(q, v, -float(stamps[0]))
-            found = self._followed(acting, laws, 0.0, stamps, begin, refinement)
-            parts = [found.q, found.v, found.port_forces, found.lagged]
-        if held:
-            still = zip((q, v, at_first, at_first), parts, strict=True)
-            parts = [np.vstack((np.tile(first, (held, 1)), part)) for first, part in still]
-        q, v, forces, lagged = parts
+        stamps = times[held:] if held < len(times) else np.zeros(1)  # which nobody looks at
+        if stamps[0] < 0.0:
+            begin = self._backwards(q, v, -float(stamps[0]))
+        found = self._followed(acting, laws, 0.0, stamps, begin, refinement)
+        felt = np.zeros(len(laws)) if begin.memory is None else begin.memory[:, 2]
+        parts = zip((q, v, felt, felt), (found.q, found.v, found.port_forces, found.lagged), strict=True)
+        q, v, forces, lagged = (
+            np.vstack((np.tile(still, (held, 1)), part))[: len(times)] for still, part in parts
+        )
         return Motion(self, acting, times, q, v, forces, lagged, laws, held, holding)
 
     # ------------------------------------------------------------ begin
@@ -225,11 +217,10 @@ class SecondOrderSystem(LinearSystem):
         ]
         (q, v), memory = np.zeros((2, count + len(drive))), None
         if acting.begins is Start.SETTLED:
-            parts = (float(course.at(first)[0]) * row for row, course in acting.loads)
-            load = sum(parts, acting.constant)
+            load = acting.load_at(first, np.eye(len(self.mass)))
             if load.any() or drive.any():
                 acts = laws.act_at(float(first[0]))
-                found = self.static(load[None], laws.only(acts) if laws.spans else laws, drive=drive)
+                found = self.static(load, laws.only(acts) if laws.spans else laws, drive=drive)
                 amounts = self.shapes.T @ (self.mass @ (found.values[0] - self.lift @ drive))
                 q[:moving], v[moving:count] = amounts[:moving], amounts[moving:]
                 memory = None if found.memory is None else laws.filled(found.memory, acts)
@@ -324,78 +315,18 @@ class SecondOrderSystem(LinearSystem):
 
     def _steps(self, acting: Acting, boundaries: Boundaries, feed: FloatArray) -> Steps:
         """Return the steps of all coordinates; the drives follow from nothing but what is prescribed."""
-        begin, end = self._modal_forces(acting, boundaries)
-        count, whole = len(self.angular_frequency), begin.shape[1]
-        steps = steps_under(self.free, boundaries, begin[:, :count], end[:, :count], feed)
-        if not acting.drives:
-            return steps
-        transition = np.zeros((len(steps.transition), 2, whole, 2, whole))
-        push = np.zeros((len(begin), 2, whole))
-        transition[:, :, :count, :, :count] = steps.transition.reshape(-1, 2, count, 2, count)
-        push[..., :count] = steps.push.reshape(-1, 2, count)
-        for number, drive in enumerate(acting.drives.values()):
-            for order in range(2):
-                push[:, order, count + number] = self.heaviness * drive.at(boundaries.time[1:], order)
-        size = 2 * whole
-        return steps._replace(
-            transition=transition.reshape(-1, size, size), push=push.reshape(-1, size), begin=begin, end=end
-        )
-
-    def _modal_forces(self, acting: Acting, boundaries: Boundaries) -> tuple[FloatArray, FloatArray]:
-        """Return the modal forces (K, M + P) at both ends of each step, those of splines made good for it.
-
-        Straight lines through f - h^2/12 f'' have the mean effect of the curve to fourth order in the step h.
-        """
-        count = len(self.angular_frequency)
-        begin, end = acting.ends(boundaries.time, self.shapes)
+        time, count, heaviness = boundaries.time, len(self.angular_frequency), self.heaviness
+        begin, end = acting.ends(time, self.all_shapes)
+        for number, drive in enumerate(acting.drives.values(), count):
+            for order, part in enumerate(self.driven(number - count)):
+                for side, amount in zip((begin, end), drive.ends(time, order), strict=True):
+                    side[:, :count] -= np.outer(amount, part)
+                    side[:, number] = heaviness * amount
+        steps = steps_under(self.modal, boundaries, begin, end, feed)
         if acting.drives:
-            begin, end = (np.pad(side, ((0, 0), (0, len(acting.drives)))) for side in (begin, end))
-        bend = boundaries.lengths**2 / 12.0
-        for number, drive in enumerate(acting.drives.values()):
-            parts = self.driven(number)
-            for side, time in ((begin, boundaries.time[:-1]), (end, boundaries.time[1:])):
-                w = [drive.at(time, order) for order in range(4)]
-                side[:, :count] -= np.outer(w[0] - bend * w[2], parts[0])
-                side[:, :count] -= np.outer(w[1] - bend * w[3], parts[1])
-                side[:, :count] -= np.outer(w[2], parts[2])
-                side[:, count + number] = self.heaviness * w[2]
-        return begin, end
-
-
-def free_motion(
-    modal: ModalSystem, q: FloatArray, v: FloatArray, times: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return free motion (N, M), displacement and velocity, of uncoupled modes.
-
-    Parameters
-    ----------
-    modal : ModalSystem
-        The modes; only the diagonal of their damping acts.
-    q, v : (M,) ndarray
-        Displacement and velocity at time zero, mass-normalised.
-    times : (N,) ndarray
-        [s]; evenly spaced ones take a tenth of the time.
-    """
-    half = 0.5 * np.diag(modal.damping)
-    w = modal.angular_frequency
-    root = np.sqrt((half**2 - w**2).astype(complex))
-    root = np.where(np.abs(root) < 1e-6 * w, 1e-6 * w, root)  # critical: beside it, by 1e-12 of w^2
-    fast, slow = -half - root, -half + root
-    first = (v - fast * q) / (2.0 * root)  # q = first e^(slow t) + second e^(fast t)
-    if np.all(root.imag != 0.0):  # the two are conjugate
-        wave = 2.0 * first * _waves(slow, times)
-        return np.ascontiguousarray(wave.real), np.ascontiguousarray((slow * wave).real)
-    one, two = first * _waves(slow, times), (q - first) * _waves(fast, times)
-    return np.ascontiguousarray((one + two).real), np.ascontiguousarray((slow * one + fast * two).real)
-
-
-def _waves(rates: NDArray[Any], times: FloatArray) -> NDArray[np.complex128]:
-    """Return e^(rate t) (N, M); at evenly spaced times as products of few exponentials."""
-    count, block = len(times), 32
-    if count <= 2 * block or not is_even(times):
-        return np.asarray(np.exp(np.outer(times, rates)))
-    interval = (times[-1] - times[0]) / (count - 1)
-    blocks = -(-count // block)
-    coarse = np.exp(np.outer(times[0] + interval * block * np.arange(blocks), rates))
-    fine = np.exp(np.outer(interval * np.arange(block), rates))
-    return np.asarray((coarse[:, None, :] * fine).reshape(blocks * block, -1)[:count])
+            steps = steps._replace(transition=steps.transition.copy())
+        for number, drive in enumerate(acting.drives.values(), count):
+            for order, coordinate in enumerate((number, begin.shape[1] + number)):
+                steps.transition[:, coordinate] = 0.0
+                steps.push[:, coordinate] = heaviness * drive.at(time[1:], order)
+        return steps

@@ -7,7 +7,7 @@ from scipy.stats import truncnorm
 
 from calibration.result.record import ParameterPrior, correlation
 from discrepancy.checks.fault import DataFault, FaultKind
-from discrepancy.checks.observability import LEFT
+from discrepancy.checks.model_check import LEFT
 from discrepancy.parameters.posterior import ParameterPosterior
 from discrepancy.verdict import Gate
 from reporting.words import counted

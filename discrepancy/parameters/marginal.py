@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.errors import FitError, ModelError
-from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit, fit
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 
 FloatArray = NDArray[np.float64]

@@ -8,8 +8,9 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.entry import Effect
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
-from discrepancy.report.text import WORDS, number, unit_text
 from reporting.words import listing
+
+from .text import WORDS, number, unit_text
 
 HEADINGS = (
     "effect", "testable", "shows best at", "parameter", "detectable from", "prior median", "confused with",

@@ -1,24 +1,179 @@
 """What the report shows, and its figures with their captions, as far as the data allow them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.files.document import Origin
 from discrepancy.files.patch import PrimitiveInterval
-from discrepancy.judgement.separability import CONFUSED, Separability
+from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.report.evidence_figures import confusion_figure, pit_figure, separability_figure
-from discrepancy.report.force_figure import missing_force_figure
-from discrepancy.report.motion_figures import backbone_figure, history_figure, spectrum_figure, worst_record
-from discrepancy.report.residual_figures import heat_figure, load_figure, planform_figure, time_line_figure
-from discrepancy.report.text import WORDS, added_label, force_sentence, scored
+from discrepancy.missing_force.shares import MissingForce
 from discrepancy.self_calibration import SelfCalibration
+from discrepancy.verdict import ForceAtPort, Scores
 from discrepancy.workflow import Investigation
 from fe.wing.design import WingDesign
+from reporting.figures import (
+    BAND_OPACITY,
+    OBSERVED,
+    PAST,
+    PREDICTION,
+    REFERENCE,
+    panel_label,
+    publication_style,
+)
 from reporting.page import ReportFigure
 from reporting.words import listing
+
+from .kit import heat_map, panels, plain_powers
+from .motion_figures import backbone_figure, history_figure, spectrum_figure, worst_record
+from .residual_figures import heat_figure, load_figure, planform_figure, time_line_figure
+from .text import WORDS, added_label, force_sentence, motion_of, scored
+
+_LARGEST_DISTANCE = 1e4
+
+
+def pit_figure(scores: Mapping[str, Scores]) -> Figure:
+    """Draw histograms of probability integral transforms; keys are titles, in order before and after."""
+    with publication_style():
+        figure, (row,) = panels(1, 2, 1.9)
+        for spare in row[len(scores) :]:
+            spare.remove()
+        top = max(max(item.pit) for item in scores.values())
+        for number, (axes, (title, item)) in enumerate(zip(row, scores.items(), strict=False)):
+            count = len(item.pit)
+            axes.bar(
+                (np.arange(count) + 0.5) / count, item.pit, 0.94 / count,
+                color=PREDICTION if number == 0 and len(scores) > 1 else PAST, alpha=0.75,
+            )  # fmt: skip
+            axes.axhline(1.0 / count, color=OBSERVED, lw=0.9, ls="--")
+            axes.set_ylim(0.0, 1.1 * max(top, 0.16))
+            axes.set_xlim(0.0, 1.0)
+            axes.yaxis.set_major_locator(MaxNLocator(4))
+            axes.set_xlabel("probability integral transform")
+            axes.set_ylabel("share of samples" if number == 0 else "")
+            axes.set_title(f"{'ab'[number]}  {title}" if len(scores) > 1 else title, loc="left")
+    return figure
+
+
+def _map_of_names(
+    values: FloatArray, rows: Sequence[str], columns: Sequence[str], norm: Normalize,
+    texts: NDArray[np.str_] | None = None,
+) -> tuple[Figure, Axes, AxesImage]:  # fmt: skip
+    """Return a figure with a map of square cells between names of effects."""
+    figure, ((axes,),) = panels(1, 1, 0.175 * len(rows) + 1.6)
+    words = ([name.replace("_", " ") for name in names] for names in (rows, columns))
+    image = heat_map(axes, values, (next(words), next(words)), norm, 55, texts)
+    axes.set_aspect("equal", anchor="W")
+    axes.tick_params(labelsize=6.5)
+    return figure, axes, image
+
+
+def separability_figure(found: Separability) -> Figure | None:
+    """Draw how well each effect can be told from each other one; None with fewer than two effects."""
+    names = found.identifiers
+    if len(names) < 2:
+        return None
+    # Members of a confusion group stand side by side.
+    number = {name: at for at, group in reversed([*enumerate(found.groups)]) for name in group}
+    order = sorted(range(len(names)), key=lambda n: (number.get(names[n], len(found.groups)), n))
+    distance = found.distance[np.ix_(order, order)]
+    table = np.clip(distance, 0.3, _LARGEST_DISTANCE)
+    np.fill_diagonal(table, np.nan)
+    labels = [names[n] for n in order]
+    with publication_style():
+        figure, axes, image = _map_of_names(table, labels, labels, LogNorm(1.0, _LARGEST_DISTANCE))
+        for row, column in zip(*np.nonzero(distance < CONFUSED), strict=True):
+            if row != column:
+                axes.plot(column, row, "x", color=PREDICTION, ms=4.0, mew=1.1)
+        cell = 1.0 / len(names)
+        bar = figure.colorbar(image, cax=axes.inset_axes((1.0 + 0.4 * cell, 0.0, 0.4 * cell, 1.0)))
+        bar.set_label("squared distance d²")
+        plain_powers(bar.ax.yaxis, (1.0,))
+        bar.outline.set_linewidth(0.5)
+        bar.ax.axhline(CONFUSED, color=PREDICTION, lw=1.2)
+        bar.ax.axhline(DETECTED, color="white", lw=1.2)
+    return figure
+
+
+def confusion_figure(found: SelfCalibration) -> Figure:
+    """Draw the confusion matrix of the workflow on simulated campaigns of this geometry."""
+    rows, columns, counts = found.confusion()
+    share = np.where(counts > 0, counts / np.maximum(counts.sum(axis=1, keepdims=True), 1), np.nan)
+    texts = np.where(counts > 0, counts.astype(str), "")
+    with publication_style():
+        figure, axes, _ = _map_of_names(share, rows, columns, Normalize(0.0, 1.0), texts)
+        axes.set_ylabel("what was hidden")
+        axes.set_xlabel("verdict")
+    return figure
+
+
+MOST_DOTS = 3000
+"""Dots of a panel; of longer records some are left out evenly."""
+MOST_TURNS = 400
+"""Samples of the course in time: the stretch where the force is largest."""
+
+
+def missing_force_figure(missing: MissingForce, told: ForceAtPort) -> Figure:
+    """Draw a missing force and what is told of it, with its law and what is left where there is one."""
+    parts = [("missing force", "force"), ("what is left", "left")][: 2 if missing.law else 1]
+    what, place, rate = motion_of(told)
+    integral, state = ("displacement", "speed") if place else ("integral of the state", "state")
+    along = (("position", ", ".join(filter(None, (integral, place)))), ("speed", f"{state}, {rate}"))
+    with publication_style():
+        figure, rows = panels(len(parts), 3, 2.4 * len(parts) + 0.5)
+        for number, (row, (title, name)) in enumerate(zip(rows, parts, strict=True)):
+            for axes, (motion, label) in zip(row[:2], along, strict=True):
+                _draw_over(axes, missing, motion, name)
+                axes.set_xlabel(label)
+            _draw_in_time(row[2], missing, name)
+            row[0].set_ylabel(f"{what}, {told.unit}")
+            for column, axes in enumerate(row):
+                axes.axhline(0.0, color=REFERENCE, lw=0.6, zorder=0)
+                axes.locator_params(axis="x", nbins=4)  # the integral of a state may have six digits
+                if axes is not rows[0][0]:
+                    axes.sharey(rows[0][0])
+                panel_label(axes, "abcdef"[3 * number + column], title)
+        drawn = rows[0][0].get_legend_handles_labels()
+        figure.legend(*drawn, loc="outside upper right", ncols=2, markerscale=3.0)
+    return figure
+
+
+def _draw_over(axes: Axes, missing: MissingForce, motion: str, name: str) -> None:
+    total = sum(len(item.time) for item in missing.courses)
+    every = -(-total // MOST_DOTS)
+    along, values, deviation = (
+        np.concatenate([getattr(item, key)[::every] for item in missing.courses])
+        for key in (motion, name, "deviation")
+    )
+    axes.vlines(along, values - deviation, values + deviation, color=OBSERVED, lw=0.4, alpha=BAND_OPACITY)
+    axes.plot(along, values, ".", color=OBSERVED, ms=2.6, alpha=0.6, label="seen, ± 1 deviation")
+    if missing.law and name == "force":
+        law = np.concatenate([item.law[::every] for item in missing.courses if item.law is not None])
+        axes.plot(along, law, ".", color=PREDICTION, ms=1.2, alpha=0.7, label=missing.law)
+
+
+def _draw_in_time(axes: Axes, missing: MissingForce, name: str) -> None:
+    """Draw the stretch of the trial in which the force is largest."""
+    item = max(missing.courses, key=lambda one: float(np.max(np.abs(one.force))))
+    first = int(np.argmax(np.abs(item.force))) - MOST_TURNS // 2
+    first = max(min(first, len(item.time) - MOST_TURNS), 0)
+    stretch = slice(first, first + MOST_TURNS)
+    time, values, deviation = item.time[stretch], getattr(item, name)[stretch], item.deviation[stretch]
+    reach = 2.0 * deviation
+    axes.fill_between(time, values - reach, values + reach, color=OBSERVED, alpha=BAND_OPACITY, lw=0.0)
+    axes.plot(time, values, color=OBSERVED, lw=0.9)
+    if item.law is not None and name == "force":
+        axes.plot(time, item.law[stretch], "--", color=PREDICTION, lw=0.9)
+    axes.set_xlabel(f"time in {item.trial}, s")
 
 
 @dataclass(frozen=True)

@@ -3,16 +3,16 @@
 from collections.abc import Callable
 from math import isfinite, isnan
 
-from discrepancy.judgement.conclusion import effects_text, named_effects
+from discrepancy.judgement.conclusion import effects_text, named_effects, probability_text
 from discrepancy.judgement.when import when_sentence
-from discrepancy.report import text as words
-from discrepancy.report.figures import ReportInput
-from discrepancy.report.sizes import size_sentence
-from discrepancy.report.text import WORDS
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page
 from reporting.words import counted, listing
+
+from . import text as words
+from .figures import ReportInput
+from .text import WORDS, size_sentence
 
 LEAST_SHARE = 0.05
 """Findings in words that explain less of the excess variance are left to the file."""
@@ -90,7 +90,7 @@ def _opening(investigation: Investigation) -> list[tuple[str, str]]:
         told = f"noise deviations, rms on {verdict.explained.trials} trials, before and after"
         items.append((f"{before} → {after}", told))
     if not isnan(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
-        items.append((words.probability_text(verdict.probability), "probability of the verdict"))
+        items.append((probability_text(verdict.probability), "probability of the verdict"))
     compared = [gate for gate in verdict.gates if isfinite(gate.statistic)]
     judged = [gate for gate in compared if gate.name not in ("shape", "held-out trials")]
     if proof is None and force is None and judged:  # of gates that compare a p-value, the one that decided

@@ -5,16 +5,17 @@ from math import isfinite, isnan, nan
 
 from discrepancy.campaign.units import UNITS
 from discrepancy.files.document import Origin
-from discrepancy.judgement.conclusion import calibrated_parameters
-from discrepancy.report import text as words
-from discrepancy.report.check_tables import can_decide_rows, group_lines
-from discrepancy.report.figures import ReportInput
-from discrepancy.report.text import WORDS
+from discrepancy.judgement.conclusion import calibrated_parameters, probability_text
 from discrepancy.self_calibration import Share, outcomes
 from discrepancy.verdict import Gate, Proof, Scores, Verdict
 from discrepancy.workflow import Investigation
 from reporting.page import Page
 from reporting.words import listing
+
+from . import text as words
+from .check_tables import can_decide_rows, group_lines
+from .figures import ReportInput
+from .text import WORDS
 
 SHOWN_HYPOTHESES = 8
 NINETY = 1.6449
@@ -54,13 +55,13 @@ def add_evidence(page: Page, verdict: Verdict) -> None:
     rows = []
     for rank, (item, first) in enumerate(ranked):
         if rank < SHOWN_HYPOTHESES or item is none:
-            row = words.hypothesis_name(item), role if first else "", words.probability_text(item.probability)
+            row = words.hypothesis_name(item), role if first else "", probability_text(item.probability)
             over = nan if none is None else item.log_evidence - none.log_evidence
             told = f"{over:+,.1f}".replace("-", "\N{MINUS SIGN}")
             rows.append(row if none is None else (*row, told))
     inclusion = sorted(verdict.inclusion.items(), key=lambda row: -row[1])
     shown = [(name.replace("_", " "), p) for name, p in inclusion if p >= 1e-3][:6]
-    part = listing(f"{name} {words.probability_text(p)}" for name, p in shown)
+    part = listing(f"{name} {probability_text(p)}" for name, p in shown)
     takes_part = f" Probability that an effect takes part: {part}." if shown[1:] else ""
     WORDS.add_table(page, "evidence", rows, takes_part=takes_part)
 

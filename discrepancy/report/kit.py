@@ -13,6 +13,7 @@ from matplotlib.image import AxesImage
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from numpy.typing import NDArray
 
+from discrepancy.campaign.records import FloatArray
 from discrepancy.location.residuals import ResidualSet
 from reporting.figures import LEVELS, PAST, PREDICTION, REFERENCE, new_figure
 
@@ -66,7 +67,7 @@ def plain_powers(axis: Axis, parts: tuple[float, ...]) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-def scale_of(values: Sequence[float] | NDArray[np.float64]) -> Normalize:
+def scale_of(values: Sequence[float] | FloatArray) -> Normalize:
     """Return the colour scale of sizes of residuals: logarithmic, with 1 (noise) near its dark end."""
     found = np.asarray(values, dtype=float)
     largest = float(np.nanmax(found, initial=1.0))
@@ -83,7 +84,7 @@ def size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:
 
 def heat_map(
     axes: Axes,
-    values: NDArray[np.float64],
+    values: FloatArray,
     names: tuple[Iterable[str], Iterable[str]],
     norm: Normalize,
     slant: float,

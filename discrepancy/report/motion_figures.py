@@ -6,20 +6,18 @@ from dataclasses import dataclass, fields
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.signal import welch
 
-from discrepancy.campaign.records import TrialKind
+from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import FitError
 from discrepancy.location.backbone import Backbone, backbones
 from discrepancy.location.dependence import predicted_frequencies
 from discrepancy.location.residuals import FittedTrial, ResidualSet
-from discrepancy.report.kit import draw_noise, models, panels, plain_powers
-from discrepancy.report.residual_figures import size
 from reporting.figures import OBSERVED, REFERENCE, TRUTH, publication_style
 
-FloatArray = NDArray[np.float64]
+from .kit import draw_noise, models, panels, plain_powers
+from .residual_figures import size
 
 LEAST_POINTS = 4
 """Fewest measured points of a mode whose backbone is drawn."""

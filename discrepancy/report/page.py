@@ -2,10 +2,11 @@
 
 from functools import partial
 
-from discrepancy.report import findings, grounds
-from discrepancy.report.figures import ReportInput
 from discrepancy.verdict import VerdictKind
 from reporting.page import Page, ReportFigure
+
+from . import findings, grounds
+from .figures import ReportInput
 
 
 def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dict[str, ReportFigure]) -> str:

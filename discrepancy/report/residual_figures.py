@@ -9,17 +9,15 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Channel, Quantity, TrialKind
+from discrepancy.campaign.records import Channel, FloatArray, Quantity, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import FittedTrial, ResidualSet
-from discrepancy.report.kit import Shown, draw_noise, heat_map, models, panels, scale_of, size_bar, titles
 from discrepancy.verdict import GapWindow, Moment
 from fe.wing.design import WingDesign
 from reporting.figures import LEVELS, OBSERVED, REFERENCE, publication_style
 
-FloatArray = NDArray[np.float64]
+from .kit import Shown, draw_noise, heat_map, models, panels, scale_of, size_bar, titles
 
 MOST_RECORDS = 12
 """Records that are drawn; those with the largest gaps go first."""
@@ -29,14 +27,14 @@ MOST_CELLS = 12
 _STRAIN = re.compile(r"strain\[(\d+)\]")
 
 
-def _squares(item: FittedTrial, column: int) -> NDArray[np.float64]:
+def _squares(item: FittedTrial, column: int) -> FloatArray:
     """Return the sum of squared residuals of a channel over the noise, and what noise would leave (2,)."""
     used = item.used[:, column]
     left = np.sum(item.standardised[used, column] ** 2)
     return np.array([left, item.expected_variance[used, column].sum()])
 
 
-def _rms(squares: NDArray[np.float64]) -> float:
+def _rms(squares: FloatArray) -> float:
     """Return a size over what noise would leave; nan where the fit has absorbed all that there was."""
     left, expected = squares
     return float(np.sqrt(left / expected)) if expected >= 0.5 else float("nan")
@@ -49,7 +47,7 @@ def size(item: FittedTrial, column: int) -> float:
 
 def size_by_channel(residuals: ResidualSet) -> dict[str, float]:
     """Return the rms residual of each channel over what noise would leave, all trials together."""
-    sums: dict[str, NDArray[np.float64]] = {}
+    sums: dict[str, FloatArray] = {}
     for item in residuals.trials:
         for column, name in enumerate(item.trial.channels):
             sums[name] = sums.get(name, 0.0) + _squares(item, column)

@@ -9,19 +9,17 @@ import numpy as np
 from scipy.special import ndtri
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, attempt, fit, objective
 from discrepancy.fits.gates import absolute_gate
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.fits.trial_data import shortened
 from discrepancy.search_settings import SEARCH
 
-from .hypotheses import Tell, in_silence
-from .starting_points import starts
+from .hypotheses import Tell, in_silence, starts
 
 
 def gap_row(residual: FloatArray) -> int:
@@ -64,16 +62,6 @@ class Beginnings:
                 count = min(count, least if late < least else late + least)
             trials.append(shortened(trial, count))
         return self.problem.with_trials(tuple(trials))
-
-    def refine(self, refinement: int) -> None:
-        """Take time steps so many times smaller than the model's own."""
-        if "short" in self.__dict__:
-            self.short.refinement = refinement
-
-    def set_up(self, setting: Setting) -> None:
-        """Build effects for another setting."""
-        if "short" in self.__dict__:
-            self.short.setting = setting
 
     def scan(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
         """Fit effects in addition to those of `base`, beginnings first; return the most promising ones."""

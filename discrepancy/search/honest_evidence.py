@@ -2,15 +2,157 @@
 
 The search itself goes by the noise as recorded: how far a fit is from the truth shows best there. Where no
 hypothesis leaves noise, thousands of nats separate what a model of a real thing cannot separate.
+
+No model of a real thing leaves white noise (Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63, 425-464). Where
+none does, hypotheses are compared under a noise that is as wide as what the best of them leaves, and that
+counts as many samples as are independent: the sum of squares of N samples of autocorrelation rho_k is as
+sure as that of N / (1 + 2 sum rho_k^2) (Bartlett 1946, Suppl. J. R. Stat. Soc. 8, 27-41). Trials at rest
+have none.
 """
 
-from discrepancy.fits.fitting import CandidateFit
+from dataclasses import replace
+
+import numpy as np
+
+from discrepancy.campaign.noise_tests import SHORTEST_SERIES, combine, ljung_box, variance_p_value
+from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.fits.candidate import Remainder
+from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.wider_noise import left_by, refitted, widened
 from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.search_settings import SEARCH
 
 from .strategy import Search
+
+LEVEL = 1e-3
+"""p-value below which what is left is more than noise, or no white noise."""
+LAGS = 0.25
+"""Share of a record up to which its autocorrelation is looked at."""
+SWINGS = -0.25
+"""Autocorrelation at its first minimum below which a process swings."""
+LIKE_RECORD = 3.0
+"""Deviations within which the correlation of a noise record is that of what is left."""
+LEAST_WHITE = 1e-12
+"""Least share of what is left that is taken for noise where none is recorded."""
+STEPS = 12
+"""Steps of a hypothesis under the wider noise."""
+
+
+def left_by(problem: Problem, found: CandidateFit) -> Remainder:
+    """Return what a fit to the recorded noise leaves."""
+    count = len(problem.channel_names)
+    size, time, frequency = np.zeros((3, count))
+    factor, of_noise = np.ones(count), np.zeros(count, dtype=bool)
+    noise_of = noise_levels(problem, found)
+    for channel, name in enumerate(problem.channel_names):
+        series, used, interval = _records(problem, found, channel)
+        counted = sum(float(item.sum()) for item in used)
+        if not series:
+            continue
+        freedom, known = max(counted - found.spent[channel], 1.0), problem.freedom[channel]
+        left = sum(float(item @ item) for item in series) / freedom
+        larger = bool(known > 0.0 and variance_p_value(left, freedom, known) < LEVEL)
+        if (
+            not larger
+            and combine([ljung_box(x, used=u)[1] for x, u in zip(series, used, strict=True)]) > LEVEL
+        ):
+            continue
+        rho, chance = _autocorrelation(series)
+        of_noise[channel] = not larger and _is_of_record(problem, name, interval, float(rho[0]), counted)
+        level = 1.0 if of_noise[channel] else max(left, 1.0) if known > 0.0 else left
+        factor[channel] = np.sqrt(level * max(1.0 + 2.0 * float(np.sum(rho**2 - chance)), 1.0))
+        beside = left / noise_of[channel] - 1.0
+        if of_noise[channel] or beside <= 0.0:
+            continue
+        ratio = (1.0 + beside) / beside
+        own = rho * ratio
+        size[channel] = np.sqrt(beside)
+        time[channel] = interval * max(1.0 + 2.0 * float(np.sum(own**2 - ratio**2 * chance)), 1.0)
+        first = int(np.argmax(np.diff(own) > 0.0))  # the first minimum
+        if own[first] < SWINGS:
+            frequency[channel] = 0.5 / ((first + 1) * interval)
+            time[channel] *= 2.0  # the mean of a squared cosine is a half
+    return Remainder(size, factor, time, frequency, of_noise)
+
+
+def noise_levels(problem: Problem, found: CandidateFit) -> FloatArray:
+    """Return the mean square (channels,) of the noise over its recorded one: of the quick part where none is.
+
+    Second differences of white noise have six times its variance, and hardly any of what is slow.
+    """
+    levels = np.ones(len(problem.channel_names))
+    for channel in np.flatnonzero(problem.freedom == 0.0):
+        series, _, _ = _records(problem, found, int(channel))
+        total = sum(float(item @ item) for item in series) / max(sum(len(item) for item in series), 1)
+        quick = [np.diff(item, 2) for item in series]
+        white = sum(float(item @ item) for item in quick) / 6.0 / max(sum(len(item) for item in quick), 1)
+        at_rest = 1.0 / problem.precisions(found.sums)[channel]
+        levels[channel] = min(max(white, LEAST_WHITE * total), total) if total > 0.0 else at_rest
+    return levels
+
+
+def widened(problem: Problem, remainder: Remainder) -> Problem:
+    """Return a problem under the noise that a remainder makes."""
+    return problem.widened(remainder.factor) if remainder.acts else problem
+
+
+def refitted(problem: Problem, wide: Problem, found: CandidateFit, steps: int = STEPS) -> CandidateFit | None:
+    """Return a hypothesis at its maximum under a wider noise, with evidence and covariance of that.
+
+    All else of it is told against the recorded noise, with what it leaves. None where it cannot be fitted so:
+    evidence under two noises is not compared.
+    """
+    if wide is problem:
+        return found
+    again = attempt(wide, found.candidate, found.point, iterations=steps)
+    here = None if again is None else attempt(problem, found.candidate, again.point, iterations=0)
+    if again is None or here is None:
+        return None
+    left = left_by(problem, here)
+    return replace(
+        here, log_evidence=again.log_evidence, covariance=again.covariance, converged=again.converged,
+        remainder=left if left.acts else None,
+    )  # fmt: skip
+
+
+def _records(
+    problem: Problem, found: CandidateFit, channel: int
+) -> tuple[list[FloatArray], list[BoolArray], float]:
+    """Return the residuals of a channel in motion, which samples of them count, and their interval [s]."""
+    series, used, intervals = [], [], [0.0]
+    for data, residual in zip(problem.trials, found.residuals, strict=True):
+        for column in np.flatnonzero(data.groups == channel) if data.trial.is_dynamic else ():
+            if len(residual) >= SHORTEST_SERIES:
+                series.append(np.ascontiguousarray(residual[:, column]))
+                used.append(data.weight[:, column] > 0.0)
+                intervals.append(float(np.median(data.steps[1:])))
+    return series, used, max(intervals)
+
+
+def _autocorrelation(series: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return the autocorrelation (K,) of records together from one sample on, and its variance for noise."""
+    lags = max(int(LAGS * max(len(item) for item in series)), 2)
+    products, pairs = np.zeros(lags + 1), np.zeros(lags + 1)
+    for item in series:
+        power = np.abs(np.fft.rfft(item, 2 * len(item))) ** 2
+        own = np.fft.irfft(power)[: min(lags + 1, len(item))]
+        products[: len(own)] += own
+        pairs[: len(own)] += len(item) - np.arange(len(own))
+    return products[1:] / max(products[0], 1e-300), pairs[1:] / pairs[0] ** 2
+
+
+def _is_of_record(problem: Problem, name: str, interval: float, rho: float, count: float) -> bool:
+    """Whether the noise record of a channel may have the correlation rho of what is left at one sample."""
+    record, noise = problem.campaign.channels[name].noise, problem.noise[name]
+    if record is None or record.samples is None or record.interval is None:
+        return False
+    if not np.any(record.samples) or abs(record.interval - interval) > LAGS * interval:
+        return False
+    values = noise.whiten(record.samples - record.samples.mean(), record.interval)
+    own = float(values[1:] @ values[:-1] / (values @ values))
+    deviation = np.sqrt(1.0 / len(values) + 1.0 / count)
+    return bool(abs(rho - own) < LIKE_RECORD * deviation)
+
 
 TURNS = 3
 """Times that another hypothesis may turn out to be the best one."""
@@ -33,7 +175,7 @@ def weigh_with_remainders(found: Search) -> None:
         if key_of(leading.candidate) == key_of(best.candidate):
             break
         best = leading
-    found.judge(judged)
+    found.judged = judged
 
 
 def _judged(found: Search, wide: Problem, chosen: list[CandidateFit]) -> dict[Key, CandidateFit]:

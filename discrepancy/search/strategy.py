@@ -1,6 +1,6 @@
 """The search for the set of effects that explains a campaign: screen, fit, add, take away, try pairs."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -9,10 +9,9 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
-from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.candidate import Base, Candidate, Point
 from discrepancy.fits.fitting import CandidateFit, attempt, fit
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
-from discrepancy.fits.linearisation import Base, Point
 from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
@@ -21,8 +20,7 @@ from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
 
 from .growing_records import Beginnings
-from .hypotheses import Hypotheses, Tell, in_silence
-from .starting_points import acts_within, are_related, pairs, slips, starts
+from .hypotheses import Hypotheses, Tell, acts_within, are_related, in_silence, pairs, slips, starts
 
 
 @dataclass
@@ -44,6 +42,10 @@ class Search(Hypotheses):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Take the beginnings of records as the problem is now."""
         self.beginnings = Beginnings(self.problem, self.tell, self.none.residuals)
 
     def screened(self, base: CandidateFit, effects: Iterable[Effect]) -> dict[str, list[Change]]:
@@ -164,12 +166,34 @@ class Search(Hypotheses):
     # ---------------------------------------------------------------- the strategy
 
     def run(self) -> None:
-        """Search by all moves of the strategy, in their order."""
-        for move in STRATEGY:
-            if move.settled:
-                self.settle()
-            if move.needed(self):
-                move.make(self)
+        """Search: simple causes before others.
+
+        One effect, one law of free shape, more effects, any two; then fewer again. The best candidate is
+        computed finely before what rests on its evidence: finely divided, a joint may have the shape of the
+        name in place of one that is free.
+        """
+        self.singles()
+        if self._misfits(self.none) and absolute_gate(self.problem, self.best()).passed is False:
+            self.relatives()
+        self.settle()
+        self.families()
+        self.settle()
+        if self._open:
+            self.longer()
+        if self._open and len(self.effects) > 1 and self.unexplained():
+            self.fit_pairs()
+        if self._open:
+            self.shorter()
+        self.settle()
+        if self._open and 0 < len(self.best().candidate.terms) < self.longest:
+            self._extended(self.best())  # what stood in for a smaller set hid what is beside it
+        self.settle()
+        self.other_places()
+
+    @property
+    def _open(self) -> bool:
+        """Whether further effects are looked for: beside a law whose shape is free they would be anything."""
+        return not self.best().candidate.is_family
 
     def by_force(self) -> bool:
         """Fit the sets of effects that follow the missing force best; False where that is not seen."""
@@ -216,10 +240,6 @@ class Search(Hypotheses):
             if not self._misfits(item) and (misses or (rank == 0 and is_box(item.candidate))):
                 self.keep(around(self.problem, item), exact=True)
 
-    def far_and_failing(self) -> bool:
-        """Whether the best candidate does not fit where the nuisances of no effect are far off."""
-        return self._misfits(self.none) and absolute_gate(self.problem, self.best()).passed is False
-
     def longer(self) -> None:
         """Add one effect at a time to the best set while that makes a better one."""
         current: CandidateFit | None = self.best()
@@ -228,14 +248,6 @@ class Search(Hypotheses):
             if self.longest > 1 and self._far(current):
                 break  # a third effect is looked for only where two nearly do
             current = self._extended(current)
-
-    def shortened(self) -> bool:
-        """Whether a smaller set became the best one: what stood in for it hid what is beside it."""
-        return 0 < len(self.best().candidate.terms) < self.longest
-
-    def longer_again(self) -> None:
-        """Add one effect to the best set."""
-        self._extended(self.best())
 
     def relatives(self) -> None:
         """Fit effects that are easily taken for the best one, from where it stands."""
@@ -293,7 +305,7 @@ class Search(Hypotheses):
             and solver_share(self.problem, self.best()) > SEARCH.solver_share
         ):
             self.problem.refinement *= 2
-            self.beginnings.refine(self.problem.refinement)
+            self._begin_anew()
             ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))[: SEARCH.refitted]
             self._fit_again([item for item in ranked if item.candidate.terms])
 
@@ -304,7 +316,7 @@ class Search(Hypotheses):
             return
         ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))
         self.problem.setting = replace(setting, joint_elements=SEARCH.fine_joint)
-        self.beginnings.set_up(self.problem.setting)
+        self._begin_anew()
         self._fit_again([item for item in ranked if slips(self.problem, item)][: SEARCH.refitted])
         if slips(self.problem, self.best()):
             self.keep(around(self.problem, self.best()), exact=True)
@@ -366,48 +378,6 @@ class Search(Hypotheses):
             found = attempt(self.problem, less, Point(best.point.shared, best.point.local, effect))
             if found is not None:
                 self.keep(found, exact=True)
-
-
-def _always(found: Search) -> bool:
-    return True
-
-
-def _open(found: Search) -> bool:
-    """Whether further effects are looked for: beside a law whose shape is free they would be anything."""
-    return not found.best().candidate.is_family
-
-
-@dataclass(frozen=True)
-class Move:
-    """One way from the hypotheses of a search to more of them.
-
-    Attributes
-    ----------
-    make : callable
-        The move.
-    needed : callable
-        When it is made.
-    settled : bool
-        Whether the best candidate has to be computed finely before.
-    """
-
-    make: Callable[[Search], None]
-    needed: Callable[[Search], bool] = _always
-    settled: bool = False
-
-
-STRATEGY = (
-    Move(Search.singles),
-    Move(Search.relatives, Search.far_and_failing),
-    Move(Search.families, settled=True),
-    # finely divided, a joint may have the shape of the name in place of one that is free
-    Move(Search.longer, _open, settled=True),
-    Move(Search.fit_pairs, lambda found: _open(found) and len(found.effects) > 1 and found.unexplained()),
-    Move(Search.shorter, _open),
-    Move(Search.longer_again, lambda found: _open(found) and found.shortened(), settled=True),
-    Move(Search.other_places, settled=True),
-)
-"""Simple causes before others: one effect, one law of free shape, more effects, any two; then fewer again."""
 
 
 def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -> Search:

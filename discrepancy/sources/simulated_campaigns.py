@@ -10,9 +10,8 @@ from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, fit
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
 from discrepancy.judgement.separability import DETECTED, as_predicted

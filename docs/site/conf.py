@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jupyter_client
 from sphinx.application import Sphinx
+from sphinx.config import Config
 from sphinx.environment import BuildEnvironment
 from traitlets import CaselessStrEnum
 
@@ -97,7 +98,14 @@ def _spread(app: Sphinx, env: BuildEnvironment, names: list[str]) -> None:
     names[:] = pages
 
 
+def _quiet(app: Sphinx, config: Config) -> None:
+    """Accept that the language of a notebook is not known where its kernel is not asked."""
+    if config.nb_execution_mode == "off":
+        config.suppress_warnings.append("myst-nb.lexer")
+
+
 def setup(app: Sphinx) -> None:
     """Make the pages of `MADE` where Sphinx reads them, and let processes share the notebooks."""
+    app.connect("config-inited", _quiet)
     app.connect("source-read", _make)
     app.connect("env-before-read-docs", _spread)

@@ -12,7 +12,7 @@ Transactions on Mathematical Software 9 (1983).
 
 from collections.abc import Iterator
 from functools import cache, lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 from scipy import sparse
@@ -155,16 +155,19 @@ class Cholesky:
 
     def __init__(self, matrix: sparse.csr_array) -> None:
         if not np.all(matrix.diagonal() > 0.0):
-            raise SolutionError(
-                f"A matrix of {matrix.shape[0]} unknowns is not positive definite: it has a diagonal entry "
-                "that is not positive."
-            )
+            self._refuse(matrix, "it has a diagonal entry that is not positive")
         places = (part.astype(np.int32).tobytes() for part in (matrix.indptr, matrix.indices))
         elimination = _analysed(matrix.shape[0], *places)
         self._order, self._fronts = elimination.order, elimination.fronts
         self._factors: list[tuple[FloatArray, FloatArray]] = []
         with _threads().limit(limits=1):
             self._eliminate(matrix)
+
+    def _refuse(self, matrix: sparse.csr_array, why: str) -> NoReturn:
+        raise SolutionError(
+            "The matrix cannot be factorised; some part of the structure is not held or has no stiffness: of "
+            f"{matrix.shape[0]} unknowns, {why}."
+        )
 
     def _eliminate(self, matrix: sparse.csr_array) -> None:
         size = matrix.shape[0]
@@ -189,10 +192,8 @@ class Cholesky:
             diagonal, side = np.ascontiguousarray(top[:, :pivots]), np.ascontiguousarray(top[:, pivots:])
             lower, failed = lapack.dpotrf(diagonal.T, lower=1, overwrite_a=1, clean=0)
             if failed:
-                raise SolutionError(
-                    f"A matrix of {size} unknowns is not positive definite: unknown "
-                    f"{self._order[front.start + failed - 1]} is left without a positive pivot."
-                )
+                unknown = self._order[front.start + failed - 1]
+                self._refuse(matrix, f"unknown {unknown} is left without a positive pivot")
             if held:
                 below = blas.dtrsm(1.0, lower, side.T, side=1, lower=1, trans_a=1, overwrite_b=1)
                 left = blas.dsyrk(-1.0, below, beta=1.0, c=rest.T, lower=1, overwrite_c=1)
@@ -201,8 +202,8 @@ class Cholesky:
                 below = side.T
             self._factors.append((lower, below))
 
-    def solve(self, right_hand_side: FloatArray) -> FloatArray:
-        """Solution (n,) or (n, k)."""
+    def riesz(self, right_hand_side: FloatArray) -> FloatArray:
+        """X^-1 f (n,) or (n, k) without a check of the residual, for iterations that check their own."""
         found = self.whitened(right_hand_side)
         values = found.reshape(len(found), -1)
         with _threads().limit(limits=1):
@@ -216,7 +217,7 @@ class Cholesky:
         return solution
 
     def whitened(self, right_hand_side: FloatArray) -> FloatArray:
-        """L^-1 f (n,) or (n, k), in the order of elimination; its length is the dual norm of f."""
+        """L^-1 f (n,) or (n, k), X = L L', in the order of elimination; its length is the dual norm of f."""
         found = np.array(right_hand_side[self._order], dtype=np.float64, order="C")
         values = found.reshape(len(found), -1)
         with _threads().limit(limits=1):

@@ -18,7 +18,7 @@ Thin cells make the condition number about 1e10, so that about 1e-6 is what doub
 """
 
 
-class Factorisation:
+class Factorisation(Cholesky):
     """Factorised symmetric positive definite matrix X, its energy norm, and the norm dual to it.
 
     Parameters
@@ -39,16 +39,7 @@ class Factorisation:
 
     def __init__(self, matrix: sparse.sparray) -> None:
         self.stiffness = matrix.tocsr()
-        try:
-            factors = Cholesky(self.stiffness)
-        except SolutionError as error:
-            raise SolutionError(
-                "The stiffness matrix cannot be factorised; some part of the structure is not held or has no "
-                f"stiffness. {error}"
-            ) from None
-        self.riesz, self.whitened = factors.solve, factors.whitened
-        """X^-1 f (n,) or (n, k) of functionals f without a check of the residual, for iterations that check
-        their own; and L^-1 f, with X = L L', whose lengths are the dual norms of f."""
+        super().__init__(self.stiffness)
 
     def product(self, vectors: FloatArray) -> FloatArray:
         """Return X times vectors (n, k)."""

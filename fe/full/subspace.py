@@ -65,7 +65,7 @@ def conjugate_gradients(
     residual = right - product(solution)
     direction = correction = preconditioner.riesz(residual)
     size = np.einsum("ik,ik->k", residual, correction)
-    for _ in range(most_iterations):
+    for _ in range(most_iterations + 1):
         if np.all(size <= wanted):
             return solution
         image = product(direction)
@@ -78,8 +78,6 @@ def conjugate_gradients(
         direction = (
             correction + np.divide(size, before, out=np.zeros_like(size), where=before > 0.0) * direction
         )
-    if np.all(size <= wanted):
-        return solution
     missed = size > wanted
     reached = tolerance * float(np.sqrt(np.max(size[missed] / wanted[missed])))
     raise SolutionError(

@@ -209,19 +209,21 @@ class Deck:
             for name, members in self._sets["NSET"].values()
         }
         cell_sets, face_sets = {}, {}
+        facets = {name: [*self._of_surface(rows, kind, solid)] for name, rows in self.surfaces.items()}
         for name, members in self._sets["ELSET"].values():
             flat = self._flat(name, [number for number in members if number not in cell])
             inside = _once([cell[number] for number in members if number in cell])
             if len(inside) or not flat:
                 cell_sets[name] = inside
-                continue
-            node_sets.setdefault(name, kept[_once([node for _, nodes in flat for node in nodes])])
-            corners = (np.sort(kept[nodes[: FLAT[what][1]]]) for what, nodes in flat)
-            if faces := frozenset(tuple(face.tolist()) for face in corners if len(face) > 2):
-                face_sets[name] = faces
-        for name, rows in self.surfaces.items():
-            face_sets[name], nodes = self._faces(rows, kind, kept[cells], cell)
-            node_sets.setdefault(name, nodes)
+            else:
+                facets.setdefault(name, flat)
+        for name, found in facets.items():
+            faces = [
+                (kept[self._places(nodes, f"the set {name!r}")].tolist(), count) for nodes, count in found
+            ]
+            node_sets.setdefault(name, _once([node for nodes, _ in faces for node in nodes]))
+            if corners := frozenset(tuple(sorted(nodes[:count])) for nodes, count in faces if count > 2):
+                face_sets[name] = corners
         return StructureMesh(
             source=source,
             kind=kind,
@@ -267,8 +269,8 @@ class Deck:
     def _place(self) -> dict[int, int]:
         return {number: index for index, number in enumerate(self.nodes)}
 
-    def _flat(self, name: str, members: list[int]) -> list[tuple[str, list[int]]]:
-        """Return types and nodes of those elements of a set that only name nodes and faces."""
+    def _flat(self, name: str, members: list[int]) -> list[tuple[list[int], int]]:
+        """Return nodes, of which so many are corners, of elements of a set that only name nodes and faces."""
         lost = next((number for number in members if number not in self.elements), None)
         if lost is not None:
             fail(str(self.path), f"the set {name!r} names element {lost}, which is not there.")
@@ -278,28 +280,22 @@ class Deck:
                 f"{len(members)} bars, membranes or shells of the set {name!r} have a section and bear loads"
             )
             fail(section, f"{what}, but solids alone are read; delete one or the other.")
-        own = ((number, *self.elements[number]) for number in members)
-        return [(kind, self._places(nodes, f"element {number}")) for number, kind, nodes in own]
+        return [(nodes, FLAT[kind][1]) for kind, nodes in map(self.elements.__getitem__, members)]
 
-    def _faces(
-        self, rows: list[tuple[str, str, str]], kind: ElementKind, cells: IntArray, cell: dict[int, int]
-    ) -> tuple[frozenset[tuple[int, ...]], IntArray]:
-        """Return the faces of a surface, by their corners, and its nodes."""
-        found: set[tuple[int, ...]] = set()
-        nodes: set[int] = set()
+    def _of_surface(
+        self, rows: list[tuple[str, str, str]], kind: ElementKind, solid: dict[int, list[int]]
+    ) -> Iterator[tuple[list[int], int]]:
+        """Yield the nodes of the faces of a surface, and how many of them, the first, are corners."""
         for where, member, face in rows:
-            label = face.upper()
+            label, last = face.upper(), len(kind.faces)
             number = int(label[1:]) if re.fullmatch("S[1-6]", label) else 0
-            if not 1 <= number <= len(kind.faces):
-                last = len(kind.faces)
+            if not 1 <= number <= last:
                 fail(where, f"a face S1 to S{last} of {kind.name} is expected, but {shown(face)} came.")
-            members = set(self.named("ELSET", where, member))
-            for lost in members - cell.keys():
-                fail(where, f"the surface names element {lost}, which is not a solid element.")
-            inside = cells[[cell[element] for element in members]]
-            found.update(map(tuple, np.sort(inside[:, kind.faces[number - 1]], axis=1).tolist()))
-            nodes.update(inside[:, kind.face_nodes[number - 1]].ravel().tolist())
-        return frozenset(found), _once([*nodes])
+            for element in {*self.named("ELSET", where, member)}:
+                if element not in solid:
+                    fail(where, f"the surface names element {element}, which is not a solid element.")
+                nodes = [solid[element][node] for node in kind.face_nodes[number - 1]]
+                yield nodes, len(kind.faces[number - 1])
 
 
 def _once(numbers: list[int]) -> IntArray:

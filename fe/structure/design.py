@@ -153,10 +153,9 @@ class Material(Given):
         """Compliance (6, 6) [1/Pa] in the axes of the material; strains 11, 22, 33, 23, 13, 12."""
         if self.young_modulus is not None and self.poisson_ratio is not None:
             return isotropic_compliance(self.young_modulus, self.poisson_ratio)
-        assert self.young_moduli is not None
-        assert self.poisson_ratios is not None
-        assert self.shear_moduli is not None
-        return orthotropic_compliance(self.young_moduli, self.poisson_ratios, self.shear_moduli)
+        return orthotropic_compliance(
+            *map(np.asarray, (self.young_moduli, self.poisson_ratios, self.shear_moduli))
+        )
 
     @property
     def elasticity(self) -> FloatArray:
@@ -185,14 +184,12 @@ class Support(Part):
     @model_validator(mode="after")
     def _holds_something(self) -> "Support":
         springs = self.springs or ()
-        if self.rigid_about is None:
-            turns = len(springs) > 3 or any(name not in MOTIONS[:3] for name in self.hold)
-            if turns or bool(self.hold) == any(springs):
-                raise ValueError(
-                    'either hold = ["x", "y", "z"] or springs = [x, y, z] in N/m is expected; what turns, '
-                    "too, is a rigid set, with the point `rigid_about`"
-                )
-            return self
+        turns = len(springs) > 3 or any(name not in MOTIONS[:3] for name in self.hold)
+        if self.rigid_about is None and (turns or bool(self.hold) == any(springs)):
+            raise ValueError(
+                'either hold = ["x", "y", "z"] or springs = [x, y, z] in N/m is expected; what turns, '
+                "too, is a rigid set, with the point `rigid_about`"
+            )
         if not self.hold and not any(springs):
             raise ValueError("a rigid set needs hold, springs or both")
         for name, spring in zip(MOTIONS, springs, strict=False):

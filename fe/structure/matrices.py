@@ -132,10 +132,9 @@ class Matrices:
         matrix, own = read_matrix(self.folder, name)
         size, place = len(self.places), f"{where}: {self.folder / name}"
         if own is not None:
-            chosen = np.array([self.rows_of(each, place)[0] for each in own])
-            entries = matrix.tocoo()
-            row, column = chosen[entries.row], chosen[entries.col]
-            matrix = sparse.coo_array((entries.data, (row, column)), (size, size)).tocsr()
+            chosen = [self.rows_of(each, place)[0] for each in own]
+            placed = sparse.eye_array(size, format="csc")[:, chosen].tocsr()
+            matrix = (placed @ matrix @ placed.T).tocsr()
         if partial and matrix.shape[0] < size:
             matrix.resize((size, size))
         if matrix.shape[0] != size:
@@ -253,11 +252,12 @@ def _rows(design: MatrixDesign, files: Matrices, key: str) -> Iterator[FloatArra
 
 def _expansion(files: Matrices) -> sparse.csr_array:
     """Return the displacements of all nodes (3 nodes, n), zero where the matrices do not tell them."""
-    nodes = {node: number for number, node in enumerate(sorted({node for node, _ in files.places}))}
+    nodes = sorted({node for node, _ in files.places})
     found = sparse.lil_array((3 * len(nodes), len(files.places)))
-    for (node, component), own in files.rows.items():
-        if component <= 3 and len(own) in READ:
-            found[3 * nodes[node] + component - 1, own] = READ[len(own)]
+    for row, place in enumerate(itertools.product(nodes, (1, 2, 3))):
+        own = files.rows.get(place, [])
+        if len(own) in READ:
+            found[row, own] = READ[len(own)]
     return found.tocsr()
 
 

@@ -213,17 +213,11 @@ def memory_estimate(mesh: StructureMesh) -> float:
     shape = (len(mesh.cells), len(mesh.points))
     inside = sparse.coo_array((np.ones(len(cells), dtype=np.int32), (cells, mesh.cells.ravel())), shape=shape)
     graph = (inside.T @ inside).tocsr()  # of nodes that share a cell
-    waiting: dict[int, int] = {}
-    factors = peak = 0
-    for number, front in enumerate(analyse(graph).fronts):
-        pivots, boundary = front.end - front.start, len(front.boundary)
-        here = pivots * (pivots + boundary)
-        peak = max(peak, factors + sum(waiting.values()) + 2 * here + boundary**2)
-        waiting.pop(number, None)
-        factors += here
-        if front.parent >= 0:
-            waiting[front.parent] = waiting.get(front.parent, 0) + boundary**2
-    return float(_PROGRAM + _MATRICES * _ENTRY * 9 * graph.nnz + 8 * 9 * peak)
+    sizes = [(front.end - front.start, len(front.boundary)) for front in analyse(graph).fronts]
+    pivots, boundary = np.array(sizes).T
+    factors = pivots * (pivots + boundary)
+    most = factors.sum() + (2 * factors + boundary**2).max()  # the last fronts are the largest
+    return float(_PROGRAM + _MATRICES * _ENTRY * 9 * graph.nnz + 8 * 9 * most)
 
 
 def available_memory() -> float:

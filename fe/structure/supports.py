@@ -15,7 +15,6 @@ from .tables import MOTIONS
 
 _FREE = 1e-8
 """A rigid motion that the supports resist by less than this share of the stiffest one is free."""
-_AXES = "xyz"
 
 
 @dataclass(frozen=True)
@@ -102,28 +101,27 @@ def supported(design: MeshDesign, mesh: StructureMesh) -> SupportedUnknowns:
         If a set is missing or empty, a rigid one lies on a line or shares nodes with another support, or the
         supports leave a rigid motion of the structure free.
     """
-    rigid: dict[int, RigidSet] = {}
+    rigid: dict[str, RigidSet] = {}
     held = np.zeros((len(mesh.points), 3), dtype=bool)
     springs = np.zeros((len(mesh.points), 3))
-    for number, part in enumerate(design.support, start=1):
-        nodes = mesh.nodes_of(part.set, f"support[{number}]")
+    for where, part in ((f"support[{number}]", part) for number, part in enumerate(design.support, start=1)):
+        nodes = mesh.nodes_of(part.set, where)
         if part.rigid_about is not None:
-            rigid[number] = _rigid_set(part, mesh, nodes, f"support[{number}]")
+            rigid[where] = _rigid_set(part, mesh, nodes, where)
             continue
-        for axis in part.hold:
-            held[nodes, _AXES.index(axis)] = True
+        held[nodes] |= np.isin(MOTIONS[:3], part.hold)
         if part.springs is not None:
             springs[nodes] += np.asarray(part.springs) / len(nodes)
     springs[held] = 0.0
-    owner = np.where((held | (springs > 0.0)).any(axis=1), -1, 0)
-    for number, body in rigid.items():
-        shared = body.nodes[owner[body.nodes] != 0]
+    taken = np.any(held | (springs > 0.0), axis=1)
+    for where, body in rigid.items():
+        shared = body.nodes[taken[body.nodes]]
         if len(shared):
             raise MeshError(
-                f"support[{number}]: {len(shared)} nodes of the rigid set belong to another support, too, "
-                f"such as that at {mesh.place(mesh.points[shared[0]])}; say what holds it in its own table."
+                f"{where}: {len(shared)} nodes of the rigid set belong to another support, too, such as that "
+                f"at {mesh.place(mesh.points[shared[0]])}; say what holds it in its own table."
             )
-        owner[body.nodes] = number
+        taken[body.nodes] = True
     bodies = tuple(rigid.values())
     _check_rigid_motions(mesh, held, springs, bodies)
     return SupportedUnknowns(held.ravel(), springs.ravel(), bodies)

@@ -1,6 +1,5 @@
 """The tables that every structure file has, whether its structure comes from a mesh or from matrices."""
 
-import itertools
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
@@ -213,16 +212,13 @@ class StructureDesign(Part):
             ("load",),
             *((key,) for key in self.own_names),
         ):
-            named = [
-                (f"{key}[{number}]", part.name)
-                for key in keys
-                for number, part in enumerate(getattr(self, key), start=1)
-            ]
-            for (first, one), (second, two) in itertools.combinations(named, 2):
-                if one == two:
-                    raise ValueError(
-                        f"{first} and {second} are both named {one!r}; give each a name of its own"
-                    )
+            first: dict[str, str] = {}
+            named = ((key, *item) for key in keys for item in enumerate(getattr(self, key), start=1))
+            for key, number, part in named:
+                place = f"{key}[{number}]"
+                if first.setdefault(part.name, place) != place:
+                    both = f"{first[part.name]} and {place} are both named {part.name!r}"
+                    raise ValueError(f"{both}; give each a name of its own")
         table = self.scaled_table
         self._check_ties(table, "scaled_by", "parameter", "is scaled by", f"scales no {table}")
         self._check_ties("load", "control", "control", "is tied to the control", "commands no load")

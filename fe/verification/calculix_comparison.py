@@ -37,43 +37,21 @@ def _relative_each(theirs: FloatArray, ours: FloatArray) -> float:
 
 
 @dataclass(frozen=True)
-class LoadAgreement:
-    """Differences under one load, each relative.
-
-    Attributes
-    ----------
-    load : str
-        Its name.
-    field : float
-        Largest difference of a nodal displacement, over the largest displacement.
-    strain, output : float or None
-        Of the strains of the gauges and of displacement outputs, over the largest of their kind, or of a wing
-        each over its own; None where there are none.
-    tensor : float or None
-        Of a wing: largest difference of a strain component at the integration points of the cells with
-        gauges, over the largest strain there. CalculiX evaluates these strains itself.
-    """
-
-    load: str
-    field: float
-    strain: float | None
-    output: float | None
-    tensor: float | None = None
-
-
-@dataclass(frozen=True)
 class Agreement:
     """A model and CalculiX.
 
     Attributes
     ----------
-    loads : tuple of LoadAgreement
-        One for each load.
+    loads : dict of str to dict of str to float
+        Of each load the relative differences: of `nodal displacements`, over the largest; of `gauge strains`
+        and `displacement outputs`, where there are some, over the largest of their kind, or of a wing each
+        over its own; of a wing also of `strains at integration points` in the cells with gauges, which
+        CalculiX evaluates itself, over the largest.
     ours, calculix : (m,) Hz
         Lowest frequencies of both codes.
     """
 
-    loads: tuple[LoadAgreement, ...]
+    loads: dict[str, dict[str, float]]
     ours: FloatArray
     calculix: FloatArray
 
@@ -108,19 +86,20 @@ def _agreement(
     if len(theirs) < modes:
         raise CalculixError(f"CalculiX printed {len(theirs)} frequencies instead of {modes}.")
     solve = Factorisation(structure.at(deck.values)[0]).solve
-    parts = (slice(0, len(structure.gauges)), slice(len(structure.gauges), len(deck.probes)))
-    found = []
+    gauges, end = len(structure.gauges), len(deck.probes)
+    parts = {"gauge strains": slice(0, gauges), "displacement outputs": slice(gauges, end)}
+    differences = {}
     for number, (name, (load, _)) in enumerate(loads.items()):
-        displacement = solve(load)
-        ours = deck.probes @ displacement
-        probes = printed["NPROBES"][number][:, 1:].ravel() if len(ours) else ours
-        strain, output = (relative(probes[own], ours[own]) if len(ours[own]) else None for own in parts)
-        field = _relative(printed["NALL"][number][:, 1:], structure.full_displacement(displacement))
-        strains = (
-            None if tensor is None else _relative(printed["EGAUGES"][number][:, 2:], tensor(displacement))
-        )
-        found.append(LoadAgreement(name, field, strain, output, strains))
-    return Agreement(tuple(found), frequencies, theirs[:modes])
+        displacement, tables = solve(load), {key: rows[number] for key, rows in printed.items()}
+        ours, nodes = deck.probes @ displacement, structure.full_displacement(displacement)
+        found = differences[name] = {"nodal displacements": _relative(tables["NALL"][:, 1:], nodes)}
+        for what, own in parts.items():
+            if len(ours[own]):
+                found[what] = relative(tables["NPROBES"][:, 1:].ravel()[own], ours[own])
+        if tensor:
+            strains = tensor(displacement)
+            found["strains at integration points"] = _relative(tables["EGAUGES"][:, 2:], strains)
+    return Agreement(differences, frequencies, theirs[:modes])
 
 
 def structure_agreement(structure: Structure, folder: Path, modes: int = 6) -> Agreement:

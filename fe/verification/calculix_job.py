@@ -34,16 +34,14 @@ def read_tables(text: str) -> dict[str, list[FloatArray]]:
     tables: dict[str, list[FloatArray]] = {}
     _, *found = _HEADER.split(text)
     for what, name, body in zip(found[::3], found[1::3], found[2::3], strict=True):
-        rows = []
-        for line in filter(str.strip, body.splitlines()):
-            try:
-                rows.append([float(value) for value in line.split()])
-            except ValueError:
-                raise CalculixError(
-                    f"The table of {what} that CalculiX printed holds the line {line.strip()!r}, which is "
-                    "not a row of numbers; its version may print another format (2.20 is known)."
-                ) from None
-        tables.setdefault(name, []).append(np.array(rows))
+        try:
+            rows = np.loadtxt(body.splitlines(), ndmin=2)
+        except ValueError as error:
+            raise CalculixError(
+                f"The table of {what} that CalculiX printed holds what is not a row of numbers ({error}); "
+                "its version may print another format (2.20 is known)."
+            ) from None
+        tables.setdefault(name, []).append(rows)
     return tables
 
 
@@ -99,8 +97,6 @@ def run_calculix(text: str, folder: Path, name: str) -> str:
         )
     except subprocess.TimeoutExpired:
         raise CalculixError(f"CalculiX took more than {_TIME_LIMIT:g} s for {folder / name}.inp.") from None
-    except OSError as error:
-        raise CalculixError(f"CalculiX ({program}) cannot be run: {error.strerror}.") from None
     log = folder / f"{name}.log"
     log.write_text(done.stdout + done.stderr, encoding="utf-8")
     result = folder / f"{name}.dat"

@@ -6,7 +6,7 @@ their own; the balance and the mesh convergence check the wing itself.
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import sparse
@@ -191,39 +191,21 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[s
     }
 
 
-class ConvergenceRow(NamedTuple):
-    """Results of the healthy wing at e = 1 on one mesh.
+def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> dict[str, FloatArray]:
+    """Results of the healthy wing at e = 1 on a sequence of meshes; nothing is refitted.
 
-    Attributes
-    ----------
-    unknowns : int
-        Free unknowns.
-    tip_stiffness : float
-        N/m.
-    first_bending, second_bending : float
-        Flapwise bending frequencies at the design's nominal masses [Hz].
-    strain : (gauges,) dimensionless
-        Gauge strains at the load factor of the design's lift.
-    """
-
-    unknowns: int
-    tip_stiffness: float
-    first_bending: float
-    second_bending: float
-    strain: FloatArray
-
-
-def mesh_convergence(
-    design: WingDesign, refinements: Sequence[float] = (0.5, 1.0, 1.5, 2.0)
-) -> tuple[ConvergenceRow, ...]:
-    """Results of the same wing on a sequence of meshes; nothing is refitted.
+    Returns
+    -------
+    dict of str to (meshes, ...)
+        Free `unknowns`; `tip stiffness` [N/m]; frequencies of `first bending` and `second bending` at the
+        design's nominal masses [Hz]; `strain` (meshes, gauges) at the load factor of the design's lift.
 
     Raises
     ------
     InvalidDesignError
         If a refinement lies outside the range of the design.
     """
-    rows = []
+    found: dict[str, list[Any]] = {}
     for refinement in refinements:
         operators = assemble(design.changed(mesh={"refinement": refinement}))
         loads = np.column_stack((operators.turn(design.lift.load_factor), operators.load_tip))
@@ -231,11 +213,15 @@ def mesh_convergence(
         masses = point_masses(design.masses.servo, design.masses.pitot)
         frequency, shapes = natural_frequencies(operators, 4, masses)
         first, second = frequency[most_moved(operators.load_tip, frequency**2, shapes)].tolist()
-        stiffness = 1.0 / float(operators.load_tip @ bent)
-        rows.append(
-            ConvergenceRow(operators.unknowns, stiffness, first, second, operators.gauge_output @ turn)
-        )
-    return tuple(rows)
+        for name, value in (
+            ("unknowns", operators.unknowns),
+            ("tip stiffness", 1.0 / float(operators.load_tip @ bent)),
+            ("first bending", first),
+            ("second bending", second),
+            ("strain", operators.gauge_output @ turn),
+        ):
+            found.setdefault(name, []).append(value)
+    return {name: np.array(values) for name, values in found.items()}
 
 
 def observed_order(ratio: float, values: Sequence[float]) -> float:

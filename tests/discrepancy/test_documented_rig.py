@@ -13,7 +13,7 @@ import pytest
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
-from discrepancy.judgement.look_alikes import look_alike_remark
+from discrepancy.judgement.when import look_alike_remark
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import checked, investigate, without_port

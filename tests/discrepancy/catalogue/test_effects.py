@@ -18,7 +18,7 @@ from benchmarks.effect_pictures import FLOWS
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Effect, Prior, Setting
 from discrepancy.catalogue.library import library
-from discrepancy.catalogue.places import mains_lines
+from discrepancy.catalogue.needs import mains_lines
 from discrepancy.catalogue.scales import loss_integral
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, fit
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.models.interface import (
     Conditions,

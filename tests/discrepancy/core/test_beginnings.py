@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.linearisation import Point
 from discrepancy.search.growing_records import Beginnings, gap_row
-from discrepancy.search.starting_points import are_related
+from discrepancy.search.hypotheses import are_related
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier
-from discrepancy.fits.candidate import Candidate, Term
-from discrepancy.fits.linearisation import PARAMETER_STEP, Base
+from discrepancy.fits.candidate import PARAMETER_STEP, Base, Candidate, Term
 from discrepancy.fits.problem import Problem
 
 FloatArray = NDArray[np.float64]

@@ -21,9 +21,8 @@ from discrepancy.campaign.records import (
 from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, in_events, library
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe

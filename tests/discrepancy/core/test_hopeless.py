@@ -14,7 +14,7 @@ from discrepancy.catalogue.entry import Effect, Prior, Setting
 from discrepancy.catalogue.library import effect_by_identifier, library, load_catalogue
 from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.fits.candidate import Candidate, Term
-from discrepancy.fits.cholesky import Cholesky
+from discrepancy.fits.elimination import Cholesky
 from discrepancy.fits.fitting import attempt, fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen

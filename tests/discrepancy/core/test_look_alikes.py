@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from discrepancy.catalogue.entry import Setting
-from discrepancy.judgement.look_alikes import look_alike_remark, with_untested
+from discrepancy.judgement.when import look_alike_remark, with_untested
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch
 

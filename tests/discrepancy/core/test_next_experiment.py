@@ -13,9 +13,8 @@ from scipy.stats import norm
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.next_experiment import (
     Proposal,

@@ -11,9 +11,8 @@ from benchmarks.cantilever import Cantilever, campaign
 from discrepancy.campaign.records import NoiseRecord, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, fit
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.other_optima import elsewhere
 from discrepancy.fits.problem import Problem
 from discrepancy.models.interface import Conditions

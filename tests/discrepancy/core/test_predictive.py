@@ -8,9 +8,8 @@ from math import inf
 import numpy as np
 
 from discrepancy.campaign.records import NoiseRecord
-from discrepancy.fits.candidate import Candidate
+from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 

@@ -13,7 +13,7 @@ from discrepancy.campaign.records import NoiseRecord
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.wider_noise import left_by, refitted, widened
+from discrepancy.search.honest_evidence import left_by, refitted, widened
 
 FloatArray = NDArray[np.float64]
 

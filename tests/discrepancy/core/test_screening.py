@@ -8,7 +8,7 @@ import pytest
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.screening import Screen, grid, rescaled
-from discrepancy.search.starting_points import pairs
+from discrepancy.search.hypotheses import pairs
 from discrepancy.search_settings import SEARCH
 
 

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
-from discrepancy.judgement.trial_by_trial import LARGE_SCATTER, SizeByTrial, sizes_by_trial
+from discrepancy.judgement.consistency_gate import LARGE_SCATTER, SizeByTrial, sizes_by_trial
 
 
 def test_cochrans_q_and_the_scatter_beyond_it_against_their_definitions() -> None:

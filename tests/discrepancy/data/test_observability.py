@@ -8,8 +8,7 @@ import pytest
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign
 from discrepancy.checks.fault import FaultKind
-from discrepancy.checks.model_check import check_against_model
-from discrepancy.checks.observability import prior_left, unobservable
+from discrepancy.checks.model_check import check_against_model, prior_left, unobservable
 from discrepancy.models.lumped import LumpedModel
 from tests.discrepancy.rigs import model_of
 

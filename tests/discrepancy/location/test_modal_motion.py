@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from discrepancy.location.modal_motion import modal_motion
+from discrepancy.location.dependence import modal_motion
 
 
 def test_two_damped_modes_are_split_up_to_the_ends() -> None:

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
-from discrepancy.missing_force.filtered import Filtered, Process
-from discrepancy.missing_force.regression import regression
+from discrepancy.missing_force.filtered import Filtered, Process, regression
 from discrepancy.missing_force.trial import SeenTrial
 from discrepancy.models.interface import PortedSystem
 

@@ -14,20 +14,18 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.linearisation import Point
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.force import MissingForce, missing_force
 from discrepancy.missing_force.naming import ForceSearch
-from discrepancy.missing_force.shares import ForceShares, Share, order_of
+from discrepancy.missing_force.shares import ForceShares, MissingForce, Share, missing_force, order_of
 from discrepancy.missing_force.trial import seen_trial
 from discrepancy.model_choice import load_model
 from discrepancy.models.acting import refined
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.report.force_figure import missing_force_figure
+from discrepancy.report.figures import missing_force_figure
 from discrepancy.report.text import force_sentence
 from discrepancy.search.strategy import Search
 from discrepancy.sources.examples import ExampleKind, example_campaign, plan_for, plan_of

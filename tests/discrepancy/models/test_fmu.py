@@ -344,7 +344,7 @@ def test_what_is_hidden_is_named_and_nothing_where_nothing_is(
         ("scales = {", 'effects = { point_mass = "extra" }\nscales = {', "effect.extra.active"),
         ("scales = {", 'effects = { free_play = "gap" }\nscales = {', "internal forces act at ports"),
         ('name = "slide"', 'name = "slide", hinge = 1', "is not a key of an FMU model"),
-        ("settle = true", "parameters = { respose = 1.0 }", "static.parameters.respose"),
+        ("settle = true", "parameters = { respose = 1.0 }", "names 'respose', which is not a variable"),
         ('velocity = "release_speed"', 'hold = "slide.force"', "exactly one of displacement"),
         ("low = 0.7", "low = 1.7", "is not between low"),
     ],

@@ -10,15 +10,14 @@ from scipy.linalg import expm
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.models.acting import Acting, Course
 from discrepancy.models.compiled_motion import compiled_kernel
+from discrepancy.models.high_pass import filtered_record
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import State
-from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, laws_of
 from fe.runtime.patch import HighPass, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.runtime.sensors import SensorRecord, apply_sensors
-from fe.runtime.stepwise import Boundaries
 from tests.fe.runtime.stepping import simulate
 
 pytestmark = pytest.mark.xdist_group("compiling")
@@ -50,31 +49,6 @@ def shown(model: LumpedModel, what: Trial, *items: Primitive, refinement: int = 
     return model.respond(
         what, OUTPUTS, ModelPatch(items), Conditions(np.ones(3), refinement=refinement)
     ).values
-
-
-@pytest.mark.parametrize("coupled", [False, True])
-def test_steps_of_any_length_are_matrix_exponentials(coupled: bool) -> None:
-    generator = np.random.default_rng(3)
-    damping = np.diag([0.3, 1.0, 200.0])
-    if coupled:
-        damping = damping + generator.normal(size=(3, 3))
-    frequency = np.array([0.0, 7.0, 60.0])
-    system = ModalSystem(frequency, damping)
-    lengths = np.array([0.01, 0.013, 0.01, 0.4])
-    time = np.concatenate(([0.0], np.cumsum(lengths)))
-    distinct, which = Boundaries(time, np.arange(5), lengths).alike
-    np.testing.assert_array_equal(distinct[which], lengths)
-    transition, begin, end = system.exact_steps(distinct)
-    for k, h in enumerate(lengths):
-        matrix = np.zeros((12, 12))
-        matrix[:3, 3:6] = np.eye(3)
-        matrix[3:6, :3], matrix[3:6, 3:6] = -np.diag(frequency**2), -damping
-        matrix[3:6, 6:9], matrix[6:9, 9:] = np.eye(3), np.eye(3) / h
-        whole = expm(h * matrix)
-        at = which[k]
-        np.testing.assert_allclose(transition[at], whole[:6, :6], rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(end[at], whole[:6, 9:], rtol=1e-9, atol=1e-13)
-        np.testing.assert_allclose(begin[at], whole[:6, 6:9] - whole[:6, 9:], rtol=1e-9, atol=1e-13)
 
 
 @pytest.mark.parametrize("laws", [(), (COULOMB,), (QUADRATIC, CUBIC)])
@@ -141,7 +115,13 @@ def test_a_high_pass_follows_uneven_stamps() -> None:
     wave = 2.0 * np.pi * 1.3
     record = SensorRecord((("x", "velocity"),), "forced", time, 0.0, np.zeros(len(time)))
     patch = ModelPatch((HighPass("x", 0.3),))
-    found, _ = apply_sensors(patch, record, np.sin(wave * time)[:, None], wave * np.cos(wave * time)[:, None])
+    found, _ = apply_sensors(
+        patch,
+        record,
+        np.sin(wave * time)[:, None],
+        wave * np.cos(wave * time)[:, None],
+        filtered=filtered_record,
+    )
     # y' = x' - y / tau from rest: steady part and what the begin leaves
     gain = 1j * wave * 0.3 / (1.0 + 1j * wave * 0.3)
     steady = np.imag(gain * np.exp(1j * wave * time))

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from discrepancy.files.patch import primitive_intervals
-from discrepancy.judgement.conclusion import named_effects
+from discrepancy.judgement.conclusion import named_effects, probability_text
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import parse_lumped
@@ -25,8 +25,14 @@ from discrepancy.report.residual_figures import (
     size_by_channel,
     size_table,
 )
-from discrepancy.report.sizes import si_sizes, size_sentence
-from discrepancy.report.text import formula, headline, number, probability_text, rounded
+from discrepancy.report.text import (
+    formula,
+    headline,
+    number,
+    rounded,
+    si_sizes,
+    size_sentence,
+)
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import Investigation, patch_draws
 from fe.runtime.patch import (

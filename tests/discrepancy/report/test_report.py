@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import norm
 
 from discrepancy.campaign.records import TrialKind
+from discrepancy.judgement.conclusion import probability_text
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
 from discrepancy.report.check_tables import (
     confused_lines,
@@ -30,7 +31,6 @@ from discrepancy.report.text import (
     headline,
     number,
     percent,
-    probability_text,
     remainders_sentence,
     residual_sizes,
     share_text,

@@ -20,8 +20,7 @@ from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import CampaignDataError, CampaignFileError
-from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.linearisation import Point
+from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import choice_of_run, choose_model
 from discrepancy.models.interface import Conditions, Model

@@ -113,7 +113,7 @@ def test_solutions_are_those_of_a_general_solver(seed, size, share, copies, colu
     shape = (matrix.shape[0], columns) if columns else (matrix.shape[0],)
     right = np.random.default_rng(seed).standard_normal(shape)
     given_side = right.copy()
-    found = Cholesky(matrix).solve(right)
+    found = Cholesky(matrix).riesz(right)
     assert np.array_equal(right, given_side)
     assert found.shape == shape
     expected = spsolve(matrix.tocsc(), right).reshape(shape)
@@ -123,9 +123,9 @@ def test_solutions_are_those_of_a_general_solver(seed, size, share, copies, colu
 def test_a_body_of_many_fronts():
     matrix = grid(40, 12, 9)
     right = np.random.default_rng(5).standard_normal((matrix.shape[0], 3))
-    found = Cholesky(matrix).solve(right)
+    found = Cholesky(matrix).riesz(right)
     assert found == pytest.approx(spsolve(matrix.tocsc(), right), rel=1e-11, abs=1e-11)
-    single = Cholesky(matrix).solve(right[:, 0])
+    single = Cholesky(matrix).riesz(right[:, 0])
     assert single == pytest.approx(found[:, 0], rel=1e-12, abs=1e-12)
 
 
@@ -145,7 +145,7 @@ def test_factors_are_the_same_bytes_whatever_the_number_of_threads(coarse_operat
     for threads in (1, 2, 2):
         with threadpool_limits(threads):
             factors = Cholesky(stiffness)
-            found.append((factors.solve(load).tobytes(), factors.solve(np.eye(len(load), 3)).tobytes()))
+            found.append((factors.riesz(load).tobytes(), factors.riesz(np.eye(len(load), 3)).tobytes()))
     assert found[0] == found[1] == found[2]
 
 
@@ -181,10 +181,10 @@ def test_a_pattern_met_before_is_not_analysed_again(monkeypatch):
     third = grid(7, 9, 3)
     right = np.arange(189.0)
     for matrix in (first, second, third, first):
-        assert matrix @ Cholesky(matrix).solve(right) == pytest.approx(right, abs=1e-10)
+        assert matrix @ Cholesky(matrix).riesz(right) == pytest.approx(right, abs=1e-10)
     assert len(calls) == 2
     second.indices[:] = third.indices  # what is kept does not follow a matrix that is changed in place
     second.indptr[:] = third.indptr
     second.data[:] = third.data
-    assert second @ Cholesky(second).solve(right) == pytest.approx(right, abs=1e-10)
+    assert second @ Cholesky(second).riesz(right) == pytest.approx(right, abs=1e-10)
     assert len(calls) == 2

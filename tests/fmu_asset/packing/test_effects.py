@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from discrepancy.campaign.records import Campaign, Channel, Quantity, TrialKind
 from discrepancy.files.document import Origin
 from discrepancy.files.patch import StoredPatch, fmu_outputs, patch_effects, read_patch, write_patch
+from discrepancy.models.high_pass import filtered_record
 from discrepancy.models.wing import WingModel
 from discrepancy.verdict import NamedEffect, VerdictKind
 from fe.runtime.patch import (
@@ -151,9 +152,11 @@ def naming_side(arrays: PatchArrays) -> WingModel:
     return WingModel(arrays)
 
 
-def flown(fmu: Path, rows: Sequence[Sequence[float]], step: float = 0.05, **parameters: float) -> np.ndarray:
+def flown(
+    fmu: Path, rows: Sequence[Sequence[float]], step: float = 0.05, start: float = 0.0, **parameters: float
+) -> np.ndarray:
     """Return all outputs at the start and after steps of load factor, z1, z2 and tip force."""
-    with FmiAsset(fmu, watching(step), isolated=False, parameters=parameters) as asset:
+    with FmiAsset(fmu, watching(step, start_time=start), isolated=False, parameters=parameters) as asset:
         n, z1, z2, _ = rows[0]
         asset.reset(control={"load_factor": n}, health={"z1": z1, "z2": z2})
         seen = [asset.observe()]
@@ -219,7 +222,7 @@ def test_effects_of_sensors_are_those_of_whole_records(
     """From the first step on, or from the release on."""
     moving = response == 2.0
     rows = [(0.0, 0.0, 0.0, 0.0)] * 80 if moving else [(n, 0.1, 0.0, 0.0) for n in (1.0, 2.0, -1.0, 3.0)]
-    given = {"response": response, "release": 0.03 * moving}
+    given = {"response": response, "release": 0.03 * moving, "start": 2.0 * moving}
     first = 0 if moving else 1
     plain, shown = (
         flown(path, rows, **given, **switched)[first:, :26]
@@ -228,9 +231,8 @@ def test_effects_of_sensors_are_those_of_whole_records(
     whole = ModelPatch(tuple(item for effect in patch.for_gauges(24).effects for item in effect.patch))
     time, kind = 0.05 * np.arange(first, len(rows) + 1), "ringdown" if moving else "flight"
     more = {"release": 0.03} if moving else {}
-    wanted, _ = apply_sensors(
-        whole, SensorRecord(CHANNELS, kind, time, 0.0, np.zeros(len(time)), **more), plain
-    )
+    record = SensorRecord(CHANNELS, kind, time, 2.0 * moving, np.zeros(len(time)), **more)
+    wanted, _ = apply_sensors(whole, record, plain, filtered=filtered_record)
     if moving:
         scale = np.abs(wanted).max(axis=0)
         np.testing.assert_allclose(shown / scale, wanted / scale, rtol=0.0, atol=1e-12)

@@ -1,0 +1,315 @@
+"""The contract of reduced models of a wing, a structure, springs: the full model within certified bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fe.full.statics import Factorisation
+from fe.reduction.certified_basis import compressed
+from fe.reduction.reduced_basis import reduce_structure
+from fe.reduction.structure_errors import measured_errors
+from fe.runtime import kept_arrays
+from fe.runtime.errors import OutsideModelError, ReducedModelFileError
+from fe.runtime.kept_arrays import arrays_from_bytes, arrays_to_bytes
+from fe.runtime.reduced import ReducedModel
+from fe.structure.affine import AffineStructure
+from fe.structure.field import natural_frequencies, static_response
+from fe.structure.operators import load_and_assemble
+from fe.wing.responses import eigenmodes
+from tests.fe.springs import SETTINGS, reduced_springs, springs
+from tests.wings import tip_stiffness
+
+HURT = {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 3.0, "push": -120.0}
+
+
+class Pair(NamedTuple):
+    """A full model and its reduced one, what bounds and frequencies are good to, how often to look."""
+
+    full: AffineStructure
+    model: ReducedModel
+    tolerance: float
+    frequency: float
+    examples: int
+
+
+@pytest.fixture(scope="module", params=["wing", "beam", "springs", "springs 1", "springs 4", "rough"])
+def pair(request: pytest.FixtureRequest) -> Pair:
+    kind, get = request.param, request.getfixturevalue
+    if kind == "wing":
+        return Pair(get("coarse_operators"), get("model"), 1e-3, 1e-4, 15)
+    if kind == "beam":
+        return Pair(get("beam"), get("beam_reduction").model, 1e-3, 2e-5, 15)
+    if kind in ("springs 1", "springs 4"):
+        return Pair(springs(int(kind[-1])), reduced_springs(int(kind[-1])).model, 1e-2, 2e-3, 40)
+    full, model = springs(2), reduced_springs(2).model
+    if kind == "springs":
+        return Pair(full, model, 2.0 * SETTINGS.bound_tolerance, 1e-4, 100)
+    # so small that its errors are far above rounding
+    return Pair(full, compressed(model, np.eye(len(model.static_load.T))[:, :4]), np.inf, 1e-4, 200)
+
+
+def named(model: ReducedModel, vector: np.ndarray) -> dict[str, float]:
+    return dict(zip(model.chosen, vector.tolist(), strict=True))
+
+
+def states(model: ReducedModel, count: int) -> np.ndarray:
+    """Random values (count, V) in the validity box."""
+    low, high = model.validity_box.T
+    return low + (high - low) * np.random.default_rng(3).random((count, len(low)))
+
+
+def test_the_bound_holds_and_keeps_the_tolerance(pair: Pair) -> None:
+    """At corners and edges of the box, which count most, and anywhere inside."""
+    model, (low, high) = pair.model, pair.model.validity_box.T
+    share = st.sampled_from((0.0, 0.5, 1.0)) | st.floats(0.0, 1.0)
+
+    @settings(max_examples=pair.examples, deadline=None)
+    @given(shares=st.lists(share, min_size=len(low), max_size=len(low)))
+    def holds(shares: list[float]) -> None:
+        vector = low + (high - low) * np.array(shares)
+        # of all loads at once: where they nearly cancel, a sum of solutions has lost its digits
+        full, found = static_response(pair.full, named(model, vector)), model.static_response(vector)
+        loads = model.load_coefficients(vector)
+        alone = [model.static_response(vector, load=unit) for unit in np.eye(len(loads))]
+        for what, wanted in (("strain", full.strain), ("displacement", full.output)):
+            bound = getattr(found, f"{what}_error_bound")
+            assert np.abs(getattr(found, what) - wanted).max() <= bound
+            # combined loads may nearly cancel, so the scale is that of each load alone
+            scale = sum(
+                np.abs(getattr(one, what)).max() * abs(part) for one, part in zip(alone, loads, strict=True)
+            )
+            assert bound <= pair.tolerance * scale + 1e-300
+
+    holds()
+
+
+def test_frequencies_are_those_of_the_full_model(pair: Pair) -> None:
+    model = pair.model
+    for vector in states(model, 3):
+        wanted, _ = natural_frequencies(pair.full, model.mode_count, named(model, vector))
+        relative = model.modes(vector).frequency / wanted - 1.0
+        assert np.all(relative > -1e-6)  # a projection can only be stiffer
+        assert np.all(relative < pair.frequency)
+
+
+def test_modes_are_orthonormal_in_the_mass(pair: Pair) -> None:
+    modes = pair.model.modes(states(pair.model, 1)[0])
+    np.testing.assert_allclose(
+        modes.shape.T @ modes.mass @ modes.shape, np.eye(pair.model.mode_count), atol=1e-11
+    )
+    assert np.all(np.diff(modes.frequency) > 0)
+    assert np.all(modes.output[-1] >= 0)
+
+
+def test_low_modes_keep_their_digits(pair: Pair) -> None:
+    """Another orthonormal basis of the same space gives the same frequencies, to rounding."""
+    model, size = pair.model, len(pair.model.modal_load.T)
+    turn = np.linalg.qr(np.random.default_rng(4).normal(size=(size, size)))[0]
+    sides = {name: getattr(model, name) @ turn for name in ("modal_load", "modal_output", "followed_shapes")}
+    both = {name: turn.T @ getattr(model, name) @ turn for name in ("modal_stiffness", "modal_mass")}
+    turned = replace(model, **sides, **both)
+    for name in both:
+        np.testing.assert_array_equal(getattr(model, name), getattr(model, name).transpose(0, 2, 1))
+    for vector in states(model, 3):
+        one, other = (which.modes(vector) for which in (model, turned))
+        np.testing.assert_allclose(other.frequency, one.frequency, rtol=2e-13)
+        np.testing.assert_allclose(other.followed_mac, one.followed_mac, rtol=1e-11)
+        assert other.followed == one.followed
+
+
+def test_many_states_at_once_equal_one_by_one(pair: Pair) -> None:
+    model, vectors = pair.model, states(pair.model, 40)
+    columns = dict(zip(model.chosen, vectors.T, strict=True))
+    np.testing.assert_array_equal(model.vectors(columns), vectors)
+    found = [model.static_response(named(model, vector)) for vector in vectors]
+    one_by_one = [np.append(one.strain, one.displacement) for one in found]
+    np.testing.assert_allclose(model.static_outputs(vectors), one_by_one, rtol=1e-11, atol=1e-16)
+    name = model.regions[0]
+    alone = np.tile(model.nominal, (40, 1))
+    alone[:, model.chosen.index(name)] = columns[name]
+    np.testing.assert_array_equal(model.vectors({name: columns[name]}), alone)
+    assert model.static_outputs(model.vectors({name: 0.1})).shape == (1, len(model.static_output))
+
+
+def test_without_a_load_there_is_no_strain_and_no_bound(pair: Pair) -> None:
+    response = pair.model.static_response(load=np.zeros(len(pair.model.static_load)))
+    assert not response.strain.any()
+    assert not response.displacement.any()
+    assert response.strain_error_bound == response.displacement_error_bound == 0.0
+
+
+def test_the_bound_allows_for_rounding(pair: Pair) -> None:
+    # Residuals do not show what rounding does to the solution itself, of which 5e-6 is the least allowed for.
+    model = pair.model
+    assert model.rounding_allowance >= 5e-6
+    for vector in states(model, 3):
+        response = model.static_response(vector)
+        without = replace(model, rounding_allowance=0.0).static_response(vector)
+        for kind in ("strain", "displacement"):
+            added = getattr(response, f"{kind}_error_bound") - getattr(without, f"{kind}_error_bound")
+            size = np.linalg.norm(getattr(response, kind))
+            assert added == pytest.approx(model.rounding_allowance * size, rel=1e-9)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e9, -1e9])
+def test_values_outside_validity_are_refused_by_name(pair: Pair, bad: float) -> None:
+    model = pair.model
+    for name in model.chosen:
+        vector = model.vector({name: bad})
+        asked = [(ask, vector) for ask in (model.static_response, model.modes)]
+        for ask, values in (*asked, (model.static_outputs, np.stack((model.nominal, vector)))):
+            with pytest.raises(OutsideModelError, match=rf"^{name} must lie between"):
+                ask(values)
+    with pytest.raises(OutsideModelError, match="nothing named 'z9'"):
+        model.static_response({"z9": 0.1})
+
+
+def test_all_corners_of_the_box_are_inside(pair: Pair) -> None:
+    assert tuple(pair.model.validity) == pair.model.chosen
+    for corner in pair.model.validity_box.T:
+        pair.model.static_response(corner)
+        pair.model.modes(corner)
+
+
+def test_a_saved_model_comes_back_to_the_last_bit(pair: Pair, tmp_path: Path) -> None:
+    path, model = tmp_path / "model.npz", pair.model
+    model.save(path)
+    again = ReducedModel.load(path)
+    for item in fields(model):
+        if item.init:
+            np.testing.assert_array_equal(getattr(again, item.name), getattr(model, item.name))
+    assert again.to_bytes() == model.to_bytes() == path.read_bytes()
+    assert [p.name for p in tmp_path.iterdir()] == ["model.npz"]
+
+
+def test_incomplete_damaged_or_foreign_files_are_refused(model: ReducedModel, tmp_path: Path) -> None:
+    path = tmp_path / "wing.npz"
+    with pytest.raises(FileNotFoundError):
+        ReducedModel.load(path)
+    path.write_bytes(model.to_bytes()[:1000])
+    with pytest.raises(ReducedModelFileError, match=r"wing\.npz is not a sound archive"):
+        ReducedModel.load(path)
+    arrays = arrays_from_bytes(model.to_bytes(), "the model")
+    for changes, sentence in (
+        ({"cross_mass": None}, "lacks cross_mass"),
+        ({"format": np.array(99)}, "has the format 99"),
+        ({"static_load": np.zeros((2, 1))}, "static_load"),
+        ({"static_load": arrays["static_load"] * np.nan}, "finite"),
+        ({"mode_count": np.array(0)}, "modes"),
+        ({"rounding_allowance": np.array(-1.0)}, "rounding_allowance"),
+    ):
+        wrong = {name: array for name, array in {**arrays, **changes}.items() if array is not None}
+        with pytest.raises(ReducedModelFileError, match=sentence):
+            ReducedModel.from_bytes(arrays_to_bytes(wrong))
+
+
+@pytest.mark.parametrize(
+    "value", [np.array(1.0), np.array("a"), np.zeros(5), np.zeros(0), np.zeros((0, 0, 0)), np.array(1j)]
+)
+def test_arrays_of_a_wrong_kind_are_refused(model: ReducedModel, value: np.ndarray) -> None:
+    arrays = arrays_from_bytes(model.to_bytes(), "the model")
+    numbers = {"format", "mode_count", "residual_allowance", "rounding_allowance"}
+    for name in set(arrays) - {item.name for item in fields(model) if item.type is str}:
+        if name in numbers and value.shape == () and value.dtype.kind == "f":
+            continue
+        with pytest.raises(ReducedModelFileError):
+            ReducedModel.from_bytes(arrays_to_bytes({**arrays, name: value}))
+
+
+def test_failed_write_leaves_the_old_file(model: ReducedModel, tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "wing.npz"
+    path.write_bytes(b"old")
+
+    def full_disk(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(kept_arrays.os, "fsync", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        model.save(path)
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["wing.npz"]
+
+
+# ---------------------------------------------------------------- what one kind alone shows
+
+
+@pytest.mark.parametrize(("e", "z"), [(0.9, (0.8, 0.8)), (1.1, (0.0, 0.0)), (1.0, (0.1, 0.7))])
+def test_the_tip_is_as_stiff_as_that_of_the_full_wing(coarse_operators, model: ReducedModel, e, z) -> None:
+    assert model.tip_stiffness(e, z) == pytest.approx(tip_stiffness(coarse_operators, e, z), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        (0.9, (0.8, 0.8), 0.30, 0.0),
+        (1.1, (0.0, 0.8), 0.05, 0.30),
+        (0.97, (0.35, 0.6), 0.21, 0.07),
+        (1.04, (0.8, 0.15), 0.05, 0.0),
+    ],
+)
+def test_the_wing_bends_in_the_modes_of_the_full_one(coarse_operators, model: ReducedModel, state) -> None:
+    full = eigenmodes(coarse_operators, *state)
+    e, loss, servo, pitot = state
+    reduced = model.modes(stiffness_loss=loss, young_modulus_factor=e, servo_mass=servo, pitot_mass=pitot)
+    np.testing.assert_allclose(reduced.frequency, full.frequency[: model.mode_count], rtol=1e-4)
+    assert reduced.followed == tuple(full.flapwise_bending)
+    assert min(reduced.followed_mac) > 0.8  # far more than any other mode could have
+    for index in reduced.followed:
+        shape, output = full.shape[:, index], reduced.output[:, index]
+        np.testing.assert_allclose(output[-1], coarse_operators.tip_row @ shape, rtol=3e-3)
+        np.testing.assert_allclose(
+            reduced.participation[1, index], coarse_operators.load_tip @ shape, rtol=3e-3
+        )
+        strain = coarse_operators.gauge_output @ shape
+        np.testing.assert_allclose(output[:-1], strain, rtol=0, atol=1e-2 * np.abs(strain).max())
+
+
+def test_modal_compliance_adds_up_to_the_static_one(model: ReducedModel) -> None:
+    modes = model.modes(stiffness_loss=(0.2, 0.2), servo_mass=0.169, pitot_mass=0.134)
+    terms = modes.participation[1] ** 2 / (2 * np.pi * modes.frequency) ** 2
+    assert 0.97 < terms.sum() * model.tip_stiffness(1.0, (0.2, 0.2)) < 1.0
+
+
+def test_a_beam_in_all_its_parts(beam, beam_reduction) -> None:
+    """Parameter times loss, controls, the weight of a free mass and modes are those of the full sums."""
+    model, masses = beam_reduction.model, {"pump": 0.07}
+    stiffness, mass = beam.stiffness({"e": 1.05}, {"z1": 0.6, "z2": 0.3}), beam.mass(masses)
+    full = Factorisation(stiffness).solve(beam.load("weight", 3.0, masses) + beam.load("pushed", -120.0))
+    found = model.static_response(HURT)
+    np.testing.assert_allclose(found.strain, beam.gauge_output @ full, atol=found.strain_error_bound, rtol=0)
+    tip = beam.displacement_output @ full
+    np.testing.assert_allclose(found.displacement, tip, atol=found.displacement_error_bound, rtol=0)
+    _, shapes = natural_frequencies(beam, 6, HURT)
+    np.testing.assert_allclose(shapes.T @ (mass @ shapes), np.eye(6), atol=1e-7)
+    wanted = np.abs(np.vstack((beam.gauge_output @ shapes, beam.displacement_output @ shapes)))
+    np.testing.assert_allclose(np.abs(model.modes(HURT).output[:4]), wanted, atol=2e-3 * wanted.max())
+
+
+@pytest.mark.parametrize(
+    ("full", "reduced", "count", "largest"),
+    [("beam", "beam_reduction", 6, 1e-3), ("coarse_plate", "plate_model", 20, 8e-3)],
+)
+def test_errors_are_measured(full: str, reduced: str, count: int, largest: float, request) -> None:
+    """The bound holds at random states, nearly as asked for, and tells the error within a few times."""
+    model = request.getfixturevalue(reduced)
+    errors = measured_errors(request.getfixturevalue(full), getattr(model, "model", model), count, seed=7)
+    assert max(errors.strain, errors.displacement) < errors.bound < largest
+    assert errors.broken == 0
+    assert errors.frequency < 2e-5 if full == "beam" else errors.bound < 30 * errors.strain
+
+
+def test_a_load_that_no_output_sees(write_beam: Callable[..., Path], tmp_path: Path) -> None:
+    """A push to the side moves the tip up by nothing, by symmetry: it is bounded all the same."""
+    file = write_beam(tmp_path, {"force = [0, 0, 1]": "force = [0, 1, 0]"}, cells=2)
+    model = reduce_structure(load_and_assemble(file), "beam").model
+    found = model.static_response({"load_factor": 0.0, "push": 100.0})
+    upwards = model.static_response({"load_factor": 6.0, "push": 0.0}).displacement[0]
+    assert abs(found.displacement[0]) <= found.displacement_error_bound < 1e-3 * abs(upwards)

@@ -1,0 +1,319 @@
+"""The contract of a law of a port, each law: slopes, rest, order of steps, both loops, over the planform."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.polynomial import Polynomial
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+
+from discrepancy.models.compiled_motion import compiled_kernel
+from fe.runtime import laws as functions
+from fe.runtime import patch
+from fe.runtime.errors import InvalidPatchError, SolutionError
+from fe.runtime.flexible_ports import settle_port
+from fe.runtime.laws.interface import PortForce
+from fe.runtime.modal_system import ModalSystem
+from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
+from fe.runtime.motion_arrays import State
+from fe.runtime.patch import (
+    BoucWen,
+    FreePlay,
+    MicroSlip,
+    ModelPatch,
+    Overflow,
+    PowerDamping,
+    PowerStiffness,
+    Primitive,
+    SineForce,
+)  # fmt: skip
+from fe.runtime.patched_wing import PatchedWing
+from fe.runtime.planform_forces import PLANFORM, STATION_COUNT, STATION_PORTS, at_stations, planform_stations
+from fe.runtime.stepwise import substeps
+from tests.fe.runtime.stepping import simulate
+
+A, W = 0.05, 2.0 * np.pi * np.array([5.6, 20.0, 35.0, 60.0])
+PORTS = {"tip": np.array([1.3, -1.1, 0.2, 1.2]), "root": np.array([0.8, 2.0, -0.3, 3.0])}
+WING = ModalSystem(W, np.diag(0.04 * W), PORTS)
+K1 = float(W[0] ** 2 / 1.3**2)
+AT_EACH = {  # one of each law
+    law.kind: law
+    for law in (
+        PowerDamping(PLANFORM, 2.0, 2.0, 0.5, 0.3, 0.1),
+        PowerStiffness(PLANFORM, 40.0, 3.0, 0, 0.02),
+        FreePlay(PLANFORM, 90.0, 0.004),
+        MicroSlip(PLANFORM, 12.0, 1500.0, -0.3, 8),
+        BoucWen(PLANFORM, 800.0, 0.01, 1.5),
+        SineForce(PLANFORM, 3.0, 2.0, 0.1),
+        Overflow(PLANFORM, 5.0, 1.4, 0.2, 0.1),
+    )
+}
+
+
+def laws(*items: Primitive) -> Laws:
+    return laws_of(ModelPatch(items), ["tip", "root", "mass", PLANFORM])
+
+
+def moved(*items: Primitive, system: ModalSystem = WING, **options: Any) -> Any:
+    start = {"q": np.array([A / 1.3, 0.002, 0.0, 0.001]), "v": np.zeros(4), "kernel": compiled_kernel()}
+    return simulate(system, laws(*items), interval=0.005, **start | options)
+
+
+def test_there_is_an_example_of_each_law() -> None:
+    assert {type(item) for item in AT_EACH.values()} == set(functions.LAWS)
+
+
+@pytest.mark.parametrize("kind", AT_EACH)
+def test_the_slope_is_that_of_the_force(kind: str) -> None:
+    """On ways to both sides from a place where it was never loaded, whose memory stays."""
+    law = laws(AT_EACH[kind])
+    memory = law.memory()
+    for x in (-0.03, 0.0013, 0.021):
+        force = [
+            functions.pull(law.numbers[0], law.values[0], law.elements[0], memory[0], x + way, 0.02, 400)
+            for way in (-1e-7, 0.0, 1e-7)
+        ]
+        assert force[1][1] == pytest.approx((force[2][0] - force[0][0]) / 2e-7, rel=2e-3, abs=1e-6)
+    assert not memory.any()
+
+
+@pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5, 2.0])
+@pytest.mark.parametrize(
+    ("law", "lowest"),
+    [(Overflow("tip", 0.7, 1.0, 2.0, 1.3), 2.0), (PowerDamping("tip", 0.7, 1.0, 0.5, 1.3, 0.1), 0.0)],
+)
+def test_what_a_law_of_speed_takes_is_its_equation(law: Any, lowest: float, exponent: float) -> None:
+    """A kick is s' = -w F(x, s), to the level where the law ends and no further."""
+    changed = type(law)(**vars(law) | {"exponent" if lowest else "velocity_exponent": exponent})
+    given = laws(changed)
+    number, values, x = given.numbers[0], given.values[0], 0.03
+    strength = functions.strength(number, values, 0.4) * functions.share(number, values, x)
+    exact = solve_ivp(
+        lambda t, s: -0.4 * functions.steady(number, values, x, s[0]),
+        (0.0, 2.0),
+        [3.5],
+        rtol=1e-10,
+        atol=1e-12,
+    )
+    assert functions.kick(number, values, 3.5, strength, 2.0, False) == pytest.approx(
+        exact.y[0, -1], abs=1e-6
+    )
+    assert functions.kick(number, values, 3.5, strength, 1e4, False) == pytest.approx(lowest, abs=1e-2)
+    if lowest:
+        assert functions.kick(number, values, 1.9, strength, 2.0, False) == 1.9
+        assert functions.steady(number, values, 0.0, 1.9) == 0.0
+
+
+# ---------------------------------------------------------------- at rest
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        PowerStiffness("tip", 300.0, 3.0, 0, 0.1),
+        PowerStiffness("tip", -20.0, 3.0, 0, 0.1),
+        PowerStiffness("tip", -40.0, 1.0, -1, 0.1),
+        FreePlay("tip", 500.0, 0.02),
+        MicroSlip("tip", 10.0, 500.0, -0.5),
+        BoucWen("tip", 500.0, 0.03, 1.7),
+        BoucWen("tip", 900.0, 0.001, 12.0),
+        SineForce("tip", 40.0, 15.0, 0.4),
+    ],
+)
+def test_static_levels_are_in_equilibrium_and_follow_the_path(law: Primitive) -> None:
+    compliance = np.array([[1e-3]])  # the structure has 1000 N/m there
+    load = np.array([0.0, 20.0, 60.0, 60.0, 10.0, -50.0, -50.1, 0.0])
+    linear = load[:, None] * 1e-3
+    solution = static_solution(laws(law), linear, compliance, kernel=compiled_kernel())
+    plain = static_solution(laws(law), linear, compliance)
+    np.testing.assert_allclose(solution.positions + solution.forces * 1e-3, linear, atol=1e-12)
+    np.testing.assert_allclose(solution.positions, plain.positions, atol=1e-14)
+    assert solution.positions[2] == pytest.approx(solution.positions[3], abs=1e-12)
+    fine = np.interp(np.linspace(0, 7, 7 * 64 + 1), np.arange(8), linear[:, 0])[:, None]
+    followed = static_solution(laws(law), fine, compliance, kernel=compiled_kernel())
+    np.testing.assert_allclose(followed.positions[::64], solution.positions, atol=3e-6)
+    if isinstance(law, SineForce):
+        np.testing.assert_allclose(
+            solution.forces, 40.0 * np.sin(15.0 * solution.positions + 0.4), atol=1e-10
+        )
+
+
+@given(
+    load=st.lists(st.floats(-100.0, 100.0), min_size=1, max_size=6),
+    share=st.floats(0.0, 0.95),
+    width=st.floats(1e-4, 0.2),
+    order=st.floats(0.5, 10.0),
+)
+@settings(max_examples=80, deadline=None)
+def test_static_solutions_exist_for_every_softening_that_leaves_stiffness(load, share, width, order) -> None:
+    both = laws(
+        BoucWen("tip", 0.5 * share * 1000.0, width, order),
+        MicroSlip("root", 500.0 * share * width, 0.5 * share * 1000.0, -0.3),
+        FreePlay("tip", 0.04 * 1000.0, width),
+    )
+    compliance = 1e-3 * np.array([[1.0, 0.6, 1.0], [0.6, 1.0, 0.6], [1.0, 0.6, 1.0]])
+    if len(both) < 3:  # a share of zero leaves the gap only
+        compliance = np.full((1, 1), 1e-3)
+    linear = np.outer(load, compliance[0])
+    solution = static_solution(both, linear, compliance, kernel=compiled_kernel())
+    np.testing.assert_allclose(solution.positions + solution.forces @ compliance.T, linear, atol=1e-9)
+
+
+def test_a_structure_that_softens_away_is_refused() -> None:
+    spring = laws(PowerStiffness("tip", -500.0, 3.0, 0, 0.1))
+    with pytest.raises(SolutionError, match="level 2 was not found: an internal force at tip"):
+        static_solution(spring, np.array([[0.01], [0.5]]), np.array([[1e-3]]))
+
+
+@pytest.mark.parametrize("flexibility", [0.1, 0.16])  # from 1/6 m/N on there is more than one root
+def test_a_sine_on_flexibility_is_settled(flexibility: float) -> None:
+    sine = laws(SineForce("tip", 2.0, 3.0, 0.4))
+    ports = sine.at(np.zeros((1, 0)), np.array([flexibility]), 0.0, np.zeros((2, 1)))
+    for y in np.linspace(-9.0, 9.0, 91):
+        state = State(np.zeros(0), np.zeros(0), sine.memory(), np.zeros(1))
+        x = settle_port(0, np.zeros(1, dtype=np.int64), ports, state, y, flexibility, 1.0, 1)
+        near = 1e-11 * (abs(x) + abs(y))
+        assert abs(x + flexibility * state.current[0] - y) <= near
+        assert flexibility * abs(state.current[0] - 2.0 * np.sin(3.0 * x + 0.4)) <= near
+
+
+# ---------------------------------------------------------------- in motion
+
+TYPICAL: dict[str, tuple[Primitive, float, float]] = {
+    # law, least observed order, largest error of the default steps in shares of the release
+    "coulomb": (PowerDamping("tip", 0.02 * K1 * A, 0, 0, 1, 1), 1.7, 5e-5),
+    "quadratic": (PowerDamping("tip", 0.05 * K1 * A, 2, 0, W[0] * A, 1), 1.9, 5e-5),
+    "structural": (PowerDamping("tip", 0.03 * K1 * A, 0, 1, 1, A), 1.5, 5e-5),
+    "cubic": (PowerStiffness("tip", 0.05 * K1 * A, 3, 0, A), 1.9, 3e-5),
+    "crack": (PowerStiffness("tip", -0.05 * K1 * A, 1, -1, A), 1.5, 5e-5),
+    "free play": (FreePlay("tip", 0.1 * K1, 0.1 * A), 1.2, 5e-5),
+    "micro-slip": (MicroSlip("tip", 0.05 * K1 * A, 0.1 * K1, -0.3), 1.3, 1e-4),
+    "Bouc-Wen": (BoucWen("tip", 0.1 * K1, 0.5 * A, 2.0), 1.3, 1e-4),
+    "drift": (patch.StiffnessDrift(0.02), 1.9, 1e-5),
+}
+
+
+@pytest.mark.parametrize("name", TYPICAL)
+def test_default_steps_are_fine_and_the_order_is_two(name: str) -> None:
+    law, least_order, largest = TYPICAL[name]
+    exact, *coarse = (
+        moved(law, force=np.zeros(1000), refinement=n).q @ PORTS["tip"] / A for n in (128, 1, 2, 4, 8)
+    )
+    errors = [np.max(np.abs(one - exact)) for one in coarse]
+    assert errors[0] < largest
+    # events fall differently into the steps of each refinement, so the order is that over a factor of eight
+    assert np.log2(errors[0] / errors[-1]) / 3.0 > least_order
+
+
+SEVERAL = (
+    PowerDamping("tip", 0.03 * K1 * A, 0.0, 0.0, 1.0, 1.0),
+    PowerDamping("root", 0.01 * K1 * A, 0.4, 0.5, 2.0, A),
+    PowerStiffness("root", 0.02 * K1 * A, 2.5, 1, A),
+    MicroSlip("root", 0.02 * K1 * A, 0.05 * K1, -0.2, 5),
+    BoucWen("tip", 0.05 * K1, 0.3 * A, 1.5),
+    FreePlay("tip", 0.05 * K1, 0.1 * A),
+    patch.StiffnessDrift(0.01),
+)
+PUSHED = {"force": 0.1 * K1 * A * np.sin(np.arange(101) * 0.3), "shape": PORTS["tip"]}
+
+
+@pytest.mark.parametrize("coupling", [0.0, 0.3])
+def test_plain_and_compiled_loops_agree(coupling: float) -> None:
+    system = ModalSystem(W, WING.damping + coupling, PORTS)
+    one, other = (moved(*SEVERAL, system=system, **PUSHED, kernel=k) for k in (None, compiled_kernel()))
+    np.testing.assert_allclose(one.q, other.q, atol=1e-12)
+    np.testing.assert_allclose(one.port_forces, other.port_forces, atol=1e-8)
+
+
+def test_a_run_can_be_stopped_and_taken_further() -> None:
+    whole, first = moved(*SEVERAL, **PUSHED), moved(*SEVERAL, **PUSHED | {"force": PUSHED["force"][:41]})
+    left = {"q": first.q[-1], "v": first.v[-1], "memory": first.memory, "start": 0.2}
+    rest = moved(*SEVERAL, **PUSHED | {"force": PUSHED["force"][40:]}, **left)
+    np.testing.assert_allclose(rest.q, whole.q[40:], atol=1e-13)
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=25, deadline=None)
+def test_damping_never_feeds_energy(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    exponents = random.choice([0.0, 0.3, 1.0, 2.2]), random.choice([0.0, 1.0])
+    law = PowerDamping("tip", random.uniform(0, 0.3) * K1 * A, *exponents, 2.0, A)
+    start = {"q": random.normal(size=4) * 0.02, "v": random.normal(size=4) * 0.5, "force": np.zeros(400)}
+    run = moved(law, system=ModalSystem(W, np.zeros((4, 4)), PORTS), **start)
+    energy = np.sum((run.q * W) ** 2 + run.v**2, axis=1)
+    assert np.all(np.diff(energy) <= 2e-3 * energy[0])
+    assert energy[-1] <= energy[0]
+
+
+# ---------------------------------------------------------------- of a patch
+
+
+def test_laws_without_magnitude_leave_the_linear_structure() -> None:
+    damping, play = PowerDamping("tip", 0.0, 0, 0, 1, 1), FreePlay("tip", 10.0, 0.0)
+    nothing = laws(damping, play, patch.StiffnessDrift(0.0), patch.PointMass(1.0, 0.5))
+    assert nothing is NO_LAWS
+    assert len(substeps(WING, nothing, np.array([0.0, 0.005])).lengths) == 1
+
+
+@pytest.mark.parametrize(
+    ("law", "sentence"),
+    [
+        (PowerDamping("nose", 1, 0, 0, 1, 1), "port 'nose', which this model does not have; it has tip"),
+        (PowerDamping("tip", -1, 0, 0, 1, 1), "coefficient of 'power_damping' must not be negative"),
+        (PowerDamping("tip", 1, 0, 0, 0, 1), "reference_velocity of 'power_damping' must be positive"),
+        (PowerStiffness("tip", 1, 0, 0, 1), "exponent of 'power_stiffness' must be positive"),
+        (PowerStiffness("tip", 1, 1, 2, 1), "side"),
+        (MicroSlip("tip", 1, 1, 0.5), "-chi of 'micro_slip' must not be negative"),
+        (MicroSlip("tip", 1, 1, 0.0, 0), "element_count of 'micro_slip' must be positive"),
+        (BoucWen("tip", 1, 0, 1), "yield_displacement of 'bouc_wen' must be positive"),
+        (Overflow("tip", 1.0, 1.0, -1.0, 1.0), "level of 'overflow' must not be negative"),
+    ],
+)
+def test_a_law_that_cannot_be_is_refused_in_a_sentence(law: Primitive, sentence: str) -> None:
+    with pytest.raises(InvalidPatchError, match=sentence):
+        laws(law)
+
+
+# ---------------------------------------------------------------- over the planform
+
+SPAN, ROOT, TIP = 1.8, 0.4, 0.25
+
+
+@given(st.floats(0.05, 5.0), st.floats(0.05, 5.0), st.integers(0, 2 * STATION_COUNT - 2))
+def test_powers_of_the_distance_have_the_mean_over_the_area(root: float, tip: float, power: int) -> None:
+    distance, share = planform_stations(SPAN, root, tip)
+    chord = Polynomial((root, (tip - root) / SPAN))
+    moment = (chord * Polynomial((0.0, 1.0)) ** power).integ()(SPAN) / chord.integ()(SPAN)
+    assert share.sum() == pytest.approx(1.0)
+    assert float(share @ distance**power) == pytest.approx(moment, rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", AT_EACH)
+def test_where_all_places_move_alike_the_forces_add_up_to_the_law(kind: str) -> None:
+    """What is elsewhere in a patch stays as it is."""
+    share, item = planform_stations(SPAN, ROOT, TIP).share, AT_EACH[kind]
+    before, after = patch.PointMass(0.1, 1.0), FreePlay("root", 2.0, 1e-3)
+    first, *spread, last = at_stations(ModelPatch((before, item, after)), share)
+    assert (first, last) == (before, after)
+    assert at_stations(ModelPatch((before, after)), share) == ModelPatch((before, after))
+    assert [force.port for force in spread if isinstance(force, PortForce)] == list(STATION_PORTS)
+    one, parts = laws(item), laws_of(ModelPatch(tuple(spread)), STATION_PORTS)
+    np.testing.assert_allclose(parts.values[:, 0], share * one.values[0, 0], rtol=1e-12)
+    assert np.all(parts.values[:, 1:] == one.values[0, 1:])
+    assert np.allclose(parts.elements, one.elements)  # each slips where the whole does
+
+
+def test_rows_of_the_stations_are_displacements_of_the_elastic_line(coarse_patched_wing: PatchedWing) -> None:
+    wing = coarse_patched_wing
+    bent = np.linalg.solve(wing.structure(1.0, (0.0, 0.0), 0.17, 0.13).stiffness, wing.arrays.load_tip)
+    along = wing.arrays.line_rows[2] @ bent
+    seen = np.array([wing.port_rows[port] @ bent for port in STATION_PORTS])
+    between = CubicSpline(wing.arrays.stations, along)(wing.planform.distance)
+    assert seen == pytest.approx(between, rel=1e-2)
+    # the mean over the area is that of the port "span"
+    assert float(wing.planform.share @ seen) == pytest.approx(float(wing.port_rows["span"] @ bent), rel=1e-2)
+    with pytest.raises(InvalidPatchError, match="it has root, tip, span, planform"):
+        laws_of(wing.internal_forces(ModelPatch((FreePlay("flap", 1.0, 1e-3),))), wing.port_rows)
