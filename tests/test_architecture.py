@@ -57,7 +57,7 @@ ROOMS = {
     "discrepancy": (
         "errors", "sentences", "campaign", "models", "lumped_models", "location", "catalogue",
         "document_types", "verdict", "files", "search_settings", "fits", "missing_force", "search",
-        "judgement", "force_told", "checks",
+        "judgement", "checks",
         "sources", "model_choice", "workflow", "parameters", "application", "self_calibration", "report",
         "verdict_folder",
     ),
@@ -67,9 +67,6 @@ LONGEST_MODULE, LONGEST_FUNCTION = 450, 60
 """Lines of a module, and lines of code of a function (docstring, comments and blank lines left out)."""
 
 LONGER: dict[str, str] = {
-    "fe/runtime/static_path.py:static_path": (
-        "Newton's method within the halving of its steps shares its arrays throughout, compiled as one."
-    ),
     "discrepancy/workflow.py:investigate": "The whole way, one stage after the other.",
     "discrepancy/models/fmu_runs.py:_made_binding": "One binding, its tables in the order of the file.",
     "fmu_asset/slaves/table.py:structure_table": "A table: one call a variable.",

@@ -6,16 +6,15 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
+from discrepancy.models.high_pass import filtered_record
 from discrepancy.models.interface import Conditions, Model, Response
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive
+from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive, SensorRotation
 from fe.runtime.sensors import (
     SensorRecord,
     apply_sensors,
     check_channels,
     clock_of,
-    needs_components,
-    uses_sensors,
 )
 
 
@@ -54,9 +53,9 @@ def observe(
         (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
     )
     patch = (_by_channels(model.sensors, campaign) + patch).in_trial(trial.name)
-    if not uses_sensors(patch):
+    if not len(patch.of(*SENSORS)):
         return model.respond(trial, outputs, patch, conditions)
-    (rate, zero), components = clock_of(patch), needs_components(patch)
+    (rate, zero), components = clock_of(patch), len(patch.of(SensorRotation)) > 0
     if rate or zero or components:
         clock = (conditions.clock[0] + rate, conditions.clock[1] + zero)
         conditions = replace(conditions, clock=clock, components=components)
@@ -139,6 +138,6 @@ def observe_response(
     )  # fmt: skip
     try:
         check_channels(patch, [(name, channel.quantity.value) for name, channel in campaign.channels.items()])
-        return Response(*apply_sensors(patch, record, *response))
+        return Response(*apply_sensors(patch, record, *response, filtered=filtered_record))
     except InvalidPatchError as cause:
         raise CatalogueError(str(cause)) from cause

@@ -4,6 +4,7 @@ NumPy and relative imports only: this file is copied into the FMU.
 """
 
 import ast
+import re
 from collections.abc import Callable, Collection, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
@@ -151,20 +152,12 @@ class Expression:
         )
 
     def with_numbers(self, values: Mapping[str, float]) -> str:
-        """Return the text with numbers in the place of names."""
-        return ast.unparse(_Numbers(values).visit(deepcopy(self._tree())))
+        """Return the text with numbers in the place of names; powers of negative ones stay what they are."""
 
+        def number(name: re.Match[str]) -> str:
+            if name[0] not in values:
+                return name[0]
+            value = float(values[name[0]])
+            return f"({value!r})" if value < 0.0 else repr(value)
 
-class _Numbers(ast.NodeTransformer):
-    """Puts numbers in the place of names."""
-
-    def __init__(self, values: Mapping[str, float]) -> None:
-        self.values = values
-
-    def visit_Name(self, node: ast.Name) -> ast.expr:
-        """Return the number of a name, with a sign of its own, so that powers of it stay what they are."""
-        if node.id not in self.values:
-            return node
-        value = float(self.values[node.id])
-        number = ast.Constant(abs(value))
-        return ast.UnaryOp(ast.USub(), number) if value < 0.0 else number
+        return re.sub(r"\b[A-Za-z_]\w*", number, self.text)

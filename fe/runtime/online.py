@@ -4,9 +4,9 @@ NumPy only: this file is copied into the FMU. The equations are in `docs/reduced
 """
 
 from bisect import bisect_right
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import partial
 from math import sqrt
-from typing import NamedTuple
 
 import numpy as np
 from numpy import einsum
@@ -14,57 +14,10 @@ from numpy.linalg import solve
 
 from .arrays import FloatArray
 from .reduced_arrays import ReducedArrays
+from .state import Losses
 
+Dual = Callable[[FloatArray, Losses], tuple[FloatArray, FloatArray]]
 multiply_outer = np.multiply.outer
-
-
-@dataclass(frozen=True, slots=True)
-class DualArrays:
-    """Approximate dual solutions: `correction` (O, R), and `factor` (T O, T) or their residuals (O, F)."""
-
-    correction: FloatArray
-    factor: FloatArray
-
-
-@dataclass(frozen=True, slots=True)
-class CombinedDual:
-    """M dual functions of each output, whose Galerkin solution is its approximate dual solution.
-
-    Attributes
-    ----------
-    stiffness : (T, O M M) ndarray
-        Stiffness terms in the functions.
-    output : (O, M, 1) ndarray
-        Each output of its functions.
-    correction : (O M, R) ndarray
-        The functions, applied to the basis of the residuals.
-    factor : (O, F, 1 + T M) ndarray
-        Factors of the dual residuals.
-    """
-
-    stiffness: FloatArray
-    output: FloatArray
-    correction: FloatArray
-    factor: FloatArray
-
-    def at(self, theta: FloatArray) -> DualArrays:
-        """Return the dual solutions at the coefficients (T,) of the stiffness, with the residuals (O, F)."""
-        outputs, functions, _ = self.output.shape
-        stiffness = (theta @ self.stiffness).reshape(outputs, functions, functions)
-        weights = solve(stiffness, self.output)
-        coefficients = np.empty((outputs, self.factor.shape[2], 1))
-        coefficients[:, 0] = 1.0
-        coefficients[:, 1:] = (-theta[:, np.newaxis] * weights.transpose(0, 2, 1)).reshape(outputs, -1, 1)
-        correction = weights.transpose(0, 2, 1) @ self.correction.reshape(outputs, functions, -1)
-        return DualArrays(correction[:, 0], (self.factor @ coefficients)[:, :, 0])
-
-
-class CertifiedSolution(NamedTuple):
-    """Coordinates (N,), outputs (O,) and certified bounds (O,) of their errors, rounding left out."""
-
-    coordinates: FloatArray
-    output: FloatArray
-    bound: FloatArray
 
 
 class OnlineArrays:
@@ -81,14 +34,9 @@ class OnlineArrays:
         (N, N).
     stiffness : (T, N N) ndarray
         Stiffness terms, flat.
-    splits : tuple of list of float
-        `dual_split` of each damage region.
     """
 
-    __slots__ = (
-        "_allowance", "_combined", "_dual", "_load", "_output", "_reference", "_residual", "splits", "square",
-        "stiffness",
-    )  # fmt: skip
+    __slots__ = ("_allowance", "_dual", "_load", "_output", "_reference", "_residual", "square", "stiffness")
 
     def __init__(self, arrays: ReducedArrays) -> None:
         stiffness = arrays.static_stiffness
@@ -102,30 +50,12 @@ class OnlineArrays:
         )
         self._allowance = arrays.residual_allowance
         self._reference = (*arrays.bound_reference.tolist(), 1.0)
-        ends = np.cumsum(arrays.dual_counts - 1)[:-1]
-        self.splits = tuple([float(value) for value in split] for split in np.split(arrays.dual_split, ends))
-        dual, functions = arrays.dual_residual, arrays.dual_output.shape[-1]
-        self._combined, self._dual = None, []
-        if functions:
-            by_output = arrays.dual_correction.transpose(1, 0, 2)
-            self._combined = CombinedDual(
-                np.ascontiguousarray(arrays.dual_stiffness.transpose(1, 0, 2, 3)).reshape(len(stiffness), -1),
-                arrays.dual_output[:, :, np.newaxis],
-                np.ascontiguousarray(by_output).reshape(-1, by_output.shape[2]),
-                dual[0],
-            )
-            return
-        # to be multiplied by theta, as the stiffness
-        factors = np.concatenate((-dual[..., 1:], dual[..., :1]), axis=-1)
-        self._dual = [
-            DualArrays(
-                np.ascontiguousarray(correction), np.ascontiguousarray(factor.reshape(-1, len(stiffness)))
-            )
-            for correction, factor in zip(arrays.dual_correction, factors, strict=True)
-        ]
+        self._dual = (_combined if arrays.dual_output.shape[-1] else _nearest)(arrays)
 
-    def solution(self, theta: FloatArray, load: FloatArray, loss: tuple[float, ...]) -> CertifiedSolution:
-        """Return the static solution and its bounds.
+    def solution(
+        self, theta: FloatArray, load: FloatArray, loss: tuple[float, ...]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return coordinates (N,), outputs (O,) and certified bounds (O,) of their errors, rounding left out.
 
         Parameters
         ----------
@@ -138,7 +68,6 @@ class OnlineArrays:
         """
         stiffness = (theta @ self.stiffness).reshape(self.square)
         coordinates = np.asarray(solve(stiffness, load @ self._load), dtype=np.float64)
-        output = self._output @ coordinates
 
         # |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha, norms dual to the reference
         coefficients = np.empty(self._residual.shape[1])
@@ -146,19 +75,59 @@ class OnlineArrays:
         coefficients[:loads] = load
         multiply_outer(theta, coordinates, out=coefficients[loads:].reshape(theta.size, -1))
         residual = self._residual @ coefficients
-        if self._combined is not None:
-            anchor = self._combined.at(theta)
-            dual = anchor.factor
-        else:
-            number = 0
-            for split, value in zip(self.splits, loss, strict=True):
-                number = number * (len(split) + 1) + bisect_right(split, value)
-            anchor = self._dual[number]
-            dual = (anchor.factor @ theta).reshape(-1, theta.size)
+        correction, dual = self._dual(theta, loss)
         coercivity = min(
             value / reference for value, reference in zip(theta.tolist(), self._reference, strict=True)
         )
         outside = self._allowance * sqrt(coordinates @ coordinates)
         remainder = (sqrt(residual @ residual) + outside) / coercivity
-        bound = remainder * np.sqrt(einsum("ij,ij->i", dual, dual)) + np.abs(anchor.correction @ residual)
-        return CertifiedSolution(coordinates, output, bound)
+        bound = remainder * np.sqrt(einsum("ij,ij->i", dual, dual)) + np.abs(correction @ residual)
+        return coordinates, self._output @ coordinates, bound
+
+
+# An approximate dual solution, at coefficients (T,) of the stiffness and losses of the regions, is what it
+# gives applied to the basis of the residuals (O, R), and the dual residuals of the outputs (O, F).
+
+
+def _nearest(arrays: ReducedArrays) -> Dual:
+    """Return the dual solution of the anchor that is next to the losses."""
+    terms, dual = len(arrays.static_stiffness), arrays.dual_residual
+    # to be multiplied by theta, as the stiffness
+    factors = np.concatenate((-dual[..., 1:], dual[..., :1]), axis=-1)
+    anchors = [
+        (np.ascontiguousarray(correction), np.ascontiguousarray(factor.reshape(-1, terms)))
+        for correction, factor in zip(arrays.dual_correction, factors, strict=True)
+    ]
+    splits = np.split(arrays.dual_split, np.cumsum(arrays.dual_counts - 1)[:-1])
+    return partial(_at_anchor, anchors, [split.tolist() for split in splits])
+
+
+def _at_anchor(
+    anchors: list[tuple[FloatArray, FloatArray]], splits: list[list[float]], theta: FloatArray, loss: Losses
+) -> tuple[FloatArray, FloatArray]:
+    number = 0
+    for split, value in zip(splits, loss, strict=True):
+        number = number * (len(split) + 1) + bisect_right(split, value)
+    correction, factor = anchors[number]
+    return correction, (factor @ theta).reshape(-1, theta.size)
+
+
+def _combined(arrays: ReducedArrays) -> Dual:
+    """Return the Galerkin solution of each output in its M dual functions."""
+    terms, by_output = len(arrays.static_stiffness), arrays.dual_correction.transpose(1, 0, 2)
+    stiffness = np.ascontiguousarray(arrays.dual_stiffness.transpose(1, 0, 2, 3)).reshape(terms, -1)
+    corrections, factor = np.ascontiguousarray(by_output), arrays.dual_residual[0]
+    return partial(_galerkin, stiffness, arrays.dual_output[:, :, np.newaxis], corrections, factor)
+
+
+def _galerkin(
+    stiffness: FloatArray, output: FloatArray, corrections: FloatArray, factor: FloatArray, theta: FloatArray,
+    loss: Losses,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    outputs, functions, _ = output.shape
+    weights = solve((theta @ stiffness).reshape(outputs, functions, functions), output)
+    across = weights.transpose(0, 2, 1)
+    coefficients = np.empty((outputs, factor.shape[2], 1))
+    coefficients[:, 0] = 1.0
+    coefficients[:, 1:] = (-theta[:, np.newaxis] * across).reshape(outputs, -1, 1)
+    return (across @ corrections)[:, 0], (factor @ coefficients)[:, :, 0]

@@ -4,7 +4,7 @@ NumPy and relative imports only: this file is copied into the FMU.
 """
 
 import re
-from dataclasses import Field, asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from inspect import get_annotations
 from math import inf, isfinite
 from typing import Any, ClassVar, NamedTuple, dataclass_transform
@@ -32,16 +32,8 @@ def course_of(text: str, kind: str) -> Expression:
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
-class Record:
-    """What makes each class that derives from it a frozen dataclass."""
-
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
-    def __init_subclass__(cls) -> None:
-        dataclass(frozen=True)(cls)
-
-
-class Primitive(Record):
+@dataclass(frozen=True)
+class Primitive:
     """One primitive change; `kind` names its class in a file. All values SI; zero magnitude is no change.
 
     A class of primitives is a frozen record of its annotated values, without a decorator of its own.
@@ -62,7 +54,7 @@ class Primitive(Record):
     windows: tuple[Window, ...] = field(default=(), kw_only=True)
 
     def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
+        dataclass(frozen=True)(cls)
         if "kind" not in cls.__dict__:
             cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
         hints = get_annotations(cls).items()

@@ -304,18 +304,15 @@ class ReducedModel(ReducedArrays):
         first, gauges = len(self.parameters), len(self.gauges)
         loss = tuple(chosen[first : first + len(self.regions)])
         acting = self._of_one(chosen, 1) if load is None else load
-        found, rounding = (
-            self._online.solution(self._of_one(chosen, 0), acting, loss),
-            self.rounding_allowance,
-        )
-        strain, displacement = found.output[:gauges], found.output[gauges:]
-        bound = found.bound.tolist()
+        theta, rounding = self._of_one(chosen, 0), self.rounding_allowance
+        coordinates, output, errors = self._online.solution(theta, acting, loss)
+        strain, displacement, bound = output[:gauges], output[gauges:], errors.tolist()
         return StaticResponse(
             strain,
             displacement,
             max(bound[:gauges], default=0.0) + rounding * sqrt(strain @ strain),
             max(bound[gauges:], default=0.0) + rounding * sqrt(displacement @ displacement),
-            found.coordinates,
+            coordinates,
         )
 
     def static_outputs(self, vectors: FloatArray) -> FloatArray:

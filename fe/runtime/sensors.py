@@ -2,12 +2,13 @@
 
 Pure functions on arrays for the primitives of `fe.runtime.patch.SENSORS`; clocks are not here, because they
 say when the response is taken and so belong to whoever computes it. Without sensors the input comes back
-untouched. A record whose end is not known is read row after row, with what filters remember (`FilterMemory`).
+untouched. A high-pass needs the whole record, or of one that is read row after row what it remembers
+(`FilterMemory`).
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from math import exp, expm1, factorial, pi, sqrt
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from .arrays import BoolArray, FloatArray
 from .errors import InvalidPatchError
-from .high_pass import high_pass
 from .patch import (
     EVERY_CHANNEL,
     SENSORS,
@@ -36,6 +36,8 @@ from .patch import (
     ThermalStrain,
     course_of,
 )
+
+Filter = Callable[[HighPass, "SensorRecord", FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
 STRAIN = "strain"
 """Quantity of a strain gauge."""
@@ -77,19 +79,9 @@ class SensorRecord:
         return self.kind in ("ringdown", "forced", "driven")
 
 
-def uses_sensors(patch: ModelPatch) -> bool:
-    """Return whether a patch changes what is read (the clock included)."""
-    return any(isinstance(item, SENSORS) for item in patch)
-
-
-def needs_components(patch: ModelPatch) -> bool:
-    """Return whether a patch asks for the strain across the gauges and the shear strain."""
-    return any(isinstance(item, SensorRotation) for item in patch)
-
-
 def needs_structure(patch: ModelPatch) -> bool:
     """Return whether a patch needs more than what its sensors make of the readings of the plain structure."""
-    return needs_components(patch) or any(not isinstance(item, SENSORS) for item in patch)
+    return any(isinstance(item, SensorRotation) or not isinstance(item, SENSORS) for item in patch)
 
 
 def clock_of(patch: ModelPatch) -> tuple[float, float]:
@@ -130,7 +122,8 @@ def apply_sensors(
     rates: FloatArray | None = None,
     transverse: FloatArray | None = None,
     shear: FloatArray | None = None,
-    memory: "FilterMemory | None" = None,
+    *,
+    filtered: Filter,
 ) -> tuple[FloatArray, FloatArray | None]:
     """Return what the channels show and its time derivative.
 
@@ -151,9 +144,10 @@ def apply_sensors(
         Its time derivative, for dynamic trials.
     transverse, shear : (N, C) ndarray, optional
         Strain across each gauge's direction and engineering shear strain; needed for rotations.
-    memory : FilterMemory, optional
-        The record is one row (1, C) of a longer one, and this is what its filters remember; there are no
-        rates then.
+    filtered : callable
+        How columns (N, C) of a dynamic record and their rates pass a high-pass:
+        `discrepancy.models.high_pass.filtered_record`, or `FilterMemory.filtered` of one row of a longer one,
+        which has no rates.
 
     Raises
     ------
@@ -179,10 +173,10 @@ def apply_sensors(
         elif not isinstance(item, HighPass):
             added, rate = _added(item, record)
             read = signal + np.reshape(added, (-1, 1)), slope + np.reshape(rate, (-1, 1))
-        elif not record.is_dynamic:
-            continue
+        elif record.is_dynamic:
+            read = filtered(item, record, signal, slope)
         else:
-            read = _filtered(item, record, signal, slope) if memory is None else memory.filtered(item, signal)
+            continue
         acting = _acts(item, record.time)[:, np.newaxis]
         shown[:, columns], slopes[:, columns] = (
             np.where(acting, after, before) for after, before in zip(read, (signal, slope), strict=True)
@@ -283,38 +277,6 @@ def _decaying_line(item: DecayingLine, record: SensorRecord) -> tuple[FloatArray
     return value, -zeta * omega * value + envelope * damped * (item.sine * c - item.cosine * s)
 
 
-# ---------------------------------------------------------------- high-pass
-
-
-def _filtered(
-    item: HighPass, record: SensorRecord, signal: FloatArray, slope: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Pass columns through a high-pass filter; where sampling is uneven, on an even grid and back."""
-    time, tau = record.time, item.time_constant
-    count = max(len(time) - 1, 1)
-    interval = float(time[-1] - time[0]) / count
-    even = len(time) < 3 or bool(np.max(np.abs(np.diff(time) - interval)) <= 2e-3 * interval)
-    if not even:  # on a grid twice as fine as the usual step, and back
-        count = int(np.ceil(2.0 * float(time[-1] - time[0]) / float(np.median(np.diff(time)))))
-        interval = float(time[-1] - time[0]) / count
-        grid = np.linspace(time[0], time[-1], count + 1)
-        signal, slope = _at(grid, time, signal), _at(grid, time, slope)
-    held = signal[0] if record.kind == "ringdown" else np.zeros(signal.shape[1])
-    shown = high_pass(signal, interval, tau, item.order, held)
-    if item.order in (1.0, 2.0):  # each stage obeys y' = x' - y / tau
-        if item.order == 2.0:
-            slope = slope - high_pass(signal, interval, tau, 1.0, held) / tau
-        slope = slope - shown / tau
-    else:
-        slope = high_pass(slope, interval, tau, item.order, np.zeros(len(held)))
-    return (shown, slope) if even else (_at(time, grid, shown), _at(time, grid, slope))
-
-
-def _at(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
-    """Return columns (N, C) that are known at some times at others, linear in between."""
-    return np.stack([np.interp(times, known, column) for column in values.T], axis=1)
-
-
 LARGEST_ORDER = 4
 """Most stages of a high-pass."""
 
@@ -339,7 +301,9 @@ class FilterMemory:
         self._before, self._duration = None if before is None else iter(before), duration
         self.after: list[float] = []
 
-    def filtered(self, item: HighPass, row: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def filtered(
+        self, item: HighPass, record: SensorRecord, row: FloatArray, rates: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Return what columns (1, C) show, and no rates; raises `InvalidPatchError`."""
         if not (item.time_constant > 0.0 and item.order in range(1, LARGEST_ORDER + 1)):
             raise InvalidPatchError(

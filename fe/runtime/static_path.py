@@ -11,19 +11,19 @@ from .motion_arrays import FloatArray, IntArray, Ports, Unnamed
 
 
 def static_forces(
-    x: FloatArray, ports: Ports, memory: FloatArray, least: IntArray, forces: FloatArray, slopes: FloatArray
-) -> None:
-    """Fill `forces` and `slopes` (J,) at positions `x` (J,) reached from `memory`, which stays as it is.
+    x: FloatArray, ports: Ports, memory: FloatArray, least: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return forces and slopes (J,) at positions `x` (J,) reached from `memory`, which stays as it is.
 
     `least` (J,) is the least number of parts in which a hysteretic law follows the way; laws of speed are
     zero at rest.
     """
+    forces, slopes = np.zeros(len(x)), np.zeros(len(x))
     for j in range(len(x)):
-        forces[j] = 0.0
-        slopes[j] = 0.0
         if ports.of_speed[j] == 0:
             number, values, elements = ports.numbers[j], ports.values[j], ports.elements[j]
             forces[j], slopes[j] = pull(number, values, elements, memory[j], x[j], 1.0, least[j])
+    return forces, slopes
 
 
 def arrive_at_rest(
@@ -71,8 +71,7 @@ def static_path(
     levels, count = linear.shape
     old = start.copy()
     x = memory[:, 1].copy()
-    own, gradient = np.zeros(count), np.zeros(count)
-    trial_force, trial_slope = np.zeros(count), np.zeros(count)
+    own, unit = np.zeros(count), np.eye(count)
     least = np.zeros(count, dtype=np.int64)
     for level in range(levels):
         done, step = 0.0, 1.0
@@ -81,42 +80,32 @@ def static_path(
             for j in range(count):  # fixed during the iteration, so that the force is a smooth function
                 least[j] = parts(ports.numbers[j], ports.values[j], abs(goal[j] - x[j]))
             guess = x.copy()
-            static_forces(guess, ports, memory, least, own, gradient)
+            own, slopes = static_forces(guess, ports, memory, least)
             yielded = compliance @ own  # what a law that pulls without a load moves
             scale = np.max(np.abs(goal)) + np.max(np.abs(x)) + np.max(np.abs(yielded)) + 1e-300
             residual = guess + yielded - goal
             size = np.max(np.abs(residual))
-            found = size <= 1e-12 * scale
             for _ in range(60):
-                if found:
+                if size <= 1e-12 * scale:
                     break
-                matrix = np.eye(count) + compliance * gradient
-                for j in range(count):  # a singular matrix is moved off its zero
-                    matrix[j, j] += 1e-14
-                move = np.linalg.solve(matrix, residual)
-                fraction = 1.0
-                better = False
+                # a singular matrix is moved off its zero
+                move = np.linalg.solve(unit + compliance * slopes + 1e-14 * unit, residual)
+                fraction, before = 1.0, size
                 for _ in range(12):
                     candidate = guess - fraction * move
-                    static_forces(candidate, ports, memory, least, trial_force, trial_slope)
-                    trial_residual = candidate + compliance @ trial_force - goal
-                    trial_size = np.max(np.abs(trial_residual))
-                    if trial_size < size:
-                        better = True
+                    trial, trial_slopes = static_forces(candidate, ports, memory, least)
+                    rest = candidate + compliance @ trial - goal
+                    if np.max(np.abs(rest)) < size:
+                        guess, own, slopes, residual = candidate, trial, trial_slopes, rest
+                        size = np.max(np.abs(rest))
                         break
                     fraction *= 0.5
-                if not better:
+                if size == before:
                     break
-                guess, residual, size = candidate, trial_residual, trial_size
-                own[:] = trial_force
-                gradient[:] = trial_slope
-                found = size <= 1e-12 * scale
-            if not found and size <= 1e-9 * scale:
-                found = True  # rounding, or a kink met exactly
-            # A solution that is not stable lies on another branch, beyond a snap.
-            if found and np.linalg.det(np.eye(count) + compliance * gradient) <= -1e-9:
-                found = False
-            if found:
+            # What is left may be rounding, or a kink met exactly. A solution that is not stable lies on
+            # another branch, beyond a snap.
+            stable = np.linalg.det(unit + compliance * slopes) > -1e-9
+            if size <= 1e-9 * scale and stable:
                 x[:] = guess
                 arrive_at_rest(guess, ports, memory, least, own)
                 done = min(done + step, 1.0)

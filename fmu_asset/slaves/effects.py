@@ -235,7 +235,9 @@ class Effects:
         )
         transverse, shear = (None, None) if across is None else across[:, np.newaxis]
         filters = FilterMemory(memory, duration)
-        (shown,), _ = apply_sensors(acting.patch, row, values[np.newaxis], None, transverse, shear, filters)
+        (shown,), _ = apply_sensors(
+            acting.patch, row, values[np.newaxis], None, transverse, shear, filtered=filters.filtered
+        )
         if not math.isfinite(float(shown.sum())):
             raise UnacceptableValuesError("With the effects that are on, an output is not finite.")
         return shown.tolist(), filters.after

@@ -10,6 +10,7 @@ from scipy.linalg import expm
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.models.acting import Acting, Course
 from discrepancy.models.compiled_motion import compiled_kernel
+from discrepancy.models.high_pass import filtered_record
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.second_order import SecondOrderSystem
@@ -114,7 +115,13 @@ def test_a_high_pass_follows_uneven_stamps() -> None:
     wave = 2.0 * np.pi * 1.3
     record = SensorRecord((("x", "velocity"),), "forced", time, 0.0, np.zeros(len(time)))
     patch = ModelPatch((HighPass("x", 0.3),))
-    found, _ = apply_sensors(patch, record, np.sin(wave * time)[:, None], wave * np.cos(wave * time)[:, None])
+    found, _ = apply_sensors(
+        patch,
+        record,
+        np.sin(wave * time)[:, None],
+        wave * np.cos(wave * time)[:, None],
+        filtered=filtered_record,
+    )
     # y' = x' - y / tau from rest: steady part and what the begin leaves
     gain = 1j * wave * 0.3 / (1.0 + 1j * wave * 0.3)
     steady = np.imag(gain * np.exp(1j * wave * time))

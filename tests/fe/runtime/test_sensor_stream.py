@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from discrepancy.models.high_pass import filtered_record, high_pass
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.high_pass import high_pass
 from fe.runtime.patch import (
     DecayingLine,
     HighPass,
@@ -49,14 +49,14 @@ def test_samples_are_the_rows_of_the_whole_record(kind: str) -> None:
     record = SensorRecord(
         CHANNELS, kind, since if dynamic else start + since, start, temperature, release=0.05
     )
-    expected, _ = apply_sensors(PATCH, record, values, None, across, shear)
+    expected, _ = apply_sensors(PATCH, record, values, None, across, shear, filtered=filtered_record)
     memory = None
     shown = []
     for row in range(count):
         one = replace(record, time=record.time[row : row + 1], temperature=temperature[row : row + 1])
         filters = FilterMemory(memory, interval)
         parts = (part[row : row + 1] for part in (across, shear))
-        (read,), _ = apply_sensors(PATCH, one, values[row : row + 1], None, *parts, memory=filters)
+        (read,), _ = apply_sensors(PATCH, one, values[row : row + 1], None, *parts, filtered=filters.filtered)
         memory = filters.after
         shown.append(read)
         assert len(memory) == (7 if dynamic else 0)  # signal and stages: 3 of one gauge, then 2 of each gauge
@@ -89,5 +89,6 @@ def test_filter_is_that_of_whole_records() -> None:
 
 @pytest.mark.parametrize("item", [HighPass("*", 0.0), HighPass("*", 1.0, 1.5), HighPass("*", 1.0, 5.0)])
 def test_filters_that_cannot_be_remembered_are_refused(item: HighPass) -> None:
+    record = SensorRecord(CHANNELS, "ringdown", np.zeros(1), 0.0, np.zeros(1))
     with pytest.raises(InvalidPatchError, match="sample by sample"):
-        FilterMemory(None, 0.1).filtered(item, np.zeros((1, 2)))
+        FilterMemory(None, 0.1).filtered(item, record, np.zeros((1, 2)), np.zeros((1, 2)))

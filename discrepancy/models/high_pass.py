@@ -1,18 +1,47 @@
-"""First-order high-pass filters in series, of any order, exact for signals that are linear between samples.
-
-NumPy and standard library only: this file is copied into the FMU.
-"""
+"""High-pass filters of whole records, of any order, exact for signals that are linear between samples."""
 
 from functools import lru_cache
-from math import gamma
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import hyp1f1
 
-from .arrays import FloatArray
-from .errors import InvalidPatchError
+from discrepancy.campaign.records import FloatArray
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.patch import HighPass
+from fe.runtime.sensors import SensorRecord
 
-_SERIES_LIMIT = 30.0  # beyond it the asymptotic series of the confluent function is exact to rounding
+
+def filtered_record(
+    item: HighPass, record: SensorRecord, signal: FloatArray, slope: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Pass columns (N, C) of a record, and their rates, through a filter.
+
+    Where sampling is uneven, on an even grid and back.
+    """
+    time, tau = record.time, item.time_constant
+    count = max(len(time) - 1, 1)
+    interval = float(time[-1] - time[0]) / count
+    even = len(time) < 3 or bool(np.max(np.abs(np.diff(time) - interval)) <= 2e-3 * interval)
+    if not even:  # on a grid twice as fine as the usual step, and back
+        count = int(np.ceil(2.0 * float(time[-1] - time[0]) / float(np.median(np.diff(time)))))
+        interval = float(time[-1] - time[0]) / count
+        grid = np.linspace(time[0], time[-1], count + 1)
+        signal, slope = _at(grid, time, signal), _at(grid, time, slope)
+    held = signal[0] if record.kind == "ringdown" else np.zeros(signal.shape[1])
+    shown = high_pass(signal, interval, tau, item.order, held)
+    if item.order in (1.0, 2.0):  # each stage obeys y' = x' - y / tau
+        if item.order == 2.0:
+            slope = slope - high_pass(signal, interval, tau, 1.0, held) / tau
+        slope = slope - shown / tau
+    else:
+        slope = high_pass(slope, interval, tau, item.order, np.zeros(len(held)))
+    return (shown, slope) if even else (_at(time, grid, shown), _at(time, grid, slope))
+
+
+def _at(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
+    """Return columns (N, C) that are known at some times at others, linear in between."""
+    return np.stack([np.interp(times, known, column) for column in values.T], axis=1)
 
 
 def high_pass(
@@ -77,49 +106,8 @@ def _kernel(count: int, ratio: float, order: float) -> tuple[FloatArray, NDArray
     unit increment that was spread over one interval: the mean of the step response over that interval.
     """
     u: FloatArray = ratio * np.arange(count + 1, dtype=np.float64)
-    integral = u * _confluent(order, 2, u)
+    integral = u * hyp1f1(order, 2, -u)
     ramp = np.diff(integral) / ratio
-    step = _confluent(order, 1, u[:-1])
+    step = hyp1f1(order, 1, -u[:-1])
     length = 1 << (2 * count - 1).bit_length()
     return step, np.fft.rfft(ramp, length), length
-
-
-def _confluent(order: float, b: int, u: FloatArray) -> FloatArray:
-    """Return 1F1(order; b; -u) for u >= 0, b = 1 or 2.
-
-    Kummer's transformation turns it into e^-u 1F1(b - order; b; u), whose series has terms of one sign (after
-    finitely many); far out the asymptotic series takes over (Abramowitz and Stegun 1964, 13.1.27, 13.5.1).
-    """
-    a = b - order
-    if a <= 0.0 and float(a).is_integer():  # whole orders: a polynomial times e^-u
-        return np.exp(-u) * _polynomial(int(-a), b, u)
-    if order == 1.0:
-        return np.where(u > 0.0, -np.expm1(-u) / np.where(u > 0.0, u, 1.0), 1.0)
-    near = u <= _SERIES_LIMIT
-    result = np.empty_like(u)
-    x = u[near]
-    term = np.ones_like(x)
-    total = np.ones_like(x)
-    for k in range(160):
-        term = term * ((a + k) / ((b + k) * (k + 1.0))) * x
-        total += term
-    result[near] = np.exp(-x) * total
-    x = u[~near]
-    if x.size:
-        term = np.ones_like(x)
-        total = np.ones_like(x)
-        for k in range(24):
-            term = term * ((order + k) * (order - b + 1.0 + k) / ((k + 1.0) * x))
-            total += term
-        result[~near] = gamma(b) / gamma(a) * x**-order * total
-    return result
-
-
-def _polynomial(degree: int, b: int, u: FloatArray) -> FloatArray:
-    """Return the terminating series 1F1(-degree; b; u)."""
-    term = np.ones_like(u)
-    total = np.ones_like(u)
-    for k in range(degree):
-        term = term * ((k - degree) / ((b + k) * (k + 1.0))) * u
-        total = total + term
-    return total
