@@ -69,6 +69,11 @@ class Candidate:
         return tuple(sorted(term.label for term in self.terms))
 
     @property
+    def words(self) -> str:
+        """The effects for a line of progress."""
+        return " and ".join(self.identifiers)
+
+    @property
     def is_family(self) -> bool:
         """Whether a shape is free."""
         return any(term.free_shape for term in self.terms)

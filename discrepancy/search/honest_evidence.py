@@ -22,6 +22,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.search_settings import SEARCH
 
+from .hypotheses import each
 from .strategy import Search
 
 LEVEL = 1e-3
@@ -185,9 +186,7 @@ def _judged(found: Search, wide: Problem, chosen: list[CandidateFit]) -> dict[Ke
     able = [item for item in ranked[: SEARCH.weighed_fits] if _promised(found, wide, item) > least]
     judged: dict[Key, CandidateFit] = {}
     _add(judged, found, wide, found.none)
-    for number, item in enumerate(able):
-        words = " and ".join(item.candidate.identifiers)
-        found.tell(f"weighing {words} with its remainder, {len(able) - number - 1} more")
+    for item in each(found.tell, able, lambda one: f"weighing {one.candidate.words} with its remainder"):
         _add(judged, found, wide, found.exactly(item))
     leading = max(judged.values(), key=found.score).candidate.identifiers
     for item in list(found.all().values()):  # what the leading set holds is asked for by itself

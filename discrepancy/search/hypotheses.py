@@ -3,9 +3,10 @@
 Fits begin at the most promising changes of each effect and of pairs of effects, from a screen.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from math import exp, inf
+from typing import TypeVar
 
 import numpy as np
 from scipy.special import logsumexp
@@ -21,11 +22,19 @@ from discrepancy.missing_force.hypotheses import Key, key_of, log_prior
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import SENSORS, MicroSlip
 
+T = TypeVar("T")
 Tell = Callable[[str], None]
 
 
 def in_silence(what: str) -> None:
     """Tell nobody."""
+
+
+def each(tell: Tell, items: Sequence[T], words: Callable[[T], str]) -> Iterator[T]:
+    """Yield items, and tell of each what is done with it and how many are left."""
+    for number, item in enumerate(items):
+        tell(f"{words(item)}, {len(items) - number - 1} more")
+        yield item
 
 
 @dataclass
