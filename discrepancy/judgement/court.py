@@ -179,13 +179,13 @@ class Court(ABC, Generic[H]):
 
     def _with(self, item: H, kept: Sequence[int]) -> H | None:
         """Return a hypothesis with some of its effects only."""
-        candidate = Candidate(tuple(item.candidate.terms[number] for number in kept))
-        key, parts = key_of(candidate), item.candidate.parts(item.effect)
+        candidate, values = item.candidate.some(kept, item.effect)
+        key = key_of(candidate)
         known = next((one for one in self.ranked if key_of(one.candidate) == key), None)
         if known is not None:
             return known
         if key not in self._followed:
-            self._followed[key] = self.followed(candidate, np.concatenate([parts[k] for k in kept]))
+            self._followed[key] = self.followed(candidate, values)
         return self._followed[key]
 
     def slimmed(self, best: H) -> H:

@@ -269,11 +269,8 @@ class ForceSearch:
                 break
             beam = ranked[:BEAM]
         best = self._ranked(found, len(effects))[0]
-        parts = best.candidate.parts(best.effect)
-        for index in range(len(parts) if len(parts) > 1 else 0):
-            less = best.candidate.without(index)
+        for less, values in best.candidate.each_without(best.effect):
             if key_of(less) not in found:
-                values = np.concatenate(parts[:index] + parts[index + 1 :])
                 one = self.followed(self.whole, less, values)
                 if one is not None:
                     found[key_of(less)] = one

@@ -357,13 +357,8 @@ class Search(Hypotheses):
     def shorter(self) -> None:
         """Fit the best set less one effect, for each."""
         best = self.best()
-        if len(best.candidate.terms) < 2:
-            return
-        for index in range(len(best.candidate.terms)):
+        for less, effect in best.candidate.each_without(best.effect):
             # from here even a set that was fitted before may find a better optimum
-            less = best.candidate.without(index)
-            parts = best.candidate.parts(best.point.effect)
-            effect = np.concatenate(parts[:index] + parts[index + 1 :])
             found = attempt(self.problem, less, Point(best.point.shared, best.point.local, effect))
             if found is not None:
                 self.keep(found, exact=True)
