@@ -9,6 +9,7 @@ from discrepancy.campaign.records import BoolArray, FloatArray, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
 from fe.runtime.patch import ModelPatch
 
+Key = tuple[tuple[str, str], ...]
 FREE_SHAPE = " (free shape)"
 """What marks the identifier of an effect whose shape is free: its family."""
 
@@ -67,6 +68,11 @@ class Candidate:
     def identifiers(self) -> tuple[str, ...]:
         """Identifiers of the effects, sorted; those of free shape are marked by `FREE_SHAPE`."""
         return tuple(sorted(term.label for term in self.terms))
+
+    @property
+    def key(self) -> Key:
+        """What tells candidates apart: sorted (identifier, place)."""
+        return tuple(sorted((term.label, term.place) for term in self.terms))
 
     @property
     def words(self) -> str:

@@ -14,11 +14,11 @@ from scipy.special import logsumexp
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Key, Term
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
-from discrepancy.missing_force.hypotheses import Key, key_of, log_prior
+from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import SENSORS, MicroSlip
 
@@ -120,7 +120,7 @@ class Hypotheses:
     def keep(self, found: CandidateFit, *, exact: bool) -> None:
         """Keep a fit if it is better than what is known of the same candidate."""
         kept = self.exact if exact else self.rough
-        key = key_of(found.candidate)
+        key = found.candidate.key
         if key not in kept or kept[key].log_evidence < found.log_evidence:
             kept[key] = found
 

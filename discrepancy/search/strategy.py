@@ -15,7 +15,7 @@ from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
-from discrepancy.missing_force.hypotheses import key_of, sees_forces
+from discrepancy.missing_force.hypotheses import sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
 
@@ -135,7 +135,7 @@ class Search(Hypotheses):
 
     def exactly(self, rough: CandidateFit) -> CandidateFit:
         """Fit a candidate to convergence from a rough fit, and keep it."""
-        key = key_of(rough.candidate)
+        key = rough.candidate.key
         if key in self.judged:
             return self.judged[key]
         found = self.exact.get(key)
@@ -316,7 +316,7 @@ class Search(Hypotheses):
         for item in rough:
             again = attempt(self.problem, item.candidate, item.point)
             if again is not None:  # else the rough one stands
-                self.exact[key_of(item.candidate)] = again
+                self.exact[item.candidate.key] = again
 
     def _extended(self, current: CandidateFit) -> CandidateFit | None:
         """Return a better set with one more effect, or None."""
@@ -338,7 +338,7 @@ class Search(Hypotheses):
         words = "fitting the pair {1.term.effect.identifier} and {2.term.effect.identifier}"
         for _, first, second in each(self.tell, ranked, lambda pair: words.format(*pair)):
             candidate = Candidate((first.term, second.term))
-            if key_of(candidate) in self.exact:
+            if candidate.key in self.exact:
                 continue
             start = np.concatenate((rescaled(first), rescaled(second)))
             if begun is None:
