@@ -48,6 +48,10 @@ class Term:
             item.name: item.prior.value(float(u)) for item, u in zip(self.parameters, normal, strict=True)
         }
 
+    def patch(self, setting: Setting, normal: Sequence[float] | FloatArray) -> ModelPatch:
+        """Return the patch at standard normal variables, one for each parameter."""
+        return self.effect.patch(setting, self.values(normal), self.place)
+
     def start(self) -> FloatArray:
         """Return the standard normal variables at prior medians and canonical shapes."""
         return np.array(
@@ -108,7 +112,7 @@ class Candidate:
         """Return the patch at standard normal variables (size,)."""
         patch = ModelPatch()
         for term, part in zip(self.terms, self.parts(normal), strict=True):
-            patch = patch + term.effect.patch(setting, term.values(part), term.place)
+            patch = patch + term.patch(setting, part)
         return patch
 
     def start(self) -> FloatArray:

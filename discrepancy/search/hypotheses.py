@@ -154,7 +154,7 @@ def acts_within(effect: Effect, setting: Setting) -> bool:
     """Whether an effect acts within the structure or on its loads, not on readings only."""
     term = Term(effect, effect.places(setting)[0])
     try:
-        patch = effect.patch(setting, term.values(term.start() + 1.0), term.place)
+        patch = term.patch(setting, term.start() + 1.0)
     except DiscrepancyError:  # a law that cannot be so large
         return True
     return not all(isinstance(item, SENSORS) for item in patch)
