@@ -314,7 +314,7 @@ def test_modal_outputs_are_those_of_the_patched_wing(
         off = asset.step(load={"root": 0.0}).extra["frequency[1]"]
     patch = ModelPatch(EFFECTS["point_mass"] + EFFECTS["root"])
     wing = naming_side.wing
-    assert seen == pytest.approx(wing.structure(1.0, (0.0, 0.0), 0.169, 0.134, patch).modes(1).frequency[0])
+    assert seen == pytest.approx(wing.structure(1.0, (0.0, 0.0), 0.169, 0.134, patch).lowest(1).frequency[0])
     assert off > seen
 
 
