@@ -366,22 +366,13 @@ def _channels(
     channels = {}
     for item in section.channel:
         to_si = conversion_of(item.quantity, item.unit).to_si
-        channel = Channel(
-            name=item.name,
-            quantity=item.quantity,
-            output=item.output,
-            noise=None,
-            gain_deviation=inf if item.gain_deviation == "free" else item.gain_deviation,
-            offset_deviation=inf if item.offset_deviation == "free" else to_si(item.offset_deviation),
-            station=item.station,
-            chord=item.chord,
-            column=item.table_column,
-            unit=item.unit,
-        )
+        given = item.model_dump(exclude={"noise", "column", "offset_deviation"})
+        free = to_si(item.offset_deviation)
+        channel = Channel(**given, noise=None, offset_deviation=free, column=item.table_column)
         stated = None
         if item.noise is not None:
-            deviation = to_si(item.noise.standard_deviation)
-            stated = NoiseRecord(deviation, item.noise.degrees_of_freedom, source=item.noise.source)
+            stated = NoiseRecord(**item.noise.model_dump())
+            stated = replace(stated, standard_deviation=to_si(stated.standard_deviation))
         noise, remark = with_noise(channel, recorded, stated, trials)
         remarks += [remark] if remark else []
         channels[item.name] = replace(channel, noise=noise)

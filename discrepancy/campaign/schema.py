@@ -2,9 +2,10 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from keyword import iskeyword
+from math import inf, isinf
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, PlainSerializer, field_validator, model_validator
 
 from discrepancy.campaign.records import Hold, Quantity, Start, TrialKind
 from discrepancy.campaign.units import conversion_of
@@ -27,7 +28,12 @@ Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
-Deviation = Annotated[float, Field(allow_inf_nan=False, ge=0.0)] | Literal["free"]
+Deviation = Annotated[
+    float,
+    Field(ge=0.0),
+    BeforeValidator(lambda value: inf if value == "free" else value),
+    PlainSerializer(lambda value: "free" if isinf(value) else value, when_used="json"),
+]
 MOST_MODES = 100
 _LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 """What a list of the file becomes before it is checked."""
@@ -51,7 +57,7 @@ class StatedNoise(Section):
     """`noise` of a channel [its unit]; exact without degrees of freedom."""
 
     standard_deviation: Positive
-    degrees_of_freedom: Positive = float("inf")
+    degrees_of_freedom: Annotated[float, Field(gt=0.0)] = inf
     source: Literal["stated", "repeats", "pre-trigger"] = "stated"
 
 

@@ -84,13 +84,6 @@ class Separability:
     distance: FloatArray
     groups: tuple[tuple[str, ...], ...]
 
-    def group_of(self, identifier: str) -> tuple[str, ...]:
-        """Return the confusion group of an effect, itself alone if it has none."""
-        for group in self.groups:
-            if identifier in group:
-                return group
-        return (identifier,)
-
 
 def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
     """Return the campaign with what the model predicts in the place of the data.
@@ -130,18 +123,14 @@ def begun(problem: Problem) -> Point:
         As `fit`.
     """
     start = problem.start(Candidate())
-    unknown = [_unknown_begin(data.trial) for data in problem.trials]
+    trials = [data.trial for data in problem.trials]  # some begin in a state that only their data tell
+    unknown = [i.begins is Start.UNKNOWN or (i.release and not i.release.at_rest) for i in trials]
     if not any(unknown):
         return start
     # parameters follow: beside a frequency that is off, what begins would fade out of the record
     found = fit(problem, Candidate(), start, evidence=False).point.local
     chosen = zip(unknown, found, start.local, strict=True)
     return replace(start, local=tuple(own if free else kept for free, own, kept in chosen))
-
-
-def _unknown_begin(trial: Trial) -> bool:
-    """Whether a trial begins in a state that only its data tell."""
-    return trial.begins is Start.UNKNOWN or (trial.release is not None and not trial.release.at_rest)
 
 
 def separability(

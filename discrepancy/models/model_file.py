@@ -5,8 +5,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Quantity
-from discrepancy.models.interface import Model, ModelParameter
+from discrepancy.models.interface import Model
 
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0, strict=True)]
@@ -38,9 +39,9 @@ class ParameterSection(NamedSection):
     unit: str = "1"
 
     @property
-    def calibrated(self) -> ModelParameter:
+    def calibrated(self) -> ParameterPrior:
         """The parameter of the model."""
-        return ModelParameter(self.name, self.mean, self.deviation, self.unit, self.low, self.high)
+        return ParameterPrior(self.name, self.unit, self.mean, self.deviation, self.low, self.high)
 
     @model_validator(mode="after")
     def _in_range(self) -> Self:

@@ -5,9 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Release, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Model, ModelParameter, Outputs, Place
+from discrepancy.models.interface import Model, Outputs, Place
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import (
@@ -78,12 +79,12 @@ def laws_at(forces: ModelPatch, ports: Collection[str], *, in_windows: bool = Tr
         raise ModelError(str(cause)) from cause
 
 
-def prior_mean(campaign: Campaign, parameters: Sequence[ModelParameter]) -> FloatArray:
+def prior_mean(campaign: Campaign, parameters: Sequence[ParameterPrior]) -> FloatArray:
     """Return the means (P,) of parameters, those of the campaign where it says them."""
     return np.array([campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in parameters])
 
 
-def check_parameters(what: str, parameters: Sequence[ModelParameter], values: FloatArray) -> None:
+def check_parameters(what: str, parameters: Sequence[ParameterPrior], values: FloatArray) -> None:
     """Refuse values of another number than a model, `what`, has parameters."""
     if values.shape != (len(parameters),):
         raise ModelError(f"{what} has {counted(len(parameters), 'parameter')}, but {values.size} came.")

@@ -242,19 +242,20 @@ def compressed(model: ReducedModel, directions: FloatArray) -> ReducedModel:
         The Galerkin model on the combinations; its bound is as certified as before.
     """
     stiffness = directions.T @ model.static_stiffness @ directions
-    residual = np.concatenate(
-        (model.residual_load, (model.residual_stiffness @ directions).reshape(len(model.residual_load), -1)),
-        axis=1,
+    # what changes with health first: its columns of the triangular factor are the shortest
+    order = np.argsort(model.stiffness_factors[:, 1] == 0, kind="stable")
+    images = (model.residual_stiffness @ directions)[:, order]
+    orthonormal, factor = np.linalg.qr(
+        np.concatenate((images.reshape(len(images), -1), model.residual_load), axis=1)
     )
-    orthonormal, factor = np.linalg.qr(residual)
-    loads = model.residual_load.shape[1]
+    terms = factor[:, : -model.residual_load.shape[1]].reshape(len(factor), len(stiffness), -1)
     return replace(
         model,
         static_stiffness=0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
         static_load=model.static_load @ directions,
         static_output=model.static_output @ directions,
-        residual_load=np.ascontiguousarray(factor[:, :loads]),
-        residual_stiffness=np.ascontiguousarray(factor[:, loads:].reshape(len(factor), len(stiffness), -1)),
+        residual_load=np.ascontiguousarray(factor[:, -model.residual_load.shape[1] :]),
+        residual_stiffness=np.ascontiguousarray(terms[:, np.argsort(order)]),
         dual_correction=model.dual_correction @ orthonormal,
         cross_mass=model.cross_mass @ directions,
     )

@@ -5,6 +5,13 @@
 #include <string.h>
 
 #define MOST_SWEEPS 60
+#define LANES 8
+/* Eigenvalues that lie closer, relative to their size, have vectors that single iterations do not keep apart. */
+#define LEAST_GAP 0.05
+#define MOST_CORRECTIONS 10
+/* The largest correction of a value, relative to it, after which its vector is taken: one of rounding, since the next
+   would be about the third power. */
+#define SETTLED 4e-14
 
 /* Also compiled for wider vector registers, and chosen when the library is loaded. The numbers are the same to the
    last bit, because each element is computed by the same operations in the same order. */
@@ -23,8 +30,7 @@ void structure_add(double *restrict sum, size_t size, double factor, const doubl
     }
 }
 
-STRUCTURE_WIDE
-static void add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
+static inline void inline_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
                         size_t count, const double *restrict coefficients) {
     size_t c = 0;
     for (; c + 4 <= count; c += 4) { /* four at a time, so that the sum is loaded and stored less often */
@@ -44,8 +50,17 @@ static void add_columns(double *restrict sum, size_t size, const double *restric
         c += 2;
     }
     if (c < count) {
-        structure_add(sum, size, coefficients[c], columns + c * stride);
+        const double *a = columns + c * stride, fa = coefficients[c];
+        for (size_t i = 0; i < size; ++i) {
+            sum[i] += fa * a[i];
+        }
     }
+}
+
+STRUCTURE_WIDE
+static void add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
+                        size_t count, const double *restrict coefficients) {
+    inline_add_columns(sum, size, columns, stride, count, coefficients);
 }
 
 void structure_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
@@ -53,8 +68,7 @@ void structure_add_columns(double *restrict sum, size_t size, const double *rest
     add_columns(sum, size, columns, stride, count, coefficients); /* the clones themselves would be exported */
 }
 
-STRUCTURE_WIDE
-static double dot(const double *first, const double *second, size_t size) {
+static inline double inline_dot(const double *first, const double *second, size_t size) {
     /* Four sums that do not wait for each other. */
     double a = 0.0, b = 0.0, c = 0.0, d = 0.0;
     size_t i = 0;
@@ -69,6 +83,9 @@ static double dot(const double *first, const double *second, size_t size) {
     }
     return (a + b) + (c + d);
 }
+
+STRUCTURE_WIDE
+static double dot(const double *first, const double *second, size_t size) { return inline_dot(first, second, size); }
 
 double structure_dot(const double *first, const double *second, size_t size) { return dot(first, second, size); }
 
@@ -87,18 +104,19 @@ void structure_sum_terms(double *restrict result, size_t size, const double *res
     structure_add_columns(result, size * size, terms, size * size, count, theta);
 }
 
-bool structure_cholesky(double *matrix, size_t size) {
+STRUCTURE_WIDE
+static bool cholesky(double *matrix, size_t size) {
     for (size_t k = 0; k < size; ++k) {
         double *row = matrix + k * size;
         /* Column k of the factor, negative, moves to the lower triangle, where it lies in one piece. */
         for (size_t i = 0; i < k; ++i) {
             row[i] = -matrix[i * size + k];
         }
-        structure_add_columns(row + k, size - k, matrix + k, size, k, row);
+        inline_add_columns(row + k, size - k, matrix + k, size, k, row);
         if (!(row[k] > 0.0)) { /* also NaN */
             return false;
         }
-        const double scale = 1.0 / sqrt(row[k]);
+        const double scale = sqrt(row[k]) * (1.0 / row[k]); /* neither waits for the other */
         row[k] = scale;
         for (size_t j = k + 1; j < size; ++j) {
             row[j] *= scale;
@@ -107,19 +125,36 @@ bool structure_cholesky(double *matrix, size_t size) {
     return true;
 }
 
-void structure_solve_lower(const double *restrict factor, size_t size, double *restrict right) {
+bool structure_cholesky(double *matrix, size_t size) { return cholesky(matrix, size); }
+
+STRUCTURE_WIDE
+static void solve_lower(const double *restrict factor, size_t size, double *restrict right) {
     for (size_t k = 0; k < size; ++k) {
-        const double *row = factor + k * size;
-        right[k] *= row[k];
-        structure_add(right + k + 1, size - k - 1, -right[k], row + k + 1);
+        const double *row = factor + k * size, found = right[k] * row[k];
+        right[k] = found;
+        for (size_t i = k + 1; i < size; ++i) {
+            right[i] -= found * row[i];
+        }
+    }
+}
+
+void structure_solve_lower(const double *restrict factor, size_t size, double *restrict right) {
+    solve_lower(factor, size, right);
+}
+
+STRUCTURE_WIDE
+static void solve_upper(const double *restrict factor, size_t size, double *restrict right) {
+    for (size_t k = size; k-- > 0;) {
+        const double *row = factor + k * size, found = right[k] * row[k];
+        right[k] = found;
+        for (size_t i = 0; i < k; ++i) { /* column k, negative */
+            right[i] += found * row[i];
+        }
     }
 }
 
 void structure_solve_upper(const double *restrict factor, size_t size, double *restrict right) {
-    for (size_t k = size; k-- > 0;) {
-        const double *row = factor + k * size;
-        right[k] = (right[k] - structure_dot(row + k + 1, right + k + 1, size - k - 1)) * row[k];
-    }
+    solve_upper(factor, size, right);
 }
 
 STRUCTURE_WIDE
@@ -150,9 +185,9 @@ STRUCTURE_WIDE
 static void tridiagonalise(double *restrict matrix, size_t size, double *restrict diagonal,
                            double *restrict off_diagonal, double *restrict factors, double *restrict work) {
     for (size_t k = 0; k + 1 < size; ++k) {
-        double *v = matrix + k * size + k + 1;
+        double *v = matrix + k * size + k + 1, *below = v + size;
         const size_t length = size - k - 1;
-        const double norm = structure_norm(v, length);
+        const double norm = sqrt(inline_dot(v, v, length));
         diagonal[k] = matrix[k * size + k];
         if (length == 1 || norm == 0.0) {
             off_diagonal[k] = v[0];
@@ -164,12 +199,35 @@ static void tridiagonalise(double *restrict matrix, size_t size, double *restric
         /* (v', v) / 2 = norm (norm + |v0|), without a difference of like numbers */
         factors[k] = 1.0 / (norm * (norm + fabs(v[0])));
         v[0] -= reflected;
-        for (size_t i = 0; i < length; ++i) {
-            work[i] = factors[k] * structure_dot(matrix + (k + 1 + i) * size + k + 1, v, length);
+        memset(work, 0, length * sizeof *work);
+        size_t i = 0;
+        for (; i + 4 <= length; i += 4) { /* the matrix is symmetric: its rows are its columns */
+            const double *a = below + i * size, *b = a + size, *c = b + size, *d = c + size;
+            const double va = v[i], vb = v[i + 1], vc = v[i + 2], vd = v[i + 3];
+            for (size_t j = 0; j < length; ++j) {
+                work[j] += (va * a[j] + vb * b[j]) + (vc * c[j] + vd * d[j]);
+            }
         }
-        structure_add(work, length, -0.5 * factors[k] * structure_dot(work, v, length), v);
-        for (size_t i = 0; i < length; ++i) {
-            double *row = matrix + (k + 1 + i) * size + k + 1;
+        for (; i < length; ++i) {
+            const double *a = below + i * size, va = v[i];
+            for (size_t j = 0; j < length; ++j) {
+                work[j] += va * a[j];
+            }
+        }
+        const double share = -0.5 * factors[k] * factors[k] * inline_dot(work, v, length);
+        for (size_t j = 0; j < length; ++j) {
+            work[j] = factors[k] * work[j] + share * v[j];
+        }
+        for (i = 0; i + 2 <= length; i += 2) {
+            double *restrict row = below + i * size, *restrict next = row + size;
+            const double va = v[i], wa = work[i], vb = v[i + 1], wb = work[i + 1];
+            for (size_t j = 0; j < length; ++j) {
+                row[j] -= va * work[j] + wa * v[j];
+                next[j] -= vb * work[j] + wb * v[j];
+            }
+        }
+        for (; i < length; ++i) {
+            double *row = below + i * size;
             const double vi = v[i], wi = work[i];
             for (size_t j = 0; j < length; ++j) {
                 row[j] -= vi * work[j] + wi * v[j];
@@ -177,6 +235,183 @@ static void tridiagonalise(double *restrict matrix, size_t size, double *restric
         }
     }
     diagonal[size - 1] = matrix[size * size - 1];
+}
+
+/* Apply the reflections of `tridiagonalise`, the last one first, to vectors (count, size). */
+STRUCTURE_WIDE
+static void reflect(double *restrict vectors, size_t count, const double *restrict matrix, size_t size,
+                    const double *restrict factors) {
+    for (size_t k = size - 1; k-- > 0;) {
+        const double *restrict v = matrix + k * size + k + 1;
+        const size_t length = size - k - 1;
+        size_t c = 0;
+        for (; c + 3 <= count; c += 3) { /* three at a time, so that their sums do not wait for each other */
+            double *restrict x = vectors + c * size + k + 1, *restrict y = x + size, *restrict z = y + size;
+            double a[4] = {0.0}, b[4] = {0.0}, d[4] = {0.0};
+            size_t i = 0;
+            for (; i + 4 <= length; i += 4) {
+                for (size_t q = 0; q < 4; ++q) {
+                    a[q] += v[i + q] * x[i + q];
+                    b[q] += v[i + q] * y[i + q];
+                    d[q] += v[i + q] * z[i + q];
+                }
+            }
+            for (; i < length; ++i) {
+                a[0] += v[i] * x[i];
+                b[0] += v[i] * y[i];
+                d[0] += v[i] * z[i];
+            }
+            const double of_x = factors[k] * ((a[0] + a[1]) + (a[2] + a[3]));
+            const double of_y = factors[k] * ((b[0] + b[1]) + (b[2] + b[3]));
+            const double of_z = factors[k] * ((d[0] + d[1]) + (d[2] + d[3]));
+            for (i = 0; i < length; ++i) {
+                x[i] -= of_x * v[i];
+                y[i] -= of_y * v[i];
+                z[i] -= of_z * v[i];
+            }
+        }
+        for (; c < count; ++c) {
+            double *restrict x = vectors + c * size + k + 1;
+            const double of_x = factors[k] * inline_dot(x, v, length);
+            for (size_t i = 0; i < length; ++i) {
+                x[i] -= of_x * v[i];
+            }
+        }
+    }
+}
+
+/* Correct approximate eigenvalues x of a tridiagonal matrix, one in each lane, and find their vectors z (size, LANES)
+   with squares of their lengths: T - x is factorised from both ends, the vector is one where these meet with the
+   least remainder, and the Rayleigh quotient of it is the next x (Dhillon and Parlett, "Orthogonal eigenvectors and
+   relative gaps", SIAM J. Matrix Anal. Appl. 25, 2004). `work` has room for 2 size LANES doubles. */
+STRUCTURE_WIDE
+static void correct(const double *restrict d, const double *restrict e, size_t size, double *restrict x,
+                    double *restrict change, double *restrict z, double *restrict square, double *restrict work) {
+    double *restrict up = work, *restrict down = work + size * LANES;
+    const double tiny = DBL_EPSILON * DBL_EPSILON * fabs(d[0]) + DBL_MIN;
+    double pivot[LANES], least[LANES], remainder[LANES], place[LANES];
+    for (size_t i = 0; i < size; ++i) {
+        const double beside = i == 0 ? 0.0 : e[i - 1] * e[i - 1];
+        for (size_t j = 0; j < LANES; ++j) {
+            const double next = (d[i] - x[j]) - (i == 0 ? 0.0 : beside / pivot[j]);
+            pivot[j] = fabs(next) <= tiny ? tiny : next;
+            up[i * LANES + j] = pivot[j];
+        }
+    }
+    for (size_t j = 0; j < LANES; ++j) {
+        least[j] = DBL_MAX;
+        remainder[j] = place[j] = 0.0;
+    }
+    for (size_t i = size; i-- > 0;) {
+        const double beside = i + 1 == size ? 0.0 : e[i] * e[i], here = (double)i;
+        for (size_t j = 0; j < LANES; ++j) {
+            const double coupled = i + 1 == size ? 0.0 : beside / pivot[j], next = (d[i] - x[j]) - coupled;
+            const double left = up[i * LANES + j] - coupled;
+            const bool better = fabs(left) < least[j];
+            pivot[j] = fabs(next) <= tiny ? tiny : next;
+            down[i * LANES + j] = pivot[j];
+            least[j] = better ? fabs(left) : least[j];
+            remainder[j] = better ? left : remainder[j];
+            place[j] = better ? here : place[j];
+        }
+    }
+    for (size_t j = 0; j < LANES; ++j) {
+        z[(size - 1) * LANES + j] = place[j] == (double)(size - 1) ? 1.0 : 0.0;
+    }
+    for (size_t i = size - 1; i-- > 0;) {
+        const double here = (double)i;
+        for (size_t j = 0; j < LANES; ++j) {
+            const double along = -(e[i] / up[i * LANES + j]) * z[(i + 1) * LANES + j];
+            z[i * LANES + j] = here == place[j] ? 1.0 : along;
+        }
+    }
+    for (size_t j = 0; j < LANES; ++j) {
+        square[j] = z[j] * z[j];
+    }
+    for (size_t i = 1; i < size; ++i) {
+        const double here = (double)i;
+        for (size_t j = 0; j < LANES; ++j) {
+            const double along = -(e[i - 1] / down[i * LANES + j]) * z[(i - 1) * LANES + j];
+            const double kept = here > place[j] ? along : z[i * LANES + j];
+            z[i * LANES + j] = kept;
+            square[j] += kept * kept;
+        }
+    }
+    for (size_t j = 0; j < LANES; ++j) {
+        change[j] = remainder[j] / square[j];
+        x[j] += change[j];
+    }
+}
+
+/* How many eigenvalues of a tridiagonal matrix are less than x: Sylvester's law of inertia. */
+static size_t count_below(const double *d, const double *e, size_t size, double x) {
+    double pivot = d[0] - x;
+    size_t count = pivot < 0.0;
+    for (size_t i = 1; i < size; ++i) {
+        pivot = (d[i] - x) - e[i - 1] * e[i - 1] / (pivot == 0.0 ? DBL_MIN : pivot);
+        count += pivot < 0.0;
+    }
+    return count;
+}
+
+static void swap(double *first, double *second, size_t size) {
+    for (size_t i = 0; i < size; ++i) {
+        const double kept = first[i];
+        first[i] = second[i];
+        second[i] = kept;
+    }
+}
+
+/* Put the `count` smallest values first, ascending, and their vectors. */
+static void sort_pairs(double *values, double *vectors, size_t all, size_t count, size_t size) {
+    for (size_t i = 0; i < count; ++i) {
+        size_t least = i;
+        for (size_t j = i + 1; j < all; ++j) {
+            least = values[j] < values[least] ? j : least;
+        }
+        if (least != i) {
+            swap(values + i, values + least, 1);
+            swap(vectors + i * size, vectors + least * size, size);
+        }
+    }
+}
+
+/* The lowest eigenpairs of a positive definite tridiagonal matrix from values nearby; false if one is not found or
+   they lie too close to each other or to the next one. */
+static bool find_apart(const double *d, const double *e, size_t size, size_t count, double *values, double *vectors,
+                       double *work) {
+    double x[LANES], change[LANES], square[LANES], *z = work;
+    for (size_t first = 0; first < count; first += LANES) {
+        const size_t lanes = count - first < LANES ? count - first : LANES;
+        for (size_t j = 0; j < LANES; ++j) {
+            x[j] = values[first + (j < lanes ? j : 0)];
+        }
+        bool settled = false;
+        for (size_t turn = 0; turn < MOST_CORRECTIONS && !settled; ++turn) {
+            correct(d, e, size, x, change, z, square, work + size * LANES);
+            settled = true;
+            for (size_t j = 0; j < LANES; ++j) {
+                settled = settled && fabs(change[j]) <= SETTLED * x[j]; /* also not if x is not positive */
+            }
+        }
+        if (!settled) {
+            return false;
+        }
+        for (size_t j = 0; j < lanes; ++j) {
+            const double scale = 1.0 / sqrt(square[j]);
+            values[first + j] = x[j];
+            for (size_t i = 0; i < size; ++i) {
+                vectors[(first + j) * size + i] = scale * z[i * LANES + j];
+            }
+        }
+    }
+    sort_pairs(values, vectors, count, count, size);
+    for (size_t i = 1; i < count; ++i) {
+        if (values[i] < (1.0 + LEAST_GAP) * values[i - 1]) {
+            return false;
+        }
+    }
+    return count_below(d, e, size, (1.0 + LEAST_GAP) * values[count - 1]) == count;
 }
 
 /* One implicit QR step with Wilkinson's shift on the block from `low` to `high` (ibid., algorithm 8.3.2), the
@@ -213,21 +448,11 @@ static void qr_step(double *restrict d, double *restrict e, size_t low, size_t h
     }
 }
 
-bool structure_symmetric_eigen(double *restrict matrix, size_t size, double *restrict values,
-                          double *restrict vectors, double *restrict work) {
-    double *off_diagonal = work, *factors = work + size;
-    tridiagonalise(matrix, size, values, off_diagonal, factors, work + 2 * size);
-    /* The product of the reflections, transposed: the last ones concern only the last rows and columns. */
+/* All eigenpairs of a tridiagonal matrix, the diagonal becoming the eigenvalues. */
+static bool find_all(double *values, double *off_diagonal, size_t size, double *vectors) {
     memset(vectors, 0, size * size * sizeof *vectors);
     for (size_t i = 0; i < size; ++i) {
         vectors[i * size + i] = 1.0;
-    }
-    for (size_t k = size - 1; k-- > 0;) {
-        const double *v = matrix + k * size + k + 1;
-        for (size_t i = k + 1; i < size && factors[k] != 0.0; ++i) {
-            double *row = vectors + i * size + k + 1;
-            structure_add(row, size - k - 1, -factors[k] * structure_dot(row, v, size - k - 1), v);
-        }
     }
     size_t high = size - 1, sweeps = 0;
     while (high > 0) {
@@ -249,5 +474,30 @@ bool structure_symmetric_eigen(double *restrict matrix, size_t size, double *res
             qr_step(values, off_diagonal, low, high, vectors, size);
         }
     }
+    return true;
+}
+
+bool structure_symmetric_eigen(double *restrict matrix, size_t size, size_t count, double *restrict values,
+                          double *restrict vectors, double *restrict work) {
+    double *diagonal = work, *off_diagonal = work + size, *factors = work + 2 * size, *rest = work + 3 * size;
+    for (size_t i = 0; i < size; ++i) {
+        values[i] = matrix[i * size + i];
+    }
+    for (size_t i = 0; i < count; ++i) { /* the least of the diagonal, from which the lowest are looked for */
+        for (size_t j = i + 1; j < size; ++j) {
+            if (values[j] < values[i]) {
+                swap(values + i, values + j, 1);
+            }
+        }
+    }
+    tridiagonalise(matrix, size, diagonal, off_diagonal, factors, rest);
+    if (count == size || !find_apart(diagonal, off_diagonal, size, count, values, vectors, rest)) {
+        memcpy(values, diagonal, size * sizeof *values);
+        if (!find_all(values, off_diagonal, size, vectors)) {
+            return false;
+        }
+        sort_pairs(values, vectors, size, count, size);
+    }
+    reflect(vectors, count, matrix, size, factors);
     return true;
 }

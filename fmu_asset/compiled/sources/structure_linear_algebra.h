@@ -27,8 +27,9 @@ void structure_multiply(double *restrict result, const double *restrict matrix, 
 void structure_sum_terms(double *restrict result, size_t size, const double *restrict terms, size_t count,
                     const double *restrict theta);
 
-/* Replace the upper triangle of a symmetric positive definite matrix A by the upper factor U, A = U' U, with one
-   over its diagonal, by which is only divided; false if A is not positive definite. The lower triangle is not read, and is used for intermediate numbers. */
+/* Replace the upper triangle of a symmetric positive definite matrix A by the upper factor U, A = U' U, with one over
+   its diagonal, by which is only divided; false if A is not positive definite. The lower triangle is not read; it then
+   holds -U', so that columns of U lie in one piece, too. */
 bool structure_cholesky(double *matrix, size_t size);
 
 /* Replace `right` (size) by the solution of U' y = right, then of U x = y, then of both. */
@@ -38,9 +39,12 @@ void structure_solve_upper(const double *restrict factor, size_t size, double *r
 /* Replace each column of `right` (size, size) by the solution of U' y = column. */
 void structure_solve_lower_columns(const double *restrict factor, size_t size, double *restrict right);
 
-/* Eigenvalues, and unit eigenvectors as rows, of a symmetric matrix, in no order. The matrix is destroyed;
-   `work` has room for 3 size doubles. False if the iteration does not end, which finite numbers do not cause. */
-bool structure_symmetric_eigen(double *restrict matrix, size_t size, double *restrict values,
+/* The `count` lowest eigenvalues of a symmetric matrix, ascending, and their unit vectors as rows. Few of a positive
+   definite one are found several times faster than all, where they lie apart and the least of its
+   diagonal are near them. The matrix is destroyed; `values` has room for `size`, `vectors` for (size, size), `work` for
+   STRUCTURE_EIGEN_WORK(size) doubles. False if the iteration does not end, which finite numbers do not cause. */
+#define STRUCTURE_EIGEN_WORK(size) (27 * (size))
+bool structure_symmetric_eigen(double *restrict matrix, size_t size, size_t count, double *restrict values,
                           double *restrict vectors, double *restrict work);
 
 #if defined(__GNUC__) && !defined(_WIN32)

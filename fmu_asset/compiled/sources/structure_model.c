@@ -46,6 +46,7 @@ static void lay_out(structure_model *model, size_t anchors, structure_arena *are
     model->load_residual = structure_take(arena, model->loads * r);
     model->stiffness_residual = structure_take(arena, model->terms * n * r);
     model->correction_columns = structure_take(arena, (model->functions ? model->functions : anchors) * r * outputs);
+    model->dual_factor = structure_take(arena, anchors * outputs * model->dual_rows * model->dual_columns);
 }
 
 static bool is_count(double value) { return value >= 0.0 && value <= LARGEST_SIZE && value == (double)(size_t)value; }
@@ -163,6 +164,28 @@ static bool take_terms(structure_model *model, structure_problem *problem) {
     return true;
 }
 
+/* Find behind which place only zeros follow in each block of columns of the residuals, which were made triangular. */
+static bool find_ends(structure_model *model, structure_problem *problem) {
+    const size_t n = model->static_size, r = model->residual_size;
+    const size_t blocks = (n + STRUCTURE_BLOCK - 1) / STRUCTURE_BLOCK;
+    model->residual_ends = calloc((1 + model->terms - model->lasting) * blocks, sizeof *model->residual_ends);
+    if (model->residual_ends == NULL) {
+        return structure_fail(problem, "there is no memory for the model");
+    }
+    for (size_t i = 0; i < model->terms; ++i) {
+        const size_t part = i < model->lasting ? 0 : 1 + i - model->lasting; /* those that last are joined */
+        for (size_t column = 0; column < n; ++column) {
+            const double *values = model->stiffness_residual + (i * n + column) * r;
+            size_t *end = model->residual_ends + part * blocks + column / STRUCTURE_BLOCK, here = r;
+            while (here > *end && values[here - 1] == 0.0) {
+                --here;
+            }
+            *end = here;
+        }
+    }
+    return true;
+}
+
 static bool take_arrays(structure_model *model, structure_problem *problem) {
     const structure_data *data = &model->data;
     const size_t n = extent(data, "static_load", 1), outputs = extent(data, "static_output", 0),
@@ -200,7 +223,7 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
     }
     const double *static_stiffness = NULL, *static_output = NULL, *load_residual = NULL,
                  *stiffness_residual = NULL, *correction = NULL, *modes = NULL, *gauges = NULL,
-                 *residual_allowance = NULL, *rounding_allowance = NULL;
+                 *residual_allowance = NULL, *rounding_allowance = NULL, *dual_residual = NULL;
     const struct {
         const char *name;
         const double **values;
@@ -216,7 +239,7 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
         {"residual_allowance", &residual_allowance, 0, {0}},
         {"rounding_allowance", &rounding_allowance, 0, {0}},
         {"dual_correction", &correction, 3, {functions ? functions : anchors, outputs, r}},
-        {"dual_residual", &model->dual_residual, 4, {anchors, outputs, model->dual_rows, model->dual_columns}},
+        {"dual_residual", &dual_residual, 4, {anchors, outputs, model->dual_rows, model->dual_columns}},
         {"modal_stiffness", &model->modal_stiffness, 3, {terms, nm, nm}},
         {"modal_mass", &model->modal_mass, 3, {mass_terms, nm, nm}},
         {"modal_load", &model->modal_load, 2, {loads, nm}},
@@ -264,7 +287,18 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
     for (size_t a = 0; a < anchors && functions == 0; ++a) {
         transpose(model->correction_columns + a * outputs * r, correction + a * outputs * r, outputs, r, r, 1.0);
     }
-    return true;
+    for (size_t a = 0; a < anchors; ++a) {
+        const size_t values = outputs * model->dual_rows * model->dual_columns;
+        for (size_t o = 0; o < outputs; ++o) {
+            for (size_t row = 0; row < model->dual_rows; ++row) {
+                for (size_t k = 0; k < model->dual_columns; ++k) {
+                    model->dual_factor[a * values + (k * model->dual_rows + row) * outputs + o] =
+                        dual_residual[a * values + (o * model->dual_rows + row) * model->dual_columns + k];
+                }
+            }
+        }
+    }
+    return find_ends(model, problem);
 }
 
 static double value_at(const double *chosen, size_t place) { return place == 0 ? 1.0 : chosen[place - 1]; }
@@ -320,6 +354,7 @@ void structure_model_free(structure_model *model) {
     structure_data_free(&model->data);
     free(model->memory);
     free(model->places);
+    free(model->residual_ends);
     free(model->factors);
     memset(model, 0, sizeof *model);
 }

@@ -14,6 +14,7 @@
 #endif
 
 #define STRUCTURE_MOST_REGIONS 8
+#define STRUCTURE_BLOCK 4 /* columns of residuals that are added at once */
 
 /* Two positions in the vector of what can be chosen, counted from one; zero for none. */
 typedef struct {
@@ -47,8 +48,7 @@ typedef struct {
     const double *bound_reference;  /* (T - 1) */
     const double *dual_split[STRUCTURE_MOST_REGIONS]; /* (anchors less one) of each region, ascending */
     size_t functions;               /* M, dual functions of an output that are combined, or 0: the nearest counts */
-    size_t dual_rows, dual_columns; /* of a factor of `dual_residual` */
-    const double *dual_residual;    /* (A, O, T, T), or (1, O, F, 1 + T M) */
+    size_t dual_rows, dual_columns; /* of a factor of a dual residual: (T, T), or (F, 1 + T M) */
     const double *dual_stiffness;   /* (O, T, M, M) */
     const double *dual_output;      /* (O, M) */
     const double *modal_stiffness;  /* (T, Nm, Nm) */
@@ -63,7 +63,9 @@ typedef struct {
     double *output_columns;     /* (N, O) */
     double *load_residual;      /* (L, R) */
     double *stiffness_residual; /* (T, N, R) in the order of `order` */
+    size_t *residual_ends;      /* (1 + damaged terms, blocks of columns) behind which only zeros follow */
     double *correction_columns; /* (A, R, O) or, as they are in the file, (M, O, R) */
+    double *dual_factor;        /* (A, dual columns, dual rows, O) */
     structure_data data;        /* owns the arrays */
     double *memory;             /* owns what was laid out anew */
     size_t *places;             /* owns `order` */

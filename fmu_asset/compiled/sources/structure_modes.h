@@ -10,8 +10,9 @@
 
 typedef struct {
     const structure_model *model;
-    bool known;
+    bool known, basis_known;
     double *key;               /* parameters, losses and masses of these modes */
+    double *basis_key;         /* the same of the basis, without losses */
     double *theta;             /* (T) */
     double *mass_theta;        /* (1 + P) */
     double *angular_frequency; /* (M) rad/s, ascending */
@@ -19,8 +20,13 @@ typedef struct {
     double *output;            /* (M, O and accelerations) per unit of modal coordinate */
     double *participation;     /* (M, L) modal force per unit of load */
     double *mass;              /* (Nm, Nm) */
-    double *factor, *matrix, *vectors; /* (Nm, Nm) */
-    double *values, *work;     /* (Nm), (3 Nm) */
+    double *cross_mass;        /* (Nm, N) between the modal and the static basis */
+    double *basis;             /* (Nm, Nm) all modes without a loss, by which the others are found */
+    double *stiffness;         /* (1 + damaged terms, Nm, Nm) in it, first what no loss changes */
+    double *present;           /* (Nm, Nm) their sum */
+    double *images;            /* (2, M, Nm) */
+    double *matrix, *vectors;  /* (Nm, Nm) */
+    double *values, *work;
 } structure_modes;
 
 void structure_modes_lay_out(structure_modes *modes, const structure_model *model, structure_arena *arena);

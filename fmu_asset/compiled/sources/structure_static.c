@@ -24,7 +24,8 @@ void structure_static_lay_out(structure_static *steady, const structure_model *m
     const size_t functions = model->functions;
     steady->dual_weights = structure_take(arena, outputs * functions);
     steady->dual_correction = structure_take(arena, functions ? r * outputs : 0);
-    steady->dual_work = structure_take(arena, functions * functions + model->dual_columns);
+    steady->dual_work = structure_take(arena, functions * functions + model->dual_rows * outputs +
+                                                  larger(model->dual_columns, outputs));
     /* Flags in the room of doubles, of which every byte is zero at first. */
     steady->solved = (bool *)(void *)structure_take(arena, model->loads);
     steady->bounded = (bool *)(void *)structure_take(arena, model->loads);
@@ -194,19 +195,30 @@ static void combine_duals(structure_static *steady) {
     }
 }
 
+/* residual += columns (N, R) times coefficients (N), up to the end of each block of them */
+static void add_blocks(double *residual, const structure_model *model, const double *columns, const size_t *ends,
+                       const double *coefficients) {
+    const size_t n = model->static_size, r = model->residual_size;
+    for (size_t c = 0; c < n; c += STRUCTURE_BLOCK) {
+        const size_t count = n - c < STRUCTURE_BLOCK ? n - c : STRUCTURE_BLOCK;
+        structure_add_columns(residual, ends[c / STRUCTURE_BLOCK], columns + c * r, r, count, coefficients + c);
+    }
+}
+
 /* Make a residual of that of the loads, which it holds, and find its product with the approximate dual solutions. */
 static void take_residual(structure_static *steady, const double *coordinates, double *residual, double *correction) {
     const structure_model *model = steady->model;
     const size_t n = model->static_size, r = model->residual_size, outputs = model->output_count;
     const size_t lasting = model->lasting, damaged = model->terms - lasting;
-    structure_add_columns(residual, r, steady->lasting_residual, r, n, coordinates);
-    /* The damaged terms, whose columns lie one after another. */
+    const size_t blocks = (n + STRUCTURE_BLOCK - 1) / STRUCTURE_BLOCK;
+    add_blocks(residual, model, steady->lasting_residual, model->residual_ends, coordinates);
     for (size_t k = 0; k < damaged; ++k) {
         for (size_t i = 0; i < n; ++i) {
-            steady->work[k * n + i] = steady->theta_damaged[k] * coordinates[i];
+            steady->work[i] = steady->theta_damaged[k] * coordinates[i];
         }
+        add_blocks(residual, model, model->stiffness_residual + (lasting + k) * n * r,
+                   model->residual_ends + (1 + k) * blocks, steady->work);
     }
-    structure_add_columns(residual, r, model->stiffness_residual + lasting * n * r, r, damaged * n, steady->work);
     memset(correction, 0, outputs * sizeof *correction);
     const double *columns =
         model->functions ? steady->dual_correction : model->correction_columns + anchor_of(steady) * r * outputs;
@@ -229,22 +241,35 @@ static void bound_unit(structure_static *steady, size_t load) {
 static void find_dual_norms(structure_static *steady) {
     const structure_model *model = steady->model;
     const size_t rows = model->dual_rows, columns = model->dual_columns, m = model->functions;
-    const double *factor = model->dual_residual + (m ? 0 : anchor_of(steady) * model->output_count * rows * columns);
-    double *coefficients = steady->dual_work + m * m;
-    coefficients[0] = 1.0;
-    for (size_t k = 1; k < columns && m == 0; ++k) {
-        coefficients[k] = -steady->theta[k - 1];
+    const size_t outputs = model->output_count, values = rows * outputs;
+    const double *factor = model->dual_factor + (m ? 0 : anchor_of(steady) * columns * values);
+    double *residual = steady->dual_work + m * m, *coefficients = residual + values;
+    if (m == 0) {
+        coefficients[0] = 1.0;
+        for (size_t k = 1; k < columns; ++k) {
+            coefficients[k] = -steady->theta[k - 1];
+        }
+        memset(residual, 0, values * sizeof *residual);
+        structure_add_columns(residual, values, factor, values, columns, coefficients);
+    } else {
+        memcpy(residual, factor, values * sizeof *residual);
+        for (size_t k = 1; k < columns; ++k) {
+            for (size_t o = 0; o < outputs; ++o) {
+                coefficients[o] = -steady->theta[(k - 1) / m] * steady->dual_weights[o * m + (k - 1) % m];
+            }
+            for (size_t i = 0; i < values; ++i) {
+                residual[i] += factor[k * values + i] * coefficients[i % outputs];
+            }
+        }
     }
-    for (size_t o = 0; o < model->output_count; ++o) {
-        for (size_t k = 1; k < columns && m > 0; ++k) {
-            coefficients[k] = -steady->theta[(k - 1) / m] * steady->dual_weights[o * m + (k - 1) % m];
+    memset(steady->dual_norm, 0, outputs * sizeof *steady->dual_norm);
+    for (size_t row = 0; row < rows; ++row) {
+        for (size_t o = 0; o < outputs; ++o) {
+            steady->dual_norm[o] += residual[row * outputs + o] * residual[row * outputs + o];
         }
-        double sum = 0.0;
-        for (size_t row = 0; row < rows; ++row, factor += columns) {
-            const double value = structure_dot(factor, coefficients, columns);
-            sum += value * value;
-        }
-        steady->dual_norm[o] = sqrt(sum);
+    }
+    for (size_t o = 0; o < outputs; ++o) {
+        steady->dual_norm[o] = sqrt(steady->dual_norm[o]);
     }
 }
 
