@@ -153,7 +153,7 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
             )
             values = moved.seen([Shown(row) for row in rows]).values
         else:
-            values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws).values @ rows.T
+            values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws)[0] @ rows.T
         for column, (name, quantity) in enumerate(zip(names, quantities, strict=True)):
             values[:, column] = hidden.readings(name, time, values[:, column])
             values[:, column] += NOISE[quantity] * random.standard_normal(len(time))

@@ -178,8 +178,6 @@ class Acting:
         Of a system of K unknowns, in whose coordinates all this is; None: it is in those of the system.
     clock : tuple of float
         Rate and zero of the samples beside the inputs.
-    references : mapping of str to sequence of Load
-        Those of the loads that are the reference of a controller, by its name.
     """
 
     time: FloatArray
@@ -189,7 +187,6 @@ class Acting:
     begins: Start = Start.SETTLED
     initial: FloatArray = field(default_factory=lambda: np.zeros(0))
     clock: tuple[float, float] = (0.0, 0.0)
-    references: Mapping[str, Sequence[Load]] = field(default_factory=dict)
     release: tuple[FloatArray, Release] | None = None
     basis: FloatArray | None = None
 

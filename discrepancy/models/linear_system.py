@@ -7,10 +7,9 @@ ports the prescribed motion is a coordinate of its own, so heavy that they do no
 put right at every step. The wing, a structure on springs and a lumped rig are such systems.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.linalg import cho_factor, eigh, null_space
@@ -33,44 +32,22 @@ ROUNDING = 1e-10
 """Share of the largest entry below which what couples modes is rounding."""
 
 
-class Rest(NamedTuple):
-    """Rest under L load levels.
-
-    Attributes
-    ----------
-    amounts, answers : (L, k), (k, N) ndarray
-        How much of each of k loads acts, and what a unit of each gives.
-    forces, flexible : (L, J), (J, N) ndarray
-        Of the laws, and what a unit of each gives.
-    memory : ndarray, optional
-        Of the laws; None: there are none.
-    """
-
-    amounts: FloatArray
-    answers: FloatArray
-    forces: FloatArray
-    flexible: FloatArray
-    memory: FloatArray | None
-
-    def seen(self, rows: FloatArray) -> FloatArray:
-        """Return what rows (C, N) show at each level, (L, C)."""
-        return np.asarray(self.amounts @ (self.answers @ rows.T) - self.forces @ (self.flexible @ rows.T))
-
-    @property
-    def values(self) -> FloatArray:
-        """Displacements and states (L, N)."""
-        return np.asarray(self.amounts @ self.answers - self.forces @ self.flexible)
+Resting = Callable[[FloatArray], FloatArray]
+"""What returns displacements and states (L, N) at rest under loads (L, N)."""
 
 
-class Resting(Protocol):
-    """What has a rest under loads."""
-
-    def resting(self, loads: FloatArray) -> FloatArray:
-        """Return displacements and states (L, N) at rest under loads (L, N)."""
+def springs(stiffness: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what gives K^-1 loads for loads (n,) or (n, k); raises `ModelError` if K holds not all."""
+    try:
+        factor, lower = cho_factor(stiffness, check_finite=False)
+    except np.linalg.LinAlgError as cause:
+        raise ModelError(f"The structure has no stiffness left in some direction ({cause}).") from cause
+    # the LAPACK routine itself: checks of its arguments would take ten times as long
+    return lambda loads: np.asarray(dpotrs(factor, loads, lower=lower)[0])
 
 
 def at_rest(
-    system: Resting,
+    resting: Resting,
     units: FloatArray,
     amounts: FloatArray,
     laws: Laws,
@@ -78,13 +55,15 @@ def at_rest(
     memory: FloatArray | None = None,
     before: FloatArray | None = None,
     held: FloatArray | float = 0.0,
-) -> Rest:
-    """Return the rest under load levels that follow one another from zero.
+) -> tuple[FloatArray, FloatArray | None]:
+    """Return displacements and states (L, N) under load levels that follow one another from zero.
+
+    The memory of the laws comes with them, None without laws.
 
     Parameters
     ----------
-    system : Resting
-        What is loaded.
+    resting : Resting
+        Of what is loaded.
     units, amounts : (k, N), (L, k) ndarray
         Loads, and how much of each acts at each level.
     laws : Laws
@@ -101,14 +80,14 @@ def at_rest(
     ModelError
         If nothing holds the system, or a law takes more than it has.
     """
-    found = system.resting(np.concatenate((units, rows)))
+    found = resting(np.concatenate((units, rows)))
     answers, flexible = found[: len(units)] + held, found[len(units) :]
     if not len(laws):
-        return Rest(amounts, answers, np.zeros((len(amounts), 0)), flexible, None)
+        return amounts @ answers, None
     at_ports = answers @ rows.T
     start = None if before is None else before @ at_ports
     solution = solved(laws, amounts @ at_ports, rows @ flexible.T, memory, start)
-    return Rest(amounts, answers, solution.forces, flexible, solution.memory)
+    return amounts @ answers - solution.forces @ flexible, solution.memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,17 +269,12 @@ class LinearSystem:
     # ------------------------------------------------------------ rest
 
     @cached_property
-    def _factor(self) -> tuple[FloatArray, bool]:
-        factor: tuple[FloatArray, bool] = cho_factor(self.stiffness)
-        return factor
-
-    def flexibility(self, loads: FloatArray) -> FloatArray:
-        """Return K^-1 loads, for loads (n,) or (n, k), of a structure that springs hold."""
-        if self.compliance is not None:
-            return np.asarray(self.compliance @ loads)
-        # the LAPACK routine itself: checks of its arguments would take ten times as long
-        solution, _ = dpotrs(self._factor[0], loads, lower=self._factor[1])
-        return np.asarray(solution)
+    def flexibility(self) -> Callable[[FloatArray], FloatArray]:
+        """What gives K^-1 loads, for loads (n,) or (n, k), of a structure that springs hold."""
+        compliance = self.compliance
+        if compliance is None:
+            return springs(self.stiffness)
+        return lambda loads: np.asarray(compliance @ loads)
 
     def residual(self, loads: FloatArray) -> FloatArray:
         """Return the part of K^-1 loads, (n,) or (n, k), that the modes leave out."""
@@ -340,7 +314,9 @@ class LinearSystem:
             )
         return np.asarray(found.T @ self.shapes.T)
 
-    def static(self, loads: FloatArray, laws: Laws = NO_LAWS, drive: FloatArray | None = None) -> Rest:
+    def static(
+        self, loads: FloatArray, laws: Laws = NO_LAWS, drive: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray | None]:
         """Return the rest under loads (L, N) that follow one another from zero, see `at_rest`.
 
         `drive` (P,) is where the drives hold what they move; ports of states are at no position.
@@ -350,7 +326,7 @@ class LinearSystem:
         if drive is not None and len(drive):
             held = self.lift @ drive
             loads = loads - self.stiffness @ held
-        return at_rest(self, loads, np.eye(len(loads)), laws, rows, held=held)
+        return at_rest(self.resting, loads, np.eye(len(loads)), laws, rows, held=held)
 
     # ------------------------------------------------------------ what acts, and what is seen
 

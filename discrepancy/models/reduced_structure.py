@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import inv
 
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Shown, shown_rows
-from discrepancy.models.interface import NO_PATCH, ModelParameter, Outputs, Place
+from discrepancy.models.interface import NO_PATCH, Outputs, Place
 from discrepancy.models.memory import Memory
 from discrepancy.models.questions import (
     LoadChange,
@@ -102,7 +103,7 @@ class StructureModel(StructuralModel):
         nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
         self.model, self.name, self.regions = model, model.name, model.regions
         self.parameters = tuple(
-            ModelParameter(name, nominal[name], DEVIATION * (high - low), unit, low, high)
+            ParameterPrior(name, unit, nominal[name], DEVIATION * (high - low), low, high)
             for names, unit in ((model.parameters, "1"), (model.masses, "kg"))
             for name in names
             for low, high in [model.validity[name]]

@@ -220,10 +220,10 @@ class SecondOrderSystem(LinearSystem):
             load = acting.load_at(first, np.eye(len(self.mass)))
             if load.any() or drive.any():
                 acts = laws.act_at(float(first[0]))
-                found = self.static(load, laws.only(acts) if laws.spans else laws, drive=drive)
-                amounts = self.shapes.T @ (self.mass @ (found.values[0] - self.lift @ drive))
+                values, felt = self.static(load, laws.only(acts) if laws.spans else laws, drive=drive)
+                amounts = self.shapes.T @ (self.mass @ (values[0] - self.lift @ drive))
                 q[:moving], v[moving:count] = amounts[:moving], amounts[moving:]
-                memory = None if found.memory is None else laws.filled(found.memory, acts)
+                memory = None if felt is None else laws.filled(felt, acts)
         elif acting.begins is Start.UNKNOWN:
             given = np.zeros(count + moving)  # displacement and speed of each mode, and the states
             given[: len(acting.initial)] = acting.initial[: len(given)]
