@@ -337,18 +337,12 @@ class LinearSystem:
 
     def by_order(self, shown: Sequence[Shown], shapes: FloatArray) -> FloatArray:
         """Return what outputs show of modal coordinates and their derivatives (4, C, M), in shapes (N, M)."""
-        n, found = self.displacements, np.zeros((4, len(shown), shapes.shape[1]))
-        for number, item in enumerate(shown):
-            found[item.order, number] = item.row[:n] @ shapes[:n]
-            if self.states:
-                found[item.further + 1, number] += item.row[n:] @ shapes[n:]
-            if item.speed is not None:
-                found[1, number] += item.speed @ shapes[:n]
+        rows = np.array([item.rows for item in shown]).reshape(len(shown), 4, len(shapes))
+        for own, item in zip(rows, shown, strict=True):
             if item.reaction is not None:
                 along = self.lift[:, item.reaction]
-                for order, matrix in enumerate((self.stiffness, self.damping, self.mass)):
-                    found[order, number] = along @ matrix @ shapes
-        return found
+                own[:3] = [along @ matrix for matrix in (self.stiffness, self.damping, self.mass)]
+        return np.moveaxis(rows @ shapes, 1, 0)
 
     def seen_by(self, shown: Sequence[Shown], shapes: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, in shapes (N, M) of what is free.
@@ -364,8 +358,8 @@ class LinearSystem:
         for number, item in enumerate(shown):
             if item.reaction is not None:
                 force[:, number] = acts @ self.lift[:, item.reaction]
-            elif self.truncated and item.order == 0:
-                force[:, number] = -acts @ self.residual(item.row)
+            elif self.truncated:
+                force[:, number] = -acts @ self.residual(item.rows[0])
         mass, *others = (shapes.T @ matrix @ shapes for matrix in (self.mass, self.damping, self.stiffness))
         sees, acts = sees @ shapes, acts @ shapes
         push, by_damping, by_stiffness = (np.linalg.solve(mass, item) for item in (acts.T, *others))

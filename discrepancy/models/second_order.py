@@ -120,9 +120,8 @@ class Motion:
                 values += self.derivative(order) @ rows.T
                 if order < 3:
                     rates += self.derivative(order + 1) @ rows.T
-        still = [number for number, item in enumerate(shown) if item.order == 0]
-        if system.truncated and still:
-            values[:, still] += self._left_out(np.array([shown[number].row for number in still]))
+        if system.truncated:
+            values += self._left_out(np.array([item.rows[0] for item in shown]))
         for number, item in enumerate(shown):
             if item.constant:
                 values[:, number] += item.constant
@@ -133,7 +132,7 @@ class Motion:
                     values[:, number] += self.port_forces @ (
                         self.laws.rows(system.acting_rows, len(along)) @ along
                     )
-            for factor, course in item.courses:
+            for factor, course in item.courses or ():
                 values[:, number] += factor * course.at(self.time)
             if item.reaction is not None or item.courses:
                 rates[:, number] = np.gradient(values[:, number], self.time)

@@ -319,7 +319,7 @@ def test_omitted_modes_follow_slow_forces() -> None:
     force = 1.0 - np.cos(4.0 * time)
     row = np.array([0.0, 1.0, 0.0])
     acting = Acting(time, np.zeros(3), [(row, Course.of(time, force))])
-    shown = [Shown(row) for row in np.eye(3)]
+    shown = [Shown.of(row) for row in np.eye(3)]
     answers = [system.motion(acting, NO_LAWS).seen(shown).values for system in (whole, one)]
     bare = one.motion(acting, NO_LAWS).q @ one.shapes.T
     scale = np.max(np.abs(answers[0]))
