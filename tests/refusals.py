@@ -7,14 +7,15 @@ from pathlib import Path
 
 
 class Inputs:
-    """The files in the folder `inputs` beside a test file.
+    """The files in the folder `inputs` of a folder of tests, or of a test file's.
 
     Each row of a table of `refused.toml` is a piece of a good input, what stands there instead, and the
     sentence, as a regular expression, that refuses it.
     """
 
-    def __init__(self, test_file: str) -> None:
-        self.folder = Path(test_file).with_name("inputs")
+    def __init__(self, place: str | Path) -> None:
+        place = Path(place)
+        self.folder = (place if place.is_dir() else place.parent) / "inputs"
 
     def text(self, name: str, *changes: tuple[str, str]) -> str:
         """Return a good input in which pieces are exchanged."""

@@ -122,10 +122,6 @@ def turning_ports(setting: Setting, entry: Entry = ANY) -> Names:
     return tuple(name for name in force_ports(setting, entry) if name not in ports or ports[name].turns)
 
 
-def _skins(setting: Setting, entry: Entry = ANY) -> Names:
-    return tuple(f"{port}, {skin}" for port in force_ports(setting, entry) for skin in SKINS)
-
-
 def _stores(setting: Setting, entry: Entry = ANY) -> Names:
     found = state_ports(setting, entry)
     return (*found, EVERY_PORT) if len(found) > 1 else found
@@ -223,7 +219,9 @@ PLACES: dict[str, Callable[[Setting, Entry], Names]] = {
     "ports of forces": force_ports,
     "held ports": _held_ports,
     "turning ports": turning_ports,
-    "skins at ports": _skins,
+    "skins at ports": lambda setting, entry: tuple(
+        f"{port}, {skin}" for port in force_ports(setting, entry) for skin in SKINS
+    ),
     "ports of states": state_ports,
     "ports of states, or all": _stores,
     "calibrated channels": _calibrated_channels,
@@ -340,10 +338,6 @@ def _has_force(setting: Setting) -> bool:
     return any(np.any(trial.force != 0.0) for trial in loaded)
 
 
-def _has_second_clock(setting: Setting) -> bool:
-    return len(setting.campaign.loggers) != 1 or not trials(setting, INPUTS)
-
-
 def _met(holds: Callable[[Setting], object], sentence: str) -> Callable[[Setting, Entry], str | None]:
     """Return what tells that something does not hold of a setting."""
     return lambda setting, entry: None if holds(setting) else said(sentence, model=setting.model.name)
@@ -360,7 +354,10 @@ NEEDS: dict[str, Callable[[Setting, Entry], str | None]] = {
     "force": _met(_has_force, "needs.no_force"),
     "temperature": _temperature,
     "channel": _met(channels, "needs.no_channel"),
-    "second clock": _met(_has_second_clock, "needs.no_second_clock"),
+    "second clock": _met(
+        lambda setting: len(setting.campaign.loggers) != 1 or not trials(setting, INPUTS),
+        "needs.no_second_clock",
+    ),
     "input": lambda setting, entry: _trial(setting, replace(entry, kinds=INPUTS)),
     "strain across": _strain_across,
 }

@@ -25,7 +25,7 @@ from discrepancy.models.interface import (
 )
 from discrepancy.models.linear_system import Resting, at_rest
 from discrepancy.models.natural_scales import PortSizes
-from discrepancy.models.questions import check_carried, check_parameters, laws_at, prior_mean
+from discrepancy.models.questions import check_carried, check_parameters, laws_at, losses_of, prior_mean
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws
@@ -240,17 +240,7 @@ class SystemModel(Model):
         return Response(along, None, *further)
 
     def _losses(self, trial: Trial, conditions: Conditions) -> list[Losses]:
-        """Return the losses of the regions in each row from those that the trial names."""
-        losses = np.zeros((len(conditions.health), len(self.regions)))
-        for name, column in zip(trial.regions, conditions.health.T, strict=False):
-            if name in self.regions:
-                losses[:, self.regions.index(name)] = column
-            elif np.any(column):
-                raise ModelError(
-                    f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but "
-                    f"{self.name} has {', '.join(self.regions)}."
-                )
-        return [tuple(row) for row in losses.tolist()]
+        return losses_of(trial, conditions.health, self.regions, self.name)
 
     # ------------------------------------------------------------ ports
 

@@ -106,10 +106,10 @@ def _nearest(
         edges = np.einsum("nai,naj,tj->nti", nodes, slopes, tangents)
         if step == _STEPS or moved < 1e-14:
             break
-        gram = np.einsum("nti,nsi->nts", edges, edges)
-        # Outside its cell the map may fold: such a place is no solution, wherever the next step leads.
-        gram[np.linalg.det(gram) == 0.0] = np.eye(len(tangents))
-        move = np.linalg.solve(gram, np.einsum("nti,ni->nt", edges, residual)[..., None])[..., 0]
+        gram = edges @ edges.swapaxes(1, 2)
+        if len(tangents) == 3:  # outside its cell the map may fold: no solution, wherever the next step leads
+            gram[np.linalg.det(gram) == 0.0] = np.eye(3)
+        move = np.linalg.solve(gram, edges @ residual[..., None])[..., 0]
         before, along = along, kept(along + move)
         moved = float(np.abs(along - before).max(initial=0.0))
     return local, residual, edges
