@@ -14,7 +14,7 @@ from discrepancy.catalogue.library import load_catalogue
 from discrepancy.errors import ModelError
 from discrepancy.model_choice import choose_model
 from discrepancy.models.fmu import FmuModel
-from discrepancy.models.fmu_file import parse_fmu_model
+from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.examples import example_campaign, plan_for
@@ -254,7 +254,7 @@ def test_a_wrong_file_is_refused_in_one_sentence(write, old: str, new: str, sent
 
 def test_the_documented_file_is_one() -> None:
     page = (Path(__file__).parents[3] / "docs" / "fmu_models.md").read_text(encoding="utf-8")
-    described = parse_fmu_model(tomllib.loads(page.split("```toml\n")[1].split("```")[0]))
+    described = FmuModelDescription.model_validate(tomllib.loads(page.split("```toml\n")[1].split("```")[0]))
     assert described.effects == {"point_mass": "unmodelled_point_mass"}
     assert described.scales.length == 0.4
 
