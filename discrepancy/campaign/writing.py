@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import asdict
+from math import isinf
 from pathlib import Path
 from typing import Any
 
@@ -168,14 +169,17 @@ def _channel(channel: Channel, si: bool) -> dict[str, Any]:
     unit, record, noise = _unit(channel, si), channel.noise, None
     from_si = conversion_of(channel.quantity, unit).from_si
     if record is not None and record.samples is None:
-        noise = {
-            "standard_deviation": from_si(record.standard_deviation),
-            "degrees_of_freedom": record.degrees_of_freedom, "source": record.source,
-        }  # fmt: skip
+        noise = {"standard_deviation": from_si(record.standard_deviation), "source": record.source}
+        if not isinf(record.degrees_of_freedom):
+            noise["degrees_of_freedom"] = record.degrees_of_freedom
+    gain, offset = (
+        "free" if isinf(deviation) else deviation
+        for deviation in (channel.gain_deviation, from_si(channel.offset_deviation))
+    )
     return {
         "name": channel.name, "quantity": channel.quantity, "unit": unit, "output": channel.output,
-        "station": channel.station, "chord": channel.chord, "gain_deviation": channel.gain_deviation,
-        "offset_deviation": from_si(channel.offset_deviation), "noise": noise,
+        "station": channel.station, "chord": channel.chord, "gain_deviation": gain,
+        "offset_deviation": offset, "noise": noise,
     }  # fmt: skip
 
 

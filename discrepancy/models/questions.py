@@ -20,6 +20,7 @@ from fe.runtime.patch import (
     PortForce,
     Primitive,
 )
+from fe.runtime.state import Losses
 from reporting.words import counted
 
 DEFAULT_PLACE = "tip_load"
@@ -134,6 +135,26 @@ def check_no_inputs(trial: Trial, what: str) -> None:
             f"The trial {trial.name!r} is static under the inputs {names}, which {what} does not have at "
             'rest: describe the asset as an FMU model with [[input]], or record the trial as "driven".'
         )
+
+
+def losses_of(trial: Trial, health: FloatArray, regions: Sequence[str], what: str) -> list[Losses]:
+    """Return the losses of a model's regions in each row from those (N, K) that a trial names.
+
+    Raises
+    ------
+    ModelError
+        If one is of a region that the model, `what`, does not have.
+    """
+    losses = np.zeros((len(health), len(regions)))
+    for name, column in zip(trial.regions, health.T, strict=False):
+        if name in regions:
+            losses[:, regions.index(name)] = column
+        elif np.any(column):
+            raise ModelError(
+                f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but {what} has "
+                f"{', '.join(regions) or 'none'}."
+            )
+    return [tuple(row) for row in losses.tolist()]
 
 
 def check_plain(trial: Trial, what: str) -> None:
