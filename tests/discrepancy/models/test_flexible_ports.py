@@ -55,7 +55,7 @@ def ringdown(beta: float, *items: Primitive, refinement: int = 1) -> Motion:
 
 
 def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
-    return motion.seen([Shown(row) for row in rows]).values
+    return motion.seen([Shown.of(row) for row in rows]).values
 
 
 LAWS = {
