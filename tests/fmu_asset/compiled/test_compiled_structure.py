@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from fe.reduction.reduced_basis import Reduction
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.check import check_fmu
 from fmu_asset.packing.structure_fmu import build_fmu, recorded_content_hash
 
 OK, DISCARD, ERROR = 0, 2, 3
 DRIVER = Path(__file__).with_name("driver.c")
-
-
-@pytest.fixture(scope="module")
-def beam_model(beam_reduction: Reduction) -> ReducedModel:
-    return beam_reduction.model
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +97,33 @@ def test_no_check_finds_anything(compiled_beam: Path) -> None:
     assert "warning" not in {finding.verdict for finding in check.findings}
     declared, actual = recorded_content_hash(compiled_beam)
     assert declared == actual
+
+
+def test_modes_that_coincide_are_those_of_python(
+    compiler: list[str], beam_model: ReducedModel, tmp_path: Path, open_slave: Callable[..., Any]
+) -> None:
+    """A double mode, two 1e-7 apart, two 1e-3, whatever the loss: motion and frequencies to 1e-9."""
+    size = beam_model.modal_load.shape[1]
+    turn = np.linalg.qr(np.random.default_rng(5).normal(size=(size, size)))[0]
+    squares = 1e6 * np.arange(1.0, size + 1.0) ** 2
+    squares[2], squares[4] = squares[1], squares[3] * (1.0 + 1e-7)
+    squares[6] = squares[5] * 1.001
+    shares = np.full(len(beam_model.modal_stiffness), 1.0 / len(beam_model.modal_stiffness))
+    masses = np.zeros_like(beam_model.modal_mass)
+    masses[0] = np.eye(size)
+    model = replace(
+        beam_model,
+        modal_stiffness=np.multiply.outer(shares, (turn * squares) @ turn.T),
+        modal_mass=masses,
+        cross_mass=np.zeros_like(beam_model.cross_mass),
+    )
+    slaves = [
+        open_slave(build_fmu(model, tmp_path / f"{kind}.fmu", kind=kind).path)
+        for kind in ("compiled", "python")
+    ]
+    for seed in range(3):
+        ours, expected = (np.array(_fly(slave, model, seed, 2)) for slave in slaves)
+        scale = np.maximum(np.abs(expected).max(axis=0), 1e-300)
+        assert (np.abs(ours - expected).max(axis=0) <= 1e-9 * scale).all()
+    for slave in slaves:
+        slave.close()
