@@ -73,12 +73,12 @@ import sys
 from pathlib import Path
 from fe.runtime.state import DigitalState
 from fe.verification.calculix_deck import Step
-from fe.verification.calculix_models import STATIC, wing_deck
+from fe.verification.calculix_models import wing_deck
 from fe.wing.design import load_design
 from fe.wing.operators import assemble
 operators = assemble(load_design().changed(mesh={"refinement": float(sys.argv[1])}))
 deck = wing_deck(operators, DigitalState())
-text = deck.text(Step(STATIC, operators.load_tip))
+text = deck.text(Step(operators.load_tip))
 Path(sys.argv[2]).write_text(text, encoding="ascii")
 """
 

@@ -12,6 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import (
     Campaign,
     Channel,
@@ -25,7 +26,6 @@ from discrepancy.models.acting import Acting, Course, Shown
 from discrepancy.models.interface import (
     Conditions,
     Model,
-    ModelParameter,
     Outputs,
     PortScale,
     Response,
@@ -149,7 +149,7 @@ class Cantilever(Model):
     """The cantilever; outputs "tip_displacement" and "strain[0]" to "strain[2]", ports root, tip and span."""
 
     name = "cantilever"
-    parameters = (ModelParameter("young_modulus_factor", 1.0, 0.01, "1", 0.5, 2.0),)
+    parameters = (ParameterPrior("young_modulus_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is."""
@@ -243,7 +243,7 @@ def _motion(
         else:
             acting = replace(acting, loads=[(row, Course.of(trial.time, force, trial.hold))])
         motion = system.motion(acting, laws, conditions.refinement)
-        response = motion.seen([Shown(row) for row in rows])
+        response = motion.seen([Shown.of(row) for row in rows])
         return response.values, response.rates, behind * force
     loads = np.outer(force, row)
     for n in range(len(force)):
@@ -255,7 +255,7 @@ def _motion(
     values = np.empty((len(force), len(rows)))
     for level in np.unique(modulus):
         chosen = modulus == level
-        values[chosen] = (_system(float(level), structural).static(loads, laws).values @ rows.T)[chosen]
+        values[chosen] = (_system(float(level), structural).static(loads, laws)[0] @ rows.T)[chosen]
     return values, None, behind * force
 
 

@@ -24,6 +24,7 @@ from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.files.verdict import VERDICT_NAME, StoredVerdict, read_verdict_file
 from discrepancy.model_choice import ModelChoice, ModelKind, model_of
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
+from discrepancy.sentences import SENTENCES, said
 from discrepancy.verdict import Hypothesis, Verdict, VerdictKind
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.state import DigitalState
@@ -34,23 +35,9 @@ from reporting.files import atomic_write_text
 from reporting.folders import restore_folder
 from reporting.progress import Progress
 from reporting.toml_file import read_toml, toml_text
+from reporting.words import capital
 
 ENDINGS = (".toml", ".json", ".fmu")
-RESTS_ON = {
-    VerdictKind.NAMED: "named",
-    VerdictKind.NAMED_IN_PART: "named in part: what is left has no name",
-    VerdictKind.FAMILY: "of which the family is named, not the law",
-    VerdictKind.GROUP: "one of a group that the data cannot tell apart: no name",
-    VerdictKind.UNEXPLAINED: "the best hypothesis for a gap that stays unexplained: no name",
-}
-"""How sure an effect is, by the verdict."""
-NOTHING = {
-    VerdictKind.NOTHING_MISSING: "nothing is missing, and the model stands as it is",
-    VerdictKind.BELOW_LIMIT: "what may be missing is too small to tell from noise",
-    VerdictKind.DATA_ERROR: "the data are at fault; mend them first",
-    VerdictKind.UNEXPLAINED: "no hypothesis is better than the model as it is",
-}
-"""Why a verdict gives nothing to apply."""
 
 
 @dataclass(frozen=True)
@@ -132,8 +119,8 @@ def apply_verdict(
     if path.exists() and not replace:
         raise FileNotWrittenError(f"{path} exists: choose another --out or give --replace.")
     what = " and ".join(f"{item.name}{item.place and f' at {item.place}'}" for item in found.effects)
-    beside = f" (of {', '.join(stored.verdict.group)})" if found.verdict is VerdictKind.GROUP else ""
-    sentence = f"{what[0].upper()}{what[1:]}, {RESTS_ON[found.verdict]}{beside}."
+    sure = said(f"applied.{found.verdict.name.lower()}", group=", ".join(stored.verdict.group))
+    sentence = f"{capital(what)}, {sure}."
     patch = changed(patch, sentence=f"{sentence} {stored.verdict.sentence}")
     if path.suffix == ".toml":
         if not plain:
@@ -167,9 +154,9 @@ def _found(stored: StoredVerdict, file: Path, member: str | None) -> StoredPatch
         return read_patch(beside)
     best = _hypothesis(verdict, member) if verdict.kind in APPLIED else None
     if best is None:
-        raise DiscrepancyError(
-            f"{file} gives nothing to apply: {NOTHING.get(verdict.kind, 'it lacks what it names')}."
-        )
+        key = f"nothing_as_{verdict.kind.name.lower()}"
+        why = said(f"applied.{key}" if key in SENTENCES["applied"] else "applied.nothing_there")
+        raise DiscrepancyError(f"{file} gives nothing to apply: {why}.")
     residuals = file.parent / RESIDUALS_NAME
     channels = fmu_outputs(read_residuals(residuals).channels) if residuals.is_file() else {}
     effects = patch_effects(best.effects)

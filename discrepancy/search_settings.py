@@ -3,9 +3,7 @@
 Gates have levels of their own (`gates`, `consistency_gate`): they judge what the search found.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from types import MappingProxyType
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -29,12 +27,8 @@ class SearchSettings:
     """Members of a group; more of them say nothing."""
 
     # ---------------------------------------------------------------- screening: what is worth a fit
-    levels: Mapping[int, tuple[float, ...]] = field(
-        default_factory=lambda: MappingProxyType(
-            {1: (-1.5, -0.5, 0.5, 1.5), 2: (-1.3, 0.0, 1.3), 3: (-1.2, 0.0, 1.2)}
-        )
-    )
-    """Grid of the scaled parameters that are not a mere scale, by their number."""
+    levels: tuple[tuple[float, ...], ...] = ((), (-1.5, -0.5, 0.5, 1.5), (-1.3, 0.0, 1.3), (-1.2, 0.0, 1.2))
+    """Grid of the scaled parameters that are not a mere scale, by their number from none on."""
     levels_of_many: tuple[float, ...] = (-1.0, 1.0)
     """The same from four on: the grid grows with the power of their number."""
     largest_start: float = 2.5
@@ -127,10 +121,8 @@ class SearchSettings:
     """Single effects that go on from the beginnings to whole records."""
     far_extensions: int = 4
     """Longer sets that do."""
-    related_levels: Mapping[int, int] = field(
-        default_factory=lambda: MappingProxyType({1: 5, 2: 5, 3: 5, 4: 3})
-    )
-    """Levels of each parameter, by their number, at which relatives of a fitted effect are tried."""
+    related_levels: tuple[int, ...] = (0, 5, 5, 5, 3)
+    """Levels of each parameter, by their number from none on, at which relatives of an effect are tried."""
     related_starts: int = 2
     """Of these, how many begin a fit."""
 

@@ -35,15 +35,8 @@ SCHEMA = "uav-twin self calibration 1"
 NULL_SHARE = 3
 """One campaign in so many hides nothing."""
 NOTHING = "nothing"
-OTHER = {
-    VerdictKind.NOTHING_MISSING: "nothing missing",
-    VerdictKind.NAMED_IN_PART: "named in part",
-    VerdictKind.FAMILY: "family only",
-    VerdictKind.GROUP: "group",
-    VerdictKind.UNEXPLAINED: "unexplained",
-    VerdictKind.BELOW_LIMIT: "below detectability",
-    VerdictKind.DATA_ERROR: "data error",
-}
+OTHER = {kind: kind.value for kind in VerdictKind if kind is not VerdictKind.NAMED}
+OTHER[VerdictKind.FAMILY] = "family only"
 """Columns of the confusion matrix besides the names."""
 OUTCOMES = {VerdictKind.FAMILY: "family", VerdictKind.NAMED_IN_PART: "in part"}
 """Of verdicts that say less than a name, where they hold what was hidden."""

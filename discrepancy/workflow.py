@@ -16,8 +16,9 @@ from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.catalogue.needs import NO_PORT
 from discrepancy.checks.fault import DataFault
-from discrepancy.checks.outliers import wrong_ends
-from discrepancy.checks.quality import check_against_model, check_data, mark_outliers
+from discrepancy.checks.model_check import check_against_model
+from discrepancy.checks.outliers import mark_outliers, wrong_ends
+from discrepancy.checks.quality import check_data
 from discrepancy.errors import CampaignDataError
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit
@@ -25,21 +26,14 @@ from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import solver_share
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.force_told import seen_force
 from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.naming import name
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
-from discrepancy.judgement.when import (
-    acting_sentence,
-    begins_inside,
-    look_alike_remark,
-    when_sentence,
-    with_untested,
-)
+from discrepancy.judgement.when import NO_GAP, dated, look_alike_remark, with_untested
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.shares import MissingForce
+from discrepancy.missing_force.shares import MissingForce, seen_force
 from discrepancy.missing_force.windows import gap_windows, residual_windows
 from discrepancy.model_choice import load_model
 from discrepancy.models.interface import Model
@@ -57,14 +51,8 @@ from reporting.words import be, brief, listing
 DRAWS = 400
 IMPLAUSIBLE = 4.0
 """Prior deviations from which on a parameter or a gain is remarked on."""
-NO_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
-OPEN_KINDS = (
-    VerdictKind.GROUP,
-    VerdictKind.UNEXPLAINED,
-    VerdictKind.FAMILY,
-    VerdictKind.NAMED_IN_PART,
-    VerdictKind.BELOW_LIMIT,
-)
+CLOSED_KINDS = (VerdictKind.NOTHING_MISSING, VerdictKind.NAMED, VerdictKind.DATA_ERROR)
+"""Verdicts after which no experiment is proposed."""
 
 
 @dataclass(frozen=True)
@@ -198,16 +186,16 @@ def investigate(
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     if thorough and verdict.kind not in NO_GAP:
         with stage("Seeing the missing force", "force"):
-            missing, force = seen_force(problem, search, fit)
+            missing, force = seen_force(problem, search.force, search.forces, fit)
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
             proof = prove(before, after, seed=seed)
     experiments: tuple[Experiment, ...] = ()
-    if thorough and verdict.kind in OPEN_KINDS:
+    if thorough and verdict.kind not in CLOSED_KINDS:
         with stage("Looking for the next experiment", "next"):
             experiments = next_experiments(problem, open_hypotheses(search))
     verdict = replace(
-        verdict, sentence=_dated(verdict, windows), remarks=tuple(remarks), next_experiments=experiments,
+        verdict, sentence=dated(verdict, windows), remarks=tuple(remarks), next_experiments=experiments,
         not_fitted=not_fitted(problem.setting, catalogue, search), windows=windows,
         parameters=calibrated_parameters(problem, fit), force=force,
     )  # fmt: skip
@@ -215,15 +203,6 @@ def investigate(
         campaign, model, faults, verdict, location, proof, before, after, problem, search, fit, seconds,
         missing,
     )  # fmt: skip
-
-
-def _dated(verdict: Verdict, windows: tuple[GapWindow, ...]) -> str:
-    """Return the sentence of a verdict, with when the gap is there where that tells something."""
-    when = acting_sentence(verdict.effects)
-    dated = begins_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED
-    if not when and verdict.kind not in NO_GAP and dated:
-        when = when_sentence(windows)
-    return f"{verdict.sentence} {when}".strip()
 
 
 def _remarks(

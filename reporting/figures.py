@@ -145,11 +145,12 @@ def band(axes: Axes, x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str) 
     axes.fill_between(x, low, high, color=color, alpha=BAND_OPACITY, linewidth=0)
 
 
-def color_bar(figure: Figure, drawn: Any, label: str, **place: Any) -> None:
+def color_bar(figure: Figure, drawn: Any, label: str, **place: Any) -> Axes:
     """Draw the scale of colours of what was drawn; `place` is `ax`, beside a panel, or `cax`, in one."""
     bar = figure.colorbar(drawn, **place)
     bar.set_label(label)
     bar.outline.set_linewidth(0.5)
+    return bar.ax
 
 
 def panel_label(axes: Axes, label: str, title: str = "", *, offset: float = 0.0) -> None:

@@ -1,9 +1,9 @@
 """Tables of files as checked records: strict sections, and one sentence for what is wrong with them."""
 
 import re
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from reporting.words import counted, listing
 
@@ -24,6 +24,12 @@ _EXPECTED = {
     "finite_number": "a finite number",
 }
 """What is expected, by pydantic's type of error, where its own words are those of Python."""
+
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
+Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Section(BaseModel):

@@ -247,10 +247,16 @@ def _separated(
     return found
 
 
-def table_text(header: Sequence[str], columns: Sequence[Sequence[str]]) -> str:
-    """Return the text of a table, which `parse_table` reads back."""
+def table_text(columns: Mapping[str, Sequence[str] | FloatArray]) -> str:
+    """Return the text of a table, which `parse_table` reads back; a number that is none is an empty cell."""
+    cells = (
+        ["" if value != value else repr(value) for value in column.tolist()]
+        if isinstance(column, np.ndarray)
+        else column
+        for column in columns.values()
+    )
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(header)
-    writer.writerows(zip(*columns, strict=True))
+    writer.writerow(columns)
+    writer.writerows(zip(*cells, strict=True))
     return stream.getvalue()

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from typing import Any
 
 
 class Inputs:
-    """The files in the folder `inputs` beside a test file.
+    """The files in the folder `inputs` of a folder of tests, or of a test file's.
 
     Each row of a table of `refused.toml` is a piece of a good input, what stands there instead, and the
     sentence, as a regular expression, that refuses it.
     """
 
-    def __init__(self, test_file: str) -> None:
-        self.folder = Path(test_file).with_name("inputs")
+    def __init__(self, place: str | Path) -> None:
+        place = Path(place)
+        self.folder = (place if place.is_dir() else place.parent) / "inputs"
 
     def text(self, name: str, *changes: tuple[str, str]) -> str:
         """Return a good input in which pieces are exchanged."""
@@ -24,7 +26,7 @@ class Inputs:
             text = text.replace(old, new, 1)
         return text
 
-    def refused(self, table: str) -> list[tuple[str, ...]]:
+    def refused(self, table: str) -> list[tuple[Any, ...]]:
         """Return the rows of a table."""
         tables = tomllib.loads((self.folder / "refused.toml").read_text(encoding="utf-8"))
         return [tuple(row) for row in tables[table]]

@@ -137,4 +137,4 @@ def write_table_1(rows: tuple[TableRow, ...], path: Path) -> Path:
         values = (*row.prior, *row.found, *row.paper_way, *found, *row.differences)
         numbers = ["" if value is None else f"{value:.10g}" for value in values]
         lines.append((row.name, *numbers, row.paper.source))
-    return atomic_write_text(path, table_text(_CSV_COLUMNS, [*zip(*lines, strict=True)]))
+    return atomic_write_text(path, table_text(dict(zip(_CSV_COLUMNS, zip(*lines, strict=True), strict=True))))

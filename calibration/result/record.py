@@ -67,7 +67,7 @@ class ParameterPrior:
     low, high : float
         Range in which the model holds [unit].
     stated_by : str
-        Where it stands: the model's file or the campaign.
+        Where it stands: the model's file or the campaign; empty: the model's.
     title : str
         What it is; its name where nothing is said.
     """
@@ -78,7 +78,7 @@ class ParameterPrior:
     deviation: float
     low: float
     high: float
-    stated_by: str
+    stated_by: str = ""
     title: str = ""
 
     @property

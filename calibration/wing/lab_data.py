@@ -73,7 +73,7 @@ def write_lab_folder(
         cells = [
             [item if isinstance(item, str) else f"{item:.10g}" for item in of] for of in columns.values()
         ]
-        return atomic_write_text(Path(folder) / name, table_text([*columns], cells))
+        return atomic_write_text(Path(folder) / name, table_text(dict(zip(columns, cells, strict=True))))
 
     designed, measured = ([1e3 * getattr(item, of) for item in lengths] for of in ("designed", "measured"))
     files = [

@@ -5,11 +5,10 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from discrepancy.campaign.reading import assemble
+from discrepancy.campaign.reading import TABLE_ERRORS, assemble
 from discrepancy.campaign.records import Campaign, Quantity, TrialKind
 from discrepancy.campaign.schema import FORMAT, INPUT_COLUMNS, parse_campaign
 from discrepancy.campaign.sheet import Sheet
-from discrepancy.campaign.table import TABLE_ERRORS
 from discrepancy.campaign.units import UNITS, Conversion, conversion, conversion_of, quantities_of
 from discrepancy.errors import CampaignFileError
 from reporting.provenance import hash_record

@@ -71,7 +71,9 @@ def ljung_box(
     kept = series if used is None else np.where(used, series, 0.0)
     if lags < 1 or not np.any(kept):
         return 0.0, 1.0
-    pairs = count - np.arange(1.0, lags + 1) if used is None else _products(used.astype(float), lags)[0, 1:]
+    pairs = (
+        count - np.arange(1.0, lags + 1) if used is None else lag_products(used.astype(float), lags)[0, 1:]
+    )
     statistic = float(_portmanteau(kept[np.newaxis], count, pairs)[0])
     mean, deviation, skewness = _portmanteau_moments(count, lags)
     # the standardised gamma distribution of this skewness (Pearson's type III)
@@ -80,7 +82,7 @@ def ljung_box(
     return statistic, float(gammaincc(shape, rate * ((statistic - mean) / deviation + shape / rate)))
 
 
-def _products(rows: FloatArray, lags: int) -> FloatArray:
+def lag_products(rows: FloatArray, lags: int) -> FloatArray:
     """Return the sums of products of samples 0 .. lags apart of each row, (M, lags + 1)."""
     rows = np.atleast_2d(rows)
     size = 2 * rows.shape[1]
@@ -90,7 +92,7 @@ def _products(rows: FloatArray, lags: int) -> FloatArray:
 
 def _portmanteau(rows: FloatArray, count: int, pairs: FloatArray) -> FloatArray:
     """Return Q of each row, of which `count` samples count in so many pairs of each lag (lags,)."""
-    products = _products(rows, len(pairs))
+    products = lag_products(rows, len(pairs))
     rho = products[:, 1:] / products[:, :1]
     return np.asarray(count * (count + 2) * np.sum(rho**2 / np.maximum(pairs, 1.0), axis=1))
 

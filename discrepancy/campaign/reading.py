@@ -35,16 +35,19 @@ from discrepancy.campaign.schema import (
     TrialSection,
     parse_campaign,
 )
-from discrepancy.campaign.table import read_table
 from discrepancy.campaign.units import conversion_of
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.provenance import hash_file, hash_record
-from reporting.table_file import TextTable
+from reporting.table_file import TableErrors, TextTable, read_table
 from reporting.toml_file import read_toml
 from reporting.words import be, counted
 
 CAMPAIGN_FILE = "campaign.toml"
 """Name of the file that describes a campaign, in its folder."""
+SAID = ("name", "kind", "load_place", "run", "held_out", "noise_factor", "file", "hold")
+"""What a trial has as the file says it."""
+TABLE_ERRORS = TableErrors(layout=CampaignFileError, value=CampaignDataError)
+"""What a table of a campaign raises."""
 _REPEATED = "leave one out, or tell repeated readings apart by a column `time`"
 
 
@@ -82,7 +85,7 @@ def read_campaign(folder: str | Path) -> Campaign:
                 f"The file {name!r} must lie in the campaign's folder: give its place in there, with forward "
                 "slashes."
             )
-    tables = {name: read_table(folder, name) for name in sorted(names - {CAMPAIGN_FILE})}
+    tables = {name: _read_table(folder, name) for name in sorted(names - {CAMPAIGN_FILE})}
     data_hash = hash_record({name: hash_file(folder / name) for name in sorted(names)})
     return assemble(section, tables, data_hash)
 
@@ -154,6 +157,16 @@ def _events(section: CampaignSection, trials: tuple[Trial, ...]) -> Iterator[Eve
         yield found
 
 
+def _read_table(folder: Path, name: str) -> TextTable:
+    """Return a table of a campaign's folder; sentences about its content name it without the folder."""
+    if not (folder / name).exists():
+        there = sorted(item.name for item in folder.glob("*.csv"))
+        raise CampaignFileError(
+            f"There is no file {name} in {folder}; the tables there are {', '.join(there) or 'none'}."
+        )
+    return read_table(folder / name, TABLE_ERRORS, name=name)
+
+
 def _read_section(folder: Path) -> CampaignSection:
     path = folder / CAMPAIGN_FILE
     if not path.exists():
@@ -177,30 +190,24 @@ def _trial(section: TrialSection, table: TextTable, campaign: CampaignSection, r
     held = section.kind is TrialKind.STATIC and inputs and "force" not in table.columns
     forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED) and not held
     pushing = (item.values for item in inputs if item.quantity in (Quantity.FORCE, Quantity.TORQUE))
+    said = section.model_dump(include={*SAID})
     return Trial(
-        name=section.name,
-        kind=section.kind,
+        **said,
         channels=tuple(channel.name for channel in chosen),
         values=np.stack(columns, axis=1),
         used=np.stack(used, axis=1),
         time=time,
         force=table.numbers("force", user) if forced else next(pushing, zeros),
         load_factor=table.numbers("load_factor", user) if section.kind is TrialKind.FLIGHT else zeros,
-        load_place=section.load_place,
         temperature=_temperature(section, table, campaign, user),
         start=start,
-        run=section.run,
         health=health,
         regions=regions,
         health_deviation=health_deviation,
         release=None if section.release is None else _release(section.release),
-        held_out=section.held_out,
-        noise_factor=section.noise_factor,
         begins=section.begins or Start.SETTLED,
         begin_assumed=section.begins is None,
         inputs=inputs,
-        file=section.file,
-        hold=section.hold,
     )
 
 
@@ -366,22 +373,13 @@ def _channels(
     channels = {}
     for item in section.channel:
         to_si = conversion_of(item.quantity, item.unit).to_si
-        channel = Channel(
-            name=item.name,
-            quantity=item.quantity,
-            output=item.output,
-            noise=None,
-            gain_deviation=inf if item.gain_deviation == "free" else item.gain_deviation,
-            offset_deviation=inf if item.offset_deviation == "free" else to_si(item.offset_deviation),
-            station=item.station,
-            chord=item.chord,
-            column=item.table_column,
-            unit=item.unit,
-        )
+        given = item.model_dump(exclude={"noise", "column", "offset_deviation"})
+        free = to_si(item.offset_deviation)
+        channel = Channel(**given, noise=None, offset_deviation=free, column=item.table_column)
         stated = None
         if item.noise is not None:
-            deviation = to_si(item.noise.standard_deviation)
-            stated = NoiseRecord(deviation, item.noise.degrees_of_freedom, source=item.noise.source)
+            stated = NoiseRecord(**item.noise.model_dump())
+            stated = replace(stated, standard_deviation=to_si(stated.standard_deviation))
         noise, remark = with_noise(channel, recorded, stated, trials)
         remarks += [remark] if remark else []
         channels[item.name] = replace(channel, noise=noise)

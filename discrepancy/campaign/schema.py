@@ -2,16 +2,25 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from keyword import iskeyword
+from math import inf, isinf
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, ConfigDict, Field, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    WrapValidator,
+    field_validator,
+    model_validator,
+)
 
 from discrepancy.campaign.records import Hold, Quantity, Start, TrialKind
 from discrepancy.campaign.units import conversion_of
 from discrepancy.errors import CampaignFileError
 from fe.runtime.expression import RESERVED
 from fe.runtime.patch import EVERY_CHANNEL
-from reporting.section import Section, checked
+from reporting.section import Name, NotNegative, Number, Positive, Section, checked
 
 FORMAT = 1
 """Version of the format."""
@@ -22,12 +31,12 @@ INPUT_COLUMNS = (
 OF_REGION = "health."
 """Begins the column of the losses of a damage region by its name."""
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0)]
-NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
-Name = Annotated[str, Field(min_length=1, max_length=200)]
-Deviation = Annotated[float, Field(allow_inf_nan=False, ge=0.0)] | Literal["free"]
+Deviation = Annotated[
+    NotNegative,
+    WrapValidator(lambda value, check: inf if value == "free" else check(value)),
+    PlainSerializer(lambda value: "free" if isinf(value) else value, when_used="json"),
+]
 MOST_MODES = 100
 _LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
 """What a list of the file becomes before it is checked."""
@@ -51,7 +60,7 @@ class StatedNoise(Section):
     """`noise` of a channel [its unit]; exact without degrees of freedom."""
 
     standard_deviation: Positive
-    degrees_of_freedom: Positive = float("inf")
+    degrees_of_freedom: Positive = inf
     source: Literal["stated", "repeats", "pre-trigger"] = "stated"
 
 

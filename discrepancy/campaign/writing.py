@@ -20,7 +20,7 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.campaign.schema import FORMAT, OF_REGION, input_columns
+from discrepancy.campaign.schema import FORMAT, OF_REGION, input_columns, parse_campaign
 from discrepancy.campaign.units import UNITS, conversion_of
 from discrepancy.errors import CampaignFileError
 from reporting.files import atomic_write_text
@@ -83,44 +83,37 @@ def write_campaign(campaign: Campaign, folder: str | Path, *, si: bool = False) 
 
 
 def _trial_table(campaign: Campaign, trial: Trial, si: bool) -> str:
-    columns: dict[str, list[str]] = {}
+    columns: dict[str, FloatArray] = {}
     if trial.is_dynamic or np.any(trial.time != trial.start):
-        columns["time"] = _plain(trial.time)
+        columns["time"] = trial.time
     if trial.kind in (TrialKind.STATIC, TrialKind.FORCED):
-        columns["force"] = _plain(trial.force)
+        columns["force"] = trial.force
     if trial.kind is TrialKind.FLIGHT:
-        columns["load_factor"] = _plain(trial.load_factor)
+        columns["load_factor"] = trial.load_factor
     if np.any(trial.temperature != 0.0):
         if campaign.reference_temperature is None:
             raise CampaignFileError(
                 f"The trial {trial.name!r} has temperatures, but the campaign has no reference "
                 "temperature to write them with."
             )
-        reference = campaign.reference_temperature
-        columns["temperature"] = _plain(reference + trial.temperature)
+        columns["temperature"] = campaign.reference_temperature + trial.temperature
     for index, region in enumerate(trial.regions):
         name = region if region in USUAL_REGIONS else f"{OF_REGION}{region}"
-        if np.any(trial.health[:, index] != 0.0):
-            columns[name] = _plain(trial.health[:, index])
-        if np.any(trial.health_deviation[:, index] != 0.0):
-            columns[f"{name}_deviation"] = _plain(trial.health_deviation[:, index])
-    for item in trial.inputs:
-        columns[item.name] = _plain(item.values)
+        for key, values in ((name, trial.health), (f"{name}_deviation", trial.health_deviation)):
+            if np.any(values[:, index] != 0.0):
+                columns[key] = values[:, index]
+    columns |= {item.name: item.values for item in trial.inputs}
     for index, name in enumerate(trial.channels):
         columns[name] = _in_unit(trial.values[:, index], campaign.channels[name], si)
-    return table_text(list(columns), list(columns.values()))
-
-
-def _plain(values: FloatArray) -> list[str]:
-    return [repr(value) for value in values.tolist()]
+    return table_text(columns)
 
 
 def _unit(channel: Channel, si: bool) -> str:
     return UNITS[channel.quantity].si if si else UNITS[channel.quantity].written
 
 
-def _in_unit(values: FloatArray, channel: Channel, si: bool) -> list[str]:
-    return _plain(conversion_of(channel.quantity, _unit(channel, si)).from_si(values))
+def _in_unit(values: FloatArray, channel: Channel, si: bool) -> FloatArray:
+    return conversion_of(channel.quantity, _unit(channel, si)).from_si(values)
 
 
 def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:
@@ -140,11 +133,11 @@ def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:
             "their standard deviations."
         )
     longest = max(len(samples) for samples, _ in recorded.values())
-    columns = {"time": [repr(interval * number) for number in range(longest)]}
+    columns: dict[str, FloatArray] = {"time": interval * np.arange(float(longest))}
     for name, (samples, _) in recorded.items():
-        cells = _in_unit(samples, campaign.channels[name], si)
-        columns[name] = cells + [""] * (longest - len(cells))
-    return table_text(list(columns), list(columns.values())), interval
+        columns[name] = np.full(longest, np.nan)
+        columns[name][: len(samples)] = _in_unit(samples, campaign.channels[name], si)
+    return table_text(columns), interval
 
 
 # ---------------------------------------------------------------- TOML
@@ -152,79 +145,66 @@ def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:
 
 def _campaign_text(campaign: Campaign, files: list[str], noise_interval: float | None, si: bool) -> str:
     inputs = {item.name: item for trial in campaign.trials for item in trial.inputs}
-    noise = None if noise_interval is None else {"file": NOISE_FILE, "interval": noise_interval}
-    order = list(campaign.channels)
-    return toml_text(
-        {
-            "format": FORMAT,
-            "name": campaign.name,
-            "reference_temperature": campaign.reference_temperature,
-            "remarks": campaign.remarks or None,
-            "parameters": {
-                name: {"mean": mean, "deviation": deviation}
-                for name, (mean, deviation) in campaign.parameters.items()
-            } or None,
-            "noise": noise,
-            "loggers": dict(campaign.loggers) or None,
-            "channel": [_channel(channel, si) for channel in campaign.channels.values()],
-            "input": [_input(item) for item in inputs.values()] or None,
-            "trial": [
-                _trial(trial, file, order) for trial, file in zip(campaign.trials, files, strict=True)
-            ],
-            "event": [
-                {"name": event.name, "trials": event.trials, "time": event.time, "until": event.until}
-                for event in campaign.events
-            ] or None,
-        }
-    )  # fmt: skip
+    content = {
+        "format": FORMAT,
+        "name": campaign.name,
+        "reference_temperature": campaign.reference_temperature,
+        "remarks": campaign.remarks,
+        "parameters": {
+            name: {"mean": mean, "deviation": deviation}
+            for name, (mean, deviation) in campaign.parameters.items()
+        },
+        "noise": None if noise_interval is None else {"file": NOISE_FILE, "interval": noise_interval},
+        "loggers": dict(campaign.loggers),
+        "channel": [_channel(channel, si) for channel in campaign.channels.values()],
+        "input": [_input(item) for item in inputs.values()],
+        "trial": [_trial(campaign, *pair) for pair in zip(campaign.trials, files, strict=True)],
+        "event": [asdict(event) for event in campaign.events],
+    }
+    section = parse_campaign(content, f"The campaign {campaign.name!r}")
+    return toml_text(section.model_dump(mode="json", exclude_defaults=True))
 
 
 def _channel(channel: Channel, si: bool) -> dict[str, Any]:
     unit, record, noise = _unit(channel, si), channel.noise, None
-
-    def printed(deviation: float) -> float | str:
-        return "free" if isinf(deviation) else conversion_of(channel.quantity, unit).from_si(deviation)
-
+    from_si = conversion_of(channel.quantity, unit).from_si
     if record is not None and record.samples is None:
-        freedom, source = record.degrees_of_freedom, record.source
-        noise = {
-            "standard_deviation": printed(record.standard_deviation),
-            "degrees_of_freedom": None if isinf(freedom) else freedom,
-            "source": None if source == "stated" else source,
-        }
-    gain = "free" if isinf(channel.gain_deviation) else channel.gain_deviation
+        noise = {"standard_deviation": from_si(record.standard_deviation), "source": record.source}
+        if not isinf(record.degrees_of_freedom):
+            noise["degrees_of_freedom"] = record.degrees_of_freedom
+    gain, offset = (
+        "free" if isinf(deviation) else deviation
+        for deviation in (channel.gain_deviation, from_si(channel.offset_deviation))
+    )
     return {
         "name": channel.name, "quantity": channel.quantity, "unit": unit, "output": channel.output,
-        "station": channel.station, "chord": channel.chord, "gain_deviation": gain or None,
-        "offset_deviation": printed(channel.offset_deviation) if channel.offset_deviation else None,
-        "noise": noise,
+        "station": channel.station, "chord": channel.chord, "gain_deviation": gain,
+        "offset_deviation": offset, "noise": noise,
     }  # fmt: skip
 
 
 def _input(item: RecordedInput) -> dict[str, Any]:
     return {
         "name": item.name, "quantity": item.quantity, "unit": UNITS[item.quantity].si, "hold": item.hold,
-        "reference": True if item.quantity.moving and item.hold is not Hold.SMOOTH else None,
-        "offset_deviation": item.offset_deviation or None,
+        "reference": bool(item.quantity.moving) and item.hold is not Hold.SMOOTH,
+        "offset_deviation": item.offset_deviation,
     }  # fmt: skip
 
 
-def _trial(trial: Trial, file: str, order: list[str]) -> dict[str, Any]:
+def _trial(campaign: Campaign, trial: Trial, file: str) -> dict[str, Any]:
     left_out = {
-        name: (np.flatnonzero(~trial.used[:, index]) + 1).tolist() or None
+        name: (np.flatnonzero(~trial.used[:, index]) + 1).tolist()
         for index, name in enumerate(trial.channels)
+        if not trial.used[:, index].all()
     }
     driven = trial.kind is TrialKind.DRIVEN and not trial.begin_assumed
     said = driven or trial.begins is not Start.SETTLED
-    in_order = list(trial.channels) == [name for name in order if name in trial.channels]
+    in_order = list(trial.channels) == [name for name in campaign.channels if name in trial.channels]
     return {
-        "name": trial.name, "kind": trial.kind, "file": file, "run": trial.run or None,
-        "held_out": trial.held_out or None,
-        "noise_factor": None if trial.noise_factor == 1.0 else trial.noise_factor,
+        "name": trial.name, "kind": trial.kind, "file": file, "run": trial.run, "held_out": trial.held_out,
+        "noise_factor": trial.noise_factor,
         "start": trial.start if trial.start or not trial.is_dynamic else None,
-        "begins": trial.begins if said else None, "hold": trial.hold,
-        "load_place": None if trial.load_place == "tip_load" else trial.load_place,
-        "channels": None if in_order else trial.channels,
-        "left_out": left_out if any(left_out.values()) else None,
+        "begins": trial.begins if said else None, "hold": trial.hold, "load_place": trial.load_place,
+        "channels": None if in_order else trial.channels, "left_out": left_out,
         "release": None if trial.release is None else asdict(trial.release),
     }  # fmt: skip

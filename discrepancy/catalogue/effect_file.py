@@ -164,7 +164,7 @@ def _check_words(section: EffectSection, names: frozenset[str], where: str) -> N
 
 def _places(places: str | tuple[str, ...] | None, entry: Entry, setting: Setting) -> tuple[str, ...]:
     if isinstance(places, str):
-        return PLACES[places][0](setting, entry)
+        return PLACES[places](setting, entry)
     return ("",) if places is None else places
 
 

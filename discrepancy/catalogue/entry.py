@@ -40,23 +40,26 @@ class Prior:
     low: Number
     high: Number
 
+    def _line(self) -> tuple[float, float]:
+        """Return mean and deviation of the value, or of its logarithm."""
+        low, high = self.low, self.high
+        if self.shape == "log_normal":
+            low, high = log(low), log(high)
+        return 0.5 * (low + high), 0.5 * (high - low) / NINETY
+
     def value(self, u: float) -> float:
         """Return the value at the standard normal variable `u`."""
         if self.shape == "uniform":
             return self.low + (self.high - self.low) * float(ndtr(u))
-        if self.shape == "normal":
-            return 0.5 * (self.low + self.high) + 0.5 * (self.high - self.low) / NINETY * u
-        middle, half = 0.5 * (log(self.low) + log(self.high)), 0.5 * (log(self.high) - log(self.low))
-        return exp(middle + half / NINETY * u)
+        mean, deviation = self._line()
+        return exp(mean + deviation * u) if self.shape == "log_normal" else mean + deviation * u
 
     def normal(self, value: float) -> float:
         """Return the standard normal variable of a value; the inverse of `value`."""
         if self.shape == "uniform":
             return float(ndtri(min(max((value - self.low) / (self.high - self.low), 1e-12), 1.0 - 1e-12)))
-        if self.shape == "normal":
-            return (value - 0.5 * (self.low + self.high)) / (0.5 * (self.high - self.low) / NINETY)
-        middle, half = 0.5 * (log(self.low) + log(self.high)), 0.5 * (log(self.high) - log(self.low))
-        return (log(value) - middle) / (half / NINETY)
+        mean, deviation = self._line()
+        return ((log(value) if self.shape == "log_normal" else value) - mean) / deviation
 
     def stepped(self, u: float, step: float) -> float:
         """Return the standard normal variable after a step, taken along the value's tangent.
@@ -65,7 +68,7 @@ class Prior:
         """
         if self.shape != "log_normal":
             return u + step
-        slope = 0.5 * (log(self.high) - log(self.low)) / NINETY
+        slope = self._line()[1]
         return u + log(max(1.0 + slope * step, LEAST_SHRINKAGE)) / slope
 
 

@@ -122,10 +122,6 @@ def turning_ports(setting: Setting, entry: Entry = ANY) -> Names:
     return tuple(name for name in force_ports(setting, entry) if name not in ports or ports[name].turns)
 
 
-def _skins(setting: Setting, entry: Entry = ANY) -> Names:
-    return tuple(f"{port}, {skin}" for port in force_ports(setting, entry) for skin in SKINS)
-
-
 def _stores(setting: Setting, entry: Entry = ANY) -> Names:
     found = state_ports(setting, entry)
     return (*found, EVERY_PORT) if len(found) > 1 else found
@@ -163,10 +159,6 @@ def _timed_gauges(setting: Setting, entry: Entry = ANY) -> Names:
         if times and max(map(np.max, times)) > max(min(map(np.min, times)), 0.0):
             places.append(name)
     return tuple(places)
-
-
-def _all_runs(setting: Setting, entry: Entry = ANY) -> Names:
-    return tuple(dict.fromkeys(trial.run for trial in trials(setting)))
 
 
 def _zeroed_runs(setting: Setting, entry: Entry = ANY) -> Names:
@@ -217,34 +209,28 @@ def _seen_lines(setting: Setting, entry: Entry = ANY) -> Names:
     return tuple(f"{line}, {name}" for line in mains_lines(setting) for name in seen)
 
 
-_NO_STRAIN = "The campaign has no strain channel."
-_NO_STATE = "The model has no port of a state (a level, a charge), at which a flow could act."
-PLACES: dict[str, tuple[Callable[[Setting, Entry], Names], str]] = {
-    "ports": (lambda setting, entry: setting.model.ports(), ""),
-    "channels": (_channels, ""),
-    "channels, or all": (lambda setting, entry: _or_all(_channels(setting, entry)), ""),
-    "strain channels": (strain_channels, _NO_STRAIN),
-    "strain channels, or all": (lambda setting, entry: _or_all(strain_channels(setting, entry)), _NO_STRAIN),
-    "runs": (_all_runs, ""),
-    "ports of forces": (force_ports, ""),
-    "held ports": (_held_ports, "Nothing holds a port of the model, so that no place is its zero."),
-    "turning ports": (
-        turning_ports,
-        said("needs.no_turning_port"),
+PLACES: dict[str, Callable[[Setting, Entry], Names]] = {
+    "ports": lambda setting, entry: setting.model.ports(),
+    "channels": _channels,
+    "channels, or all": lambda setting, entry: _or_all(_channels(setting, entry)),
+    "strain channels": strain_channels,
+    "strain channels, or all": lambda setting, entry: _or_all(strain_channels(setting, entry)),
+    "runs": lambda setting, entry: tuple(dict.fromkeys(trial.run for trial in trials(setting))),
+    "ports of forces": force_ports,
+    "held ports": _held_ports,
+    "turning ports": turning_ports,
+    "skins at ports": lambda setting, entry: tuple(
+        f"{port}, {skin}" for port in force_ports(setting, entry) for skin in SKINS
     ),
-    "skins at ports": (_skins, ""),
-    "ports of states": (state_ports, _NO_STATE),
-    "ports of states, or all": (_stores, _NO_STATE),
-    "calibrated channels": (
-        _calibrated_channels,
-        "The campaign has no channel whose gain is known, so no gain can be wrong.",
-    ),
-    "timed gauges": (_timed_gauges, "The campaign does not say at which times its channels were read."),
-    "zeroed runs": (_zeroed_runs, "No static trial has a displacement channel whose zero is known."),
-    "loggers": (_loggers, ""),
-    "mains lines": (_seen_lines, "At these sampling rates every mains line is aliased to zero frequency."),
+    "ports of states": state_ports,
+    "ports of states, or all": _stores,
+    "calibrated channels": _calibrated_channels,
+    "timed gauges": _timed_gauges,
+    "zeroed runs": _zeroed_runs,
+    "loggers": _loggers,
+    "mains lines": _seen_lines,
 }
-"""What finds the places of a word, and the reason against an effect that has none where it is known."""
+"""What finds the places of a word; `[places]` of `sentences.toml` says why there are none."""
 
 
 @dataclass(frozen=True)
@@ -313,10 +299,9 @@ def _law(setting: Setting, entry: Entry) -> str | None:
 
 
 def _place(setting: Setting, entry: Entry) -> str | None:
-    find, reason = PLACES[entry.word] if entry.word else (None, "")
-    if find is None or find(setting, replace(entry, preferred=())):
+    if not entry.word or PLACES[entry.word](setting, replace(entry, preferred=())):
         return None
-    return reason or said("needs.place", effect=entry.identifier)
+    return SENTENCES["places"].get(entry.word) or said("needs.place", effect=entry.identifier)
 
 
 def _port(setting: Setting, entry: Entry) -> str | None:
@@ -353,15 +338,9 @@ def _has_force(setting: Setting) -> bool:
     return any(np.any(trial.force != 0.0) for trial in loaded)
 
 
-def _has_second_clock(setting: Setting) -> bool:
-    return len(setting.campaign.loggers) != 1 or not trials(setting, INPUTS)
-
-
 def _met(holds: Callable[[Setting], object], sentence: str) -> Callable[[Setting, Entry], str | None]:
     """Return what tells that something does not hold of a setting."""
-    return lambda setting, entry: (
-        None if holds(setting) else said(f"needs.{sentence}", model=setting.model.name)
-    )
+    return lambda setting, entry: None if holds(setting) else said(sentence, model=setting.model.name)
 
 
 NEEDS: dict[str, Callable[[Setting, Entry], str | None]] = {
@@ -370,12 +349,15 @@ NEEDS: dict[str, Callable[[Setting, Entry], str | None]] = {
     "law": _law,
     "place": _place,
     "port": _port,
-    "turning port": _met(turning_ports, "no_turning_port"),
-    "stations": _met(lambda setting: setting.model.stations() is not None, "no_length"),
-    "force": _met(_has_force, "no_force"),
+    "turning port": _met(turning_ports, "places.turning ports"),
+    "stations": _met(lambda setting: setting.model.stations() is not None, "needs.no_length"),
+    "force": _met(_has_force, "needs.no_force"),
     "temperature": _temperature,
-    "channel": _met(channels, "no_channel"),
-    "second clock": _met(_has_second_clock, "no_second_clock"),
+    "channel": _met(channels, "needs.no_channel"),
+    "second clock": _met(
+        lambda setting: len(setting.campaign.loggers) != 1 or not trials(setting, INPUTS),
+        "needs.no_second_clock",
+    ),
     "input": lambda setting, entry: _trial(setting, replace(entry, kinds=INPUTS)),
     "strain across": _strain_across,
 }

@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from discrepancy.campaign.records import BoolArray, Campaign, FloatArray, Hold, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Setting
+from discrepancy.checks.quality import rest_faults
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.elimination import eliminated
 from discrepancy.fits.fitting import fit
@@ -19,11 +20,9 @@ from discrepancy.fits.problem import Problem
 from discrepancy.judgement.separability import begun
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
-from discrepancy.sentences import said
 from fe.runtime.patch import ModelPatch
 
 from .fault import DataFault, FaultKind, fault
-from .rest import rest_faults
 from .unit_slips import unit_slips
 
 LEFT = 0.9
@@ -49,13 +48,13 @@ def prior_left(campaign: Campaign, model: Model) -> dict[str, float]:
     }
 
 
-def unobservable(campaign: Campaign, model: Model) -> str | None:
-    """Return which calibrated parameters the records do not tell, in one sentence; None if they tell all."""
+def unobservable(campaign: Campaign, model: Model) -> Iterator[DataFault]:
+    """Yield a limit where the records do not tell calibrated parameters."""
     left = {name: share for name, share in prior_left(campaign, model).items() if share > LEFT}
-    if not left:
-        return None
-    names = ", ".join(f"{name!r} ({share:.0%})" for name, share in left.items())
-    return said("faults.unobservable", parameters="parameters" if len(left) > 1 else "parameter", names=names)
+    if left:
+        names = ", ".join(f"{name!r} ({share:.0%})" for name, share in left.items())
+        several = "parameters" if len(left) > 1 else "parameter"
+        yield fault(FaultKind.UNOBSERVABLE, parameters=several, names=names)
 
 
 LEAST_PERIODS = 3.0
@@ -101,8 +100,7 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     for trial in campaign.trials:
         faults += _holds(campaign, model, trial)
     if any(trial.kind is TrialKind.DRIVEN for trial in campaign.fitted) and model.parameters:
-        sentence = unobservable(campaign, model)
-        faults += [] if sentence is None else [DataFault(FaultKind.UNOBSERVABLE, sentence)]
+        faults += unobservable(campaign, model)
     return (*faults, *(found for _, found in swaps))
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from discrepancy.campaign.noise_records import repeated
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
@@ -108,7 +109,7 @@ def sample_outliers(values: FloatArray, used: BoolArray | None = None) -> BoolAr
         share = np.abs(rest) / _scale(rest)
         share[:edge] = share[-edge:] = 0.0
         # Only the worst of each neighbourhood: it spoils the prediction of the samples around it.
-        peaks = share == _running_maximum(share, shape[0])
+        peaks = share == maximum_filter1d(share, 2 * shape[0] + 1, mode="constant")
         new = np.flatnonzero((share > SIGNIFICANT) & peaks & ~suspects & ~events)
         if not new.size:
             break
@@ -146,9 +147,10 @@ def wrong_ends(residual: FloatArray, used: BoolArray) -> BoolArray:
         if len(rows) < 8 * _EDGE:
             continue
         rest = residual[rows, column]
-        around = np.stack([_shifted(rest, shift) for shift in (-2, -1, 1, 2)])
-        beside = rest - np.nanmedian(around, axis=0)
-        alone = np.abs(rest) > 2.0 * np.nanmax(np.abs(around), axis=0)
+        padded = np.pad(rest, 2, constant_values=np.nan)
+        around = np.lib.stride_tricks.sliding_window_view(padded, 5)[:, [0, 1, 3, 4]]
+        beside = rest - np.nanmedian(around, axis=1)
+        alone = np.abs(rest) > 2.0 * np.nanmax(np.abs(around), axis=1)
         for end in (slice(0, _EDGE), slice(-_EDGE, None)):
             # beside the roughness near that end, where the motion may be fastest
             near = beside[: 4 * _NEAR] if end.stop else beside[-4 * _NEAR :]
@@ -159,16 +161,6 @@ def wrong_ends(residual: FloatArray, used: BoolArray) -> BoolArray:
         if found[end].any(axis=0).sum() > 1:
             found[end] = False
     return found
-
-
-def _shifted(values: FloatArray, shift: int) -> FloatArray:
-    """Return each sample's neighbour, NaN beyond the ends."""
-    result = np.full(len(values), np.nan)
-    if shift > 0:
-        result[:-shift] = values[shift:]
-    else:
-        result[-shift:] = values[:shift]
-    return result
 
 
 def _is_event(rest: FloatArray, index: int, shape: tuple[int, int]) -> bool:
@@ -227,11 +219,6 @@ def _scale(rest: FloatArray) -> FloatArray:
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(inner, _NEAR, mode="reflect"), 2 * _NEAR + 1)
     near = np.pad(np.median(windows, axis=1), _EDGE, mode="edge")
     return np.maximum(whole, _NORMAL * near)
-
-
-def _running_maximum(values: FloatArray, width: int) -> FloatArray:
-    windows = np.lib.stride_tricks.sliding_window_view(np.pad(values, width), 2 * width + 1)
-    return np.asarray(windows.max(axis=1))
 
 
 # ---------------------------------------------------------------- rows of static and flight trials

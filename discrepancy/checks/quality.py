@@ -8,20 +8,256 @@ once; what only a model can tell (units, signs, swapped channels, length) is in
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import combinations
 
 import numpy as np
 from scipy.stats import f as fisher
 
+from discrepancy.campaign.noise import MAINS, line_near, without_lines
 from discrepancy.campaign.noise_records import repeat_record
-from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
+from discrepancy.campaign.noise_tests import lag_products
+from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, NoiseRecord, Trial
+from discrepancy.campaign.sampling import IntArray
+from discrepancy.checks.fault import DataFault, FaultKind, fault, place_of
+from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers
 
-from .fault import DataFault, FaultKind, fault
-from .held_and_copied import copy_faults, held_faults, roughness
-from .model_check import check_against_model
-from .outliers import LARGEST_SHARE, find_outliers, mark_outliers
-from .rest import rest_faults
+SHORTEST = 128
+"""Fewest samples of a noise record that is judged."""
+LARGEST_RATIO = 2.0
+"""Scatter of the loudest quarter of a noise record over that of the quietest."""
+LARGEST_DRIFT = 0.6
+"""Share of the variance of a noise record that a cubic in time may take."""
+LARGEST_LINE = 0.05
+"""Share of the variance that a line at the model's frequency may take."""
+LEAST_PERIODS = 8.0
+"""Fewest periods in a noise record in which a line is looked for."""
+NEAR = 0.1
+"""Share of the model's frequency by which it may be off."""
+_LEVEL = 1e-5
 
-__all__ = ["DataFault", "FaultKind", "check_against_model", "check_data", "mark_outliers"]
+
+def rest_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[DataFault]:
+    """Yield a limit for each channel whose noise record moves; see `moves`."""
+    for name, channel in campaign.channels.items():
+        what = None if channel.noise is None else moves(channel.noise, frequency)
+        if channel.noise is None or channel.noise.interval is None or what is None:
+            continue
+        column = f"{(channel.column or name)!r}" + (f" of {channel.noise.file}" if channel.noise.file else "")
+        yield fault(FaultKind.MOVES_AT_REST, name, column=column, what=what)
+
+
+def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:
+    """Return what a noise record holds beside noise of one size; None if nothing.
+
+    Without a frequency: a cubic in time that is most of it, or quarters that scatter unlike (F test
+    at 1e-5, with the degrees of freedom that correlation leaves, and a factor of two). With the frequency of
+    a mode [Hz]: a line within 10 % of it that holds more than 5 % of the variance. Mains are no motion.
+    """
+    if record.samples is None or record.interval is None or len(record.samples) < SHORTEST:
+        return None
+    rest, _ = without_lines(record.samples - record.samples.mean(), record.interval)
+    power, interval = float(rest @ rest), record.interval
+    if frequency is not None:
+        short = frequency * interval * len(rest) < LEAST_PERIODS
+        if short or any(abs(frequency / mains - 1.0) < NEAR for mains in MAINS):
+            return None
+        line = line_near(rest, interval, frequency, NEAR * frequency)
+        share = 0.0 if line is None else float(line @ line) / power
+        if share <= LARGEST_LINE:
+            return None
+        return f"holds a line near the model's {frequency:.3g} Hz with {share:.0%} of its variance"
+    time = np.linspace(-1.0, 1.0, len(rest))
+    trend = np.polynomial.Chebyshev.fit(time, rest, 3)(time)
+    if (share := float(trend @ trend) / power) > LARGEST_DRIFT:
+        return f"drifts by {np.ptp(trend):.3g} (SI) over its length, {share:.0%} of its variance"
+    quarters = np.array_split(rest - trend, 4)
+    sizes = np.array([np.mean(np.abs(quarter)) for quarter in quarters])  # single spikes weigh little
+    one, two = int(sizes.argmax()), int(sizes.argmin())
+    freedom = _freedom(quarters[two]), _freedom(quarters[one])
+    ratio = float(sizes[one] / sizes[two]) if sizes[two] > 0.0 else np.inf
+    if ratio < LARGEST_RATIO or 12.0 * fisher.sf(ratio**2, freedom[1], freedom[0]) > _LEVEL:
+        return None
+    first = sum(map(len, quarters[:one]))
+    return (
+        f"scatters {ratio:.2g} times as much from {first * interval:.4g} to "
+        f"{(first + len(quarters[one])) * interval:.4g} s as where it is quietest"
+    )
+
+
+def _freedom(series: FloatArray) -> float:
+    """Return the degrees of freedom of the variance of a series that is correlated in time."""
+    correlation = lag_products(series, len(series) // 4 - 1)[0]
+    return float(len(series) / (2.0 * np.sum((correlation / max(correlation[0], 1e-300)) ** 2) - 1.0))
+
+
+LEAST_HELD = 8
+"""Fewest equal readings in a row that are looked at."""
+_BESIDE = 4  # a run is judged beside so many times its length before and after it
+_ALIKE = 0.25  # runs of at least this share of its length are its like: pauses, square waves, coarse digits
+_MOST_ALIKE = 1.0 / 3.0  # share of the surroundings that its like may hold
+_JUMP = 3.0  # digits in one sample that no turning point makes
+_PACE = 0.25  # share of the mean step beside a run that is no standstill either
+_MOVING, _RESTING = 0.5, 0.25  # range of another record meanwhile, over its usual one in such a time
+_NOISE_DIGITS = 2.0  # noise of so many digits does not let a reading come twice
+COPIED = 0.01
+"""A channel is a copy if another leaves less than this share of its own noise."""
+LEAST_COPIED = 32
+_LAGS = 2**14  # samples in which the shift between two channels is looked for
+
+
+def roughness(values: FloatArray) -> float:
+    """Return the standard deviation of white noise that the sixth differences of a record would show.
+
+    Robust (median absolute deviation); differences of the sixth order take out motions of more than some
+    eight samples per period.
+    """
+    differences = np.diff(values, 6)
+    return float(1.4826 * np.median(np.abs(differences)) / np.sqrt(924.0))  # sum of squared binomials
+
+
+def _runs(at: BoolArray) -> IntArray:
+    """Return the first sample (R, 2) of each run of true ones, and the one after its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], at, [False])).astype(np.int8)))
+    return np.stack((edges[::2], edges[1::2]), axis=1)
+
+
+# ---------------------------------------------------------------- held
+
+
+def held_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
+    """Yield a fault for each stretch of a record in time in which a channel stood still and should not have.
+
+    See `held_span` for what is told from a pause, a square wave, a coarse converter or a rest.
+    """
+    series = np.column_stack([trial.values, *(item.values for item in trial.inputs)])
+    for column, name in enumerate(trial.channels):
+        channel = campaign.channels[name]
+        noise = channel.noise_in(trial)
+        others = np.delete(series, column, axis=1)
+        for start, stop in held_spans(trial.values[:, column], trial.used[:, column], others, noise):
+            place = place_of(channel, trial, start, stop)
+            yield fault(FaultKind.FROZEN, name, trial.name, count=stop - start, place=place)
+
+
+def held_spans(
+    values: FloatArray, used: BoolArray, others: FloatArray, noise: float = 0.0
+) -> list[tuple[int, int]]:
+    """Return the runs of equal readings, first sample and the one after the last, that are no rest.
+
+    Noise of more than two digits shows at rest too: any run is at fault. Else, what stands still comes to
+    rest before it and starts from rest: its readings go into the run and out of it by a digit at a time. A
+    run counts where the record goes in and out at speed; where it does so on one side only, another record
+    must go on moving meanwhile, and the run be alone of its kind. Other records that come to rest with it
+    acquit it, and so do a second run at the same value (a dead zone) and a third of the surroundings in runs
+    alike (a square wave, pauses).
+
+    Parameters
+    ----------
+    values : (N,) ndarray
+        A record in time.
+    used : (N,) ndarray of bool
+        Samples that count.
+    others : (N, K) ndarray
+        What else was recorded.
+    noise : float
+        Standard deviation of the channel's noise; 0: not known.
+    """
+    runs = _runs((np.diff(values) == 0.0) & used[1:] & used[:-1]) + np.array([0, 1])
+    lengths = runs[:, 1] - runs[:, 0]
+    long = runs[lengths >= LEAST_HELD].tolist()
+    distinct = np.unique(values)
+    if len(distinct) < 3 or not long:
+        return []
+    bends = np.abs(np.diff(values, 2))  # a record that rises all the way passes over digits, its bends do not
+    digit = min(np.diff(distinct).min(), bends[bends > 1e-9 * np.ptp(values)].min(initial=np.inf))
+    inner = [run for run in long if values[run[0]] not in (distinct[0], distinct[-1])]  # else told as clipped
+    if min(noise, roughness(values)) > _NOISE_DIGITS * digit:
+        return [(start, stop) for start, stop in inner]
+    steps = np.abs(np.diff(values, prepend=values[:1], append=values[-1:]))  # into each sample, and the last
+    found = []
+    for start, stop in inner:
+        length = stop - start
+        if max(steps[start], steps[stop]) < _JUMP * digit:
+            continue
+        low, high = max(start - _BESIDE * length, 0), min(stop + _BESIDE * length, len(values))
+        like = lengths >= _ALIKE * length
+        inside = like & (runs[:, 0] >= low) & (runs[:, 1] <= high)
+        dead_zone = np.count_nonzero(values[runs[like, 0]] == values[start]) > 1
+        windows = [*range(start - length, low - 1, -length), *range(stop, high - length + 1, length)]
+        if len(windows) < 2 or dead_zone or lengths[inside].sum() > _MOST_ALIKE * (high - low):
+            continue
+        speed = max(_JUMP * digit, _PACE * float(np.mean(np.r_[steps[low : start + 1], steps[stop:high]])))
+        fast = int(steps[start] >= speed) + int(steps[stop] >= speed)
+        usual = np.median([np.ptp(others[at : at + length], axis=0) for at in windows], axis=0)
+        meanwhile = np.ptp(others[start:stop], axis=0)
+        moving = bool(np.any((meanwhile > _MOVING * usual) & (usual > 0.0)))
+        resting = not moving and bool(np.any(meanwhile < _RESTING * usual))
+        if (fast == 2 and not resting) or (fast and moving and np.count_nonzero(like) == 1):
+            found.append((start, stop))
+    return found
+
+
+# ---------------------------------------------------------------- copied
+
+
+def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
+    """Yield a fault for each pair of channels of which one is the other, scaled or shifted or neither."""
+    found: dict[tuple[str, str], list[tuple[Trial, str]]] = {}
+    for trial in campaign.trials:
+        if trial.is_dynamic:
+            for one, other, how in _copies(trial):
+                found.setdefault((one, other), []).append((trial, how))
+    for (one, other), where in found.items():
+        trial, how = where[0]
+        more = f", and so in {len(where) - 1} more of its trials" if len(where) > 1 else ""
+        place = place_of(campaign.channels[other], trial)
+        yield fault(FaultKind.COPIED, other, trial.name, one=one, how=how, place=place, more=more)
+
+
+def _copies(trial: Trial) -> Iterator[tuple[str, str, str]]:
+    """Yield pairs of channels of a trial that are copies, and how."""
+    if len(trial.time) < LEAST_COPIED:
+        return
+    rough = np.diff(trial.values[:_LAGS], 6, axis=0)
+    limit = 15.0 * np.median(np.abs(rough), axis=0)  # a jump or a wrong reading would outweigh all noise
+    rough = np.where((np.abs(rough) > limit) & (limit > 0.0), 0.0, rough)
+    size = np.sum(rough**2, axis=0)
+    # Sixth differences of noise turn at each sample; those of a motion without noise do not.
+    noisy = np.sum(rough[1:] * rough[:-1], axis=0) < -0.5 * size
+    spectra = np.fft.rfft(rough, 2 * len(rough), axis=0)
+    changes = np.count_nonzero(np.diff(trial.values, axis=0), axis=0)
+    for i, j in combinations(range(len(trial.channels)), 2):
+        if not (noisy[i] and noisy[j]):
+            if changes[i] >= 2 * LEAST_COPIED and np.array_equal(trial.values[:, i], trial.values[:, j]):
+                yield trial.channels[i], trial.channels[j], "digit for digit"
+            continue
+        products = np.fft.irfft(spectra[:, j] * np.conj(spectra[:, i]))
+        at = int(np.argmax(np.abs(products)))
+        if abs(products[at]) < 0.5 * np.sqrt(size[i] * size[j]):
+            continue
+        shift = at if at < len(rough) else at - len(products)
+        how = _copied(trial.values[:, i], trial.values[:, j], trial.used[:, i], trial.used[:, j], shift)
+        if how:
+            yield trial.channels[i], trial.channels[j], how
+
+
+def _copied(one: FloatArray, other: FloatArray, first: BoolArray, second: BoolArray, shift: int) -> str:
+    """Return how the other is the one so many samples earlier; empty if it is not."""
+    count = len(one) - abs(shift)
+    a, b = max(-shift, 0), max(shift, 0)
+    kept = first[a : a + count] & second[b : b + count]
+    x, y = one[a : a + count][kept], other[b : b + count][kept]
+    noise = roughness(y) or float(np.std(np.diff(y, 6)) / np.sqrt(924.0)) if len(y) >= LEAST_COPIED else 0.0
+    if noise == 0.0 or len(np.unique(x)) < LEAST_COPIED // 2:
+        return ""
+    late = f", {abs(shift)} samples {'later' if shift > 0 else 'earlier'}," if shift else ""
+    if np.array_equal(x, y):
+        return f"digit for digit{late}"
+    centred = x - x.mean()
+    scale = float(centred @ (y - y.mean()) / (centred @ centred))
+    rest = float(np.std(y - scale * x))
+    return f"times {scale:.6g}{late}" if rest < COPIED * noise else ""
+
 
 CLIPPED_RUN = 3
 """Consecutive samples at the very extreme value that make a record clipped, if it gets there in a jump."""
@@ -122,10 +358,8 @@ def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = No
     distinct = np.unique(values)
     if len(distinct) < 3:
         return 0
-    at = np.concatenate([[False], values == extreme, [False]])
-    edges = np.flatnonzero(np.diff(at.astype(np.int8)))
-    runs = [(int(start), int(stop)) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
-    runs = [(start, stop) for start, stop in runs if stop - start >= CLIPPED_RUN]
+    found: list[tuple[int, int]] = _runs(values == extreme).tolist()
+    runs = [(start, stop) for start, stop in found if stop - start >= CLIPPED_RUN]
     if load is not None:
         for start, stop in runs:
             outside = np.concatenate([np.diff(values[:start]), np.diff(values[stop:])])

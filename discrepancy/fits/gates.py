@@ -3,13 +3,7 @@
 import numpy as np
 from scipy.stats import chi2
 
-from discrepancy.campaign.noise_tests import (
-    SHORTEST_SERIES,
-    combine,
-    ljung_box,
-    pooled_variance_p_value,
-    variance_p_value,
-)
+from discrepancy.campaign import noise_tests
 from discrepancy.campaign.records import FloatArray
 from discrepancy.verdict import Gate
 from fe.runtime.patch import ModelPatch
@@ -68,10 +62,10 @@ def absolute_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, float
     p_values = []
     for number in known:
         square = fit.sums[number] / freedom[number] / samples[number]
-        p_values.append(variance_p_value(square, freedom[number], recorded[number]))
+        p_values.append(noise_tests.variance_p_value(square, freedom[number], recorded[number]))
         tests.append((f"variance of {problem.channel_names[number]}", p_values[-1]))
     if len(known) > 1:
-        together = pooled_variance_p_value(np.array(p_values), freedom[known], recorded[known])
+        together = noise_tests.pooled_variance_p_value(np.array(p_values), freedom[known], recorded[known])
         tests.append(("variance of all channels", together))
     return [*tests, *prior_tests(problem, fit), *whiteness_tests(problem, fit)]
 
@@ -112,15 +106,15 @@ def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[tuple[str, floa
     found: dict[str, list[float]] = {}
     coloured = _dependent(problem, fit) > 1.0
     for data, residual in zip(problem.trials, fit.residuals, strict=True):
-        if not data.trial.is_dynamic or len(residual) < SHORTEST_SERIES:
+        if not data.trial.is_dynamic or len(residual) < noise_tests.SHORTEST_SERIES:
             continue
         whole = bool(np.all(data.weight > 0.0))
         for column, name in enumerate(data.trial.channels):
             if coloured[data.groups[column]]:
                 continue
             used = None if whole else data.weight[:, column] > 0.0
-            found.setdefault(name, []).append(ljung_box(residual[:, column], used=used)[1])
-    return [(f"whiteness of {name}", combine(p_values)) for name, p_values in found.items()]
+            found.setdefault(name, []).append(noise_tests.ljung_box(residual[:, column], used=used)[1])
+    return [(f"whiteness of {name}", noise_tests.combine(p_values)) for name, p_values in found.items()]
 
 
 def shape_gate(named: CandidateFit, family: CandidateFit | None) -> Gate:

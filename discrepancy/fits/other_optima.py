@@ -71,8 +71,10 @@ def _better(
     """Return the best fit so far, or one begun beside a fit at other effect parameters where it gains."""
     start = Point(found.point.shared, found.point.local, effect)
     again = attempt(problem, found.candidate, start, give_up=best.objective, **options)
-    gains = again is not None and again.log_evidence > best.log_evidence + SEARCH.neighbour_gain
-    return again if again is not None and gains else best
+    if again is None or again.log_evidence <= best.log_evidence + SEARCH.neighbour_gain:
+        return best
+    # Along a bent valley a fit that is far better may have run out of steps before its end.
+    return again if again.converged else attempt(problem, again.candidate, again.point, **options) or again
 
 
 def free_shape(

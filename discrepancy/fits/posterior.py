@@ -132,12 +132,8 @@ def ensemble(
                         walkers[index], values[index] = proposal, value
             kept.append(walkers.copy())
         block = np.concatenate(kept)
-        if len(before) and _agree(before, block):
-            break
+        if len(before):
+            old, new = (np.quantile(draws, (0.05, 0.95), axis=0) for draws in (before, block))
+            if np.all(np.abs(old - new) <= SETTLED * (new[1] - new[0])):
+                break
     return block
-
-
-def _agree(first: FloatArray, second: FloatArray) -> bool:
-    """Whether two samples have nearly the same central 90 % in every coordinate."""
-    ends, others = (np.quantile(draws, (0.05, 0.95), axis=0) for draws in (first, second))
-    return bool(np.all(np.abs(ends - others) <= SETTLED * (others[1] - others[0])))

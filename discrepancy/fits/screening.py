@@ -255,7 +255,7 @@ def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Ite
     axes: list[tuple[float, ...]] = []
     scaled = False
     count = sum(1 for item in term.parameters if not is_magnitude(item))
-    levels = SEARCH.levels.get(count, SEARCH.levels_of_many)
+    levels = SEARCH.levels[count] if count < len(SEARCH.levels) else SEARCH.levels_of_many
     for item in term.parameters:
         if is_magnitude(item):
             signed = item.prior.value(0.0) == 0.0

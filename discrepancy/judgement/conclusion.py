@@ -6,16 +6,17 @@ A gain of half a thousandth is a nuisance of instruments, not a cause.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray, TrialKind
+from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import NINETY, EffectParameter, ShapeParameter
 from discrepancy.fits.candidate import FREE_SHAPE, Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.posterior import with_draws
 from discrepancy.fits.problem import Problem
+from discrepancy.missing_force.naming import Explained
 from discrepancy.search.strategy import Search
 from discrepancy.sentences import said
 from discrepancy.verdict import (
@@ -30,25 +31,8 @@ from discrepancy.verdict import (
 from fe.runtime.patch import Clock, LoadGain, Primitive, SensorGain
 from reporting.words import listing
 
-
-class Hypothetic(Protocol):
-    """A hypothesis as it is compared."""
-
-    @property
-    def candidate(self) -> Candidate:
-        """Its effects."""
-
-    @property
-    def effect(self) -> FloatArray:
-        """Their scaled unknowns (E,)."""
-
-    @property
-    def shared(self) -> FloatArray:
-        """Scaled unknowns (Q,) that all trials share."""
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Of all unknowns (Q + E, Q + E), shared ones first."""
+Hypothetic = CandidateFit | Explained
+"""A hypothesis as it is compared: as a whole simulation, or along the missing force."""
 
 
 class Outcome(NamedTuple):

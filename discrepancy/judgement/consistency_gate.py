@@ -162,7 +162,10 @@ def score_tests(
             continue
         own = np.diag(information)[rows]
         alone = np.divide(
-            np.abs(gradient[rows]), np.sqrt(own), out=np.zeros(len(rows)), where=own > SEPARATE * size**2
+            np.abs(gradient[rows]),
+            np.sqrt(np.abs(own)),
+            out=np.zeros(len(rows)),
+            where=own > SEPARATE * size**2,
         )
         labels = list(group)
         most = int(np.argmax(alone))

@@ -10,7 +10,7 @@ from math import nan, sqrt
 import numpy as np
 from scipy import stats
 
-from discrepancy.campaign.noise_tests import SHORTEST_SERIES, ljung_box, variance_p_value
+from discrepancy.campaign.noise_tests import SHORTEST_SERIES, lag_products, ljung_box, variance_p_value
 from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.campaign.sampling import IntArray
 from discrepancy.errors import FitError
@@ -143,8 +143,7 @@ def correlation_time(series: FloatArray) -> float:
     power = float(centred @ centred)
     if count < 4 or power == 0.0:
         return 1.0
-    covariance = np.fft.irfft(np.abs(np.fft.rfft(centred, 2 * count)) ** 2)[:count]
-    rho = covariance / covariance[0]
+    rho = lag_products(centred, count - 1)[0] / power
     pairs = rho[0 : count - 1 : 2] + rho[1:count:2]
     ends = np.flatnonzero(pairs <= 0.0)
     last = int(ends[0]) if ends.size else pairs.size

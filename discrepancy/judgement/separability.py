@@ -8,16 +8,17 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf, sqrt
+from operator import attrgetter
 
 import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, NoiseRecord, Start, Trial
-from discrepancy.catalogue.entry import Effect, EffectParameter, Setting
+from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Change, Screen
+from discrepancy.fits.screening import Change, Screen, is_magnitude
 from discrepancy.fits.trial_data import stand_in
 from discrepancy.models.interface import Model
 
@@ -84,13 +85,6 @@ class Separability:
     distance: FloatArray
     groups: tuple[tuple[str, ...], ...]
 
-    def group_of(self, identifier: str) -> tuple[str, ...]:
-        """Return the confusion group of an effect, itself alone if it has none."""
-        for group in self.groups:
-            if identifier in group:
-                return group
-        return (identifier,)
-
 
 def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
     """Return the campaign with what the model predicts in the place of the data.
@@ -130,18 +124,14 @@ def begun(problem: Problem) -> Point:
         As `fit`.
     """
     start = problem.start(Candidate())
-    unknown = [_unknown_begin(data.trial) for data in problem.trials]
+    trials = [data.trial for data in problem.trials]  # some begin in a state that only their data tell
+    unknown = [i.begins is Start.UNKNOWN or (i.release and not i.release.at_rest) for i in trials]
     if not any(unknown):
         return start
     # parameters follow: beside a frequency that is off, what begins would fade out of the record
     found = fit(problem, Candidate(), start, evidence=False).point.local
     chosen = zip(unknown, found, start.local, strict=True)
     return replace(start, local=tuple(own if free else kept for free, own, kept in chosen))
-
-
-def _unknown_begin(trial: Trial) -> bool:
-    """Whether a trial begins in a state that only its data tell."""
-    return trial.begins is Start.UNKNOWN or (trial.release is not None and not trial.release.at_rest)
 
 
 def separability(
@@ -179,9 +169,9 @@ def separability(
         if not central:
             rows.append(Detectability(effect, "The structure cannot carry it at any size that was tried."))
             continue
-        best = max(central, key=_size)
+        best = max(central, key=attrgetter("size"))
         if best.size < DETECTED:  # its median place may be where nothing is measured
-            best = max([best, *(change for change in options if _at_reference(change))], key=_size)
+            best = max([best, *filter(_at_reference, options)], key=attrgetter("size"))
         little, factor = screen.shrunk(best)
         rows.append(_detectability(effect, best, min(best.size, little.size / factor**2)))
         if best.size > 1e-6:
@@ -200,42 +190,33 @@ def separability(
 
 
 def _references(screen: Screen, effect: Effect, places: Sequence[str]) -> list[Change]:
-    """Return the changes of an effect at its prior median, at the places where the structure can carry it."""
+    """Return the changes of an effect at its prior median, at the places where the structure can carry it.
+
+    Signed magnitudes are at one prior deviation.
+    """
     found = []
-    for place in places:
-        try:
-            found.append(_reference(screen, effect, place))
-        except DiscrepancyError:
-            continue
+    for term in (Term(effect, place) for place in places):
+        start = term.start()
+        for number, item in enumerate(term.parameters):
+            if is_magnitude(item) and item.prior.value(0.0) == 0.0:
+                start[number] = 1.0
+        with suppress(DiscrepancyError):
+            found.append(screen.change(term, start))
     return found
 
 
-def _reference(screen: Screen, effect: Effect, place: str) -> Change:
-    """Return the change of an effect at its prior median (signed magnitudes: at one prior deviation)."""
-    term = Term(effect, place)
-    start = term.start()
-    for number, item in enumerate(term.parameters):
-        if isinstance(item, EffectParameter) and item.magnitude and item.prior.value(0.0) == 0.0:
-            start[number] = 1.0
-    return screen.change(term, start)
-
-
-def _size(change: Change) -> float:
-    return change.size
-
-
 def _at_reference(change: Change) -> bool:
-    """Whether the magnitude is that of `_reference`."""
+    """Whether the magnitude is that of `_references`."""
     return all(
         abs(u) in (0.0, 1.0)
         for item, u in zip(change.term.parameters, change.start, strict=True)
-        if isinstance(item, EffectParameter) and item.magnitude
+        if is_magnitude(item)
     )
 
 
 def _detectability(effect: Effect, change: Change, distance: float) -> Detectability:
     for number, item in enumerate(change.term.parameters):
-        if isinstance(item, EffectParameter) and item.magnitude:
+        if is_magnitude(item):
             typical = abs(item.prior.value(float(change.start[number])))
             detectable = typical * sqrt(DETECTED / distance) if distance > 0.0 else inf
             return Detectability(

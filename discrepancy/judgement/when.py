@@ -10,6 +10,8 @@ from discrepancy.sentences import said
 from discrepancy.verdict import GapWindow, Moment, NamedEffect, Verdict, VerdictKind
 from reporting.words import listing
 
+NO_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
+"""Verdicts by which the model stands as it is."""
 TOLD = 3
 """Windows that are told one by one; of more the largest is, and all are in the file. So many effects that
 were not tested are called by name."""
@@ -56,6 +58,15 @@ def _where(window: GapWindow) -> str:
 def _times(size: float) -> str:
     two = f"{size:.2g}"
     return f"{float(two):,.0f} times" if "e+0" in two else f"{two} times"
+
+
+def dated(verdict: Verdict, windows: Sequence[GapWindow]) -> str:
+    """Return the sentence of a verdict, with when the gap is there where that tells something."""
+    when = acting_sentence(verdict.effects)
+    telling = begins_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED
+    if not when and verdict.kind not in NO_GAP and telling:
+        when = when_sentence(windows)
+    return f"{verdict.sentence} {when}".strip()
 
 
 def begins_inside(windows: Sequence[GapWindow]) -> bool:

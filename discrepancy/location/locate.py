@@ -137,7 +137,11 @@ def _meaning(
     for name, shape in shapes.items():
         values = np.array([shape.get(channel, 0.0) for channel in channels]) / noise
         compared.append((values, "dynamics or load", said("location.shape", name=name)))
-    candidates = [(_squared_cosine(weights, v), kind, words) for v, kind, words in compared if np.any(v)]
+    candidates = [
+        (float((weights @ v) ** 2 / ((weights @ weights) * (v @ v))), kind, words)
+        for v, kind, words in compared
+        if np.any(v)
+    ]
     best = max(candidates, key=lambda row: row[0])
     if best[0] < ALIKE:
         listed = np.argsort(-np.abs(weights))[:3]
@@ -146,10 +150,6 @@ def _meaning(
     if rivals:
         return "mixed", f"{best[2].rstrip(',')} or equally {' or '.join(sorted(rivals))}"
     return best[1], best[2]
-
-
-def _squared_cosine(first: FloatArray, second: FloatArray) -> float:
-    return float((first @ second) ** 2 / ((first @ first) * (second @ second)))
 
 
 GLOBAL_LEVEL = 0.01
@@ -326,10 +326,6 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
     return (said("location.outliers", far=_FAR_OUT, names=listed),)
 
 
-def _probability(p: float) -> str:
-    return "p < 1e-6" if p < 1e-6 else f"p = {p:.1g}"
-
-
 def _disagreements(
     residuals: ResidualSet,
     white: Sequence[FloatArray],
@@ -352,7 +348,7 @@ def _disagreements(
             subject = "all channels"  # a line of its own frequency is no matter of a mode that the model has
         words = told.dependence if line else f"by {_dependence_words(told, rows)}"
         whose = f"{subject[0].upper()}{subject[1:]}, {words},"
-        p = _probability(told.p_value)
+        p = "p < 1e-6" if told.p_value < 1e-6 else f"p = {told.p_value:.1g}"
         sentence = said("location.explains", what=whose, trials=name, percent=100.0 * told.share, p=p)
         found.append(Disagreement(name, subject, told.dependence, told.share, told.p_value, sentence))
     found += [

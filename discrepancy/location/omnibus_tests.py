@@ -8,19 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from discrepancy.campaign.noise_tests import (
-    SHORTEST_SERIES,
-    combine,
-    cumulative_periodogram,
-    fisher_g,
-    ljung_box,
-    variance_p_value,
-)
+from discrepancy.campaign import noise_tests
 from discrepancy.campaign.records import FloatArray
 from discrepancy.sentences import said
 
 from .residuals import ResidualSet, quadratic_moments
 
+SERIAL = (noise_tests.ljung_box, noise_tests.cumulative_periodogram)
+"""Tests of whiteness."""
 NOISE_RECORD_LEVEL = 1e-3
 """p-value below which a noise record itself counts as not white, or as holding a line."""
 
@@ -102,7 +97,7 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
         for part in parts:
             square, freedom = mean_square(part, names)
             if freedom >= 0.5:
-                found.append(variance_p_value(square, freedom, noise_freedom))
+                found.append(noise_tests.variance_p_value(square, freedom, noise_freedom))
                 if part is residuals:
                     total, weight = total + square * freedom, weight + freedom
         if found:
@@ -113,11 +108,11 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
                 square, freedom = mean_square(single, (name,))
                 if freedom < 0.5:
                     continue
-                of_places.append(variance_p_value(square, freedom, noise_freedom))
+                of_places.append(noise_tests.variance_p_value(square, freedom, noise_freedom))
                 worst = min(worst, (f"{item.trial.name}, {name}", of_places[-1]), key=lambda pair: pair[1])
     if not of_groups:
         return OmnibusTest("variance", np.nan, np.nan, "")
-    p = combine(of_groups)
+    p = noise_tests.combine(of_groups)
     if len(of_places) > 1:
         p = min(1.0, 2.0 * min(p, len(of_places) * min(of_places)))
     # Far from the truth the fit may leave no degree of freedom to the whole, but some to a trial.
@@ -153,15 +148,15 @@ def serial_tests(
         "Ljung-Box": [], "cumulative periodogram": [], "Fisher g": [],
     }  # fmt: skip
     for item, values in zip(residuals.trials, white, strict=True):
-        if not item.trial.is_dynamic or len(values) < SHORTEST_SERIES:
+        if not item.trial.is_dynamic or len(values) < noise_tests.SHORTEST_SERIES:
             continue
         for column, name in enumerate(item.trial.channels):
             if name in coloured or not item.used[:, column].any():
                 continue
             series, where = values[:, column], f"{item.trial.name}, {name}"
-            found["Ljung-Box"].append((*ljung_box(series), where))
-            found["cumulative periodogram"].append((*cumulative_periodogram(series), where))
-            share, p, place = fisher_g(series)
+            found["Ljung-Box"].append((*noise_tests.ljung_box(series), where))
+            found["cumulative periodogram"].append((*noise_tests.cumulative_periodogram(series), where))
+            share, p, place = noise_tests.fisher_g(series)
             frequency = place / (len(series) * item.trial.interval)
             found["Fisher g"].append((share, p, f"{where}, {frequency:.4g} Hz"))
     tests = []
@@ -170,7 +165,7 @@ def serial_tests(
             tests.append(OmnibusTest(name, np.nan, np.nan, ""))
             continue
         worst = min(rows, key=lambda row: row[1])
-        tests.append(OmnibusTest(name, combine([row[1] for row in rows]), worst[0], worst[2]))
+        tests.append(OmnibusTest(name, noise_tests.combine([row[1] for row in rows]), worst[0], worst[2]))
     return tuple(tests)
 
 
@@ -179,14 +174,14 @@ def coloured_noise(residuals: ResidualSet) -> dict[str, str]:
     remarks = {}
     for name, channel in residuals.channels.items():
         samples = None if channel.noise is None else channel.noise.samples
-        if samples is None or samples.size < SHORTEST_SERIES or channel.noise is None:
+        if samples is None or samples.size < noise_tests.SHORTEST_SERIES or channel.noise is None:
             continue
         series = samples - samples.mean()
-        share, line, place = fisher_g(series)
+        share, line, place = noise_tests.fisher_g(series)
         if line < NOISE_RECORD_LEVEL:
             interval = channel.noise.interval
             at = f" at {place / (series.size * interval):.4g} Hz" if interval else ""
             remarks[name] = said("location.line_in_noise", name=name, at=at, percent=100.0 * share)
-        elif min(ljung_box(series)[1], cumulative_periodogram(series)[1]) < NOISE_RECORD_LEVEL:
+        elif min(test(series)[1] for test in SERIAL) < NOISE_RECORD_LEVEL:
             remarks[name] = said("location.coloured_noise", name=name)
     return remarks

@@ -10,13 +10,15 @@ from itertools import pairwise
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
+from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Point
+from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.models.interface import Model
-from discrepancy.verdict import ForceAtPort, ForceMoment
+from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
 
 from .columns import Columns
-from .hypotheses import scaled
+from .hypotheses import key_of, scaled, sees_forces
 from .naming import Explained, ForceSearch
 from .trial import SeenTrial, seen_trial
 from .view import Motion, View
@@ -30,6 +32,8 @@ TESTED = 0.1
 OF_FORCE, OF_PREDICTIONS = "the missing force", "what the missing force does to predictions"
 OF_READINGS = "the gap"
 DRAWS, SEED = 2000, 0
+CANNOT = (DiscrepancyError, np.linalg.LinAlgError, ValueError)
+"""What keeps a picture or a share from being told: it is left out."""
 TURNS = 3
 """Times that the motion of a trial that was not fitted is looked at along the law that it shows."""
 BINS, LEAST_IN_BIN = 24, 4
@@ -349,3 +353,55 @@ def told_force(missing: MissingForce, model: Model) -> ForceAtPort:
 def of_nothing(found: Explained) -> float:
     """Return the evidence [nat] without any missing force."""
     return found.view.solve(scaled(found.processes, 1e-9, 1.0)).evidence
+
+
+def seen_force(
+    problem: Problem, force: ForceSearch | None, forces: Sequence[Explained], fit: CandidateFit
+) -> tuple[MissingForce | None, ForceAtPort | None]:
+    """Return the missing force beside the fit of a verdict, its law drawn through it, and what is told of it.
+
+    None where no force can be seen. `force`, `forces`: the missing force and hypotheses along it, if a search
+    had any.
+    """
+    terms = fit.candidate.terms
+    try:
+        ports = problem.model.ports()
+        if not sees_forces(problem) or (terms and not any(term.place in ports for term in terms)):
+            return None, None
+        force, found = _along(problem, force, forces, fit)
+        missing = missing_force(force, force.whole if found is None else found)
+    except CANNOT:
+        return None, None
+    if missing is None:
+        return None, None
+    told = told_force(missing, problem.model)
+    laws = [(term.effect.name, term.place) for term in terms if term.place in ports]
+    if missing.law and len({place for _, place in laws}) > 1:
+        told = replace(told, law=" and ".join(f"{name} at {place}" for name, place in laws))
+    if not missing.law or found is None:
+        return missing, told
+    try:
+        shares = ForceShares(force)
+        outside = _told(shares.of(found, held_out=True)) if shares.has_held_out else None
+        return missing, replace(told, fitted=_told(shares.of(found, held_out=False)), held_out=outside)
+    except CANNOT:
+        return missing, told
+
+
+def _along(
+    problem: Problem, force: ForceSearch | None, forces: Sequence[Explained], fit: CandidateFit
+) -> tuple[ForceSearch, Explained | None]:
+    """Return the missing force of a problem, and the hypothesis along it that a fit is."""
+    key = key_of(fit.candidate)
+    if force is None:
+        force = ForceSearch(problem)
+        force.locate()
+    found = next((item for item in forces if key_of(item.candidate) == key), None)
+    if found is None and fit.candidate.terms:
+        found = force.followed(force.whole, fit.candidate, fit.point.effect)
+    return force, found
+
+
+def _told(share: Share) -> ShareOfForce:
+    sizes = (share.value, *share.interval, share.left, share.whole)
+    return ShareOfForce(*sizes, ahead=share.of == OF_PREDICTIONS, trials=share.trials, tested=share.tested)

@@ -1,7 +1,7 @@
 """An FMU as a model, described by a TOML file: which variables are parameters, inputs, outputs and ports."""
 
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -9,16 +9,13 @@ from discrepancy.campaign.records import Quantity
 from discrepancy.errors import ModelError
 from discrepancy.models.model_file import (
     ModelDescription,
-    Name,
     NamedSection,
-    Number,
     ParameterSection,
-    Positive,
     Section,
     check_unique,
 )
 from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
-from reporting.section import checked
+from reporting.section import Name, Number, Positive, checked
 from reporting.toml_file import read_toml
 
 CARRIED = tuple(item.kind for item in (*STRUCTURE, *LOADS, StiffnessDrift))
@@ -34,6 +31,8 @@ class Inputs(Section):
         Applied force [N]; a table by the load places of the campaign.
     load_factor, z1, z2 : str, optional
         Load factor and stiffness losses [1].
+    health : table
+        Stiffness losses [1] by damage region; z1 and z2 can stand in it, too.
     temperature : str, optional
         Temperature less the reference [K], or the temperature itself [degC] with `temperature_reference`.
     temperature_reference : float, optional
@@ -48,8 +47,15 @@ class Inputs(Section):
     temperature_reference: Number | None = None
     z1: Name | None = None
     z2: Name | None = None
+    health: dict[Name, Name] = Field(default_factory=dict)
     bending_moment: Name | None = None
     torque: Name | None = None
+
+    @property
+    def regions(self) -> dict[str, str]:
+        """Inputs of stiffness losses by damage region."""
+        usual = {"z1": self.z1, "z2": self.z2}
+        return {name: value for name, value in usual.items() if value is not None} | self.health
 
     @property
     def forces(self) -> dict[str, str]:
@@ -217,17 +223,6 @@ class FmuModelDescription(ModelDescription):
         return self
 
 
-def parse_fmu_model(content: dict[str, Any], source: str = "the FMU model") -> FmuModelDescription:
-    """Check the content of an FMU model's file.
-
-    Raises
-    ------
-    ModelError
-        One sentence that names `source`, the place, what came and what was expected.
-    """
-    return checked(FmuModelDescription, content, source, ModelError, what="an FMU model")
-
-
 def load_fmu_model(path: Path | str) -> FmuModelDescription:
     """Read an FMU model's file.
 
@@ -236,4 +231,5 @@ def load_fmu_model(path: Path | str) -> FmuModelDescription:
     ModelError
         If there is no such file, it is not TOML, or its content is no FMU model.
     """
-    return parse_fmu_model(read_toml(path, ModelError, what="FMU model"), str(path))
+    content = read_toml(path, ModelError, what="FMU model")
+    return checked(FmuModelDescription, content, str(path), ModelError, what="an FMU model")

@@ -159,7 +159,7 @@ class FmuRuns:
         self.input_factors: dict[str, float] = {}
         units: dict[str | None, str] = {
             **dict.fromkeys(wanted.forces.values(), "N"),
-            wanted.load_factor: "1", wanted.z1: "1", wanted.z2: "1",
+            **dict.fromkeys((wanted.load_factor, *wanted.regions.values()), "1"),
             wanted.temperature: "K" if wanted.temperature_reference is None else "degC",
             wanted.bending_moment: "N.m", wanted.torque: "N.m",
             given.release.hold if given.release else None: "N",

@@ -13,7 +13,7 @@ from discrepancy.models.acting import Course
 from discrepancy.models.fmu_ports import FmuPorts
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Run, State
 from discrepancy.models.interface import Conditions, Response
-from discrepancy.models.questions import LoadChange, place_among, release_of
+from discrepancy.models.questions import LoadChange, losses_of, place_among, release_of
 from fe.runtime.motion import NO_LAWS, Laws
 
 SLOPES = (
@@ -190,11 +190,9 @@ class FmuTrials:
     def state(self, asked: Asked, row: int = 0) -> State:
         """Return parameters and constant inputs of a row of a trial."""
         (trial, conditions, patch), wanted = asked, self._description.inputs
-        inputs: dict[str, float] = {}
-        health = conditions.health[min(row, len(conditions.health) - 1)]
-        for name, value in ((wanted.z1, health[0]), (wanted.z2, health[1])):
-            if name is not None:
-                inputs[self._runs.variable(name)] = float(value)
+        losses = losses_of(trial, conditions.health, [*wanted.regions], f"the FMU model {self._name!r}")
+        health = zip(wanted.regions.values(), losses[min(row, len(losses) - 1)], strict=True)
+        inputs = {self._runs.variable(name): value for name, value in health}
         if wanted.temperature is not None:
             base = wanted.temperature_reference or 0.0
             at = 0 if trial.is_dynamic else row

@@ -9,6 +9,7 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.memory import Memory
@@ -18,30 +19,6 @@ from reporting.words import brief
 Place = str | tuple[float, float]
 KEPT = 400
 """Responses that a model keeps; the oldest goes first."""
-
-
-@dataclass(frozen=True)
-class ModelParameter:
-    """A calibrated parameter of the model; its posterior from calibration is the prior here.
-
-    Attributes
-    ----------
-    name : str
-        Such as "young_modulus_factor".
-    mean, deviation : float
-        Mean and standard deviation [unit].
-    unit : str
-        SI.
-    low, high : float
-        Range in which the model holds.
-    """
-
-    name: str
-    mean: float
-    deviation: float
-    unit: str
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -247,8 +224,8 @@ class Model(ABC):
     ----------
     name : str
         For people.
-    parameters : tuple of ModelParameter
-        Calibrated parameters.
+    parameters : tuple of ParameterPrior
+        Calibrated parameters: the posterior of a calibration is the prior here.
     quantities : mapping of str to Quantity
         What each output is, by name.
     port_names : tuple of str
@@ -264,14 +241,14 @@ class Model(ABC):
     """
 
     name: str
-    parameters: tuple[ModelParameter, ...]
+    parameters: tuple[ParameterPrior, ...]
     quantities: Mapping[str, Quantity] = MappingProxyType({})
     port_names: tuple[str, ...] = ()
     length: float | None = None
     patch: ModelPatch = NO_PATCH
     follows_windows: ClassVar[bool] = False
     shows_ports: ClassVar[bool] = False
-    _declared: tuple[ModelParameter, ...] | None = None
+    _declared: tuple[ParameterPrior, ...] | None = None
     _kept: Memory | None = None
 
     def __repr__(self) -> str:
@@ -350,7 +327,7 @@ class Model(ABC):
         return len(self.patch.of(PortForce)) > 0
 
     @property
-    def declared(self) -> tuple[ModelParameter, ...]:
+    def declared(self) -> tuple[ParameterPrior, ...]:
         """Calibrated parameters as they are without what is added."""
         return self.parameters if self._declared is None else self._declared
 

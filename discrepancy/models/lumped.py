@@ -1,7 +1,6 @@
 """A lumped linear structure as a model: masses, springs, dampers with named inputs, outputs and ports."""
 
 from collections.abc import Sequence
-from itertools import chain
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -13,7 +12,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, Shown, order_of
 from discrepancy.models.interface import Conditions, Outputs, Place
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped
-from discrepancy.models.lumped_rig import LumpedRig
+from discrepancy.models.lumped_rig import Loop, LumpedRig
 from discrepancy.models.lumped_sections import InputSection
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
@@ -22,7 +21,6 @@ from discrepancy.models.questions import (
     check_no_inputs,
     check_outputs,
     place_among,
-    prior_mean,
     release_of,
 )
 from discrepancy.models.second_order import SecondOrderSystem
@@ -148,25 +146,21 @@ class LumpedModel(DescribedModel, SystemModel):
             If the trial records an input that the model does not have or that is of another quantity.
         """
         trial, conditions, patch, _ = case
-        rig, change, at_ports = self.rig(case.state), LoadChange.of(patch), patch.of(PortLoad)
+        rig, change = self.rig(case.state), LoadChange.of(patch)
+        at_ports = [item for item in patch if isinstance(item, PortLoad)]
         if trial.kind is TrialKind.RINGDOWN:
             self._check_released(trial, at_ports)
             release = self._moved_row(rig, self._input_at(trial.load_place)), release_of(trial)
             return Acting(
                 trial.time, rig.constant, initial=conditions.initial, clock=conditions.clock, release=release
             )
-        recorded = self._recorded(trial)
-        loads, drives, references = list[Load](), dict[str, Course](), dict[str, Sequence[Load]]()
-        offsets = (*conditions.offset, *(0.0,) * len(recorded))
-        for item, offset in zip(recorded, offsets, strict=False):
-            following = {
-                name: loop.loads(trial, item, offset)
-                for name, loop in rig.loops.items()
-                if loop.section.reference == item.name
-            }
-            if following:
-                references |= following
-                loads += chain.from_iterable(following.values())
+        loads = [load for loop in rig.loops.values() for load in self._reference(case, loop)]
+        followed = {loop.section.reference for loop in rig.loops.values()}
+        reactions = {item.reaction for item in self.description.output}
+        still = Course.of(trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, 0)
+        drives = {name: still for name, item in self._inputs.items() if name in reactions}
+        for item, offset in self._recorded(case):
+            if item.name in followed:
                 continue
             section = self._section(trial, item)
             values = item.values + offset if offset else item.values
@@ -183,22 +177,33 @@ class LumpedModel(DescribedModel, SystemModel):
             if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
                 values = change.changed(values, item.values)
             loads.append((self._moved_row(rig, section, change), Course.of(trial.time, values, item.hold)))
-        loads += [self._at_port(rig, item) for item in at_ports if isinstance(item, PortLoad)]
-        reactions = {item.reaction for item in self.description.output} - {item.name for item in recorded}
-        for name, section in self._inputs.items():
-            if section.quantity.moving and name in reactions:
-                drives[name] = Course.of(trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, 0)
+        loads += [self._at_port(rig, item) for item in at_ports]
         return Acting(
-            trial.time, rig.constant, loads, drives, trial.begins, conditions.initial.ravel(),
-            conditions.clock, references,
-        )  # fmt: skip
+            trial.time,
+            rig.constant,
+            loads,
+            drives,
+            trial.begins,
+            conditions.initial.ravel(),
+            conditions.clock,
+        )
 
-    def _recorded(self, trial: Trial) -> tuple[RecordedInput, ...]:
-        """Return the recorded inputs of a trial; of one under a force this at its place."""
-        if trial.kind is TrialKind.DRIVEN:
-            return trial.inputs
-        item = self._input_at(trial.load_place)
-        return (RecordedInput(item.name, item.quantity, trial.force, trial.hold),)
+    def _recorded(self, case: Case) -> list[tuple[RecordedInput, float]]:
+        """Return the recorded inputs of a trial, or its force at its place, and what each lacks."""
+        trial, recorded = case.trial, case.trial.inputs
+        if trial.kind is not TrialKind.DRIVEN:
+            item = self._input_at(trial.load_place)
+            recorded = (RecordedInput(item.name, item.quantity, trial.force, trial.hold),)
+        return list(zip(recorded, (*case.conditions.offset, *(0.0,) * len(recorded)), strict=False))
+
+    def _reference(self, case: Case, loop: Loop) -> list[Load]:
+        """Return what the recorded reference of a controller does."""
+        return [
+            load
+            for item, offset in self._recorded(case)
+            if item.name == loop.section.reference
+            for load in loop.loads(case.trial, item, offset)
+        ]
 
     def _input_at(self, place: Place) -> InputSection:
         """Return the input of a load place; raises `ModelError` if there is none."""
@@ -234,9 +239,9 @@ class LumpedModel(DescribedModel, SystemModel):
             )
         return section
 
-    def _check_released(self, trial: Trial, at_ports: ModelPatch) -> None:
+    def _check_released(self, trial: Trial, at_ports: Sequence[PortLoad]) -> None:
         """Refuse a ring-down that the model cannot begin."""
-        why = "which no force with a course in time can act on" if len(at_ports) else ""
+        why = "which no force with a course in time can act on" if at_ports else ""
         if not self.description.is_plain:
             why = f"which the lumped model {self.name!r} cannot begin: it is free, driven or has states"
         if why:
@@ -258,8 +263,8 @@ class LumpedModel(DescribedModel, SystemModel):
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
         """Return what each output shows under what acts; None: at rest."""
         check_outputs(self.what, self, outputs, self.quantities)
-        drives, references = ({}, {}) if acting is None else (acting.drives, acting.references)
-        found, padded = [], self.description.padded
+        drives = {} if acting is None else acting.drives
+        found, description = [], self.description
         for name, quantity in outputs:
             item = self._outputs[name]
             further = 0 if quantity is item.quantity else quantity.derivatives_of(item.quantity)
@@ -269,13 +274,16 @@ class LumpedModel(DescribedModel, SystemModel):
                         f"The output {name!r} of {self.name!r} is the reaction of {item.reaction!r}, whose "
                         "motion this trial does not prescribe."
                     )
-                found.append(Shown(padded(()), reaction=list(drives).index(item.reaction)))
+                found.append(
+                    Shown.of(description.padded(()))._replace(reaction=list(drives).index(item.reaction))
+                )
             elif item.controller is not None:
                 loop = self.rig(case.state).loops[item.controller]
-                found.append(loop.effort(references.get(item.controller, ())))
+                found.append(loop.effort([] if acting is None else self._reference(case, loop)))
             else:
-                row, order = padded(item.vector or ()), order_of(item.quantity) + further
-                found.append(Shown(row, order, further, constant=item.constant * (not further)))
+                row, order = description.padded(item.vector or ()), order_of(item.quantity) + further
+                seen = Shown.of(row, order, further, description.width - description.size)
+                found.append(seen._replace(constant=item.constant * (not further)))
         return found
 
     def _losses(self, trial: Trial, conditions: Conditions) -> list[Losses]:
@@ -285,10 +293,6 @@ class LumpedModel(DescribedModel, SystemModel):
     def oscillates(self) -> bool:
         """Whether it has a mode that vibrates."""
         return bool(np.any(self.system(State(self._mean)).angular_frequency > 0.0))
-
-    def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
-        """Return natural sizes (L,) of the state at the begin of a driven or forced trial."""
-        return self.state_sizes(campaign, trial, Conditions(prior_mean(campaign, self.declared)))
 
     # ------------------------------------------------------------ ports
 

@@ -28,9 +28,9 @@ from discrepancy.models.lumped_sections import (
     RootSection,
     ScaledParameter,
 )
-from discrepancy.models.model_file import ModelDescription, Positive, check_unique
+from discrepancy.models.model_file import ModelDescription, check_unique
 from fe.runtime.patch import ModelPatch
-from reporting.section import checked
+from reporting.section import Positive, checked
 from reporting.toml_file import read_toml
 from reporting.words import counted
 

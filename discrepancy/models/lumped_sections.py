@@ -9,19 +9,12 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from discrepancy.campaign.records import Quantity
-from discrepancy.models.model_file import (
-    Name,
-    NamedSection,
-    NotNegative,
-    Number,
-    ParameterSection,
-    Section,
-)
+from discrepancy.models.model_file import NamedSection, ParameterSection, Section
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
-from reporting.section import shown
+from reporting.section import Name, NotNegative, Number, shown
 
 
 def _numbers(value: object) -> tuple[float, ...]:

@@ -1,25 +1,20 @@
 """What the TOML files of models share: their tables and kinds of numbers."""
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, model_validator
 
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Quantity
-from discrepancy.models.interface import Model, ModelParameter
-
-Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
-NotNegative = Annotated[float, Field(allow_inf_nan=False, ge=0.0, strict=True)]
-Positive = Annotated[float, Field(allow_inf_nan=False, gt=0.0, strict=True)]
+from discrepancy.models.interface import Model
+from reporting.section import Name, NotNegative, Number
 
 
 class Section(BaseModel):
     """A table of the file; unknown keys are refused, and its values cannot be changed."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class NamedSection(Section):
@@ -38,9 +33,9 @@ class ParameterSection(NamedSection):
     unit: str = "1"
 
     @property
-    def calibrated(self) -> ModelParameter:
+    def calibrated(self) -> ParameterPrior:
         """The parameter of the model."""
-        return ModelParameter(self.name, self.mean, self.deviation, self.unit, self.low, self.high)
+        return ParameterPrior(self.name, self.unit, self.mean, self.deviation, self.low, self.high)
 
     @model_validator(mode="after")
     def _in_range(self) -> Self:

@@ -5,9 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Release, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Model, ModelParameter, Outputs, Place
+from discrepancy.models.interface import Model, Outputs, Place
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import (
@@ -19,6 +20,7 @@ from fe.runtime.patch import (
     PortForce,
     Primitive,
 )
+from fe.runtime.state import Losses
 from reporting.words import counted
 
 DEFAULT_PLACE = "tip_load"
@@ -78,12 +80,12 @@ def laws_at(forces: ModelPatch, ports: Collection[str], *, in_windows: bool = Tr
         raise ModelError(str(cause)) from cause
 
 
-def prior_mean(campaign: Campaign, parameters: Sequence[ModelParameter]) -> FloatArray:
+def prior_mean(campaign: Campaign, parameters: Sequence[ParameterPrior]) -> FloatArray:
     """Return the means (P,) of parameters, those of the campaign where it says them."""
     return np.array([campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in parameters])
 
 
-def check_parameters(what: str, parameters: Sequence[ModelParameter], values: FloatArray) -> None:
+def check_parameters(what: str, parameters: Sequence[ParameterPrior], values: FloatArray) -> None:
     """Refuse values of another number than a model, `what`, has parameters."""
     if values.shape != (len(parameters),):
         raise ModelError(f"{what} has {counted(len(parameters), 'parameter')}, but {values.size} came.")
@@ -133,6 +135,26 @@ def check_no_inputs(trial: Trial, what: str) -> None:
             f"The trial {trial.name!r} is static under the inputs {names}, which {what} does not have at "
             'rest: describe the asset as an FMU model with [[input]], or record the trial as "driven".'
         )
+
+
+def losses_of(trial: Trial, health: FloatArray, regions: Sequence[str], what: str) -> list[Losses]:
+    """Return the losses of a model's regions in each row from those (N, K) that a trial names.
+
+    Raises
+    ------
+    ModelError
+        If one is of a region that the model, `what`, does not have.
+    """
+    losses = np.zeros((len(health), len(regions)))
+    for name, column in zip(trial.regions, health.T, strict=False):
+        if name in regions:
+            losses[:, regions.index(name)] = column
+        elif np.any(column):
+            raise ModelError(
+                f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but {what} has "
+                f"{', '.join(regions) or 'none'}."
+            )
+    return [tuple(row) for row in losses.tolist()]
 
 
 def check_plain(trial: Trial, what: str) -> None:

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import inv
 
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Shown, shown_rows
-from discrepancy.models.interface import NO_PATCH, ModelParameter, Outputs, Place
+from discrepancy.models.interface import NO_PATCH, Outputs, Place
 from discrepancy.models.memory import Memory
 from discrepancy.models.questions import (
     LoadChange,
@@ -102,7 +103,7 @@ class StructureModel(StructuralModel):
         nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
         self.model, self.name, self.regions = model, model.name, model.regions
         self.parameters = tuple(
-            ModelParameter(name, nominal[name], DEVIATION * (high - low), unit, low, high)
+            ParameterPrior(name, unit, nominal[name], DEVIATION * (high - low), low, high)
             for names, unit in ((model.parameters, "1"), (model.masses, "kg"))
             for name in names
             for low, high in [model.validity[name]]
@@ -163,13 +164,12 @@ class StructureModel(StructuralModel):
         """
         known = (f"{name} ({quantity.value})" for name, quantity in self.quantities.items())
         check_outputs(self.name, self, outputs, known)
-        size = len(self.model.rows[0])
-        rows = np.array([self._rows[output] for output, _ in outputs]).reshape(len(outputs), size)
-        found, always = shown_rows(rows, outputs), self._always(case.state.parameters)
+        found = shown_rows((self._rows[output] for output, _ in outputs), outputs)
+        always = self._always(case.state.parameters)
         if acting is None or not always.any():
             return found
         still = self.system(case.state).flexibility(always)
-        return [item._replace(constant=float(item.row @ still) * (item.order == 0)) for item in found]
+        return [item._replace(constant=float(item.rows[0] @ still)) for item in found]
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the structure can carry a primitive: sensors, laws at its ports, errors of its forces."""

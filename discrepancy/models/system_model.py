@@ -25,7 +25,7 @@ from discrepancy.models.interface import (
 )
 from discrepancy.models.linear_system import Resting, at_rest
 from discrepancy.models.natural_scales import PortSizes
-from discrepancy.models.questions import check_carried, check_parameters, laws_at, prior_mean
+from discrepancy.models.questions import check_carried, check_parameters, laws_at, losses_of, prior_mean
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws
@@ -113,8 +113,8 @@ class SystemModel(Model):
         """Return what moves in a state."""
 
     def rest(self, state: State) -> Resting:
-        """Return what has a rest in a state."""
-        return self.system(state)
+        """Return what gives the rest in a state."""
+        return self.system(state).resting
 
     @abstractmethod
     def acting(self, case: Case) -> Acting:
@@ -216,38 +216,31 @@ class SystemModel(Model):
             rows = slice(start, start + len(list(group)))
             case = case._replace(state=first._replace(losses=lost, warmer=warm))
             shown = [item for number in components for item in self.shown(case, outputs, None, number)]
+            units, amounts = self.acting(case).levels
+            n = units.shape[1] if self.displacements is None else self.displacements
             for (_, quantity), item in zip(outputs, shown, strict=False):
-                if item.further or (quantity.is_rate and np.any(item.row[: self.displacements])):
+                if np.any(item.rows[2:, n:]) or (quantity.is_rate and np.any(item.rows[1:, :n])):
                     raise ModelError(
                         f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
                         "acceleration."
                     )
-            units, amounts = self.acting(case).levels
             ports = laws.rows(self.port_rows, units.shape[1])
-            if self.displacements is not None:
-                ports[:, self.displacements :] = 0.0  # ports of states are at no position
+            ports[:, n:] = 0.0  # ports of states are at no position
             try:
-                found = at_rest(self.rest(case.state), units, amounts[rows], laws, ports, memory, before)
+                found, memory = at_rest(
+                    self.rest(case.state), units, amounts[rows], laws, ports, memory, before
+                )
             except ModelError as cause:
                 raise ModelError(f"The trial {trial.name!r} is at rest, but {cause}") from cause
-            values[rows] = found.seen(np.array([item.row for item in shown]))
+            seen = [np.concatenate((item.rows[0, :n], item.rows[1, n:])) for item in shown]
+            values[rows] = found @ np.array(seen).T
             values[rows] += [item.constant for item in shown]
-            memory, before, start = found.memory, amounts[rows.stop - 1], rows.stop
-        seen, *further = np.split(values, len(components), axis=1)
-        return Response(seen, None, *further)
+            before, start = amounts[rows.stop - 1], rows.stop
+        along, *further = np.split(values, len(components), axis=1)
+        return Response(along, None, *further)
 
     def _losses(self, trial: Trial, conditions: Conditions) -> list[Losses]:
-        """Return the losses of the regions in each row from those that the trial names."""
-        losses = np.zeros((len(conditions.health), len(self.regions)))
-        for name, column in zip(trial.regions, conditions.health.T, strict=False):
-            if name in self.regions:
-                losses[:, self.regions.index(name)] = column
-            elif np.any(column):
-                raise ModelError(
-                    f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but "
-                    f"{self.name} has {', '.join(self.regions)}."
-                )
-        return [tuple(row) for row in losses.tolist()]
+        return losses_of(trial, conditions.health, self.regions, self.name)
 
     # ------------------------------------------------------------ ports
 
@@ -276,25 +269,26 @@ class SystemModel(Model):
 
     # ------------------------------------------------------------ sizes
 
-    def state_sizes(self, campaign: Campaign, trial: Trial, conditions: Conditions) -> FloatArray:
+    def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of a state at the begin of a trial: of motion from rest, and of data."""
-        moved = self.moved(self.case(trial, conditions), self.laws(conditions.parameters), still=True)
+        parameters = prior_mean(campaign, self.declared)
+        case = self.case(trial, Conditions(parameters))
+        moved = self.moved(case, self.laws(parameters), still=True)
         rig = moved.system
         count, moving = len(rig.angular_frequency), rig.moving
         x, v = (np.max(np.abs(item[:, :count]), axis=0) for item in (moved.q, moved.velocity))
         pace = np.maximum(rig.angular_frequency[:moving], 1.0 / float(trial.time[-1] - trial.time[0]))
-        n, shapes = rig.displacements, rig.shapes
         channels = [campaign.channels[name] for name in trial.channels]
         outputs = tuple((channel.output, channel.quantity) for channel in channels)
-        shown = self.shown(self.case(trial, conditions), outputs, moved.acting)
+        shown = self.shown(case, outputs, moved.acting)
         for column, item in enumerate(shown):
             kept = trial.values[trial.used[:, column], column] - item.constant
-            if item.reaction is not None or item.speed is not None or not kept.size:
+            if item.reaction is not None or item.courses is not None or not kept.size:
                 continue
-            size = float(np.max(np.abs(kept)))
-            of_u, of_x = item.row[:n] @ shapes[:n, :moving], item.row[n:] @ shapes[n:, moving:]
+            size, rows = float(np.max(np.abs(kept))), item.rows @ rig.shapes
+            of_u, of_x, order = rows[:, :moving], rows[:, moving:], np.argmax(np.any(rows, axis=1))
             if np.any(of_u):
-                at = size / float(np.linalg.norm(of_u)) / pace**item.order
+                at = size / float(np.linalg.norm(of_u)) / pace**order
                 x[:moving], v[:moving] = np.maximum(x[:moving], at), np.maximum(v[:moving], at * pace)
             if np.any(of_x):
                 v[moving:] = np.maximum(v[moving:], size / float(np.linalg.norm(of_x)))
@@ -329,7 +323,7 @@ class SystemModel(Model):
             except ModelError:
                 motion = self.moved(case, laws, still=True)
             if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
-                initial = self.state_sizes(campaign, trial, conditions)
+                initial = self.initial_sizes(campaign, trial)
                 motion = self.moved(self.case(trial, replace(conditions, initial=initial)), laws)
             pushes = [
                 float(np.max(np.abs(trial.values[trial.used[:, column], column]), initial=0.0))
@@ -346,10 +340,10 @@ class SystemModel(Model):
         if held:
             row, shape = self.reference_load(parameters, campaign), system.shapes[:, 0]
             shape = shape if system.basis is None else system.basis @ shape
-            still = [1.0 / float(own @ rest.resting(own[None])[0]) for own in rows]
+            still = [1.0 / float(own @ rest(own[None])[0]) for own in rows]
             frequency, participation = float(system.angular_frequency[0]), float(row @ shape) ** 2
             mass = 1.0 / participation if participation else float(np.trace(system.mass))
-            stiffness = 1.0 / float(row @ rest.resting(row[None])[0])
+            stiffness = 1.0 / float(row @ rest(row[None])[0])
         else:
             elastic = system.angular_frequency[system.angular_frequency > 0.0]
             usual = speed / peak if peak > 0.0 < speed else 1.0 / sizes["duration"]
@@ -371,7 +365,7 @@ class SystemModel(Model):
         rest, acting = self.rest(case.state), self.acting(case)
         if acting.release is None:
             units, amounts = acting.levels
-            return np.asarray(amounts @ rest.resting(units))
+            return np.asarray(amounts @ rest(units))
         row, release = acting.release
-        shape = rest.resting(row[None])
+        shape = rest(row[None])
         return np.asarray(release.displacement / float(row @ shape[0]) * shape)

@@ -1,11 +1,10 @@
 """The wing as a model: its reduced structure under patches, in static tests, flights and ring-downs."""
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from calibration.errors import CalibrationError
 from calibration.joint.wing_table import wing_priors
@@ -14,7 +13,8 @@ from calibration.result.record import STATE
 from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown, shown_rows
-from discrepancy.models.interface import ModelParameter, Outputs, Place, PortScale
+from discrepancy.models.interface import Outputs, Place, PortScale
+from discrepancy.models.linear_system import Resting, springs
 from discrepancy.models.memory import Memory
 from discrepancy.models.questions import check_outputs
 from discrepancy.models.reduced_structure import StructuralModel
@@ -52,29 +52,6 @@ paper, its masses, and the damping of the joint posterior, whose spread holds th
 
 
 ROTATING_PORT = "root"
-KEPT_ANSWERS = 16
-"""Sets of loads whose displacements are kept with a stiffness."""
-
-
-class Stiffness:
-    """Factorised stiffness (n, n) of the wing in one state."""
-
-    def __init__(self, matrix: FloatArray) -> None:
-        self.matrix, self._answers = matrix, Memory(KEPT_ANSWERS)
-        try:
-            self._factor = cho_factor(matrix, lower=True, check_finite=False)
-        except np.linalg.LinAlgError as cause:
-            raise ModelError(
-                f"The patched wing has no stiffness left in some direction ({cause})."
-            ) from cause
-
-    def solve(self, loads: FloatArray) -> FloatArray:
-        """Return K^-1 loads, (n,) or (n, k)."""
-        return np.asarray(cho_solve(self._factor, loads, check_finite=False))
-
-    def resting(self, loads: FloatArray) -> FloatArray:
-        """Return the displacements (L, n) at rest under loads (L, n)."""
-        return self._answers.get(loads.tobytes(), lambda: self.solve(loads.T).T)
 
 
 class WingModel(StructuralModel):
@@ -113,13 +90,7 @@ class WingModel(StructuralModel):
         self.wing = wing = PatchedWing(arrays)
         prior = prior or SHIPPED_PRIOR
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
-        self.name, self.parameters = (
-            name,
-            tuple(
-                ModelParameter(item.name, item.mean, item.deviation, item.unit, item.low, item.high)
-                for item in wing_priors(box, **prior)
-            ),
-        )
+        self.name, self.parameters = name, wing_priors(box, **prior)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
         self.port_names = tuple(PORTS)
         self._stiffnesses, self._systems, self._rows = Memory(), Memory(), Memory()
@@ -222,12 +193,19 @@ class WingModel(StructuralModel):
 
     # ------------------------------------------------------------ structure
 
-    def rest(self, state: State) -> Stiffness:
-        """Return the stiffness in a state."""
-        factor = float(state.parameters[0])
-        return self._stiffnesses.get(
-            _stiffness_key(state), lambda: Stiffness(self.wing.stiffness(factor, *state[1:4]))
-        )
+    def rest(self, state: State) -> Resting:
+        """Return what gives the rest in a state."""
+        _, solve = self._stiffness(state)
+        return lambda loads: solve(loads.T).T
+
+    def _stiffness(self, state: State) -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
+        """Return the stiffness (n, n) in a state, and what gives K^-1 loads (n, k)."""
+
+        def make() -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
+            matrix = self.wing.stiffness(float(state.parameters[0]), *state[1:4])
+            return matrix, springs(matrix)
+
+        return self._stiffnesses.get(_stiffness_key(state), make)
 
     def system(self, state: State) -> SecondOrderSystem:
         """Return the wing as it moves when let go, or pushed, at a place under forces at ports."""
@@ -236,10 +214,10 @@ class WingModel(StructuralModel):
 
         def make() -> SecondOrderSystem:
             _, servo, pitot, alpha, beta = state.parameters.tolist()
-            stiffness, mass = self.rest(state), self.wing.mass(servo, pitot, masses)
-            still = stiffness.solve(np.vstack((self.wing.force_row(place), *held.values())).T)
-            basis = motion_basis(stiffness.solve, mass, self.wing.arrays.start_shapes, still)
-            small_mass, small = basis.T @ mass @ basis, basis.T @ stiffness.matrix @ basis
+            (stiffness, solve), mass = self._stiffness(state), self.wing.mass(servo, pitot, masses)
+            still = solve(np.vstack((self.wing.force_row(place), *held.values())).T)
+            basis = motion_basis(solve, mass, self.wing.arrays.start_shapes, still)
+            small_mass, small = basis.T @ mass @ basis, basis.T @ stiffness @ basis
             small_mass, small = 0.5 * (small_mass + small_mass.T), 0.5 * (small + small.T)
             rows = {port: row @ basis for port, row in held.items()}
             damping = alpha * small_mass + beta * small

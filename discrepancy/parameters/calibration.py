@@ -1,5 +1,6 @@
 """The whole way from a campaign to the calibration of a model's parameters."""
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -117,7 +118,7 @@ def stated_priors(campaign: Campaign, choice: ModelChoice) -> tuple[ParameterPri
             )
         if deviation > 0.0:
             stated = "the campaign" if item.name in campaign.parameters else label
-            found.append(ParameterPrior(item.name, item.unit, mean, deviation, item.low, item.high, stated))
+            found.append(replace(item, mean=mean, deviation=deviation, stated_by=stated, title=""))
     if not found:
         names = [item.name for item in choice.model.parameters]
         known = f"all of {', '.join(names)} have the deviation 0" if names else "it lists none"

@@ -15,13 +15,6 @@ from .text import WORDS, number, unit_text
 HEADINGS = (
     "effect", "testable", "shows best at", "parameter", "detectable from", "prior median", "confused with",
 )  # fmt: skip
-_KIND_WORDS = {
-    TrialKind.STATIC: "a static loading",
-    TrialKind.RINGDOWN: "a ring-down",
-    TrialKind.FORCED: "a forced vibration",
-    TrialKind.DRIVEN: "a driven test",
-    TrialKind.FLIGHT: "a flight",
-}
 
 
 def rows_of(found: Separability) -> list[tuple[str, ...]]:
@@ -105,7 +98,7 @@ def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) ->
         common = frozenset(TrialKind).intersection(*acts)
         apart = [kind for kind in TrialKind if kind in union - common and kind not in there]
         names = listing(name.replace("_", " ") for name in group)
-        kinds = " or ".join(_KIND_WORDS[kind] for kind in apart)
+        kinds = " or ".join(WORDS.content["kinds"][kind.value] for kind in apart)
         lines.append(WORDS.say("add_kinds" if apart else "vary", names=names, kinds=kinds))
     hidden = [
         item

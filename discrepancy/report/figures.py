@@ -27,6 +27,8 @@ from reporting.figures import (
     PAST,
     PREDICTION,
     REFERENCE,
+    band,
+    color_bar,
     panel_label,
     publication_style,
 )
@@ -95,12 +97,11 @@ def separability_figure(found: Separability) -> Figure | None:
             if row != column:
                 axes.plot(column, row, "x", color=PREDICTION, ms=4.0, mew=1.1)
         cell = 1.0 / len(names)
-        bar = figure.colorbar(image, cax=axes.inset_axes((1.0 + 0.4 * cell, 0.0, 0.4 * cell, 1.0)))
-        bar.set_label("squared distance d²")
-        plain_powers(bar.ax.yaxis, (1.0,))
-        bar.outline.set_linewidth(0.5)
-        bar.ax.axhline(CONFUSED, color=PREDICTION, lw=1.2)
-        bar.ax.axhline(DETECTED, color="white", lw=1.2)
+        beside = axes.inset_axes((1.0 + 0.4 * cell, 0.0, 0.4 * cell, 1.0))
+        bar = color_bar(figure, image, "squared distance d²", cax=beside)
+        plain_powers(bar.yaxis, (1.0,))
+        bar.axhline(CONFUSED, color=PREDICTION, lw=1.2)
+        bar.axhline(DETECTED, color="white", lw=1.2)
     return figure
 
 
@@ -169,7 +170,7 @@ def _draw_in_time(axes: Axes, missing: MissingForce, name: str) -> None:
     stretch = slice(first, first + MOST_TURNS)
     time, values, deviation = item.time[stretch], getattr(item, name)[stretch], item.deviation[stretch]
     reach = 2.0 * deviation
-    axes.fill_between(time, values - reach, values + reach, color=OBSERVED, alpha=BAND_OPACITY, lw=0.0)
+    band(axes, time, values - reach, values + reach, OBSERVED)
     axes.plot(time, values, color=OBSERVED, lw=0.9)
     if item.law is not None and name == "force":
         axes.plot(time, item.law[stretch], "--", color=PREDICTION, lw=0.9)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from math import isfinite, isnan
 
 from discrepancy.judgement.conclusion import effects_text, named_effects, probability_text
-from discrepancy.judgement.when import when_sentence
+from discrepancy.judgement.when import NO_GAP, when_sentence
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page
@@ -165,7 +165,7 @@ def add_location(page: Page, investigation: Investigation) -> None:
     if location is None:
         page.add_paragraph(WORDS.say("not_searched"))
         return
-    nothing = investigation.verdict.kind in (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
+    nothing = investigation.verdict.kind in NO_GAP
     significant = sum(cell.significant for cell in location.cells)
     are = "is a discovery" if significant == 1 else "are discoveries"
     told = "disagrees" if location.disagrees else "agrees" if nothing else "hidden"

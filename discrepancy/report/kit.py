@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.location.residuals import ResidualSet
-from reporting.figures import LEVELS, PAST, PREDICTION, REFERENCE, new_figure
+from reporting.figures import LEVELS, PAST, PREDICTION, REFERENCE, color_bar, new_figure
 
 AFTER = "with the effect"
 EMPTY = "#f0f1f2"
@@ -76,10 +76,9 @@ def scale_of(values: Sequence[float] | FloatArray) -> Normalize:
 
 def size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:
     """Draw the colour scale of sizes of residuals beside panels."""
-    bar = figure.colorbar(ScalarMappable(norm, LEVELS), ax=beside, fraction=0.045, pad=0.02, aspect=14)
-    bar.set_label("rms residual / noise")
-    plain_powers(bar.ax.yaxis, (1.0, 2.0, 5.0) if float(norm.vmax or 1.0) < 50.0 else (1.0,))
-    bar.outline.set_linewidth(0.5)
+    place = {"ax": beside, "fraction": 0.045, "pad": 0.02, "aspect": 14}
+    bar = color_bar(figure, ScalarMappable(norm, LEVELS), "rms residual / noise", **place)
+    plain_powers(bar.yaxis, (1.0, 2.0, 5.0) if float(norm.vmax or 1.0) < 50.0 else (1.0,))
 
 
 def heat_map(

@@ -63,7 +63,7 @@ def rounded(value: float, spread: float) -> Callable[[float], str]:
     if largest > 0.0 and not 1e-3 <= largest < 1e5:
         power = floor(log10(largest))
     if spread > 0.0 and isfinite(spread):
-        decimals = min(max(1 - floor(log10(spread)) + power, 0), 9)
+        decimals = min(max(1 - floor(log10(spread)) + power, 0), 12)
 
     def show(value: float) -> str:
         if not isfinite(value):

@@ -165,7 +165,8 @@ class Beginnings:
 
     def _tried(self, found: CandidateFit, candidate: Candidate) -> list[Point]:
         """Return the most promising points of a grid of a candidate's parameters, nuisances as fitted."""
-        count = SEARCH.related_levels.get(candidate.size, 0)
+        size, known = candidate.size, SEARCH.related_levels
+        count = known[size] if size < len(known) else 0
         levels = ndtri((np.arange(count) + 0.5) / max(count, 1))
         tried = []
         for effect in product(levels, repeat=candidate.size):

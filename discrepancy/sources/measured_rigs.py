@@ -12,6 +12,7 @@ from scipy.signal import savgol_filter
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import CampaignFileError
 from reporting.files import atomic_write_text
+from reporting.table_file import table_text
 
 FALLING = 3.0
 """While the reading of the sensor's z is below this share of a rest's, it falls [m/s^2]."""
@@ -78,13 +79,6 @@ def _numbers(file: Path, columns: Sequence[str], separator: str | None = ",", sk
     return np.asarray(found)
 
 
-def _table(names: Sequence[str], columns: Sequence[FloatArray]) -> str:
-    """Return a table; a reading that is left out (NaN) is an empty cell."""
-    cells = [["" if np.isnan(value) else repr(value) for value in column.tolist()] for column in columns]
-    rows = zip(*cells, strict=True)
-    return "\n".join([",".join(names), *(",".join(row) for row in rows)]) + "\n"
-
-
 def fall_of(file: Path) -> tuple[FloatArray, FloatArray]:
     """Return times [s] from the release and readings z [m/s^2] of the longest fall in a record."""
     data = _numbers(file, ("time", "x", "y", "z"))
@@ -106,8 +100,8 @@ def _phone(data: Path) -> dict[str, str]:
         raise CampaignFileError(
             f"There is no fall_NUMBER.csv in {data}: give the folder of the published records."
         )
-    falls = {file.name: _table(("time", "z"), fall_of(file)) for file in files}
-    return {"noise.csv": _table(("time", "z"), (np.round(rest[:, 0], 9), rest[:, 3])), **falls}
+    falls = {file.name: table_text(dict(zip(("time", "z"), fall_of(file), strict=True))) for file in files}
+    return {"noise.csv": table_text({"time": np.round(rest[:, 0], 9), "z": rest[:, 3]}), **falls}
 
 
 def _tanks(data: Path) -> dict[str, str]:
@@ -117,7 +111,7 @@ def _tanks(data: Path) -> dict[str, str]:
     pumps, levels = table[:, :2].T, table[:, 2:].T
     levels[levels >= LARGEST_LEVEL] = np.nan
     return {
-        f"{name}.csv": _table(("time", "pump", "level"), (time, pump, level))
+        f"{name}.csv": table_text({"time": time, "pump": pump, "level": level})
         for name, pump, level in zip(("estimation", "validation"), pumps, levels, strict=True)
     }
 
@@ -131,7 +125,7 @@ def _pendulum(data: Path) -> dict[str, str]:
         whole = len(table) // joined * joined  # what is left over at the end is dropped
         time, angle, _, torque = table[:whole].reshape(-1, joined, table.shape[1]).mean(axis=1).T
         angle = savgol_filter(angle, 2 * round(0.5 * SMOOTHED / STEP) + 1, 3)
-        tables[f"{name}.csv"] = _table(("time", "angle", "torque"), (np.round(time, 9), angle, torque))
+        tables[f"{name}.csv"] = table_text({"time": np.round(time, 9), "angle": angle, "torque": torque})
     return tables
 
 

@@ -16,7 +16,7 @@ from fe.full.subspace import Norm
 from fe.runtime.arrays import FloatArray
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
 from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.patched_wing import PatchedStructure, PatchedWing
+from fe.runtime.patched_wing import PatchedState, PatchedWing
 from fe.wing.operators import AffineOperators, point_masses
 from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
 from reporting.progress import Progress, SilentProgress
@@ -191,7 +191,7 @@ def _directions(arrays: PatchArrays, settings: PatchSettings) -> FloatArray:
         weights[:3] = LOAD_WEIGHT
         weights[len(loads.T) + len(gauges.T) // 3 : -2] = TURNED_WEIGHT
         solutions = _unit(structure.static(columns)) * weights
-        modes = _unit(structure.modes(MODES).shapes) * MODE_WEIGHTS
+        modes = _unit(structure.lowest(MODES).shapes) * MODE_WEIGHTS
         plainly = 10.0 if number == 0 else 1.0  # the wing as it was is looked at most
         shapes = np.concatenate((solutions, modes), axis=1) * plainly
         all_snapshots += shapes @ shapes.T
@@ -212,7 +212,7 @@ def _unit(vectors: FloatArray) -> FloatArray:
 
 def _patched_state(
     wing: PatchedWing, settings: PatchSettings, generator: np.random.Generator, *, plain: bool
-) -> tuple[PatchedStructure, FloatArray]:
+) -> tuple[PatchedState, FloatArray]:
     """Return a random state and its loads (N, 3 + 2 L); `plain`: of the wing as it was."""
     arrays, span = wing.arrays, wing.span
     drawn = np.array(generator.uniform(*arrays.validity_box[:-2].T))  # all but the loads

@@ -15,7 +15,6 @@ from .arrays import FloatArray
 from .errors import InvalidPatchError
 from .motion import laws_of
 from .patch import LOADS, LoadGain, ModelPatch, ModulusTemperature, PointMass, RootCompliance
-from .patch_arrays import PatchArrays
 from .planform_forces import STATION_PORTS
 from .reduced import lowest_modes
 from .state import Losses
@@ -33,41 +32,6 @@ class Modes(NamedTuple):
     frequency: FloatArray
     shapes: FloatArray
     to_modes: FloatArray
-
-
-class PatchedStructure:
-    """Stiffness and mass (n, n) of the wing at one state and under one set of changes.
-
-    Parameters
-    ----------
-    arrays : PatchArrays
-        The wing for patches, in whose basis they are.
-    stiffness, mass : (n, n) ndarray
-        As `fe.runtime.patched_wing.PatchedWing` gives them.
-    """
-
-    def __init__(self, arrays: PatchArrays, stiffness: FloatArray, mass: FloatArray) -> None:
-        self._arrays, self.stiffness, self.mass = arrays, stiffness, mass
-
-    @cached_property
-    def _inverse(self) -> FloatArray:
-        return np.asarray(np.linalg.inv(self.stiffness))
-
-    def static(self, loads: FloatArray) -> FloatArray:
-        """Return the displacements K^-1 f of loads (n,) or (n, k)."""
-        return np.asarray(self._inverse @ loads)
-
-    def modes(self, count: int, held: FloatArray | None = None) -> Modes:
-        """Return the first undamped modes, Kapteyn et al. 2021, eq. (16); the tip moves up in each of them.
-
-        The basis that they are found in holds the static shapes of the rows `held` (s, n) as well.
-        """
-        solutions = np.zeros((len(self.mass), 0)) if held is None else self.static(held.T)
-        basis = motion_basis(self.static, self.mass, self._arrays.start_shapes, solutions)
-        frequency, own = lowest_modes(basis.T @ self.stiffness @ basis, basis.T @ self.mass @ basis, count)
-        shapes = basis @ own
-        shapes = shapes * np.where(self._arrays.tip_row @ shapes < 0.0, -1.0, 1.0)
-        return Modes(frequency, shapes, shapes.T @ self.mass)
 
 
 def motion_basis(
@@ -122,19 +86,6 @@ class PatchedWing(WingRows):
     arrays : PatchArrays
         From `fe.reduction.model_cache.patch_arrays`, or read from a file.
     """
-
-    def structure(
-        self,
-        young_modulus_factor: float,
-        stiffness_loss: Losses,
-        servo_mass: float,
-        pitot_mass: float,
-        patch: ModelPatch = EMPTY,
-        temperature_difference: float = 0.0,
-    ) -> PatchedStructure:
-        """Return stiffness and mass at a state under a patch; see `stiffness` and `mass`."""
-        stiffness = self.stiffness(young_modulus_factor, stiffness_loss, patch, temperature_difference)
-        return PatchedStructure(self.arrays, stiffness, self.mass(servo_mass, pitot_mass, patch))
 
     def mass(self, servo_mass: float, pitot_mass: float, patch: ModelPatch = EMPTY) -> FloatArray:
         """Return the mass (n, n) with the point masses of a patch [kg].
@@ -207,17 +158,31 @@ class PatchedWing(WingRows):
             stiffness += lower + np.tril(lower, -1).T
         return np.asarray(stiffness)
 
-    def at(
-        self, vector: FloatArray, patch: ModelPatch = EMPTY, temperature_difference: float = 0.0
+    def structure(
+        self,
+        young_modulus_factor: float,
+        stiffness_loss: Losses,
+        servo_mass: float,
+        pitot_mass: float,
+        patch: ModelPatch = EMPTY,
+        temperature_difference: float = 0.0,
     ) -> "PatchedState":
-        """Return the wing as `fe.runtime.transient` takes it, at values (V,) of all that can be chosen.
+        """Return the wing at a state under a patch; see `stiffness` and `mass`.
 
         Raises
         ------
         InvalidPatchError
             If the wing cannot carry the patch.
         """
-        return PatchedState(self, vector, patch, temperature_difference)
+        stiffness = self.stiffness(young_modulus_factor, stiffness_loss, patch, temperature_difference)
+        return PatchedState(self, stiffness, self.mass(servo_mass, pitot_mass, patch), patch)
+
+    def at(
+        self, vector: FloatArray, patch: ModelPatch = EMPTY, temperature_difference: float = 0.0
+    ) -> "PatchedState":
+        """Return it at values (V,) of all that can be chosen; raises as `structure`."""
+        e, *losses, servo, pitot = vector[:-2].tolist()
+        return self.structure(e, tuple(losses), servo, pitot, patch, temperature_difference)
 
 
 class PatchedState:
@@ -228,6 +193,8 @@ class PatchedState:
 
     Attributes
     ----------
+    stiffness, mass : (n, n) ndarray
+        In the basis of the wing's arrays.
     components : (2, G, n) ndarray
         Rows of the strains across the gauges, and of shear.
     """
@@ -235,10 +202,10 @@ class PatchedState:
     holding = HOLDING
     on_modes = ON_MODES
 
-    def __init__(self, wing: PatchedWing, vector: FloatArray, patch: ModelPatch, temperature: float) -> None:
-        e, *losses, servo, pitot = vector[:-2].tolist()
-        arrays, self._gains = wing.arrays, [item for item in patch if isinstance(item, LoadGain)]
-        self._structure = wing.structure(e, tuple(losses), servo, pitot, patch, temperature)
+    def __init__(self, wing: PatchedWing, stiffness: FloatArray, mass: FloatArray, patch: ModelPatch) -> None:
+        self._arrays = arrays = wing.arrays
+        self._gains = [item for item in patch if isinstance(item, LoadGain)]
+        self.stiffness, self.mass = stiffness, mass
         self.laws = laws_of(wing.internal_forces(patch), wing.port_rows)
         held = wing.held_ports(self.laws.ports)
         self._held = np.vstack((arrays.load_tip, *held.values()))
@@ -261,14 +228,34 @@ class PatchedState:
         return np.array((load_factor, load_factor**2, force, 0.0))
 
     @cached_property
+    def _inverse(self) -> FloatArray:
+        return np.asarray(np.linalg.inv(self.stiffness))
+
+    def static(self, loads: FloatArray) -> FloatArray:
+        """Return the displacements K^-1 f of loads (n,) or (n, k)."""
+        return np.asarray(self._inverse @ loads)
+
+    @cached_property
     def answers(self) -> FloatArray:
         """Displacements (n, 4 + J) at rest under the unit loads."""
-        return self._structure.static(self.loads)
+        return self.static(self.loads)
+
+    def lowest(self, count: int, held: FloatArray | None = None) -> Modes:
+        """Return the first undamped modes, Kapteyn et al. 2021, eq. (16); the tip moves up in each of them.
+
+        The basis that they are found in holds the static shapes of the rows `held` (s, n) as well.
+        """
+        solutions = np.zeros((len(self.mass), 0)) if held is None else self.static(held.T)
+        basis = motion_basis(self.static, self.mass, self._arrays.start_shapes, solutions)
+        frequency, own = lowest_modes(basis.T @ self.stiffness @ basis, basis.T @ self.mass @ basis, count)
+        shapes = basis @ own
+        shapes = shapes * np.where(self._arrays.tip_row @ shapes < 0.0, -1.0, 1.0)
+        return Modes(frequency, shapes, shapes.T @ self.mass)
 
     @cached_property
     def modes(self) -> Modes:
         """The modes that move."""
-        return self._structure.modes(MODE_COUNT, self._held)
+        return self.lowest(MODE_COUNT, self._held)
 
     @property
     def shapes(self) -> FloatArray:

@@ -106,10 +106,10 @@ def _nearest(
         edges = np.einsum("nai,naj,tj->nti", nodes, slopes, tangents)
         if step == _STEPS or moved < 1e-14:
             break
-        gram = np.einsum("nti,nsi->nts", edges, edges)
-        # Outside its cell the map may fold: such a place is no solution, wherever the next step leads.
-        gram[np.linalg.det(gram) == 0.0] = np.eye(len(tangents))
-        move = np.linalg.solve(gram, np.einsum("nti,ni->nt", edges, residual)[..., None])[..., 0]
+        gram = edges @ edges.swapaxes(1, 2)
+        if len(tangents) == 3:  # outside its cell the map may fold: no solution, wherever the next step leads
+            gram[np.linalg.det(gram) == 0.0] = np.eye(3)
+        move = np.linalg.solve(gram, edges @ residual[..., None])[..., 0]
         before, along = along, kept(along + move)
         moved = float(np.abs(along - before).max(initial=0.0))
     return local, residual, edges
@@ -164,36 +164,27 @@ def _on_triangle(along: FloatArray) -> FloatArray:
     return along
 
 
-def area_vectors(mesh: CellMesh, surface: Surface) -> FloatArray:
-    """Integral (nodes, 3) [m^2] over faces of each node's shape function times the outward normal."""
-    total = np.zeros((len(mesh.points), 3))
-    for cells, vectors, values in _face_points(mesh, surface):
-        np.add.at(total, mesh.cells[cells], np.einsum("nqi,qa->nai", vectors, values))
-    return total
+def face_areas(mesh: CellMesh, surface: Surface) -> tuple[FloatArray, FloatArray]:
+    """Integrals over faces of each node's shape function: with the outward normal, and alone.
 
-
-def area_shares(mesh: CellMesh, surface: Surface) -> FloatArray:
-    """Integral (nodes,) [m^2] over faces of each node's shape function; together they are the area."""
-    total = np.zeros(len(mesh.points))
-    for cells, vectors, values in _face_points(mesh, surface):
-        np.add.at(total, mesh.cells[cells], np.linalg.norm(vectors, axis=2) @ values)
-    return total
-
-
-def _face_points(mesh: CellMesh, surface: Surface) -> list[tuple[IntArray, FloatArray, FloatArray]]:
-    """Cells (n,), weighted outward normals (n, q, 3) [m^2] and shape functions (q, k), face by face."""
-    kind, found = mesh.kind, []
-    for number in np.unique(surface.face):
+    Returns
+    -------
+    vectors, shares : (nodes, 3) m^2, (nodes,) m^2
+        The shares together are the area.
+    """
+    kind, vectors, shares = mesh.kind, np.zeros((len(mesh.points), 3)), np.zeros(len(mesh.points))
+    for number in np.unique(surface.face).tolist():
         cells = surface.cell[surface.face == number]
-        along, weight = kind.face_rule(int(number))
-        local, tangents = kind.face_places(int(number), along)
+        along, weight = kind.face_rule(number)
+        local, tangents = kind.face_places(number, along)
         values, slopes = kind.shape_functions(local)
         edges = np.einsum("nai,qaj,tj->nqti", mesh.nodes[cells], slopes, tangents, optimize=True)
-        vectors = np.cross(edges[:, :, 0], edges[:, :, 1]) * weight[:, None]
+        normals = np.cross(edges[:, :, 0], edges[:, :, 1]) * weight[:, None]
         # A node off the face has a shape function of zero on it, up to rounding.
-        values[:, [n for n in range(kind.node_count) if n not in kind.face_nodes[int(number)]]] = 0.0
-        found.append((cells, vectors, values))
-    return found
+        values[:, [n for n in range(kind.node_count) if n not in kind.face_nodes[number]]] = 0.0
+        np.add.at(vectors, mesh.cells[cells], np.einsum("nqi,qa->nai", normals, values))
+        np.add.at(shares, mesh.cells[cells], np.linalg.norm(normals, axis=2) @ values)
+    return vectors, shares
 
 
 def nodal_load(mesh: StructureMesh, load: Load, where: str) -> FloatArray:
@@ -210,7 +201,7 @@ def nodal_load(mesh: StructureMesh, load: Load, where: str) -> FloatArray:
         return np.tile(load.acceleration, (len(mesh.points), 1))
     if load.pressure is not None:
         assert load.set is not None
-        return np.asarray(-load.pressure * area_vectors(mesh, mesh.faces_of(load.set, where)))
+        return -load.pressure * face_areas(mesh, mesh.faces_of(load.set, where))[0]
     assert load.force is not None
     force = np.asarray(load.force)
     if load.point is not None:
@@ -220,7 +211,7 @@ def nodal_load(mesh: StructureMesh, load: Load, where: str) -> FloatArray:
     surface = mesh.faces_between(load.set, nodes)
     shares = np.zeros(len(mesh.points))
     if len(surface):
-        shares = area_shares(mesh, surface)
+        _, shares = face_areas(mesh, surface)
         shares /= shares.sum()
     else:
         shares[nodes] = 1.0 / len(nodes)

@@ -224,13 +224,11 @@ def _point_mass(part: MatrixMass, unit: float, files: Matrices, where: str) -> s
 
 def _load(load: MatrixLoad, unit: float, files: Matrices, where: str) -> FloatArray:
     """Return the vector (n,) of a load, or of the field of an acceleration in the unit of the matrices."""
-    if load.vector is not None:
-        return files.vector(load.vector, where, PUSHED)
     if load.acceleration is not None:
         return files.everywhere(load.acceleration, where) / unit
-    assert load.node is not None
-    assert load.force is not None
-    return files.along(load.node, load.force, where, PUSHED)
+    if load.node is not None and load.force is not None:
+        return files.along(load.node, load.force, where, PUSHED)
+    return files.vector(str(load.vector), where, PUSHED)
 
 
 def _rows(design: MatrixDesign, files: Matrices, key: str) -> Iterator[FloatArray]:
@@ -268,12 +266,10 @@ def _stiffness_terms(
     rest, nominal = whole, {part.name: part.nominal for part in design.parameter}
     for number, part in enumerate(design.part, start=1):
         where = f"part[{number}]"
-        if part.matrix is not None:
-            own = files.matrix(part.matrix, where, partial=True)
-        else:
-            assert part.changed is not None
-            assert part.times is not None
+        if part.changed is not None and part.times is not None:
             own = (whole - files.matrix(part.changed, where)) / (1.0 - part.times)
+        else:
+            own = files.matrix(str(part.matrix), where, partial=True)
         rest = rest - own
         inside = _part_of(
             whole, own, free, f"{where} takes stiffness away somewhere; its file is of another run or part"
@@ -293,9 +289,9 @@ def _part_of(
 ) -> sparse.csr_array:
     """Return the free rows of a part without what is rounding of the whole; refuse an indefinite one."""
     found, size = part.tocoo(), np.sqrt(np.abs(whole.diagonal()))
-    kept = np.abs(found.data) > _ROUNDING * size[found.row] * size[found.col]
-    entries = (found.data[kept], (found.row[kept], found.col[kept]))
-    inside = sparse.coo_array(entries, found.shape).tocsr()[free][:, free]
+    found.data[np.abs(found.data) <= _ROUNDING * size[found.row] * size[found.col]] = 0.0
+    inside = found.tocsr()[free][:, free]
+    inside.eliminate_zeros()
     _check_definite(inside + _INDEFINITE * whole[free][:, free], sentence)
     return inside
 

@@ -1,1 +1,1 @@
-"""Known answers, CalculiX, and the sandwich plate."""
+"""Known answers, and CalculiX."""

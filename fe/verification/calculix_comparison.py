@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from fe.wing.operators import AffineOperators
 
 from .calculix_deck import CalculixDeck, Step, number_line
 from .calculix_job import read_frequencies, read_tables, run_calculix
-from .calculix_models import STATIC, gauge_cells, load_step, structure_deck, wing_deck
+from .calculix_models import gauge_cells, load_step, structure_deck, wing_deck
 
 TEST_FORCE = 10.0
 """Upward force of the static test and before the ring-down [N]."""
@@ -63,13 +64,13 @@ class Agreement:
 
 def _agreement(
     deck: CalculixDeck,
-    loads: Mapping[str, tuple[FloatArray, Step]],
+    loads: Mapping[str, Step],
     folder: Path,
     modes: int,
     relative: Callable[[FloatArray, FloatArray], float],
     tensor: Callable[[FloatArray], FloatArray] | None = None,
 ) -> Agreement:
-    """Solve loads (n,) [N], given with their steps, and the lowest modes by both codes.
+    """Solve loads, given by their steps, and the lowest modes by both codes.
 
     `relative` compares strains and outputs; `tensor` gives our strains (p, 6) in the cells EGAUGES.
     """
@@ -77,20 +78,21 @@ def _agreement(
     prints = ["*NODE PRINT, NSET=NALL", "U"]
     prints += ["*NODE PRINT, NSET=NPROBES", "U"] if len(deck.probes) else []
     prints += ["*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E"] if tensor else []
-    text = deck.text(*(step._replace(lines=[*step.lines, *prints]) for _, step in loads.values()))
+    text = deck.text(*(step._replace(lines=[*step.lines, *prints]) for step in loads.values()))
     printed = read_tables(run_calculix(text, folder, "static")) if loads else {}
     if (count := len(printed.get("NALL", ()))) != len(loads):
         raise CalculixError(f"CalculiX printed {count} static solutions instead of {len(loads)}.")
     frequencies = natural_frequencies(structure, modes, deck.values)[0]
-    theirs = read_frequencies(run_calculix(deck.text(Step(("*FREQUENCY", f"{modes}"))), folder, "modes"))
+    text = deck.text(Step(procedure=("*FREQUENCY", f"{modes}")))
+    theirs = read_frequencies(run_calculix(text, folder, "modes"))
     if len(theirs) < modes:
         raise CalculixError(f"CalculiX printed {len(theirs)} frequencies instead of {modes}.")
     solve = Factorisation(structure.at(deck.values)[0]).solve
     gauges, end = len(structure.gauges), len(deck.probes)
     parts = {"gauge strains": slice(0, gauges), "displacement outputs": slice(gauges, end)}
     differences = {}
-    for number, (name, (load, _)) in enumerate(loads.items()):
-        displacement, tables = solve(load), {key: rows[number] for key, rows in printed.items()}
+    for number, (name, step) in enumerate(loads.items()):
+        displacement, tables = solve(step.load), {key: rows[number] for key, rows in printed.items()}
         ours, nodes = deck.probes @ displacement, structure.full_displacement(displacement)
         found = differences[name] = {"nodal displacements": _relative(tables["NALL"][:, 1:], nodes)}
         for what, own in parts.items():
@@ -120,9 +122,7 @@ def structure_agreement(structure: Structure, folder: Path, modes: int = 6) -> A
         If CalculiX is not there, fails, or has no such element.
     """
     deck = structure_deck(structure)
-    loads = {
-        load.name: (structure.load(load.name), load_step(structure, load)) for load in structure.design.load
-    }
+    loads = {load.name: load_step(structure, load) for load in structure.design.load}
     return _agreement(deck, loads, folder, modes, _relative)
 
 
@@ -148,15 +148,11 @@ def wing_agreement(
         If CalculiX is not there or fails.
     """
     deck, lift = wing_deck(operators, state), operators.wing_mesh.design.lift
-    loads = {"tip force": operators.turn(0.0, TEST_FORCE), "lift": operators.turn(lift.load_factor)}
-    return _agreement(
-        deck,
-        {name: (load, Step(STATIC, load)) for name, load in loads.items()},
-        folder,
-        modes,
-        _relative_each,
-        lambda displacement: _strain_tensors(operators, displacement),
-    )
+    loads = {
+        "tip force": Step(operators.turn(0.0, TEST_FORCE)),
+        "lift": Step(operators.turn(lift.load_factor)),
+    }
+    return _agreement(deck, loads, folder, modes, _relative_each, partial(_strain_tensors, operators))
 
 
 def _strain_tensors(operators: AffineOperators, free: FloatArray) -> FloatArray:
@@ -249,12 +245,12 @@ def ring_down_agreement(
     load = operators.turn(0.0, TEST_FORCE)
     text = wing_deck(operators, state).text(
         # CalculiX balances energy in a dynamic step and wants it asked for from the first step on.
-        Step(STATIC, load, ("*EL PRINT, ELSET=E0", "ENER")),
+        Step(load, ("*EL PRINT, ELSET=E0", "ENER")),
         Step(
-            ("*DYNAMIC, DIRECT, ALPHA=0.", number_line([increment, increment * steps])),
             0.0 * load,
             ("*NODE PRINT, NSET=NPROBES, FREQUENCY=1", "U"),
-            steps + 10,
+            procedure=("*DYNAMIC, DIRECT, ALPHA=0.", number_line([increment, increment * steps])),
+            increments=steps + 10,
         ),
     )
     tables, tip = read_tables(run_calculix(text, folder, "ring_down")), len(operators.gauges)

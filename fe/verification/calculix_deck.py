@@ -62,19 +62,22 @@ class Step(NamedTuple):
 
     Attributes
     ----------
+    load : (n,) N
+        What acts, in the place of that of the step before; empty where that stays.
+    lines : iterable of str
+        Loads that CalculiX applies itself, and what is printed.
+    nodal : bool
+        Whether the load is given as forces of nodes, and not by lines.
     procedure : tuple of str
         Lines that say what is solved.
-    force : (n,) N, optional
-        Nodal forces, in the place of those of the step before.
-    lines : iterable of str
-        Further loads, and what is printed.
     increments : int
         At most so many.
     """
 
-    procedure: tuple[str, ...]
-    force: FloatArray | None = None
+    load: FloatArray = np.empty(0)
     lines: Iterable[str] = ()
+    nodal: bool = True
+    procedure: tuple[str, ...] = ("*STATIC",)
     increments: int = 100
 
 

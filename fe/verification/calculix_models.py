@@ -24,7 +24,6 @@ from fe.wing.responses import wing_values
 
 from .calculix_deck import CalculixDeck, CellMaterial, PointBlock, Step, number_line
 
-STATIC = ("*STATIC",)
 NOT_COMPARABLE = (WEDGES_6,)
 """Kinds that CalculiX integrates otherwise (C3D6 at two points)."""
 ORTHOTROPIC = ([0, 0, 1, 0, 1, 2, 5, 4, 3], [0, 1, 1, 2, 2, 2, 5, 4, 3])
@@ -63,7 +62,7 @@ def structure_deck(structure: Structure) -> CalculixDeck:
 def load_step(structure: Structure, load: Load) -> Step:
     """Return the static step of a load of a structure, its control at the nominal value."""
     factor = 1.0 if load.control is None else structure.controls[load.control]
-    force, lines = structure.load(load.name), ["*DLOAD, OP=NEW"]
+    lines = ["*DLOAD, OP=NEW"]
     if load.acceleration is not None:
         size = float(np.linalg.norm(load.acceleration))
         direction = np.sign(factor) * np.asarray(load.acceleration) / size
@@ -74,7 +73,7 @@ def load_step(structure: Structure, load: Load) -> Step:
             lines.append(f"{cell + 1},P{face + 1},{number_line([factor * load.pressure])}")
     else:
         lines.append("EALL,GRAV,0.,0.,0.,1.")
-    return Step(STATIC, force if load.force is not None else 0.0 * force, lines)
+    return Step(structure.load(load.name), lines, load.force is not None)
 
 
 def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:

@@ -17,7 +17,7 @@ from fe.full.modes import most_moved
 from fe.full.statics import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.structure.field import natural_frequencies, static_response
-from fe.structure.location import area_shares
+from fe.structure.location import face_areas
 from fe.structure.mesh import Surface
 from fe.structure.supports import rigid_motions
 from fe.wing.design import WingDesign
@@ -130,7 +130,7 @@ def _end_deflection(
     """Mean displacement of the end y = `length` along a unit force there; the other end is clamped."""
     stiffness = _uniform_stiffness(body, young_modulus, poisson_ratio)
     on_end = np.flatnonzero(np.isclose(body.corners[:, :, 1].max(axis=1), length))
-    shares = area_shares(body, Surface(on_end, np.full(len(on_end), _END_FACE)))
+    _, shares = face_areas(body, Surface(on_end, np.full(len(on_end), _END_FACE)))
     shares /= shares.sum()
     free = np.flatnonzero(np.repeat(body.points[:, 1] > 1e-9, 3))
     load, found = np.zeros(body.unknowns), np.zeros(body.unknowns)

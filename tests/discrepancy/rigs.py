@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from discrepancy.campaign.records import Campaign
@@ -17,8 +18,10 @@ from fe.runtime.patch import (
     ModelPatch,
 )
 from reporting.provenance import collect_provenance
+from tests.refusals import Inputs
 
 MODEL = "single_mass_rig"
+INPUTS = Inputs(Path(__file__).with_name("models"))
 
 
 ORIGIN = Origin("Rig", MODEL, "ab" * 32, "cd" * 32, "uav-twin discrepancy run rig", collect_provenance(0))
@@ -27,6 +30,13 @@ ORIGIN = Origin("Rig", MODEL, "ab" * 32, "cd" * 32, "uav-twin discrepancy run ri
 def model_of(text: str) -> LumpedModel:
     """Return the lumped model that a text says."""
     return LumpedModel(parse_lumped(tomllib.loads(text)))
+
+
+def fmu_rig(folder: Path, fmu: object, *changes: tuple[str, str]) -> Path:
+    """Write the file of the single-mass rig as an FMU, with texts replaced."""
+    path = folder / "rig.toml"
+    path.write_text(INPUTS.text("rig.toml", ("{fmu}", str(fmu)), *changes), encoding="utf-8")
+    return path
 
 
 def one_mass(**terms: Any) -> LumpedModel:

@@ -39,7 +39,7 @@ from fmu_asset.archive.fmu_file import read_fmu
 from reporting.errors import FileNotWrittenError
 from reporting.provenance import collect_provenance
 from tests import command_line
-from tests.discrepancy.models.test_fmu import RIG as FMU_RIG
+from tests.discrepancy.rigs import fmu_rig
 
 CATALOGUE = load_catalogue()
 SPRING = ("cubic_stiffness", "seating_offset", "load_cell")
@@ -177,7 +177,7 @@ def test_there_and_back_from_python(
     file = tmp_path / "rig.toml"
     if kind == "FMU":
         shutil.copy(foreign_fmu("rig2"), tmp_path / "rig.fmu")
-        file.write_text(FMU_RIG.format(fmu="rig.fmu"), encoding="utf-8")
+        file = fmu_rig(tmp_path, "rig.fmu")
     elif kind == "structure":
         changes = {'set = "end", force': "point = [100, 10, 5], force"}
         file = write_beam(tmp_path, changes, cells=2)
@@ -440,7 +440,7 @@ def test_gains_of_a_load_act_one_upon_the_other(
 ) -> None:
     """A tare of 0.5 N that a second gain of 10 % doubles up on is 0.55 N."""
     shutil.copy(foreign_fmu("rig2"), tmp_path / "rig.fmu")
-    (tmp_path / "rig.toml").write_text(FMU_RIG.format(fmu="rig.fmu"), encoding="utf-8")
+    fmu_rig(tmp_path, "rig.fmu")
     model = uav_twin.load_model("single_mass_rig" if kind == "lumped" else tmp_path / "rig.toml")
     twice = ModelPatch((LoadGain(0.2, 0.5), LoadGain(0.1, 0.0)))
     once = ModelPatch((LoadGain(0.32, 0.55),))

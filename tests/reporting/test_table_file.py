@@ -22,7 +22,7 @@ ERRORS = TableErrors(layout=LayoutError, value=ValueRefusedError)
 
 def test_a_table_is_read_with_and_without_a_byte_order_mark(tmp_path: Path) -> None:
     file = tmp_path / "loads.csv"
-    text = "# two rows\n" + table_text(("load", "remark"), (("1.5", "-2e3"), ("a, b", "")))
+    text = "# two rows\n" + table_text({"load": ("1.5", "-2e3"), "remark": ("a, b", "")})
     for encoding in ("utf-8", "utf-8-sig"):
         file.write_text(text, encoding=encoding)
         table = read_table(file, ERRORS)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
@@ -21,7 +22,6 @@ from discrepancy.fits.problem import Problem
 from discrepancy.models.interface import (
     Conditions,
     Model,
-    ModelParameter,
     Outputs,
     PortScale,
     Response,
@@ -53,8 +53,8 @@ class ClosedForm(Model):
 
     name = "closed form"
     parameters = (
-        ModelParameter("slope", 1.0, 0.05, "1", 0.1, 2.0),
-        ModelParameter("curvature", 0.5, 0.2, "1", -3.0, 3.0),
+        ParameterPrior("slope", "1", 1.0, 0.05, 0.1, 2.0),
+        ParameterPrior("curvature", "1", 0.5, 0.2, -3.0, 3.0),
     )
 
     def output_quantity(self, output: str) -> Quantity | None:

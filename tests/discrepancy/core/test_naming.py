@@ -12,9 +12,9 @@ from scipy.signal import lfilter
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import SHAPE_GAIN
-from discrepancy.judgement.naming import name
-from discrepancy.judgement.rules import SURE, UNSURE, Case
+from discrepancy.judgement.naming import SURE, UNSURE, Case, name
 from discrepancy.search_settings import SEARCH
+from discrepancy.sentences import SENTENCES
 from discrepancy.verdict import VerdictKind
 from fe.runtime.patch import ModelPatch, PowerDamping
 
@@ -279,7 +279,9 @@ def test_what_all_probable_sets_hold_is_named_where_it_fits_alone(searched, few)
 
 def test_the_rules_stand_in_the_page_in_their_order() -> None:
     page = (Path(__file__).parents[3] / "docs" / "discrepancy.md").read_text(encoding="utf-8")
-    table = "".join(f"| {rule.kind} | {rule.when} |\n" for rule in (*UNSURE, *SURE))
+    rules = SENTENCES["rule"]
+    assert len(rules) == len((*UNSURE, *SURE))
+    table = "".join(f"| {rule['verdict']} | {rule['when']} |\n" for rule in rules)
     assert f"| verdict | where |\n| --- | --- |\n{table}\n" in page
 
 

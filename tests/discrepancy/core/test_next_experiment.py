@@ -137,10 +137,10 @@ def test_no_longer_record_of_what_does_not_swing(bench) -> None:  # type: ignore
     none = fit(problem, Candidate(), problem.start(Candidate()))
     assert oscillates(problem, none)
     decay = tuple(
-        np.exp(-data.trial.time)[:, np.newaxis] * np.ones(response.shape[1])
-        for data, response in zip(problem.trials, none.responses, strict=True)
+        replace(part, response=np.exp(-data.trial.time)[:, np.newaxis] * np.ones(part.response.shape[1]))
+        for data, part in zip(problem.trials, none.linearisations, strict=True)
     )
-    assert not oscillates(problem, replace(none, responses=decay))
+    assert not oscillates(problem, replace(none, linearisations=decay))
     names = [item.trial.name for item in proposals(problem.campaign, problem, swings=False)]
     assert names
     assert "longer record" not in names

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import (
     Conditions,
     Model,
-    ModelParameter,
     Outputs,
     PortScale,
     Response,
@@ -37,7 +37,7 @@ class Oscillator(Model):
     damping_ratio: float = 0.02
 
     name = "single mass"
-    parameters = (ModelParameter("stiffness_factor", 1.0, 0.01, "1", 0.5, 2.0),)
+    parameters = (ParameterPrior("stiffness_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 
     def output_quantity(self, output: str) -> Quantity | None:
         return Quantity.DISPLACEMENT if output == "x" else Quantity.STRAIN if output in GAUGES else None

@@ -12,8 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
-from discrepancy.checks.outliers import sample_outliers, wrong_ends
-from discrepancy.checks.quality import FaultKind, check_against_model, check_data, mark_outliers
+from discrepancy.checks.fault import FaultKind
+from discrepancy.checks.model_check import check_against_model
+from discrepancy.checks.outliers import mark_outliers, sample_outliers, wrong_ends
+from discrepancy.checks.quality import check_data
 from discrepancy.sources.examples import ExamplePlan, example_campaign
 from fe.runtime.patch import HighPass, ModelPatch, SensorDrift, SensorGain
 

@@ -10,7 +10,9 @@ import pytest
 
 from discrepancy.campaign.held_out import choose_held_out
 from discrepancy.campaign.records import TrialKind
-from discrepancy.checks.quality import check_against_model, check_data, mark_outliers
+from discrepancy.checks.model_check import check_against_model
+from discrepancy.checks.outliers import mark_outliers
+from discrepancy.checks.quality import check_data
 from discrepancy.errors import CampaignFileError, ModelError
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.examples import example_campaign, plan_for, wing_plan, write_example

@@ -88,8 +88,8 @@ def test_what_cannot_be_observed_is_said(tmp_path: Path) -> None:
     text = MODEL.replace("damping = { matrix = 0.5 }", "damping = { matrix = 1e-5 }")
     model = model_of(text)
     campaign = campaign_of(tmp_path)
-    sentence = unobservable(campaign, model)
-    assert "do not tell the calibrated parameter 'damping_factor' (100%)" in sentence
+    (found,) = unobservable(campaign, model)
+    assert "do not tell the calibrated parameter 'damping_factor' (100%)" in found.sentence
     faults = check_against_model(campaign, model)
     assert [fault.kind for fault in faults] == [FaultKind.UNOBSERVABLE]
     assert not faults[0].fatal

@@ -14,9 +14,8 @@ from scipy.signal import lfilter
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, NoiseRecord, Quantity
 from discrepancy.checks.fault import DataFault, FaultKind
-from discrepancy.checks.held_and_copied import held_spans
-from discrepancy.checks.quality import check_against_model, check_data
-from discrepancy.checks.rest import moves
+from discrepancy.checks.model_check import check_against_model
+from discrepancy.checks.quality import check_data, held_spans, moves
 from discrepancy.checks.unit_slips import slip_between
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.examples import example_campaign, plan_for

@@ -32,7 +32,7 @@ from discrepancy.sources.examples import ExampleKind, example_campaign, plan_for
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
 from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness
-from tests.discrepancy.models.test_fmu import write as write_rig
+from tests.discrepancy.rigs import fmu_rig
 
 FloatArray = NDArray[np.float64]
 
@@ -260,7 +260,7 @@ def assert_alike(campaign: Campaign, one: Model, other: Model, share: float) -> 
 
 def test_an_fmu_misses_the_force_that_the_same_lumped_model_does(foreign_fmu: Any, tmp_path: Path) -> None:
     campaign, lumped = released(ModelPatch((STIFF,))), LumpedModel.load("single_mass_rig")
-    fmu = FmuModel.load(write_rig(tmp_path, foreign_fmu("rig2")))
+    fmu = FmuModel.load(fmu_rig(tmp_path, foreign_fmu("rig2")))
     try:
         assert_alike(campaign, lumped, fmu, 2e-3)
     finally:
@@ -269,7 +269,7 @@ def test_an_fmu_misses_the_force_that_the_same_lumped_model_does(foreign_fmu: An
 
 def test_an_fmu_whose_system_is_not_known_shows_no_force(foreign_fmu: Any, tmp_path: Path) -> None:
     campaign = released(ModelPatch((STIFF,)))
-    file = write_rig(
+    file = fmu_rig(
         tmp_path, foreign_fmu("rig2"), ("isolated = false", "isolated = false\nsuperposition = false")
     )
     fmu = FmuModel.load(file)

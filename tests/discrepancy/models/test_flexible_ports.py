@@ -55,7 +55,7 @@ def ringdown(beta: float, *items: Primitive, refinement: int = 1) -> Motion:
 
 
 def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
-    return motion.seen([Shown(row) for row in rows]).values
+    return motion.seen([Shown.of(row) for row in rows]).values
 
 
 LAWS = {
@@ -316,7 +316,7 @@ def test_a_slow_force_leads_through_the_static_states(name: str) -> None:
     rows = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
     acting = Acting(time, np.zeros(len(TIP)), [(TIP, Course.of(time, force))])
     moved = values(system.motion(acting, laws), rows)
-    still = system.static(np.outer(force, TIP), laws).values @ rows.T
+    still = system.static(np.outer(force, TIP), laws)[0] @ rows.T
     assert np.abs(moved - still).max(axis=0) == pytest.approx(np.zeros(2), abs=7e-3 * np.abs(still).max())
 
 
@@ -328,7 +328,7 @@ def test_a_release_goes_on_from_its_static_state(name: str) -> None:
     first = values(motion, rows)[0]
     assert first[0] == pytest.approx(0.02, rel=1e-9)
     system = motion.system
-    at_rest = system.static(np.stack((0.0 * TIP, motion.holding)), motion.laws).values[-1]
+    at_rest = system.static(np.stack((0.0 * TIP, motion.holding)), motion.laws)[0][-1]
     assert first[1] == pytest.approx(at_rest[0], rel=1e-4)
 
 

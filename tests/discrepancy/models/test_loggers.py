@@ -7,127 +7,98 @@ import numpy as np
 import pytest
 
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, Trial
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import CampaignFileError, CatalogueError
 from discrepancy.models.interface import Conditions
-from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import Clock, LoadGain, LoggerClock, ModelPatch
 from tests.discrepancy.rigs import model_of
+from tests.refusals import Inputs
 
-MODEL = """
-format = 1
-name = "Mass on a spring"
-mass = 2.0
-stiffness = 800.0
-damping = { matrix = 3.0 }
-input = [{ name = "shaker", vector = 1.0 }]
-output = [{ name = "x", vector = 1.0 }]
-parameter = [
-  { name = "stiffness", terms = "stiffness", deviation = 0.1, low = 0.5, high = 2.0 },
-  { name = "damping", terms = "damping", deviation = 0.1, low = 0.5, high = 2.0 },
-]
-"""
-TOML = """
-format = 1
-name = "On a shaker"
-@
-input = [{ name = "shaker", quantity = "force", unit = "N" }]
-trial = [{ name = "swept", kind = "driven", file = "swept.csv", begins = "still" }]
-[[channel]]
-name = "laser"
-quantity = "displacement"
-unit = "mm"
-output = "x"
-noise = { standard_deviation = 0.01 }
-[[channel]]
-name = "camera"
-quantity = "displacement"
-unit = "mm"
-output = "x"
-noise = { standard_deviation = 0.02 }
-"""
-BOTH = 'loggers = { rack = ["shaker", "laser"], film = ["camera"] }'
+INPUTS = Inputs(__file__)
+MODEL = model_of(INPUTS.text("shaken_mass.toml"))
+BOTH = 'rack = ["shaker", "laser"], film = ["camera"]'
 RATE = 4e-3
 
 
-def campaign_of(folder: Path, loggers: str = "") -> Campaign:
-    time = np.arange(0.0, 4.0, 0.01)
-    rows = [
-        f"{t!r},{f!r},{t!r},{t!r}" for t, f in zip(time.tolist(), np.sin(9 * time**1.3).tolist(), strict=True)
-    ]
-    (folder / "swept.csv").write_text("time,shaker,laser,camera\n" + "\n".join(rows) + "\n")
-    (folder / "campaign.toml").write_text(TOML.replace("@", loggers))
-    return read_campaign(folder)
+@pytest.fixture
+def make(tmp_path: Path):
+    """A maker of the campaign of a swept force, seen by a laser and a camera, with loggers."""
+
+    def read(loggers: str = ""):
+        time = np.arange(0.0, 4.0, 0.01)
+        rows = np.stack((time, np.sin(9 * time**1.3), time, time), axis=1).tolist()
+        lines = ["time,shaker,laser,camera", *(",".join(map(repr, row)) for row in rows)]
+        (tmp_path / "swept.csv").write_text("\n".join(lines) + "\n")
+        said = f"loggers = {{ {loggers} }}" if loggers else ""
+        (tmp_path / "campaign.toml").write_text(INPUTS.text("campaign.toml", ("@", said)))
+        return read_campaign(tmp_path)
+
+    return read
 
 
-@pytest.fixture(scope="module")
-def model() -> LumpedModel:
-    return model_of(MODEL)
-
-
-def shown(model: LumpedModel, campaign: Campaign, *changes, at=(1.0, 1.0), trial: Trial | None = None):  # type: ignore[no-untyped-def]
+def shown(campaign, *changes, at=(1.0, 1.0), trial=None):
     conditions = Conditions(np.array(at))
-    return observe(model, campaign, trial or campaign.trials[0], ModelPatch(changes), conditions).values
+    return observe(MODEL, campaign, trial or campaign.trials[0], ModelPatch(changes), conditions).values
 
 
-def test_one_clock_is_a_stiffer_rig_under_a_larger_load(model: LumpedModel, tmp_path: Path) -> None:
-    campaign = campaign_of(tmp_path)
-    square = (1.0 + RATE) ** 2
-    found = shown(model, campaign, LoggerClock("*", RATE))
-    alias = shown(model, campaign, LoadGain(square - 1.0, 0.0), at=(square, 1.0 + RATE))
+def test_one_clock_is_a_stiffer_rig_under_a_larger_load(make) -> None:
+    campaign, square = make(), (1.0 + RATE) ** 2
+    found = shown(campaign, LoggerClock("*", RATE))
+    alias = shown(campaign, LoadGain(square - 1.0, 0.0), at=(square, 1.0 + RATE))
     np.testing.assert_allclose(found, alias, atol=1e-9 * np.abs(alias).max())
-    motion = shown(model, campaign, Clock(RATE, 0.0))
+    motion = shown(campaign, Clock(RATE, 0.0))
     assert np.abs(found - motion).max() > 0.05 * np.abs(alias).max()
 
 
-def test_each_logger_has_its_own(model: LumpedModel, tmp_path: Path) -> None:
-    campaign = campaign_of(tmp_path, BOTH)
-    right = shown(model, campaign)
-    film = shown(model, campaign, LoggerClock("film", RATE))
-    np.testing.assert_array_equal(film[:, 0], right[:, 0])
-    late = shown(model, campaign, Clock(RATE, 0.0))
-    np.testing.assert_array_equal(film[:, 1], late[:, 1])
-    rack = shown(model, campaign, LoggerClock("rack", RATE))
-    one = shown(model, campaign, LoggerClock("*", RATE))
+def test_each_logger_has_its_own(make, tmp_path: Path) -> None:
+    campaign = make(BOTH)
+    film, rack, one = (shown(campaign, LoggerClock(name, RATE)) for name in ("film", "rack", "*"))
+    np.testing.assert_array_equal(film[:, 0], shown(campaign)[:, 0])
+    np.testing.assert_array_equal(film[:, 1], shown(campaign, Clock(RATE, 0.0))[:, 1])
     np.testing.assert_allclose(rack[:, 0], one[:, 0], atol=1e-12)
     # the camera sees the stretched motion at its own, right times
     stretched = replace(campaign.trials[0], time=(1.0 + RATE) * campaign.trials[0].time)
-    true = shown(model, campaign, Clock(1.0 / (1.0 + RATE) - 1.0, 0.0), trial=stretched)
+    true = shown(campaign, Clock(1.0 / (1.0 + RATE) - 1.0, 0.0), trial=stretched)
     np.testing.assert_allclose(rack[:, 1], true[:, 1], atol=1e-12)
     with pytest.raises(CatalogueError, match="no logger 'tape'; it has 'rack', 'film'"):
-        shown(model, campaign, LoggerClock("tape", RATE))
+        shown(campaign, LoggerClock("tape", RATE))
     (tmp_path / "again").mkdir()
     assert read_campaign(write_campaign(campaign, tmp_path / "again")).loggers == campaign.loggers
 
 
-def test_what_is_offered(model: LumpedModel, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("loggers", "places", "motion"),
+    [
+        ("", ("",), True),
+        ('all = ["shaker", "laser", "camera"]', ("",), False),
+        (BOTH, ("rack", "film"), True),
+    ],
+)
+def test_what_is_offered(make, loggers: str, places: tuple[str, ...], motion: bool) -> None:
     shared, own = (effect_by_identifier(name, library()) for name in ("logger_clock", "clock_error"))
-    one = 'loggers = { all = ["shaker", "laser", "camera"] }'
-    for loggers, places, motion in (("", ("",), True), (one, ("",), False), (BOTH, ("rack", "film"), True)):
-        campaign = campaign_of(tmp_path, loggers)
-        setting = Setting(campaign, model, model.scales(campaign))
-        assert shared.unavailable(setting) is None
-        assert shared.places(setting) == places
-        assert (own.unavailable(setting) is None) is motion
-        name = places[0] or "*"
-        assert shared.patch(setting, {"rate_error": RATE}, places[0]) == ModelPatch(
-            (LoggerClock(name, RATE),)
-        )
+    campaign = make(loggers)
+    setting = Setting(campaign, MODEL, MODEL.scales(campaign))
+    assert shared.unavailable(setting) is None
+    assert shared.places(setting) == places
+    assert (own.unavailable(setting) is None) is motion
+    patch = shared.patch(setting, {"rate_error": RATE}, places[0])
+    assert patch == ModelPatch((LoggerClock(places[0] or "*", RATE),))
 
 
 @pytest.mark.parametrize(
     ("loggers", "sentence"),
     [
         ('a = ["laser", "camera"]', "'shaker' must be on one of the `loggers`, and it is on none"),
-        ('a = ["laser", "shaker"], b = ["laser", "camera"]',
-         "'laser' must be on one .* it is on more than one"),
+        (
+            'a = ["laser", "shaker"], b = ["laser", "camera"]',
+            "'laser' must be on one .* it is on more than one",
+        ),
         ('a = ["laser", "wire"]', "`loggers` names 'wire', but the channels and inputs are laser, camera"),
     ],
-)  # fmt: skip
-def test_wrong_loggers_are_named(tmp_path: Path, loggers: str, sentence: str) -> None:
+)
+def test_wrong_loggers_are_named(make, loggers: str, sentence: str) -> None:
     with pytest.raises(CampaignFileError, match=sentence):
-        campaign_of(tmp_path, f"loggers = {{ {loggers} }}")
+        make(loggers)

@@ -113,14 +113,14 @@ def test_it_is_its_fmu(
     )
 
 
-def test_any_region_is_known_by_its_name(pair: tuple[FmuModel, ReducedModel]) -> None:
-    own, reduced = StructureModel(pair[1]), pair[1]
+def test_any_region_is_known_by_its_name(either: tuple[Model, ReducedModel]) -> None:
+    own, reduced = either
     health, conditions = np.array([[0.0, 0.2, 0.3]]), np.array([1.0, 0.05])
     named = replace(TRIAL, regions=("other", "z2", "z1"))
     seen = own.respond(named, OUTPUTS[:1], ModelPatch(), Conditions(conditions, health=health)).values[-1]
     found = reduced.static_response({"load_factor": 0.0, "push": 200.0}, {"z1": 0.3, "z2": 0.2})
     np.testing.assert_allclose(seen, found.displacement, rtol=1e-10)
-    with pytest.raises(ModelError, match="a loss of the damage region 'other', but beam has z1, z2"):
+    with pytest.raises(ModelError, match=r"a loss of the damage region 'other', but .*beam.* has z1, z2"):
         own.respond(named, OUTPUTS[:1], ModelPatch(), Conditions(conditions, health=health[:, ::-1]))
 
 

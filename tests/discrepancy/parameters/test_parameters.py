@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationRecordError
 from calibration.result.file import FILE_NAME, load_calibration, result_bytes
-from calibration.result.record import Calibration
+from calibration.result.record import Calibration, ParameterPrior
 from calibration.static.errors_in_variables import exact_posterior
 from calibration.static.experiments import published_measurements
 from calibration.static.stiffness_curve import stiffness_curve_of
@@ -21,7 +21,6 @@ from discrepancy.model_choice import ModelChoice, ModelKind, choose_model
 from discrepancy.models.interface import (
     Conditions,
     Model,
-    ModelParameter,
     Outputs,
     PortScale,
     Response,
@@ -42,7 +41,7 @@ class Curve(Model):
     """A model at rest whose only output is any function of force and parameters."""
 
     law: Callable[[Float, Float], Float]
-    parameters: tuple[ModelParameter, ...]
+    parameters: tuple[ParameterPrior, ...]
     name: str = "curve"
 
     def output_quantity(self, output: str) -> Quantity | None:
@@ -65,7 +64,7 @@ def choice_of(
 ) -> ModelChoice:
     """Return a curve whose parameters p1, p2, ... have mean, deviation, low, high."""
     parameters = tuple(
-        ModelParameter(f"p{number}", mean, deviation, "1", low, high)
+        ParameterPrior(f"p{number}", "1", mean, deviation, low, high)
         for number, (mean, deviation, low, high) in enumerate(priors, start=1)
     )
     return ModelChoice(Curve(law, parameters), ModelKind.LUMPED, "curve.toml", "0" * 64)

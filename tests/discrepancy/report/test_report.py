@@ -24,8 +24,7 @@ from discrepancy.report.check_tables import (
 )
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.findings import add_verdict, closing_sentence
-from discrepancy.report.grounds import add_gates, add_not_compared, parameter_rows
-from discrepancy.report.page import render_report
+from discrepancy.report.page import add_gates, add_not_compared, parameter_rows, render_report
 from discrepancy.report.residual_figures import size_table
 from discrepancy.report.text import (
     headline,

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,22 +14,13 @@ from hypothesis import strategies as st
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from fe.full.statics import Factorisation
-from fe.reduction.reduced_basis import Reduction
-from fe.runtime.errors import InvalidPatchError
-from fe.runtime.patch import (
-    InertiaRelief,
-    LoadPlace,
-    LocalStiffnessLoss,
-    ModelPatch,
-    ModulusTemperature,
-    PointMass,
-    PowerDamping,
-    Primitive,
-    RootCompliance,
-    Washout,
-)
+from fe.reduction import model_cache
+from fe.reduction.patch_basis import PatchSettings
+from fe.runtime import patch
+from fe.runtime.errors import InvalidPatchError, ReducedModelFileError
+from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
+from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
-from fe.runtime.wing_rows import EMPTY
 from fe.wing.design import WingDesign
 from fe.wing.operators import (
     AffineOperators,
@@ -36,124 +30,159 @@ from fe.wing.operators import (
     modulus_variation,
     point_masses,
     section_displacement,
-)
+)  # fmt: skip
+from fe.wing.patch_operators import area_shares, strip_edges
 from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY, lift_load
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
 
-STATE = (1.0073, (0.2, 0.1))
+STATE, MASSES = (1.0073, (0.2, 0.1)), (0.1688, 0.1344)
+SOUND = (1.0, (0.0, 0.0))
 FACTOR = {"young_modulus_factor": STATE[0]}
-MASSES = (0.1688, 0.1344)
 STRAIN, DISPLACEMENT, FREQUENCY = 1e-3, 1e-3, 1e-4
 """Accuracy wanted, relative to the largest strain, the largest displacement, and of the first frequencies."""
 
 
-@pytest.fixture(scope="module")
-def wing(coarse_patched_wing: PatchedWing) -> PatchedWing:
-    return coarse_patched_wing
+class Compared:
+    """The patched wing, and its full model to compare with."""
 
+    def __init__(self, wing: PatchedWing, operators: AffineOperators) -> None:
+        self.wing, self.operators, self.arrays = wing, operators, wing.arrays
+        self.mesh, self.design = operators.wing_mesh, operators.wing_mesh.design
+        self.place, self.row = wing.arrays.load_place, wing.force_row("tip_load")
 
-@pytest.fixture(scope="module")
-def operators(coarse_operators: AffineOperators) -> AffineOperators:
-    return coarse_operators
+    def structure(
+        self, *items: Any, state: Any = STATE, masses: Any = MASSES, temperature: float = 0.0
+    ) -> Any:
+        return self.wing.structure(*state, *masses, ModelPatch(items), temperature)
 
+    def load(self, load_factor: float, *items: Any) -> FloatArray:
+        return np.array((load_factor, load_factor**2)) @ self.wing.load_parts(ModelPatch(items))
 
-@pytest.fixture(scope="module")
-def design(coarse_design: WingDesign) -> WingDesign:
-    return coarse_design
+    def solved(self, load: FloatArray, stiffness: Any = None) -> FloatArray:
+        """The full model's solution."""
+        matrix = self.operators.stiffness(FACTOR, STATE[1]) if stiffness is None else stiffness
+        return Factorisation(matrix).solve(load)
 
+    def alike(self, reduced: FloatArray, full: FloatArray, operators: AffineOperators | None = None) -> None:
+        given = operators or self.operators
+        strain = given.gauge_output @ full
+        assert np.abs(self.arrays.strain_rows[0] @ reduced - strain).max() <= STRAIN * np.abs(strain).max()
+        tip = float(given.tip_row @ full)
+        assert float(self.arrays.tip_row @ reduced) == pytest.approx(tip, rel=DISPLACEMENT)
 
-def patched(*primitives: Primitive) -> ModelPatch:
-    return ModelPatch(primitives)
+    def alike_under_loads(
+        self, structure: Any, stiffness: Any, operators: AffineOperators | None = None
+    ) -> None:
+        """Compare under the lift of 2.5 g and under a force at the tip."""
+        given = operators or self.operators
+        for reduced, full in ((self.load(2.5), 2.5 * given.load_lift), (self.row, given.load_tip)):
+            self.alike(structure.static(reduced), self.solved(full, stiffness), given)
 
+    def section(self, y: float, *webs: tuple[float, float]) -> FloatArray:
+        """Unit force upwards at a distance from the root, in shares at chords."""
+        full = np.zeros(self.mesh.unknowns)
+        full[2::3] = sum(share * section_displacement(self.mesh, y, chord) for chord, share in webs)
+        return np.asarray(self.operators.expansion.T @ full)
 
-def load(wing: PatchedWing, load_factor: float, patch: ModelPatch = EMPTY) -> FloatArray:
-    return np.array((load_factor, load_factor**2)) @ wing.load_parts(patch)
+    def softened(self, operators: AffineOperators, start: float, end: float, loss: float) -> Any:
+        """Stiffness with less in the skin between two lines, of the wing in `STATE` or a sound one."""
+        mesh, middle = operators.wing_mesh, operators.wing_mesh.centres[:, 1]
+        inside = (middle > start) & (middle < end)
+        sound = operators is not self.operators
+        factors = np.ones(3) if sound else operators.theta(FACTOR, STATE[1])[:3]
+        whole = operators.stiffness() if sound else operators.stiffness(FACTOR, STATE[1])
+        elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
+        for region, factor in enumerate(factors):
+            cells = np.flatnonzero((mesh.stiffness_term == region) & inside)
+            if cells.size:
+                part = mesh.stiffness(cells, elasticity[cells], variation[cells])
+                whole = whole - loss * factor * (operators.expansion.T @ (part @ operators.expansion))
+        return whole.tocsr()
 
+    @property
+    def upwards(self) -> FloatArray:
+        """Free unknowns of which the vertical ones are one."""
+        root = np.flatnonzero(np.abs(self.mesh.points[:, 1]) < 1e-9)
+        component = np.tile([0.0, 0.0, 1.0], len(self.mesh.points))
+        kept = np.delete(component, (3 * root[:, None] + np.arange(3)).ravel())
+        return np.concatenate((kept, [1.0, 0.0, 0.0]))
 
-def compare(wing: PatchedWing, reduced: FloatArray, operators: AffineOperators, full: FloatArray) -> None:
-    strain = operators.gauge_output @ full
-    assert np.abs(wing.arrays.strain_rows[0] @ reduced - strain).max() <= STRAIN * np.abs(strain).max()
-    tip = float(operators.tip_row @ full)
-    assert float(wing.arrays.tip_row @ reduced) == pytest.approx(tip, rel=DISPLACEMENT)
-
-
-def solved(operators: AffineOperators, loads: FloatArray, stiffness: Any = None) -> FloatArray:
-    matrix = operators.stiffness(FACTOR, STATE[1]) if stiffness is None else stiffness
-    return Factorisation(matrix).solve(loads)
-
-
-def compare_loads(wing: PatchedWing, structure: Any, operators: AffineOperators, matrix: Any = None) -> None:
-    """Compare under the lift of 2.5 g and under a force at the tip."""
-    loads = (load(wing, 2.5), 2.5 * operators.load_lift), (wing.force_row("tip_load"), operators.load_tip)
-    for reduced, full in loads:
-        compare(wing, structure.static(reduced), operators, solved(operators, full, matrix))
+    @property
+    def weight(self) -> FloatArray:
+        """Weight along the free unknowns [N]."""
+        masses = self.design.masses
+        return STANDARD_GRAVITY * (
+            self.operators.mass(point_masses(masses.servo, masses.pitot)) @ self.upwards
+        )
 
 
 def frequencies(stiffness: Any, mass: Any, count: int = 3) -> FloatArray:
-    factors = Factorisation(stiffness)
-    n = stiffness.shape[0]
+    """Lowest frequencies [Hz] of the full model."""
+    n, factors = stiffness.shape[0], Factorisation(stiffness)
     inverse = LinearOperator((n, n), matvec=factors.riesz, dtype=np.float64)
     start = np.random.default_rng(2).normal(size=n)
     square = eigsh(stiffness, count, mass, sigma=0.0, OPinv=inverse, v0=start, return_eigenvectors=False)
-    return np.sort(np.sqrt(square))
+    return np.sort(np.sqrt(square)) / (2.0 * np.pi)
+
+
+@pytest.fixture(scope="module")
+def both(coarse_patched_wing: PatchedWing, coarse_operators: AffineOperators) -> Compared:
+    return Compared(coarse_patched_wing, coarse_operators)
 
 
 # ---------------------------------------------------------------- structure
 
 
+@pytest.mark.parametrize(
+    ("e", "loss", "factor", "force"), [(*SOUND, 3.0, 0.0), (0.95, (0.6, 0.3), 2.0, 10.0)]
+)
 def test_without_a_patch_it_is_the_reduced_model_within_its_error_bound(
-    wing: PatchedWing, coarse_reduction: Reduction
+    both, model, e, loss, factor, force
 ) -> None:
-    model = coarse_reduction.model
-    for e, loss, factor, force in ((1.0, (0.0, 0.0), 3.0, 0.0), (0.95, (0.6, 0.3), 2.0, 10.0)):
-        response = model.static_response(
-            young_modulus_factor=e, stiffness_loss=loss, load_factor=factor, tip_force=force
-        )
-        u = wing.structure(e, loss, *MASSES).static(load(wing, factor) + force * wing.force_row("tip_load"))
-        scale = np.abs(response.strain).max()
-        strain = wing.arrays.strain_rows[0] @ u
-        assert np.abs(strain - response.strain).max() <= response.strain_error_bound + 3e-4 * scale
-        assert float(wing.arrays.tip_row @ u) == pytest.approx(response.displacement[0], rel=5e-4)
-        frequency = wing.structure(e, loss, *MASSES).modes(3).frequency
-        names = ("servo_mass", "pitot_mass")
-        modes = model.modes({"young_modulus_factor": e, **dict(zip(names, MASSES, strict=True))}, loss)
-        assert frequency == pytest.approx(modes.frequency[:3], rel=FREQUENCY)
+    response = model.static_response(
+        young_modulus_factor=e, stiffness_loss=loss, load_factor=factor, tip_force=force
+    )
+    structure = both.structure(state=(e, loss))
+    u = structure.static(both.load(factor) + force * both.row)
+    strain = both.arrays.strain_rows[0] @ u
+    scale = np.abs(response.strain).max()
+    assert np.abs(strain - response.strain).max() <= response.strain_error_bound + 3e-4 * scale
+    assert float(both.arrays.tip_row @ u) == pytest.approx(response.displacement[0], rel=5e-4)
+    masses = dict(zip(("servo_mass", "pitot_mass"), MASSES, strict=True))
+    modes = model.modes({"young_modulus_factor": e, **masses}, loss)
+    assert structure.lowest(3).frequency == pytest.approx(modes.frequency[:3], rel=FREQUENCY)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3])
-def test_root_compliance_is_a_softer_root_spring(wing: PatchedWing, design: WingDesign, share: float) -> None:
-    compliance = share * wing.arrays.largest_compliance / 0.4
-    softer = 1.0 / (1.0 / design.root.flap_spring + compliance)
-    operators = assemble(design.changed(root={"flap_spring": softer}))
-    structure = wing.structure(*STATE, *MASSES, patched(RootCompliance(compliance)))
-    compare_loads(wing, structure, operators)
-    wanted = frequencies(operators.stiffness(FACTOR, STATE[1]), operators.mass(point_masses(*MASSES)))
-    assert 2.0 * np.pi * structure.modes(3).frequency == pytest.approx(wanted, rel=FREQUENCY)
+def test_root_compliance_is_a_softer_root_spring(both: Compared, share: float) -> None:
+    compliance = share * both.arrays.largest_compliance / 0.4
+    softer = 1.0 / (1.0 / both.design.root.flap_spring + compliance)
+    operators = assemble(both.design.changed(root={"flap_spring": softer}))
+    structure, stiffness = both.structure(RootCompliance(compliance)), operators.stiffness(FACTOR, STATE[1])
+    both.alike_under_loads(structure, stiffness, operators)
+    wanted = frequencies(stiffness, operators.mass(point_masses(*MASSES)))
+    assert structure.lowest(3).frequency == pytest.approx(wanted, rel=FREQUENCY)
 
 
 @pytest.mark.parametrize(("first", "last", "loss"), [(5, 6, 0.5), (2, 5, 0.3), (7, 10, 0.6)])
 def test_local_loss_between_mesh_lines_is_softer_cells(
-    wing: PatchedWing, operators: AffineOperators, first: int, last: int, loss: float
+    both: Compared, first: int, last: int, loss: float
 ) -> None:
-    mesh = operators.wing_mesh
-    start, end = wing.arrays.strip_lines[[first, last]]
-    stiffness = operators.stiffness(FACTOR, STATE[1])
-    elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
-    restriction = operators.expansion.T.tocsr()
-    for region, factor in zip(range(3), operators.theta(FACTOR, STATE[1])[:3], strict=True):
-        middle = mesh.centres[:, 1]
-        cells = np.flatnonzero((mesh.region == region) & (middle > start) & (middle < end))
-        if cells.size:
-            part = operators.wing_mesh.stiffness(cells, elasticity[cells], variation[cells])
-            stiffness = stiffness - loss * factor * (restriction @ (part @ operators.expansion))
-    patch = patched(LocalStiffnessLoss(loss, start, end - start))
-    structure = wing.structure(*STATE, *MASSES, patch)
-    compare_loads(wing, structure, operators, stiffness.tocsr())
-    wanted = frequencies(stiffness.tocsr(), operators.mass(point_masses(*MASSES)))
-    frequency = 2.0 * np.pi * structure.modes(3).frequency
+    start, end = both.arrays.strip_lines[[first, last]]
+    stiffness = both.softened(both.operators, start, end, loss)
+    structure = both.structure(LocalStiffnessLoss(loss, start, end - start))
+    both.alike_under_loads(structure, stiffness)
+    wanted = frequencies(stiffness, both.operators.mass(point_masses(*MASSES)))
+    frequency = structure.lowest(3).frequency
     assert frequency[[0, 2]] == pytest.approx(wanted[[0, 2]], rel=FREQUENCY)  # flapwise
     assert frequency[1] == pytest.approx(wanted[1], rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def finer(both: Compared) -> AffineOperators:
+    """The same wing in cells of 20 mm along the span."""
+    return assemble(both.design.changed(mesh={"span_size": 0.005}))
 
 
 @pytest.mark.parametrize(
@@ -164,237 +193,152 @@ def test_local_loss_between_mesh_lines_is_softer_cells(
         (0.5, 0.6, 0.5),
     ],
 )
-def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(
-    wing: PatchedWing, design: WingDesign, start: float, end: float, loss: float
-) -> None:
-    operators = assemble(design.changed(mesh={"span_size": 0.005}))  # cells of 20 mm
-    mesh = operators.wing_mesh
-    start, end = (float(mesh.span_lines[np.abs(mesh.span_lines - place).argmin()]) for place in (start, end))
-    elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
-    inside = (mesh.centres[:, 1] > start) & (mesh.centres[:, 1] < end)
-    cells = np.flatnonzero(inside & (mesh.stiffness_term < 3))
-    part = operators.wing_mesh.stiffness(cells, elasticity[cells], variation[cells])
-    whole = operators.stiffness()
-    softer = whole - loss * (operators.expansion.T @ (part @ operators.expansion))
-    before, after = (solved(operators, operators.load_lift, matrix) for matrix in (whole, softer.tocsr()))
+def test_a_box_that_parts_strips_against_a_mesh_with_lines_there(both, finer, start, end, loss) -> None:
+    lines = finer.wing_mesh.span_lines
+    start, end = (float(lines[np.abs(lines - place).argmin()]) for place in (start, end))
+    matrices = finer.stiffness(), both.softened(finer, start, end, loss)
+    before, after = (both.solved(finer.load_lift, matrix) for matrix in matrices)
     # ratios, because the two meshes differ a little in themselves
-    strain = operators.gauge_output @ before
-    wanted = operators.gauge_output @ after / strain
-    patch = patched(LocalStiffnessLoss(loss, start, end - start))
-    plain = wing.structure(1.0, (0.0, 0.0), *MASSES).static(load(wing, 1.0))
-    u = wing.structure(1.0, (0.0, 0.0), *MASSES, patch).static(load(wing, 1.0))
-    factors = wing.strain_factors(patch)
-    ratio = factors * (wing.arrays.strain_rows[0] @ u) / (wing.arrays.strain_rows[0] @ plain)
+    strain = finer.gauge_output @ before
+    wanted = finer.gauge_output @ after / strain
+    item = LocalStiffnessLoss(loss, start, end - start)
+    plain, u = (both.structure(*items, state=SOUND).static(both.load(1.0)) for items in ((), (item,)))
+    rows = both.arrays.strain_rows[0]
+    ratio = both.wing.strain_factors(ModelPatch((item,))) * (rows @ u) / (rows @ plain)
     scale = np.abs(strain) / np.abs(strain).max()
     assert np.abs((ratio - wanted) * scale).max() < 0.03 * np.abs((wanted - 1.0) * scale).max()
     # the strips of this mesh are 0.26 m long, four times those of the shipped one
-    tip = operators.tip_row
-    moved = wing.arrays.tip_row
-    effect = float(tip @ after) / float(tip @ before) - 1.0
-    assert float(moved @ u) / float(moved @ plain) - 1.0 == pytest.approx(effect, rel=0.05)
+    effect, found = (
+        float(row @ new) / float(row @ old)
+        for row, old, new in ((finer.tip_row, before, after), (both.arrays.tip_row, plain, u))
+    )
+    assert found - 1.0 == pytest.approx(effect - 1.0, rel=0.05)
 
 
-def test_strains_need_no_factor_where_a_box_ends_at_strips(wing: PatchedWing) -> None:
-    start, end = wing.arrays.strip_lines[[3, 6]]
-    factors = wing.strain_factors(patched(LocalStiffnessLoss(0.4, start, end - start)))
+def test_strips_make_the_skin_and_losses_that_overlap_multiply(both: Compared) -> None:
+    everywhere = both.structure(LocalStiffnessLoss(0.25, 0.0, both.wing.span), state=SOUND).stiffness
+    skin = np.tensordot((0.75, 0.75, 0.75, 1.0), both.arrays.stiffness, 1)
+    assert np.abs(everywhere - skin).max() < 1e-6 * np.abs(skin).max()
+    start, end = both.arrays.strip_lines[[4, 6]]
+    once, as_one = (LocalStiffnessLoss(loss, start, end - start) for loss in (0.3, 0.51))
+    assert np.abs(both.structure(once, once).stiffness - both.structure(as_one).stiffness).max() < 1e-12
+    # strains need no factor where a box ends at strips
+    start, end = both.arrays.strip_lines[[3, 6]]
+    factors = both.wing.strain_factors(ModelPatch((LocalStiffnessLoss(0.4, start, end - start),)))
     assert factors == pytest.approx(1.0, abs=1e-12)
-    assert wing.strain_factors(patched(PointMass(0.1, 1.0), LocalStiffnessLoss(0.0, 0.1, 0.2))) is None
+    nothing = ModelPatch((PointMass(0.1, 1.0), LocalStiffnessLoss(0.0, 0.1, 0.2)))
+    assert both.wing.strain_factors(nothing) is None
 
 
-def test_the_strips_together_are_the_skin(wing: PatchedWing) -> None:
-    span = wing.span
-    everywhere = wing.structure(1.0, (0.0, 0.0), *MASSES, patched(LocalStiffnessLoss(0.25, 0.0, span)))
-    skin = np.tensordot((0.75, 0.75, 0.75, 1.0), wing.arrays.stiffness, 1)
-    assert np.abs(everywhere.stiffness - skin).max() < 1e-6 * np.abs(skin).max()
+@pytest.mark.parametrize(("station", "added"), [(0.75, 0.05), (0.4, 0.2)])
+def test_point_mass_is_a_pitot_tube_that_was_moved(both: Compared, station: float, added: float) -> None:
+    places = [place.model_dump() for place in both.design.point_masses if place.kind == "servo"]
+    moved = {"kind": "pitot", "station": station, "chord": both.design.tip_load.chord}
+    operators = assemble(both.design.changed(point_masses=[*places, moved]))
+    mass = operators.mass(point_masses(MASSES[0], added))
+    wanted = frequencies(operators.stiffness(FACTOR, STATE[1]), mass)
+    structure = both.structure(PointMass(added, station * both.wing.span), masses=(MASSES[0], 0.0))
+    assert structure.lowest(3).frequency == pytest.approx(wanted, rel=FREQUENCY)
 
 
-def test_local_losses_that_overlap_multiply(wing: PatchedWing) -> None:
-    start, end = wing.arrays.strip_lines[[4, 6]]
-    once = LocalStiffnessLoss(0.3, start, end - start)
-    twice = wing.structure(*STATE, *MASSES, patched(once, once)).stiffness
-    as_one = wing.structure(*STATE, *MASSES, patched(LocalStiffnessLoss(0.51, start, end - start))).stiffness
-    assert np.abs(twice - as_one).max() < 1e-12
-
-
-def test_point_mass_is_a_pitot_tube_that_was_moved(wing: PatchedWing, design: WingDesign) -> None:
-    for station, added in ((0.75, 0.05), (0.4, 0.2)):
-        places = [place.model_dump() for place in design.point_masses if place.kind == "servo"]
-        moved = {"kind": "pitot", "station": station, "chord": design.tip_load.chord}
-        operators = assemble(design.changed(point_masses=[*places, moved]))
-        mass = operators.mass(point_masses(MASSES[0], added))
-        wanted = frequencies(operators.stiffness(FACTOR, STATE[1]), mass)
-        patch = patched(PointMass(added, station * wing.span))
-        frequency = wing.structure(*STATE, MASSES[0], 0.0, patch).modes(3).frequency * 2.0 * np.pi
-        assert frequency == pytest.approx(wanted, rel=FREQUENCY)
-
-
-def test_temperature_is_a_change_of_the_modulus_factor(wing: PatchedWing, operators: AffineOperators) -> None:
-    patch = patched(ModulusTemperature(2e-3))
-    u = wing.structure(*STATE, *MASSES, patch, 25.0).static(load(wing, 1.0))
-    warm = operators.stiffness({"young_modulus_factor": STATE[0] * 0.95}, STATE[1])
-    full = solved(operators, operators.load_lift, warm)
-    compare(wing, u, operators, full)
-    cold = wing.structure(*STATE, *MASSES, patch, 0.0).stiffness
-    assert np.array_equal(cold, wing.structure(*STATE, *MASSES).stiffness)
+def test_temperature_is_a_change_of_the_modulus_factor(both: Compared) -> None:
+    warm, cold = (both.structure(patch.ModulusTemperature(2e-3), temperature=t) for t in (25.0, 0.0))
+    stiffness = both.operators.stiffness({"young_modulus_factor": STATE[0] * 0.95}, STATE[1])
+    both.alike(warm.static(both.load(1.0)), both.solved(both.operators.load_lift, stiffness))
+    assert np.array_equal(cold.stiffness, both.structure().stiffness)
 
 
 # ---------------------------------------------------------------- loads
 
 
-def _section_force(operators: AffineOperators, y: float, chord: float) -> FloatArray:
-    mesh = operators.wing_mesh
-    full = np.zeros(operators.wing_mesh.unknowns)
-    full[2::3] = section_displacement(mesh, y, chord)
-    return np.asarray(operators.expansion.T @ full)
+@pytest.mark.parametrize("shift", [-0.09, -0.02, 0.03])
+def test_load_place_along_the_span(both: Compared, shift: float) -> None:
+    row = both.wing.force_row("tip_load", ModelPatch((LoadPlace(shift, 0.0),)))
+    full = both.section(both.place + shift, (both.design.tip_load.chord, 1.0))
+    both.alike(both.structure().static(row), both.solved(full))
 
 
-def test_load_place_along_the_span(wing: PatchedWing, operators: AffineOperators) -> None:
-    place = wing.arrays.load_place
-    for shift in (-0.09, -0.02, 0.03):
-        row = wing.force_row("tip_load", patched(LoadPlace(shift, 0.0)))
-        full = _section_force(operators, place + shift, operators.wing_mesh.design.tip_load.chord)
-        compare(wing, wing.structure(*STATE, *MASSES).static(row), operators, solved(operators, full))
-
-
-def test_load_place_along_the_chord_follows_the_lever(
-    wing: PatchedWing, operators: AffineOperators, design: WingDesign
-) -> None:
-    place, plan = wing.arrays.load_place, design.planform
-    elastic, other = 0.3, 0.6
-    assert {elastic, other} < set(wing.arrays.line_chord.tolist())
-    aft = 0.04
-    share = aft / ((other - elastic) * plan.chord(place / plan.semi_span))
-    full = (1.0 - share) * _section_force(operators, place, elastic) + share * _section_force(
-        operators, place, other
-    )
-    row = wing.force_row("tip_load", patched(LoadPlace(0.0, aft)))
-    u = wing.structure(*STATE, *MASSES).static(row)
-    compare(wing, u, operators, solved(operators, full))
+def test_load_place_along_the_chord_follows_the_lever(both: Compared) -> None:
+    plan, aft, (elastic, other) = both.design.planform, 0.04, (0.3, 0.6)
+    assert {elastic, other} < set(both.arrays.line_chord.tolist())
+    share = aft / ((other - elastic) * plan.chord(both.place / plan.semi_span))
+    full = both.section(both.place, (elastic, 1.0 - share), (other, share))
+    u = both.structure().static(both.wing.force_row("tip_load", ModelPatch((LoadPlace(0.0, aft),))))
+    both.alike(u, both.solved(full))
     # the work of the force is the same on both ways, and the section twists tail up
-    assert wing.displacement_row(1.8, 0.9) @ u > wing.displacement_row(1.8, 0.3) @ u
+    assert both.wing.displacement_row(1.8, 0.9) @ u > both.wing.displacement_row(1.8, 0.3) @ u
 
 
 @pytest.mark.parametrize(("chord", "share"), [(0.03, 0.0), (0.15, 12.0 / 27.0), (0.9, 1.0 - 1.0 / 31.0)])
 def test_a_force_before_or_behind_goes_to_the_webs_beside_it(
-    wing: PatchedWing, operators: AffineOperators, chord: float, share: float
+    both: Compared, chord: float, share: float
 ) -> None:
-    place = wing.arrays.load_place
     webs = (0.03, 0.3) if chord < 0.3 else (0.6, 0.91)
-    full = (1.0 - share) * _section_force(operators, place, webs[0]) + share * _section_force(
-        operators, place, webs[1]
-    )
-    solution = solved(operators, full)
-    row = wing.force_row((place, chord))
-    u = wing.structure(*STATE, *MASSES).static(row)
-    compare(wing, u, operators, solution)
+    full = both.section(both.place, (webs[0], 1.0 - share), (webs[1], share))
+    solution, row = both.solved(full), both.wing.force_row((both.place, chord))
+    u = both.structure().static(row)
+    both.alike(u, solution)
     # the place itself yields by what the trailing edge gives way under the force, too
     assert float(row @ u) == pytest.approx(float(full @ solution), rel=3e-3)
 
 
 @pytest.mark.parametrize("place", ["tip_load", (1.778, 0.6), (1.778, 0.9)])
-def test_a_displaced_force_has_no_kink_at_a_web(wing: PatchedWing, place: str | tuple[float, float]) -> None:
-    nominal = wing.force_row(place)
-    before, behind = (wing.force_row(place, patched(LoadPlace(0.0, aft))) - nominal for aft in (-0.02, 0.02))
-    assert np.abs(before + behind).max() < 1e-9 * np.abs(behind).max()
-
-
-def test_a_named_place_and_its_coordinates_are_the_same(wing: PatchedWing) -> None:
-    by_place = wing.force_row((wing.arrays.load_place, float(wing.arrays.line_chord[0])))
-    assert np.abs(by_place - wing.force_row("tip_load")).max() < 1e-9 * np.abs(by_place).max()
+def test_a_displaced_force_has_no_kink_at_a_web(both: Compared, place: Any) -> None:
+    before, there, behind = (
+        both.wing.force_row(place, ModelPatch((LoadPlace(0.0, aft),))) for aft in (-0.02, 0.0, 0.02)
+    )
+    assert np.abs(before + behind - 2.0 * there).max() < 1e-9 * np.abs(behind - there).max()
 
 
 @pytest.mark.parametrize("exponent", [0.7, 2.0, 4.0])
-def test_washout_is_another_lift_distribution(
-    wing: PatchedWing,
-    operators: AffineOperators,
-    design: WingDesign,
-    exponent: float,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    coefficient, factor = 0.15, 3.0
-    plan, lift = design.planform, design.lift
-    course = DISTRIBUTIONS[lift.distribution](plan)
+def test_washout_is_another_lift_distribution(both: Compared, exponent: float, monkeypatch) -> None:
+    coefficient, factor, lift = 0.15, 3.0, both.design.lift
+    course = DISTRIBUTIONS[lift.distribution](both.design.planform)
     points, weights = np.polynomial.legendre.leggauss(400)
     eta = 0.5 * (points + 1.0)
-    kept = 1.0 - coefficient * factor * eta**exponent
-    share = float((weights * course(eta) * kept).sum() / (weights * course(eta)).sum())
+    kept = weights * course(eta) @ (1.0 - coefficient * factor * eta**exponent) / (weights @ course(eta))
 
     def washed(planform: Any) -> Any:
         return lambda station: course(station) * (1.0 - coefficient * factor * station**exponent)
 
-    restriction = operators.expansion.T
-    plain = restriction @ lift_load(operators.wing_mesh)
+    restriction = both.operators.expansion.T
+    plain = restriction @ lift_load(both.mesh)
     monkeypatch.setitem(DISTRIBUTIONS, lift.distribution, washed)
-    changed = restriction @ lift_load(operators.wing_mesh) * share
+    change = restriction @ lift_load(both.mesh) * kept - plain
     # what balances the weight is lift of the same course
-    z_force = lift.force / lift.load_factor
-    wanted = solved(operators, factor * (operators.load_lift + changed - plain))
-    lifted = (changed - plain) * (_weight(operators, design) / z_force)
-    lifted_full = solved(operators, factor * lifted * _upwards(operators))
-    u = wing.structure(*STATE, *MASSES).static(load(wing, factor, patched(Washout(coefficient, exponent))))
-    compare(wing, u, operators, wanted + lifted_full)
+    balanced = float(both.weight @ both.upwards) / (lift.force / lift.load_factor) * both.upwards
+    wanted = both.solved(factor * (both.operators.load_lift + change * (1.0 + balanced)))
+    both.alike(both.structure().static(both.load(factor, patch.Washout(coefficient, exponent))), wanted)
 
 
-def _weight(operators: AffineOperators, design: WingDesign) -> float:
-    rigid, mass = _upwards(operators), operators.mass(point_masses(design.masses.servo, design.masses.pitot))
-    return STANDARD_GRAVITY * float(rigid @ (mass @ rigid))
-
-
-def _held(operators: AffineOperators) -> FloatArray:
-    points = operators.wing_mesh.points
-    root = np.flatnonzero(np.abs(points[:, 1]) < 1e-9)
-    return (3 * root[:, None] + np.arange(3)).ravel()
-
-
-def _upwards(operators: AffineOperators) -> FloatArray:
-    """Free unknowns of which the vertical ones are one."""
-    component = np.zeros(operators.wing_mesh.unknowns)
-    component[2::3] = 1.0
-    free = np.zeros(operators.unknowns)
-    free[:-3] = component[np.setdiff1d(np.arange(len(component)), _held(operators))]
-    free[-3] = 1.0
-    return free
-
-
-def test_inertia_relief_is_weight_where_it_lies(
-    wing: PatchedWing, operators: AffineOperators, design: WingDesign
-) -> None:
-    up, mass = _upwards(operators), operators.mass(point_masses(design.masses.servo, design.masses.pitot))
-    weight = -STANDARD_GRAVITY * (mass @ up)
+def test_inertia_relief_is_weight_where_it_lies(both: Compared) -> None:
     fraction, factor = 0.2, 2.5
-    full = solved(operators, factor * (operators.load_lift + fraction * weight * up))
-    u = wing.structure(*STATE, *MASSES).static(load(wing, factor, patched(InertiaRelief(fraction))))
-    compare(wing, u, operators, full)
+    full = both.solved(factor * (both.operators.load_lift - fraction * both.weight * both.upwards))
+    both.alike(both.structure().static(both.load(factor, patch.InertiaRelief(fraction))), full)
 
 
 # ---------------------------------------------------------------- outputs
 
 
 @pytest.mark.parametrize("degrees", [-15.0, 8.0, 90.0])
-def test_a_turned_gauge_follows_from_the_three_components(
-    wing: PatchedWing, operators: AffineOperators, degrees: float
-) -> None:
-    angle = np.deg2rad(degrees)
-    turned = gauge_output(operators.wing_mesh, angle)
-    full = solved(operators, operators.load_lift)
-    wanted = turned @ (operators.expansion @ full)
-    u = wing.structure(*STATE, *MASSES).static(load(wing, 1.0))
-    along, across, shear = wing.arrays.strain_rows @ u
+def test_a_turned_gauge_follows_from_the_three_components(both: Compared, degrees: float) -> None:
+    angle, full = np.deg2rad(degrees), both.solved(both.operators.load_lift)
+    wanted = gauge_output(both.mesh, angle) @ (both.operators.expansion @ full)
+    along, across, shear = both.arrays.strain_rows @ both.structure().static(both.load(1.0))
     c, s = np.cos(angle), np.sin(angle)
-    scale = np.abs(operators.gauge_output @ full).max()
+    scale = np.abs(both.operators.gauge_output @ full).max()
     assert np.abs(c * c * along + s * s * across + s * c * shear - wanted).max() <= STRAIN * scale
 
 
-def test_outputs_by_name(wing: PatchedWing) -> None:
-    u = wing.structure(*STATE, *MASSES).static(load(wing, 1.0))
-    elastic = float(wing.arrays.line_chord[0])
-    tip = wing.output_row("tip_displacement")
-    there = wing.output_row(f"displacement[{wing.span}, {elastic}]")
+def test_outputs_and_places_by_name(both: Compared) -> None:
+    wing, elastic = both.wing, float(both.arrays.line_chord[0])
+    u = both.structure().static(both.load(1.0))
+    tip, there = wing.output_row("tip_displacement"), wing.output_row(f"displacement[{wing.span}, {elastic}]")
     assert float(tip @ u) == pytest.approx(float(there @ u), rel=1e-9)
-    strain = wing.output_row("strain[24]")
-    assert np.array_equal(strain, wing.arrays.strain_rows[0, 23])
-    across = wing.output_row("strain[24]", 1)
-    assert np.array_equal(across, wing.arrays.strain_rows[1, 23])
+    for component in (0, 1):
+        assert np.array_equal(
+            wing.output_row("strain[24]", component), both.arrays.strain_rows[component, 23]
+        )
     unknown = (
         "strain[0]",
         "strain[25]",
@@ -404,10 +348,12 @@ def test_outputs_by_name(wing: PatchedWing) -> None:
         "velocity",
     )
     assert all(wing.output_row(name) is None for name in unknown)
+    by_place = wing.force_row((both.place, elastic))
+    assert np.abs(by_place - both.row).max() < 1e-9 * np.abs(by_place).max()
 
 
-def test_the_span_port_weighs_by_area(wing: PatchedWing) -> None:
-    arrays = wing.arrays
+def test_the_span_port_weighs_by_area(both: Compared) -> None:
+    arrays = both.arrays
     assert arrays.station_weights.sum() == pytest.approx(1.0)
     root, tip, span = arrays.root_chord, arrays.tip_chord, arrays.semi_span
     mean = (root / 2.0 + (tip - root) / 3.0) * span / (0.5 * (root + tip))  # of y over the trapezium
@@ -417,22 +363,19 @@ def test_the_span_port_weighs_by_area(wing: PatchedWing) -> None:
 # ---------------------------------------------------------------- no change, softer, impossible
 
 
-def test_no_change_is_no_change_to_the_last_bit(wing: PatchedWing) -> None:
-    nothing = patched(
-        PointMass(0.0, 1.0),
-        RootCompliance(0.0),
-        LocalStiffnessLoss(0.0, 0.3, 0.2),
-        ModulusTemperature(0.0),
-        PowerDamping("tip", 1.0, 1.0, 0.0, 1.0, 1.0),
-    )
-    one, other = wing.structure(*STATE, *MASSES, nothing, 10.0), wing.structure(*STATE, *MASSES)
+def test_no_change_is_no_change_to_the_last_bit(both: Compared) -> None:
+    nothing = (
+        PointMass(0.0, 1.0), RootCompliance(0.0), LocalStiffnessLoss(0.0, 0.3, 0.2),
+        patch.ModulusTemperature(0.0), patch.PowerDamping("tip", 1.0, 1.0, 0.0, 1.0, 1.0),
+    )  # fmt: skip
+    one, other = both.structure(*nothing, temperature=10.0), both.structure()
     assert np.array_equal(one.stiffness, other.stiffness)
     assert np.array_equal(one.mass, other.mass)
-    loads = patched(LoadPlace(0.0, 0.0), Washout(0.0, 2.0), InertiaRelief(0.0))
-    assert np.array_equal(load(wing, 2.0, loads), load(wing, 2.0))
-    assert np.array_equal(wing.force_row("tip_load", loads), wing.force_row("tip_load"))
-    factors = wing.strain_factors(nothing)
-    assert factors is None or np.array_equal(factors, np.ones(len(wing.arrays.gauge_stations)))
+    loads = LoadPlace(0.0, 0.0), patch.Washout(0.0, 2.0), patch.InertiaRelief(0.0)
+    assert np.array_equal(both.load(2.0, *loads), both.load(2.0))
+    assert np.array_equal(both.wing.force_row("tip_load", ModelPatch(loads)), both.row)
+    factors = both.wing.strain_factors(ModelPatch(nothing))
+    assert factors is None or np.array_equal(factors, np.ones(len(both.arrays.gauge_stations)))
 
 
 @settings(max_examples=25, deadline=None)
@@ -443,35 +386,90 @@ def test_no_change_is_no_change_to_the_last_bit(wing: PatchedWing) -> None:
     compliance=st.floats(0.0, 2e-4),
 )
 def test_softer_is_softer(
-    wing: PatchedWing, loss: float, start: float, length: float, compliance: float
+    both: Compared, loss: float, start: float, length: float, compliance: float
 ) -> None:
-    row = wing.force_row("tip_load")
-    patch = patched(LocalStiffnessLoss(loss, start, length), RootCompliance(compliance))
-    stiff = float(row @ wing.structure(*STATE, *MASSES).static(row))
-    soft = float(row @ wing.structure(*STATE, *MASSES, patch).static(row))
+    softer = LocalStiffnessLoss(loss, start, length), RootCompliance(compliance)
+    stiff, soft = (float(both.row @ both.structure(*items).static(both.row)) for items in ((), softer))
     assert soft >= stiff * (1.0 - 1e-9)
-    lever = wing.arrays.load_place
     # the full solutions of which the basis is made are good to some 1e-6
-    assert soft >= stiff + (1.0 - 1e-5) * compliance * lever**2 - 1e-9 * stiff
+    assert soft >= stiff + (1.0 - 1e-5) * compliance * both.place**2 - 1e-9 * stiff
 
 
 @pytest.mark.parametrize(
-    ("patch", "message"),
+    ("ask", "message"),
     [
-        (patched(LocalStiffnessLoss(1.0, 0.2, 0.5)), "must leave some stiffness"),
-        (patched(RootCompliance(-1.0)), "cannot be reduced"),
-        (patched(ModulusTemperature(0.2)), "must be positive"),
-        (patched(PointMass(0.1, 3.0)), "must lie on the wing"),
-        (patched(PointMass(0.1, -0.1)), "must lie on the wing"),
+        (LocalStiffnessLoss(1.0, 0.2, 0.5), "must leave some stiffness"),
+        (RootCompliance(-1.0), "cannot be reduced"),
+        (patch.ModulusTemperature(0.2), "must be positive"),
+        (PointMass(0.1, 3.0), "must lie on the wing"),
+        (PointMass(0.1, -0.1), "must lie on the wing"),
+        (lambda both: both.wing.force_row("nose"), "place 'nose' is not known"),
+        (lambda both: both.load(1.0, patch.Washout(0.1, -1.0)), "must not be negative"),
     ],
 )
-def test_impossible_changes_are_refused(wing: PatchedWing, patch: ModelPatch, message: str) -> None:
+def test_what_cannot_be_is_refused(both: Compared, ask: Any, message: str) -> None:
     with pytest.raises(InvalidPatchError, match=message):
-        _ = wing.structure(*STATE, *MASSES, patch, 10.0).mass
+        _ = ask(both) if callable(ask) else both.structure(ask, temperature=10.0).mass
 
 
-def test_impossible_places_are_refused(wing: PatchedWing) -> None:
-    with pytest.raises(InvalidPatchError, match="place 'nose' is not known"):
-        wing.force_row("nose")
-    with pytest.raises(InvalidPatchError, match="must not be negative"):
-        load(wing, 1.0, patched(Washout(0.1, -1.0)))
+# ---------------------------------------------------------------- its arrays
+
+
+def test_a_file_gives_the_arrays_back(coarse_patch_arrays: PatchArrays, tmp_path: Path) -> None:
+    coarse_patch_arrays.save(tmp_path / "wing.npz")
+    again = PatchArrays.load(tmp_path / "wing.npz")
+    for item in fields(PatchArrays):
+        assert np.array_equal(*(getattr(one, item.name) for one in (coarse_patch_arrays, again))), item.name
+    assert again.to_bytes() == coarse_patch_arrays.to_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("load_tip", lambda _: np.full(3, np.nan), "array"),
+        ("flap_spring", lambda _: 0.0, "flap_spring"),
+        ("straight_chord_line", lambda _: 2.0, "straight_chord_line"),
+        ("weight", lambda _: np.zeros(2), "weight"),
+        ("strip_of", lambda strips: np.array([99, *strips[1:]]), "strips"),
+        ("stations", lambda stations: stations[::-1].copy(), "must rise"),
+    ],
+)
+def test_wrong_arrays_are_refused(
+    coarse_patch_arrays, name: str, change: Callable[[Any], Any], message: str
+) -> None:
+    with pytest.raises(ReducedModelFileError, match=message):
+        replace(coarse_patch_arrays, **{name: change(getattr(coarse_patch_arrays, name))})
+
+
+def test_strips_end_at_mesh_lines_and_shares_of_the_area_integrate_a_parabola_on_each_cell() -> None:
+    lines = np.array([0.0, 0.003, 0.1, 0.25, 0.5, 0.52, 0.8, 1.0])
+    assert strip_edges(lines, 4).tolist() == [0.0, 0.25, 0.5, 0.8, 1.0]
+    assert strip_edges(lines, 100).tolist() == lines.tolist()
+    stations = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+    # mean of y^2 with chord 2 - y: (2/3 - 1/4) / 1.5
+    mean = area_shares(stations, 2.0, 1.0) @ stations**2
+    assert mean == pytest.approx((2.0 / 3.0 - 0.25) / 1.5, rel=1e-12)
+
+
+def test_the_cache_builds_once(
+    coarse_design: WingDesign, coarse_patch_arrays: PatchArrays, tmp_path: Path, monkeypatch, caplog
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    built: list[str] = []
+    monkeypatch.setattr(
+        model_cache,
+        "build_patch_arrays",
+        lambda design, *_: (built.append(design.hash), coarse_patch_arrays)[1],
+    )
+    first = model_cache.patch_arrays(coarse_design)
+    assert model_cache.patch_arrays(coarse_design).to_bytes() == first.to_bytes()
+    assert built == [coarse_design.hash]
+    entries = {
+        model_cache.entry("patches", coarse_design.hash, own) for own in (None, PatchSettings(vectors=30))
+    }
+    assert len(entries) == 2
+    (file,) = (tmp_path / "uav-twin").glob("patches-*.npz")
+    file.write_bytes(b"rubbish")
+    model_cache.patch_arrays(coarse_design)
+    assert len(built) == 2
+    assert "not usable" in caplog.text

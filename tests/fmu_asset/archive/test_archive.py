@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import stat
+import struct
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -14,141 +17,167 @@ from hypothesis import strategies as st
 
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
 from fmu_asset.door.binding import Binding
+from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import FmuError, FmuFileError, FmuUnsupportedError
+from fmu_asset.errors import FmuCallError, FmuError, FmuFileError, FmuUnsupportedError
+from tests.fmu_asset.door.kinds import HOSTILE
+from tests.fmu_asset.making import DESCRIPTION, archive_of, edited, members
 
-Repack = Callable[[Callable[[str, bytes], tuple[str, bytes] | None]], Path]
-
-
-@pytest.fixture
-def repack(fmu: Path, tmp_path: Path) -> Repack:
-    """Return a function that writes a changed copy of the FMU."""
-
-    def write(change: Callable[[str, bytes], tuple[str, bytes] | None]) -> Path:
-        path = tmp_path / "changed.fmu"
-        with zipfile.ZipFile(fmu) as source, zipfile.ZipFile(path, "w") as target:
-            for name in source.namelist():
-                entry = change(name, source.read(name))
-                if entry is not None:
-                    target.writestr(*entry)
-        return path
-
-    return write
+Change = Callable[[dict[str, bytes]], dict[str, bytes]]
 
 
-def without(prefix: str) -> Callable[[str, bytes], tuple[str, bytes] | None]:
-    return lambda name, data: None if name.startswith(prefix) else (name, data)
+def without(prefix: str) -> Change:
+    return lambda contents: {n: c for n, c in contents.items() if not n.startswith(prefix)}
 
 
-def in_description(old: bytes, new: bytes) -> Callable[[str, bytes], tuple[str, bytes] | None]:
-    return lambda name, data: (name, data.replace(old, new) if name == "modelDescription.xml" else data)
+def described(*changes: tuple[str, str]) -> Change:
+    def change(contents: dict[str, bytes]) -> dict[str, bytes]:
+        text = contents[DESCRIPTION].decode()
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        return contents | {DESCRIPTION: text.encode()}
+
+    return change
 
 
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(FmuFileError, match="There is no FMU"):
-        read_fmu(tmp_path / "none.fmu")
-    with pytest.raises(FmuFileError, match="is a folder"):
-        read_fmu(tmp_path)
+def added(name: str, content: bytes = b"x") -> Change:
+    return lambda contents: contents | {name: content}
 
 
-def test_not_an_archive(tmp_path: Path) -> None:
-    (tmp_path / "a.fmu").write_text("hello", encoding="utf-8")
-    with pytest.raises(FmuFileError, match=r"not a sound FMU archive .* fetch or build it again"):
-        read_fmu(tmp_path / "a.fmu")
+def in_utf_16(contents: dict[str, bytes]) -> dict[str, bytes]:
+    text = contents[DESCRIPTION].decode().replace("encoding='UTF-8'", "encoding='UTF-16'")
+    return contents | {DESCRIPTION: text.encode("utf-16")}
 
 
-def test_no_description(repack: Repack) -> None:
-    with pytest.raises(FmuFileError, match=r"without modelDescription\.xml"):
-        read_fmu(repack(without("modelDescription.xml")))
-
-
-def test_broken_description(repack: Repack) -> None:
-    with pytest.raises(FmuFileError, match=r"The model description of .* cannot be read"):
-        read_fmu(repack(in_description(b"</ModelVariables>", b"")))
-
-
-def test_numbers_that_are_none(repack: Repack, binding: Binding) -> None:
-    with pytest.raises(FmuFileError, match=r"The model description of .* cannot be read .*'abc'"):
-        read_fmu(repack(in_description(b'min="0.0"', b'min="abc"')))
-    strange = repack(in_description(b'start="1.0"', b'start="abc"'))
-    with pytest.raises(FmuFileError, match=r"start value that is no number .*'abc'"):
-        FmiAsset(strange, binding).reset()
-
-
-def test_another_version(repack: Repack, binding: Binding) -> None:
-    with pytest.raises(FmuUnsupportedError, match=r"FMI 4\.0; FMI 1\.0, 2\.0 or 3\.0 is needed"):
-        read_fmu(repack(in_description(b'fmiVersion="2.0"', b'fmiVersion="4.0"')))
+ENTITIES = '<!DOCTYPE x [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;">]>'
+with_entities = described(("encoding='UTF-8'?>", f"encoding='UTF-8'?>{ENTITIES}"))
+UNREADABLE = r"The model description of .* cannot be read"
+OUTSIDE = "outside its folder; it was refused"
+REFUSED: list[tuple[Change, type[FmuError], str]] = [
+    (without(DESCRIPTION), FmuFileError, r"without modelDescription\.xml"),
+    (described(("</ModelVariables>", "")), FmuFileError, UNREADABLE),
+    (described(('min="0.0"', 'min="abc"')), FmuFileError, rf"{UNREADABLE} .*'abc'"),
+    (
+        described(('fmiVersion="2.0"', 'fmiVersion="4.0"')),
+        FmuUnsupportedError,
+        r"FMI 4\.0; FMI 1\.0, 2\.0 or 3\.0 is needed",
+    ),
     # What only pretends to be of another version cannot be read as such.
-    with pytest.raises(FmuFileError, match=r"The model description of .* cannot be read"):
-        read_fmu(repack(in_description(b'fmiVersion="2.0"', b'fmiVersion="3.0"')))
+    (described(('fmiVersion="2.0"', 'fmiVersion="3.0"')), FmuFileError, UNREADABLE),
+    (
+        described(("<CoSimulation ", "<ScheduledExecution ")),
+        FmuUnsupportedError,
+        "offers neither co-simulation nor model exchange",
+    ),
+    (
+        without("binaries/linux64"),
+        FmuUnsupportedError,
+        r"no binary for this platform .*binaries there: win64",
+    ),
+    *(
+        (added(name), FmuFileError, OUTSIDE)
+        for name in (
+            "../outside.txt",
+            "resources/../../outside.txt",
+            "/etc/outside",
+            "a\\..\\b",
+            "C:/outside",
+        )
+    ),
+    (
+        added("resources/zeros", bytes(300 * 1024**2)),
+        FmuFileError,
+        r"would extract to 30\d MiB, which looks like an archive made",
+    ),
+    (
+        added(f"{3000 * 'd/'}x"),
+        FmuFileError,
+        r"an entry 3001 folders deep; no tool exports that .*refused",
+    ),
+    (with_entities, FmuFileError, "defines a document type or entities"),
+    (lambda c: in_utf_16(with_entities(c)), FmuFileError, "defines a document type or entities"),
+    (
+        lambda c: described((re.search(r'modelIdentifier="(\w+)"', c[DESCRIPTION].decode())[1], "../../x"))(
+            c
+        ),
+        FmuFileError,
+        "is no name of a C function",
+    ),
+]
 
 
-def test_no_interface_that_could_be_flown(repack: Repack, fmu: Path) -> None:
-    with pytest.raises(FmuUnsupportedError, match="offers neither co-simulation nor model exchange"):
-        read_fmu(repack(in_description(b"<CoSimulation ", b"<ScheduledExecution ")))
-    with pytest.raises(
-        FmuUnsupportedError, match=r"offers co-simulation only, but .* asks for model-exchange"
+@pytest.mark.parametrize(("change", "kind", "words"), REFUSED, ids=[str(n) for n in range(len(REFUSED))])
+def test_what_is_wrong_with_a_file_is_one_sentence(
+    fmu: Path, tmp_path: Path, change: Change, kind: type[FmuError], words: str
+) -> None:
+    with pytest.raises(kind, match=words):
+        read_fmu(archive_of(tmp_path / "changed.fmu", change(members(fmu))))
+
+
+def test_what_is_no_fmu_is_one_sentence(fmu: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.fmu").write_text("hello", encoding="utf-8")
+    for path, words in (
+        (tmp_path / "none.fmu", "There is no FMU"),
+        (tmp_path, "is a folder"),
+        (tmp_path / "a.fmu", r"not a sound FMU archive .* fetch or build it again"),
     ):
+        with pytest.raises(FmuFileError, match=words):
+            read_fmu(path)
+    words = r"offers co-simulation only, but .* asks for model-exchange"
+    with pytest.raises(FmuUnsupportedError, match=words):
         read_fmu(fmu, "model-exchange")
-
-
-def test_another_platform(repack: Repack) -> None:
-    with pytest.raises(FmuUnsupportedError, match=r"no binary for this platform .*binaries there: win64"):
-        read_fmu(repack(without("binaries/linux64")))
-
-
-@pytest.mark.parametrize(
-    "name", ["../outside.txt", "resources/../../outside.txt", "/etc/outside", "a\\..\\b", "C:/outside"]
-)
-def test_paths_that_lead_outside(fmu: Path, tmp_path: Path, name: str) -> None:
-    path = tmp_path / "evil.fmu"
-    path.write_bytes(fmu.read_bytes())
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.writestr(name, "x")
-    with pytest.raises(FmuFileError, match="outside its folder; it was refused"):
-        read_fmu(path)
-
-
-def test_an_entry_that_is_there_twice_is_harmless_where_both_are_equal(fmu: Path, tmp_path: Path) -> None:
-    """An official Reference FMU holds one of its files twice."""
-    path = tmp_path / "twice.fmu"
-    path.write_bytes(fmu.read_bytes())
-    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
-        archive.writestr("modelDescription.xml", archive.read("modelDescription.xml"))
-    described = read_fmu(path)
-    assert described.variables == read_fmu(fmu).variables
-    assert (extract_fmu(described) / "modelDescription.xml").is_file()
-    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
-        archive.writestr("modelDescription.xml", b"another")
-    with pytest.raises(FmuFileError, match=r"'modelDescription\.xml' twice with different content"):
-        read_fmu(path)
-
-
-def test_links_are_refused(fmu: Path, tmp_path: Path) -> None:
-    path = tmp_path / "evil.fmu"
+    path = tmp_path / "link.fmu"
     path.write_bytes(fmu.read_bytes())
     with zipfile.ZipFile(path, "a") as archive:
         link = zipfile.ZipInfo("resources/link")
         link.external_attr = (stat.S_IFLNK | 0o777) << 16
         archive.writestr(link, "/etc/passwd")
-    with pytest.raises(FmuFileError, match="outside its folder; it was refused"):
+    with pytest.raises(FmuFileError, match=OUTSIDE):
         read_fmu(path)
 
 
-def test_a_file_that_changes_after_its_check_is_not_extracted(fmu: Path, tmp_path: Path) -> None:
-    path = tmp_path / "wing.fmu"
+def test_what_is_seen_when_it_is_loaded_is_one_sentence(
+    foreign_fmu: Any, fmu: Path, binding: Binding, tmp_path: Path, scratch: Path
+) -> None:
+    strange = edited(fmu, tmp_path / "strange.fmu", ('start="1.0"', 'start="abc"'))
+    with pytest.raises(FmuFileError, match=r"start value that is no number .*'abc'"):
+        FmiAsset(strange, binding).reset()
+    contents = members(foreign_fmu("hostile2"))
+    library = bytearray(contents["binaries/linux64/hostile2.so"])
+    struct.pack_into("<H", library, 18, 183)  # ELF e_machine: AArch64
+    arm = archive_of(tmp_path / "arm.fmu", contents | {"binaries/linux64/hostile2.so": bytes(library)})
+    with pytest.raises(FmuCallError, match=r"binary cannot be loaded on this machine .*another processor"):
+        FmiAsset(arm, HOSTILE).reset()
+    needing = ("<CoSimulation ", '<CoSimulation needsExecutionTool="true" ')
+    tool = edited(foreign_fmu("hostile2", "NO_INSTANCE"), tmp_path / "tool.fmu", needing)
+    with pytest.raises(FmuCallError, match=r"could not be instantiated .*needs its authoring tool"):
+        FmiAsset(tool, HOSTILE).reset()
+    assert not list(scratch.iterdir())
+
+
+def test_odd_files_that_are_sound(fmu: Path, tmp_path: Path) -> None:
+    """An official Reference FMU holds one of its files twice, equal."""
+    path = archive_of(tmp_path / "utf16.fmu", in_utf_16(members(fmu)))
+    assert read_fmu(path).model_name == "uav_wing"
+    path = tmp_path / "twice.fmu"
     path.write_bytes(fmu.read_bytes())
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr(DESCRIPTION, archive.read(DESCRIPTION))
     description = read_fmu(path)
-    path.write_bytes(fmu.read_bytes() + b"x")
+    assert description.variables == read_fmu(fmu).variables
+    assert (extract_fmu(description) / DESCRIPTION).is_file()
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr(DESCRIPTION, b"another")
+    with pytest.raises(FmuFileError, match=r"'modelDescription\.xml' twice with different content"):
+        read_fmu(path)
     with pytest.raises(FmuFileError, match="has changed since it was checked"):
         extract_fmu(description)
 
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
-def test_a_damaged_file_is_refused_or_read(
-    fmu: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
+def test_a_damaged_file_is_refused_or_read(fmu: Path, tmp_path_factory: Any, data: st.DataObject) -> None:
     """Cut anywhere or with any byte changed, the file gives an FmuError or a description, nothing else."""
     content = bytearray(fmu.read_bytes())
     if data.draw(st.booleans()):
@@ -161,3 +190,27 @@ def test_a_damaged_file_is_refused_or_read(
     path.write_bytes(content)
     with suppress(FmuError):
         assert read_fmu(path).model_name == "uav_wing"
+
+
+@settings(max_examples=100, deadline=None)
+@given(data=st.data())
+def test_a_description_with_one_odd_attribute(
+    foreign_fmu: Any, tmp_path_factory: Any, data: st.DataObject
+) -> None:
+    """Whatever one attribute says, or if it is missing: a description and a draft, or one sentence."""
+    model = data.draw(st.sampled_from(["lag1", "room2", "array3", "swing3", "ball2"]))
+    contents = members(foreign_fmu(model))
+    text = contents[DESCRIPTION].decode()
+    place = data.draw(st.sampled_from(list(re.finditer(r'\s[A-Za-z]+="([^"]*)"', text))))
+    odd = st.sampled_from(["", "-1", "1e999", "nan", "x", "0", "99999999999999999999", "true", "1 2", "&lt;"])
+    if data.draw(st.booleans()):
+        text = text[: place.start()] + text[place.end() :]
+    else:
+        text = text[: place.start(1)] + data.draw(odd) + text[place.end(1) :]
+    path = archive_of(tmp_path_factory.mktemp("odd") / "odd.fmu", contents | {DESCRIPTION: text.encode()})
+    sentence = ""
+    try:
+        draft_binding(read_fmu(path))
+    except FmuError as error:
+        sentence = str(error)
+    assert "\n" not in sentence

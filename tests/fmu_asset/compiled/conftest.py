@@ -1,147 +1,17 @@
-"""The small wing of the folder above as a compiled FMU, and slaves to compare it with the Python one."""
+"""A compiled wing of FMI 2 in this process."""
 
 from __future__ import annotations
 
-import ctypes
-import itertools
-import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
-from fmpy import calloc, free
-from fmpy.fmi1 import FMICallException
-from fmpy.fmi2 import (
-    FMU2Slave,
-    fmi2CallbackAllocateMemoryTYPE,
-    fmi2CallbackFreeMemoryTYPE,
-    fmi2CallbackFunctions,
-    fmi2CallbackLoggerTYPE,
-)
-from fmpy.logging import addLoggerProxy
 
-from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
-
-OK, DISCARD, ERROR = 0, 2, 3
-
-
-# fmpy's native proxy, which formats messages, knows one logger in a process: it finds the log by the name.
-_logs: dict[bytes, list[tuple[int, str]]] = {}
-_numbers = itertools.count()
-
-
-def _take(_: object, name: bytes, status: int, category: bytes, message: bytes) -> None:
-    _logs[name].append((status, message.decode()))
-
-
-_LOGGER = fmi2CallbackLoggerTYPE(_take)
-
-
-class Slave:
-    """An FMU in this process, call by call: statuses and log messages are kept, none is an exception.
-
-    With `like`, another instance of the FMU that one has extracted.
-    """
-
-    def __init__(self, path: Path, *, like: Slave | None = None) -> None:
-        self.description = read_fmu(path) if like is None else like.description
-        self.folder = extract_fmu(self.description) if like is None else like.folder
-        self._owns_folder = like is None
-        name = f"wing-{next(_numbers)}"
-        self.reference = {v.name: v.reference for v in self.description.variables}
-        self.real = [v.reference for v in self.description.variables if v.kind == "Real"]
-        self.log = _logs.setdefault(name.encode(), [])
-        callbacks = fmi2CallbackFunctions()
-        callbacks.logger = _LOGGER
-        callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
-        callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
-        addLoggerProxy(ctypes.byref(callbacks))
-        self.fmu = FMU2Slave(
-            guid=self.description.guid,
-            modelIdentifier=self.description.model_identifier,
-            unzipDirectory=str(self.folder),
-            instanceName=name,
-        )
-        self.fmu.instantiate(callbacks=callbacks, loggingOn=True)
-
-    def status_of(self, call: Callable[..., object], *arguments: object) -> int:
-        """Return the FMI status of a call."""
-        try:
-            call(*arguments)
-        except FMICallException as error:
-            return int(error.status)
-        return OK
-
-    def start(self, *, response: int = 1, start_time: float = 0.0, **parameters: float) -> int:
-        """Set parameters, dots in their names written as two underscores, and initialise."""
-        self.fmu.setupExperiment(startTime=start_time)
-        self.fmu.enterInitializationMode()
-        self.fmu.setInteger([self.reference["response"]], [response])
-        for name, value in parameters.items():
-            self.fmu.setReal([self.reference[name.replace("__", ".")]], [value])
-        return self.status_of(self.fmu.exitInitializationMode)
-
-    def step(self, inputs: Sequence[float], time: float, size: float) -> int:
-        """Set load factor, z1, z2, tip force and make a step."""
-        self.fmu.setReal([0, 1, 2, 3], list(inputs))
-        return self.status_of(self.fmu.doStep, time, size)
-
-    def everything(self) -> list[float]:
-        """Return all real variables."""
-        return [float(value) for value in self.fmu.getReal(self.real)]
-
-    @property
-    def status(self) -> int:
-        """The output `status`."""
-        return int(self.fmu.getInteger([self.reference["status"]])[0])
-
-    def saved(self) -> bytes:
-        """Return the serialised state."""
-        state = self.fmu.getFMUstate()
-        try:
-            return bytes(self.fmu.serializeFMUstate(state))
-        finally:
-            self.fmu.freeFMUstate(state)
-
-    def restore(self, content: bytes) -> int:
-        """Restore a serialised state and return the worst status."""
-        try:
-            state = self.fmu.deSerializeFMUstate(content)
-        except FMICallException as error:
-            return int(error.status)
-        try:
-            return self.status_of(self.fmu.setFMUstate, state)
-        finally:
-            self.fmu.freeFMUstate(state)
-
-    def close(self) -> None:
-        """Free the instance."""
-        self.fmu.freeInstance()
-        if self._owns_folder:
-            shutil.rmtree(self.folder)
-
-
-@pytest.fixture(scope="session")
-def open_slave() -> type[Slave]:
-    return Slave
-
-
-def opened(path: Path) -> Iterator[Slave]:
-    with closing(Slave(path)) as made:
-        yield made
+from tests.fmu_asset.slaves.slave import Slave
 
 
 @pytest.fixture
 def slave(compiled_fmu: Path) -> Iterator[Slave]:
-    yield from opened(compiled_fmu)
-
-
-@pytest.fixture
-def other_slave(compiled_fmu: Path) -> Iterator[Slave]:
-    yield from opened(compiled_fmu)
-
-
-@pytest.fixture
-def python_slave(fmu: Path) -> Iterator[Slave]:
-    yield from opened(fmu)
+    with closing(Slave(compiled_fmu)) as made:
+        yield made

@@ -1,0 +1,487 @@
+"""Our FMUs as files, whatever is packed: sound, equal for equal input, guarded, refused in one sentence."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fmpy import read_model_description
+from fmpy.validation import validate_fmu
+
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.state import WING, DigitalState
+from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.check import check_file, check_fmu
+from fmu_asset.compiled.compiler import compile_library, find_compiler
+from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.errors import FmuBuildError, FmuCallError, FmuInputError, FmuUnsupportedError
+from fmu_asset.packing.script import build_script_fmu, script_fmu
+from fmu_asset.packing.structure_fmu import build_fmu, recorded_content_hash
+from fmu_asset.slaves.table import structure_table
+from scenarios import asset_scripts, binding_files
+from tests.command_line import command
+from tests.fmu_asset.making import DESCRIPTION, archive_of, bound, edited, members, run_python
+from tests.fmu_asset.ours import NAMES, REGIONS, STRUCTURES, OurFmus
+
+BIN = Path(sys.executable).parent
+PUMP = asset_scripts()["gear_pump"]
+OURS = [name for name in NAMES if name not in ("spring_mass", "linear")]
+BINARIES = {"compiled": {"linux64"}, "source": set(), "python": {"linux64", "win64"}}
+
+
+@pytest.fixture(scope="module")
+def fmutool() -> str:
+    tool = shutil.which("fmutool", path=str(BIN)) or shutil.which("fmutool")
+    if tool is None:
+        pytest.skip("fmutool (fmu-manipulation-toolbox) is not installed")
+    return tool
+
+
+def opinion(fmutool: str, fmu: Path, home: Path) -> tuple[int, str]:
+    """Return what another tool says; it keeps its log and settings in the home of the user."""
+    words, home_ = [fmutool, "-input", str(fmu), "-check"], {"HOME": str(home), "PATH": "/usr/bin:/bin"}
+    done = subprocess.run(words, capture_output=True, text=True, env=home_, check=False)
+    return done.returncode, done.stdout + done.stderr
+
+
+# ---------------------------------------------------------------------- what holds of all
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_a_packed_fmu_is_sound(ours: OurFmus, name: str) -> None:
+    """`fmpy validate`, the standard's rules and ours, a flight in a worker; without a word."""
+    path = ours(name)
+    assert validate_fmu(str(path)) == []
+    if name in STRUCTURES:
+        declared, actual = recorded_content_hash(path)
+        assert declared == actual
+    if "source" in name:
+        return
+    binding = load_binding(binding_files()["uav_wing_fmi3"]) if name == "fmi3" else None
+    check = check_fmu(path, binding, **({"cycles": 20} if name.endswith("3") else {}))
+    assert check.problems == ()
+    warned = [finding for finding in check.findings if finding.verdict == "warning"]
+    assert not warned or name in ("exchange", "exchange3", *asset_scripts())
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_another_tool_has_no_complaint(fmutool: str, ours: OurFmus, name: str, tmp_path: Path) -> None:
+    code, said = opinion(fmutool, ours(name), tmp_path)
+    assert code == 0, said
+    assert f"seems to be compliant with FMI-{3 if '3' in name else 2}.0" in said
+    assert "No semantic error" in said
+    assert "ERROR" not in said
+    assert "WARNING" not in said
+
+
+def test_another_tool_does_complain_where_there_is_reason(fmutool: str, fmu: Path, tmp_path: Path) -> None:
+    bad = edited(fmu, tmp_path / "bad.fmu", ('causality="input"', 'causality="inward"'))
+    code, said = opinion(fmutool, bad, tmp_path)
+    assert code != 0
+    assert "seems to be compliant" not in said
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_equal_input_gives_equal_bytes(
+    ours: OurFmus, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also in another folder; of what takes a compiler, one is compiled again."""
+    elsewhere = tmp_path / "else where"
+    elsewhere.mkdir()
+    monkeypatch.setenv("TMPDIR", str(elsewhere))
+    again = tmp_path / "again.fmu"
+    if name in STRUCTURES:
+        which, options = ours.model(name), STRUCTURES[name][1]
+        if options.get("kind") == "compiled" and name != "compiled":
+            return
+        build_fmu(ReducedModel.from_bytes(which.to_bytes()), again, **options)
+    else:
+        ours.write(name, again)
+    assert again.read_bytes() == ours(name).read_bytes()
+
+
+def test_the_environment_does_not_show_and_other_content_does(
+    ours: OurFmus, model: ReducedModel, make_model: Any, tmp_path: Path
+) -> None:
+    fmu = ours("python")
+    model.save(tmp_path / "model.npz")
+    program = (
+        "import sys; from fe.runtime.reduced import ReducedModel; "
+        "from fmu_asset.packing.structure_fmu import build_fmu; "
+        "build_fmu(ReducedModel.load(sys.argv[1]), sys.argv[2])"
+    )
+    environment = {**os.environ, "PYTHONHASHSEED": "7", "TZ": "Asia/Tokyo", "LC_ALL": "C"}
+    run_python(program, tmp_path / "model.npz", tmp_path / "other.fmu", env=environment)
+    assert (tmp_path / "other.fmu").read_bytes() == fmu.read_bytes()
+    stiffer = build_fmu(make_model(1e5), tmp_path / "stiffer.fmu")
+    tailored = build_fmu(model, tmp_path / "e.fmu", state=DigitalState(young_modulus_factor=1.02))
+    assert len({read_fmu(fmu).guid, stiffer.guid, tailored.guid}) == 3
+    modules = [{name for name in members(path) if name.endswith(".py")} for path in (fmu, stiffer.path)]
+    assert not modules[0] & modules[1]
+    script = tmp_path / "gear_pump.py"
+    script.write_text(PUMP.read_text("utf-8").replace("AMBIENT = 40.0", "AMBIENT = 41.0"))
+    assert build_script_fmu(script, tmp_path / "pump.fmu").guid != read_fmu(ours("gear_pump")).guid
+    assert script_fmu(PUMP)[0] == ours("gear_pump").read_bytes()
+    assert not list(tmp_path.glob("__pycache__"))
+
+
+CHANGED = {
+    "python": [("design.json", b'"chain"', b'"other"'), ("slavemodule.txt", b"", b"\xff")],
+    "compiled": [("sources/structure_static.c", b"", b" "), ("resources/reduced_model.bin", b"", b" ")],
+}
+
+
+@pytest.mark.parametrize("kind", CHANGED)
+def test_a_changed_part_is_noticed(ours: OurFmus, kind: str, tmp_path: Path) -> None:
+    contents = members(ours(kind))
+    for entry, old, new in CHANGED[kind]:
+        name = next(name for name in contents if name.endswith(entry))
+        content = contents[name].replace(old, new) if old else contents[name] + new
+        problems = check_fmu(archive_of(tmp_path / "changed.fmu", contents | {name: content})).problems
+        assert any("GUID" in text or "was changed after its build" in text for text in problems), entry
+
+
+MODEL = """
+from pythonfmu import Fmi2Causality, Fmi2Slave, Real
+class Model(Fmi2Slave):
+    unit_table = {"m": {"m": 1}}
+    variable_table = {%s}
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.u = 0.0
+        self.register_variable(Real("u", causality=Fmi2Causality.input))
+        %s
+    def do_step(self, current_time, step_size):
+        return True
+"""
+IN_FURLONG = '"u": ("input", "furlong", None, None, None, "")'
+OF_NOTHING = '"v": ("input", "m", None, None, None, "")'
+SCRIPTS: list[tuple[str, str | None, str]] = [
+    ("gear-pump.py", "", "name is an identifier"),
+    ("missing.py", None, "cannot be read"),
+    ("empty.py", "x = 1", "must define one subclass of pythonfmu's Fmi2Slave, and it defines none"),
+    ("broken.py", "import nowhere_to_be_found", "cannot be run: ModuleNotFoundError"),
+    ("units.py", MODEL % (IN_FURLONG, "pass"), "gives u in furlong, which its unit_table does not have"),
+    ("table.py", MODEL % (OF_NOTHING, "pass"), "has v, which the model does not register"),
+    ("raising.py", MODEL % ("", "raise ValueError('no')"), "cannot be instantiated: ValueError"),
+]
+EXCHANGE = {"interface": "model-exchange", "kind": "python"}
+BUILDS: list[tuple[dict[str, Any], str]] = [
+    ({"state": DigitalState(young_modulus_factor=2.0)}, r"start value .* of young_modulus_factor"),
+    ({"start": {"z9": 1.0}}, "'z9'"),
+    ({"start": {"health.z1": 0.9}}, r"health\.z1"),
+    ({"fmi": 3}, r"'python' is of FMI 2\.0 .* but FMI 3\.0 .* 'compiled' or 'source'"),
+    (EXCHANGE, "build the kind 'compiled'"),
+    (EXCHANGE | {"fmi": 3}, "build the kind 'compiled'"),
+    *(({"resources": {name: b"x"}}, "cannot have the name") for name in ("start.json", "a/b.json", "")),
+]
+
+
+def test_what_cannot_be_packed_is_one_sentence(model: ReducedModel, ours: OurFmus, tmp_path: Path) -> None:
+    target = tmp_path / "x.fmu"
+    for name, text, words in SCRIPTS:
+        if text is not None:
+            (tmp_path / name).write_text(text)
+        with pytest.raises(FmuBuildError, match=words):
+            build_script_fmu(tmp_path / name, target)
+    for options, words in BUILDS:
+        with pytest.raises(FmuBuildError, match=words):
+            build_fmu(model, target, **options)
+    with pytest.raises(FmuBuildError, match=r"suffix \.fmu"):
+        build_fmu(model, tmp_path / "wing.zip")
+    for build, source, existing in ((build_fmu, model, "python"), (build_script_fmu, PUMP, "gear_pump")):
+        with pytest.raises(FmuBuildError, match="exists"):
+            build(source, ours(existing))
+    assert not target.exists()
+
+
+# ---------------------------------------------------------------------- what is declared
+
+
+def test_units_ranges_and_starts_are_declared(ours: OurFmus, model: ReducedModel) -> None:
+    description = read_model_description(str(ours("python")))
+    variables = {variable.name: variable for variable in description.modelVariables}
+    assert description.variableNamingConvention == "structured"
+    assert all(v.unit is not None for v in variables.values() if v.type == "Real")
+    low, high = model.validity["load_factor"]
+    assert (float(variables["load_factor"].min), float(variables["load_factor"].max)) == (low, high)
+    assert (variables["strain[24]"].unit, variables["strain[24]"].displayUnit) == ("1", "microstrain")
+    factors = {u.name: {d.name: float(d.factor) for d in u.displayUnits} for u in description.unitDefinitions}
+    assert factors["1"]["microstrain"] == 1e6
+    assert float(variables["mass.servo"].start) == DigitalState().servo_mass
+    # The compiled one declares the same, and of its sources all.
+    compiled = read_model_description(str(ours("compiled")))
+    facts = [
+        [(v.name, v.valueReference, v.type, v.causality, v.unit, v.displayUnit, v.min, v.max, v.start)
+         for v in each.modelVariables]
+        for each in (description, compiled)
+    ]  # fmt: skip
+    assert facts[0] == facts[1]
+    for able in ("GetAndSetFMUstate", "SerializeFMUstate"):
+        assert getattr(description.coSimulation, f"can{able}")
+        assert getattr(compiled.coSimulation, f"can{able}")
+    assert compiled.coSimulation.canHandleVariableCommunicationStepSize
+    assert not compiled.coSimulation.needsExecutionTool
+    assert not compiled.coSimulation.canBeInstantiatedOnlyOncePerProcess
+    listed = set(compiled.buildConfigurations[0].sourceFileSets[0].sourceFiles)
+    there = {n.removeprefix("sources/") for n in members(ours("compiled")) if n.endswith(".c")}
+    assert listed == there
+    for name in ("regions", "compiled_regions"):
+        declared = {item.name: item for item in read_fmu(ours(name)).variables}
+        health = [each for each in declared if each.startswith("health.")]
+        assert health == [f"health.{region}" for region in REGIONS]
+        assert float(declared["health.tip_panel"].start) == 0.3
+        assert declared["tip_force"].reference == 4
+    pump = {variable.name: variable for variable in read_fmu(ours("gear_pump")).variables}
+    assert [pump[name].unit for name in ("flow", "torque", "temperature", "speed", "wear")] == [
+        "L/min", "N.m", "degC", "1/min", "1",
+    ]  # fmt: skip
+    assert (pump["wear"].minimum, pump["wear"].maximum) == (0.0, 1.0)
+    text = members(ours("source3_beam"))[DESCRIPTION].decode()
+    assert '<Float64 name="strain" ' in text
+    assert '<Float64 name="health" ' in text
+
+
+def test_a_structure_of_the_wings_name_is_no_wing(ours: OurFmus) -> None:
+    model = ours.model("beam")
+    table, roles = structure_table(replace(model, name=WING), {})
+    assert roles.displacement_bound == "displacement_error_bound"
+    assert [row.name for row in table] == [row.name for row in structure_table(model, {})[0]]
+    findings = {check: verdict for check, verdict, _ in check_file(read_fmu(ours("beam")))}
+    assert set(findings.values()) == {"ok"}
+    assert {"fmpy validate", "content", "units", "ranges"} <= set(findings)
+
+
+def test_a_note_and_a_further_file(model: ReducedModel, fmu: Path, tmp_path: Path) -> None:
+    note, content = 'Calibrated for "Wing <7> & é".', b'{"asset": "Wing <7>"}\n'
+    one, two = (
+        build_fmu(model, tmp_path / name, note=note, resources={"calibration.json": content}).path
+        for name in ("one.fmu", "two.fmu")
+    )
+    assert one.read_bytes() == two.read_bytes()
+    assert validate_fmu(str(one)) == []
+    assert check_fmu(one).passed
+    described = read_model_description(str(one))
+    assert described.description.endswith(note)
+    assert described.guid != read_model_description(str(fmu)).guid
+    inside = members(one)
+    assert inside["resources/calibration.json"] == content
+    assert "Wing &lt;7&gt; &amp; é" in inside["documentation/index.html"].decode()
+    declared, actual = recorded_content_hash(one)
+    assert declared == actual
+
+
+# ---------------------------------------------------------------------- the kind in Python
+
+
+def test_it_needs_numpy_alone(fmu: Path, tmp_path: Path) -> None:
+    """The runtime loads with everything of the project and all other packages hidden."""
+    shutil.unpack_archive(fmu, tmp_path, "zip")
+    project = re.compile(rb"^\s*(?:from|import) (?:fe|fmu_asset|reporting)\b", re.MULTILINE)
+    assert not [name for name, text in members(fmu).items() if name.endswith(".py") and project.search(text)]
+    program = (
+        "import os, sys\n"
+        "os.chdir(sys.argv[1])\n"
+        "class Refuse:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        top = name.partition('.')[0]\n"
+        "        ours = top == 'numpy' or top.startswith('uav_wing_')\n"
+        "        if top not in sys.stdlib_module_names and not ours:\n"
+        "            raise ImportError(name)\n"
+        "sys.meta_path.insert(0, Refuse())\n"
+        "sys.path.insert(0, 'resources')\n"
+        "name = open('resources/slavemodule.txt').read()\n"
+        "module = __import__(name)\n"
+        "wing = getattr(module, 'Structure_' + name.rpartition('_')[2])\n"
+        "wing = wing(instance_name='a', resources='resources')\n"
+        "wing.enter_initialization_mode(); wing.exit_initialization_mode()\n"
+        "assert wing.do_step(0.0, 1.0) is True, wing.log_queue\n"
+        "assert wing.get_real([12])[0] != 0.0\n"
+    )
+    run_python(program, tmp_path)
+
+
+def test_units_of_a_list_are_converted_each_on_its_own(ours: OurFmus) -> None:
+    units = bound(
+        1.0, {"all": (["temperature", "filter_pressure", "flow"], ["K", "Pa", "L/min"])},
+        control={"speed": ("speed", "1/s")},
+    )  # fmt: skip
+    with FmiAsset(ours("gear_pump"), binding_files()["gear_pump"]) as asset:
+        flow, _, temperature, drop = asset.step({"speed": 1500.0}).values
+        with pytest.raises(FmuInputError, match=r"wear = 1\.5 lies outside"):
+            asset.step(health={"wear": 1.5})
+        with pytest.raises(Exception, match="cannot hold the oil below 120 C"):
+            asset.step({"speed": 2500.0, "pressure": 210.0}, {"wear": 1.0})
+        seen = asset.step({"speed": 1500.0, "pressure": 150.0}, {"wear": 0.0})
+        assert seen.values[0] == pytest.approx(23.03, abs=0.01)
+    with FmiAsset(ours("gear_pump"), units) as asset:
+        seen = asset.step({"speed": 25.0}).values
+        assert seen == pytest.approx([temperature + 273.15, 1e5 * drop, flow])
+    with pytest.raises(ValueError, match=r"one for each of the 3 variables, and 2 came"):
+        bound(1.0, {"all": (["temperature", "filter_pressure", "flow"], ["K", "Pa"])})
+
+
+# ---------------------------------------------------------------------- the compiled kind
+
+
+def test_the_sources_alone_are_the_same_fmu_without_a_binary(
+    ours: OurFmus, model: ReducedModel, tmp_path: Path, binding: Binding, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = members(ours("compiled"))
+    with monkeypatch.context() as patch:
+        patch.setenv("PATH", str(tmp_path))  # needs no compiler
+        sources = build_fmu(model, tmp_path / "source.fmu", kind="source")
+    assert sources.guid == read_model_description(str(ours("compiled"))).guid
+    assert members(sources.path) == {n: c for n, c in whole.items() if not n.startswith("binaries/")}
+    assert len(whole) == len(members(sources.path)) + 1
+    assert json.loads(whole["resources/design.json"]) == {"design_hash": model.design_hash}
+    with pytest.raises(FmuUnsupportedError, match="no binary for this platform"):
+        FmiAsset(sources.path, binding)
+    shutil.unpack_archive(ours("fmi3"), tmp_path, "zip")
+    library = ctypes.CDLL(str(next((tmp_path / "binaries" / "x86_64-linux").iterdir())))
+    header = (tmp_path / "sources" / "fmi3Functions.h").read_text()
+    exported = [line for line in header.splitlines() if line.startswith("FMI3_Export fmi3")]
+    assert len(exported) == 75
+    assert all(hasattr(library, line.split()[-1].rstrip(";")) for line in exported)
+    assert not (tmp_path / "sources" / "structure_fmi2.c").exists()
+
+
+def test_a_damaged_data_file_is_refused_with_a_sentence(
+    ours: OurFmus, binding: Binding, tmp_path: Path, isolated: bool
+) -> None:
+    contents = members(ours("compiled"))
+    name = "resources/reduced_model.bin"
+    contents[name] = contents[name][:999] + bytes([contents[name][999] ^ 4]) + contents[name][1000:]
+    with pytest.raises(FmuCallError, match="checksum is wrong"):
+        FmiAsset(archive_of(tmp_path / "damaged.fmu", contents), binding, isolated=isolated).step()
+
+
+@pytest.mark.long
+def test_fmpy_compiles_the_sources(ours: OurFmus, binding: Binding, tmp_path: Path) -> None:
+    """As a user of another platform does: the sources alone, through fmpy's own CMake project."""
+    if shutil.which("cmake") is None and not (BIN / "cmake").exists():
+        pytest.skip("cmake is not installed")
+    kept = {n: c for n, c in members(ours("compiled")).items() if not n.startswith("binaries/")}
+    path = archive_of(tmp_path / "wing.fmu", kept)
+    words = [BIN / "fmpy", "compile", path, "--all-warnings", "--warning-as-error"]
+    found = {**os.environ, "PATH": f"{BIN}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env=found)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert check_fmu(path).passed
+    with FmiAsset(path, binding) as theirs, FmiAsset(ours("compiled"), binding) as mine:
+        for z1 in (0.0, 0.5):
+            seen = [asset.step({"load_factor": 3.0}, {"z1": z1}) for asset in (theirs, mine)]
+            np.testing.assert_allclose(seen[0].values, seen[1].values, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("fmi", "binary"), [pytest.param(2, "linux64", marks=pytest.mark.long), (3, "x86_64-linux")]
+)
+def test_cmake_builds_the_sources(
+    model: ReducedModel, compiler: list[str], tmp_path: Path, fmi: Any, binary: str
+) -> None:
+    """As a user without fmpy does: the project among the sources puts the binary in its place."""
+    cmake = shutil.which("cmake") or shutil.which("cmake", path=str(BIN))
+    if cmake is None:
+        pytest.skip("cmake is not installed")
+    built = build_fmu(model, tmp_path / "wing.fmu", kind="source", fmi=fmi).path
+    shutil.unpack_archive(built, tmp_path / "wing", "zip")
+    place = ["-S", tmp_path / "wing" / "sources", "-B", tmp_path / "build", "-DCMAKE_C_FLAGS=-O0 -Werror"]
+    subprocess.run([cmake, *place, "-DCMAKE_BUILD_TYPE=Debug"], check=True, capture_output=True)
+    subprocess.run([cmake, "--build", tmp_path / "build"], check=True, capture_output=True)
+    identifier = read_model_description(str(tmp_path / "wing")).coSimulation.modelIdentifier
+    assert [path.name for path in (tmp_path / "wing" / "binaries" / binary).iterdir()] == [f"{identifier}.so"]
+
+
+def test_compilers_that_are_not_there_fail_or_are_chosen(
+    compiler: list[str], model: ReducedModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(FmuBuildError, match=r"failed with exit code 1.*(?s:.*)wing\.c:1"):
+        compile_library({"wing.c": b"this is no C;\n"})
+    monkeypatch.setenv("CC", f"{compiler[0]} -DANSWER=fmi2_answer")
+    assert find_compiler()[1:] == ["-DANSWER=fmi2_answer"]
+    source = b'__attribute__((visibility("default"))) int ANSWER(void) { return 42; }\n'
+    assert b"fmi2_answer" in compile_library({"answer.c": source})
+    monkeypatch.setenv("CC", shutil.which("true") or "true")
+    with pytest.raises(FmuBuildError, match="failed with exit code 0"):
+        compile_library({"wing.c": b"int wing;\n"})
+    monkeypatch.setenv("CC", "no-such-compiler -m64")
+    with pytest.raises(FmuBuildError, match="looked for: CC=no-such-compiler -m64"):
+        find_compiler()
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CC")
+    with pytest.raises(FmuBuildError, match=r"looked for: cc, gcc, clang\); install one .* --kind source"):
+        build_fmu(model, tmp_path / "wing.fmu", kind="compiled")
+    assert not (tmp_path / "wing.fmu").exists()
+
+
+# ---------------------------------------------------------------------- command lines
+
+
+@pytest.mark.slow
+def test_the_command_line_builds_each_kind(
+    compiler: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def build(kind: str) -> subprocess.CompletedProcess[str]:
+        return command("fmu", "build", "--kind", kind, "--out", tmp_path / f"{kind}.fmu")
+
+    with monkeypatch.context() as patch:
+        patch.setenv("CC", "no-such-compiler")
+        refused = build("compiled")
+    assert refused.returncode != 0
+    assert "no-such-compiler" in " ".join(refused.stderr.split())
+    assert not (tmp_path / "compiled.fmu").exists()
+    for kind, platforms in BINARIES.items():
+        done = build(kind)
+        assert done.returncode == 0, done.stderr
+        names = members(tmp_path / f"{kind}.fmu")
+        assert {name.split("/")[1] for name in names if name.startswith("binaries/")} == platforms
+    assert build("fortran").returncode != 0
+
+
+def test_fmpy_validates_and_simulates_both_kinds_on_the_command_line(ours: OurFmus, tmp_path: Path) -> None:
+    done = subprocess.run([BIN / "fmpy", "validate", ours("python")], capture_output=True, check=False)
+    assert done.returncode == 0, done.stdout
+    tables = []
+    for kind in ("compiled", "python"):
+        result = tmp_path / f"{kind}.csv"
+        words = [
+            *(BIN / "fmpy", "simulate", ours(kind), "--stop-time", "2", "--output-interval", "0.01"),
+            *("--output-file", result, "--start-values", "response", "2", "load_factor", "0"),
+            *("initial_tip_displacement", "0.05"),
+        ]
+        subprocess.run(words, check=True, capture_output=True)
+        tables.append(np.genfromtxt(result, delimiter=",", names=True, deletechars=""))
+    tip = tables[1]["tip_displacement"]
+    assert len(tip) == 201
+    assert tip[0] == pytest.approx(0.05, rel=0.05)
+    assert min(tip) < -0.5 * tip[0]
+    for name in tables[0].dtype.names:
+        scale = np.abs(tables[1][name]).max()
+        np.testing.assert_allclose(tables[0][name], tables[1][name], rtol=0.0, atol=1e-12 * scale)
+
+
+@pytest.mark.parametrize("kind", ["compiled", "python"])
+def test_fmpy_ends_a_simulation_at_a_refused_step(ours: OurFmus, kind: str) -> None:
+    """In a process with a time limit: a host that is not told to end repeats the refused step for ever."""
+    program = (
+        "import sys, numpy as np; from fmpy import simulate_fmu\n"
+        "course = np.array([(0.0, 1.0), (3.0, 99.0)], dtype=[('time', 'f8'), ('load_factor', 'f8')])\n"
+        "seen = simulate_fmu(sys.argv[1], stop_time=5.0, step_size=1.0, output_interval=1.0, input=course,"
+        " output=['strain[1]'])\n"
+        "print(seen['time'].tolist())"
+    )
+    said = run_python(program, ours(kind), timeout=60)
+    assert said.splitlines()[-1] == "[0.0, 1.0, 1.0]"
+    assert kind == "python" or "load_factor = 33.6" in said

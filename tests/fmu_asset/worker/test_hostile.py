@@ -1,0 +1,360 @@
+"""FMUs that do what they must not: the twin lives on, says what happened, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fmu_asset import errors
+from fmu_asset.door.binding import Binding
+from fmu_asset.door.session import FmiAsset
+from fmu_asset.errors import FmuCallError, FmuMemoryError, FmuStateError, FmuTimeoutError, FmuWorkerError
+from fmu_asset.worker.client import WorkerInstance
+from fmu_asset.worker.protocol import CALL, HEADER
+from tests.fmu_asset.door.kinds import HOSTILE
+from tests.fmu_asset.making import ROOT, changed, run_python
+
+MISBEHAVIOURS = tomllib.loads(Path(__file__).with_name("misbehaviours.toml").read_text("utf-8"))
+REPLAYED = changed(HOSTILE, header={"state": "replay"})
+FREE = changed(HOSTILE, limits={"sandbox": False})
+LIMITS = {"step_timeout": 30.0, "load_timeout": 30.0, "memory_limit": 400.0}
+Hostile = Callable[..., FmiAsset]
+
+
+@pytest.fixture
+def hostile(foreign_fmu: Any) -> Hostile:
+    """Return what makes an asset of an FMU that misbehaves."""
+    return lambda *what, binding=HOSTILE, **limits: FmiAsset(
+        foreign_fmu("hostile2", *what), binding, **limits
+    )
+
+
+def cases(table: str) -> pytest.MarkDecorator:
+    """Return the parametrisation by a table of the file: what is done, the error, and its sentence."""
+    rows = [(row["what"], getattr(errors, row["error"]), row["sentence"]) for row in MISBEHAVIOURS[table]]
+    return pytest.mark.parametrize(("what", "kind", "sentence"), rows, ids=[row[0] for row in rows])
+
+
+def descriptors() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def processes(of: Path) -> list[str]:
+    """Return the processes whose working directory or arguments lie in a folder."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            where = (process / "cwd").readlink()
+            what = (process / "cmdline").read_bytes().decode("utf-8", "replace")
+        except OSError:
+            continue
+        if of in where.parents or of == where or str(of) in what:
+            found.append(process.name)
+    return found
+
+
+def wait_until(done: Callable[[], Any], limit: float = 20.0) -> None:
+    """Wait: who is killed does not die in the same moment."""
+    deadline = time.monotonic() + limit
+    while not done():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def await_nothing(scratch: Path, limit: float = 20.0) -> None:
+    """Wait until nothing is left behind, neither processes nor files."""
+    wait_until(lambda: not processes(scratch) and not list(scratch.iterdir()), limit)
+
+
+def await_processes(scratch: Path, *counts: int) -> None:
+    """A second look may find one that ends just now."""
+    wait_until(lambda: len(processes(scratch)) in counts)
+
+
+# ---------------------------------------------------------------------- start, step, end, state
+
+
+@cases("step")
+def test_a_step_that_goes_wrong_is_one_sentence(
+    hostile: Hostile, scratch: Path, what: str, kind: type[Exception], sentence: str
+) -> None:
+    before = descriptors()
+    limits = LIMITS | ({"step_timeout": 0.5} if kind is FmuTimeoutError else {})
+    with hostile(what, **limits) as asset:
+        assert [asset.step().values[0] for _ in range(2)] == [1.0, 2.0]
+        saved = asset.save_state()
+        with pytest.raises(kind, match=sentence) as caught:
+            asset.step()
+        assert str(asset.description.path) in str(caught.value)
+        if what != "NOT_A_NUMBER":
+            with pytest.raises(FmuWorkerError, match="reset the asset"):
+                asset.step()
+        # The same instance is never used again; another one goes on from the last state.
+        asset.restore_state(saved)
+        assert (asset.step_index, asset.observe().values[0]) == (2, 2.0)
+    await_nothing(scratch)
+    assert descriptors() == before
+
+
+def test_a_refused_step_can_be_made_otherwise(hostile: Hostile) -> None:
+    with hostile("REFUSE", **LIMITS) as asset:
+        asset.step(), asset.step()
+        with pytest.raises(FmuCallError, match=r"(?s)step 2 from t = 2 s.*returned Discard.*u is too large"):
+            asset.step({"u": 6.0})
+        assert asset.step({"u": 5.0}).values[0] == 7.0
+
+
+def test_a_slow_leak_is_noticed_between_short_steps(hostile: Hostile) -> None:
+    with (
+        hostile("LEAK_SLOWLY", **LIMITS) as asset,
+        pytest.raises(FmuMemoryError, match=r"more than the limit of 400 MiB"),
+    ):
+        wait_until(lambda: asset.step() is None)
+
+
+@cases("start")
+def test_a_start_that_goes_wrong_is_one_sentence(
+    hostile: Hostile, scratch: Path, what: str, kind: type[Exception], sentence: str
+) -> None:
+    asset = hostile(what, load_timeout=2.0 if kind is FmuTimeoutError else 30.0)
+    for _ in range(2):
+        with pytest.raises(kind, match=sentence):
+            asset.reset()
+        await_nothing(scratch)
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        "CRASH_IN_FREE", "HANG_IN_FREE", "START_PROCESS", "CHATTER", "NEST_FOLDERS", "HOP",
+        ("START_PROCESS_ELSEWHERE", "GROUP=setpgid(0,0)"), ("START_PROCESS_ELSEWHERE", "GROUP=setsid()"),
+    ],
+)  # fmt: skip
+def test_what_goes_wrong_at_the_end_leaves_nothing(hostile: Hostile, scratch: Path, what: Any) -> None:
+    """Nor a process that leaves the group."""
+    with hostile(*([what] if isinstance(what, str) else what)) as asset:
+        assert [asset.step().values[0] for _ in range(4)] == [1.0, 2.0, 3.0, 4.0]
+        if not isinstance(what, str):
+            assert len(processes(scratch)) == 3  # the keeper, the worker, and what the FMU has started
+    await_nothing(scratch)
+
+
+def test_an_fmu_that_removes_its_files_is_extracted_again(hostile: Hostile, scratch: Path) -> None:
+    free = changed(HOSTILE, limits={"programs": True})  # it removes them by a program
+    with hostile("REMOVE_FILES", binding=free) as asset:
+        for _ in range(4):
+            asset.step()
+        asset.close()
+        asset.reset()
+        assert asset.step().values[0] == 1.0
+    assert not list(scratch.iterdir())
+
+
+@cases("state")
+def test_a_state_that_lies_is_found_and_can_be_replayed(
+    hostile: Hostile, what: str, kind: type[Exception], sentence: str
+) -> None:
+    with hostile(what) as asset:
+        asset.step(), asset.step()
+        with pytest.raises(kind, match=sentence):  # noqa: PT012 - either of the two may tell
+            saved = asset.save_state()
+            asset.step()
+            asset.restore_state(saved)
+    with hostile(what, binding=REPLAYED) as asset:
+        asset.step(), asset.step({"u": 3.0})
+        saved = asset.save_state()
+        asset.step()
+        asset.restore_state(saved)
+        assert asset.observe().values[0] == 4.0
+
+
+def test_what_cannot_be_replayed_says_so(hostile: Hostile) -> None:
+    with hostile("NOT_DETERMINISTIC", binding=REPLAYED) as asset:
+        asset.step()
+        saved = asset.save_state()
+        asset.close()
+        with pytest.raises(FmuStateError, match="does not give equal outputs for equal inputs"):
+            asset.restore_state(saved)
+
+
+@pytest.mark.parametrize("in_one_go", [False, True], ids=["steps", "run"])
+def test_two_processes_that_return_from_one_step(hostile: Hostile, scratch: Path, in_one_go: bool) -> None:
+    pushes = [float(k) for k in range(1, 11)]
+    with hostile("FORK_AND_RETURN") as asset:
+        if in_one_go:
+            seen = asset.simulate({"u": pushes}).values[:, 0].tolist()
+        else:
+            seen = [asset.step({"u": push}).values[0] for push in pushes if not time.sleep(0.01)]
+        assert seen == [sum(pushes[: k + 1]) for k in range(10)]
+    await_nothing(scratch)
+
+
+def test_an_answer_to_another_request_is_not_taken(hostile: Hostile) -> None:
+    """A reply that is whole but bears another number, as one that comes late."""
+    with hostile() as asset:
+        asset.step()
+        instance = asset._housing.instance
+        assert isinstance(instance, WorkerInstance)
+        question = instance._pickled("read")
+        os.write(instance._out, HEADER.pack(CALL, 0, 77, len(question)) + question)
+        with pytest.raises(FmuWorkerError, match="wrote something else into it"):
+            asset.step()
+
+
+# ---------------------------------------------------------------------- who is killed
+
+
+@contextmanager
+def twin(fmu: Path, binding: Binding, *lines: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A twin in another process that carries out these lines with its asset, and is killed in the end."""
+    program = (
+        "import json, sys\n"
+        "from fmu_asset.door.binding import parse_binding\n"
+        "from fmu_asset.door.session import FmiAsset\n"
+        "asset = FmiAsset(sys.argv[1], parse_binding(json.loads(sys.argv[2])))\n"
+    )
+    told = json.dumps(binding.model_dump(exclude_none=True, mode="json"))
+    command = [sys.executable, "-c", program + "\n".join(lines), fmu, told]
+    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def status_of(worker: int | None) -> str:
+    return Path(f"/proc/{worker}/status").read_text()
+
+
+def keeper_of(worker: int | None) -> int:
+    match = re.search(r"PPid:\s+(\d+)", status_of(worker))
+    assert match is not None
+    return int(match[1])
+
+
+def kill_keeper(worker: int | None) -> None:
+    os.kill(keeper_of(worker), signal.SIGKILL)
+
+
+@pytest.mark.parametrize("end", ["(void)0", "hang()", "kill(getppid(),SIGKILL)"])
+def test_nothing_is_left_when_the_keeper_is_killed(hostile: Hostile, scratch: Path, end: str) -> None:
+    """The worker has cleared its parent-death signal, and what it has started is in a session of its own."""
+    with hostile(f"ESCAPE={end}", binding=FREE, step_timeout=1.0) as asset:
+        asset.step(), asset.step()
+        if end == "hang()":
+            threading.Timer(0.3, kill_keeper, [asset.worker_process_id]).start()
+            with pytest.raises(FmuTimeoutError, match=r"longer than 1 s"):
+                asset.step()
+        else:
+            asset.step()
+            if end == "(void)0":
+                kill_keeper(asset.worker_process_id)
+            assert asset.step().values[0] == 4.0
+            await_processes(scratch, 1, 2)  # the worker, and mostly the process that has left it
+    await_nothing(scratch)
+
+
+ASKED = "asset.step(), asset.step()", "print(asset.worker_process_id, flush=True)"
+
+
+def test_nothing_is_left_when_twin_and_worker_end_before_the_keeper_looks(
+    foreign_fmu: Any, scratch: Path
+) -> None:
+    with twin(foreign_fmu("hostile2"), HOSTILE, *ASKED, "sys.stdin.read()") as process:
+        worker = int(process.stdout.readline())
+        keeper = keeper_of(worker)
+        os.kill(keeper, signal.SIGSTOP)
+    wait_until(lambda: "\nState:\tZ" in status_of(worker))
+    os.kill(keeper, signal.SIGCONT)
+    await_nothing(scratch)
+
+
+def test_what_a_dead_twin_without_a_keeper_left_is_ended_by_the_next(foreign_fmu: Any, scratch: Path) -> None:
+    with twin(foreign_fmu("hostile2", "ESCAPE=hang()"), HOSTILE, *ASKED, "asset.step()") as process:
+        worker = int(process.stdout.readline())
+        await_processes(scratch, 3)
+        os.kill(process.pid, signal.SIGSTOP)
+        kill_keeper(worker)
+    await_processes(scratch, 2)
+    run_python("from fmu_asset.folders import plain_folder, remove_folder; remove_folder(plain_folder())")
+    await_nothing(scratch)
+
+
+@pytest.mark.parametrize("what", ["HANG", "START_PROCESS", "ATTEMPT=(hold_pipes(),hang(),0)"])
+def test_nothing_is_left_when_the_twin_is_killed_during_a_step(
+    foreign_fmu: Any, scratch: Path, what: str
+) -> None:
+    lines = *ASKED, "asset.step()", "print('fourth', flush=True)", "sys.stdin.read()"
+    with twin(foreign_fmu("hostile2", what), HOSTILE, *lines) as process:
+        assert int(process.stdout.readline())
+        if what == "START_PROCESS":
+            assert process.stdout.readline() == b"fourth\n"
+            assert len(processes(scratch)) == 3  # with the keeper
+    await_nothing(scratch, 30.0)
+
+
+def test_what_a_dead_twin_left_is_removed_by_the_next(hostile: Hostile, scratch: Path) -> None:
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    with hostile() as asset:
+        own = next(scratch.iterdir()).name
+        asset.step()
+    (scratch / own.replace(f"-{os.getpid()}-", f"-{dead.pid}-")).mkdir()
+    (scratch / "somebody-else").mkdir()
+    made = run_python("from fmu_asset.folders import plain_folder\nprint(plain_folder())\n").strip()
+    assert {path.name for path in scratch.iterdir()} == {Path(made).parent.name, "somebody-else"}
+
+
+# ---------------------------------------------------------------------- an FMU in Python
+
+SPOILT = [
+    (10, FmuCallError, r"(?s)fmi2DoStep returned Fatal.*the FMU says: .*the spring broke"),
+    (11, FmuWorkerError, r"wrote something else into it"),
+    (12, FmuCallError, r"(?s)fmi2DoStep returned Fatal.*\\x1b\[2J.*the spring \\x9b31mcreaks"),
+]
+
+
+@pytest.mark.parametrize(("misbehaviour", "kind", "sentence"), SPOILT, ids=["json", "builtins", "escapes"])
+def test_an_fmu_in_python_that_spoils_what_we_share(
+    spring_mass: Path, spring_binding: Binding, misbehaviour: int, kind: type[Exception], sentence: str
+) -> None:
+    with FmiAsset(spring_mass, spring_binding) as asset:
+        with pytest.raises(kind, match=sentence) as caught:
+            asset.step(load={"misbehaviour": misbehaviour})
+        told = [str(caught.value), *(text for _, text in asset.log)]
+        assert not [text for text in told if re.search(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]", text)]
+        asset.reset()
+        assert asset.step({"push": 1.0}).extra == {"steps": 1.0}
+
+
+@pytest.mark.parametrize("misbehaviour", [8, 9], ids=["loop", "hold"])
+def test_an_fmu_in_python_that_loops(
+    spring_mass: Path, spring_binding: Binding, scratch: Path, misbehaviour: int
+) -> None:
+    """It holds the interpreter of the worker; neither the limit nor the death of the twin needs that."""
+    with (
+        FmiAsset(spring_mass, spring_binding, step_timeout=0.5) as asset,
+        pytest.raises(FmuTimeoutError, match=r"longer than 0\.5 s for the step"),
+    ):
+        asset.step(load={"misbehaviour": misbehaviour})
+    lines = (
+        "asset.step()",
+        "print('loops', flush=True)",
+        f"asset.step(load={{'misbehaviour': {misbehaviour}}})",
+    )
+    with twin(spring_mass, spring_binding, *lines) as process:
+        assert process.stdout.readline() == b"loops\n"
+    await_nothing(scratch, 30.0)
