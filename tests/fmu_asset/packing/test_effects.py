@@ -407,7 +407,7 @@ def test_modal_outputs_are_those_of_the_patched_wing(patched: Path, naming_side:
         seen = asset.step({"load_factor": 1.0}, load={"root": 1.0}).extra["frequency[1]"]
         off = asset.step(load={"root": 0.0}).extra["frequency[1]"]
     heavier = ModelPatch((*WING["point_mass"], *WING["root"]))
-    modes = naming_side.wing.structure(1.0, (0.0, 0.0), 0.169, 0.134, heavier).modes(1)
+    modes = naming_side.wing.structure(1.0, (0.0, 0.0), 0.169, 0.134, heavier).lowest(1)
     assert seen == pytest.approx(modes.frequency[0])
     assert off > seen
 
