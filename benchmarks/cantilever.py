@@ -243,7 +243,7 @@ def _motion(
         else:
             acting = replace(acting, loads=[(row, Course.of(trial.time, force, trial.hold))])
         motion = system.motion(acting, laws, conditions.refinement)
-        response = motion.seen([Shown(row) for row in rows])
+        response = motion.seen([Shown.of(row) for row in rows])
         return response.values, response.rates, behind * force
     loads = np.outer(force, row)
     for n in range(len(force)):

@@ -151,7 +151,7 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
             moved = system.motion(
                 Acting(time, np.zeros(len(end)), initial=initial, release=(end, release)), laws
             )
-            values = moved.seen([Shown(row) for row in rows]).values
+            values = moved.seen([Shown.of(row) for row in rows]).values
         else:
             values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws)[0] @ rows.T
         for column, (name, quantity) in enumerate(zip(names, quantities, strict=True)):

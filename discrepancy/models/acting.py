@@ -1,6 +1,6 @@
 """What acts on a system in a trial, between the samples too, and what its outputs show."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from math import isfinite, pi
@@ -230,19 +230,31 @@ class Acting:
 
 
 class Shown(NamedTuple):
-    """What an output shows: row . u and row . x, speed . u', courses with their factors, and a constant.
+    """What an output shows of the unknowns and their derivatives.
 
-    `order` is how often row . u is derived, `further` how often row . x; `reaction` is the number of a drive
-    whose force it shows instead.
+    Attributes
+    ----------
+    rows : (4, N) ndarray
+        Of z = (u, s) and its first three derivatives; a state is x = s'.
+    reaction : int, optional
+        Number of a drive whose force it shows instead.
+    constant : float
+        In it.
+    courses : sequence of (float, Course), optional
+        In it, each with its factor; None but for what a controller gives.
     """
 
-    row: FloatArray
-    order: int = 0
-    further: int = 0
+    rows: FloatArray
     reaction: int | None = None
     constant: float = 0.0
-    speed: FloatArray | None = None
-    courses: tuple[tuple[float, Course | FormulaCourse], ...] = ()
+    courses: Sequence[tuple[float, Course | FormulaCourse]] | None = None
+
+    @classmethod
+    def of(cls, row: FloatArray, order: int = 0, further: int = 0, states: int = 0) -> "Shown":
+        """Return what shows row . (u, x), u derived `order` times and the `states` x `further` times."""
+        rows, n = np.zeros((4, len(row))), len(row) - states
+        rows[order, :n], rows[further + 1, n:] = row[:n], row[n:]
+        return cls(rows)
 
 
 @cache
@@ -251,9 +263,9 @@ def order_of(quantity: Quantity) -> int:
     return quantity.moving.index(quantity) if quantity.moving else 0
 
 
-def shown_rows(rows: FloatArray, outputs: Sequence[tuple[str, Quantity]]) -> list[Shown]:
-    """Return what sensors of displacements and their derivatives show at rows (C, n)."""
-    return [Shown(row, order_of(quantity)) for row, (_, quantity) in zip(rows, outputs, strict=True)]
+def shown_rows(rows: Iterable[FloatArray], outputs: Sequence[tuple[str, Quantity]]) -> list[Shown]:
+    """Return what sensors of displacements and their derivatives show at rows (n,)."""
+    return [Shown.of(row, order_of(quantity)) for row, (_, quantity) in zip(rows, outputs, strict=True)]
 
 
 def refined(trial: Trial, parts: int) -> Trial:

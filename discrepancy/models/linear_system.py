@@ -8,7 +8,7 @@ put right at every step. The wing, a structure on springs and a lumped rig are s
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -220,36 +220,27 @@ class LinearSystem:
         return np.hstack((self.shapes, self.lift / self.heaviness)) if len(self.drives) else self.shapes
 
     @cached_property
-    def free(self) -> ModalSystem:
-        """What is free, with ports; what couples modes by rounding only does not."""
-        frequency, shapes, _ = self.modes
-        damping, stiffness = (shapes.T @ matrix @ shapes for matrix in (self.damping, self.stiffness))
+    def modal(self) -> ModalSystem:
+        """What is free and the drives, with ports; what couples modes by rounding only does not."""
+        frequency, free = np.pad(self.angular_frequency, (0, len(self.drives))), self._free_shapes
+        damping, stiffness = (free.T @ matrix @ free for matrix in (self.damping, self.stiffness))
         diagonal, loose = np.diag(np.diag(damping)), self.mode_count is None
         if loose:
             apart = np.abs(stiffness - np.diag(frequency**2)).max(initial=0.0)
             loose = bool(apart > ROUNDING * np.abs(stiffness).max(initial=1e-300))
         if np.abs(damping - diagonal).max(initial=0.0) <= ROUNDING * np.abs(diagonal).max(initial=1e-300):
             damping = diagonal
-        return ModalSystem(
-            frequency, damping, self._modal(self.ports), self._left_out, self.relaxation,
-            stiffness if loose else None, self._modal(self.acting_rows if self.actions else {}),
-        )  # fmt: skip
-
-    def _modal(self, rows: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        return {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
-
-    @cached_property
-    def modal(self) -> ModalSystem:
-        """What is free and the drives, with ports."""
-        if not len(self.drives):
-            return self.free
-        further, stiffness = (0, len(self.drives)), self.free.stiffness_matrix
-        return replace(
-            self.free,
-            angular_frequency=np.pad(self.free.angular_frequency, further),
-            damping=np.pad(self.free.damping, further),
-            stiffness_matrix=None if stiffness is None else np.pad(stiffness, further),
+        ports, actions = (
+            {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
+            for rows in (self.ports, self.acting_rows if self.actions else {})
         )
+        whole = stiffness if loose else None
+        return ModalSystem(frequency, damping, ports, self._left_out, self.relaxation, whole, actions)
+
+    @property
+    def _free_shapes(self) -> FloatArray:
+        """Shapes (N, M + P) of what is free, and nothing for the drives."""
+        return np.pad(self.shapes, ((0, 0), (0, len(self.drives))))
 
     @cached_property
     def _left_out(self) -> FloatArray | None:
@@ -288,7 +279,8 @@ class LinearSystem:
     @cached_property
     def _restoring(self) -> tuple[FloatArray, bool]:
         """Matrix (M, M) of modal forces at rest by displacements and states; whether it tells the rest."""
-        matrix = np.hstack((self.free.whole[:, : self.moving], self.free.damping[:, self.moving :]))
+        free, moving = len(self.angular_frequency), self.moving
+        matrix = np.hstack((self.modal.whole[:free, :moving], self.modal.damping[:free, moving:free]))
         values = np.linalg.svd(matrix, compute_uv=False) if matrix.size else np.ones(1)
         return matrix, bool(values[-1] > LEAST_PIVOT * max(values[0], 1e-300))
 
@@ -331,32 +323,26 @@ class LinearSystem:
     # ------------------------------------------------------------ what acts, and what is seen
 
     def driven(self, number: int) -> list[FloatArray]:
-        """Return what resists a drive's motion, its speed and its acceleration, on the modes (M,)."""
-        along = self.lift[:, number]
-        return [self.shapes.T @ (matrix @ along) for matrix in (self.stiffness, self.damping, self.mass)]
+        """Return what resists a drive's motion, its speed and its acceleration, on the modes (M + P,)."""
+        along, free = self.lift[:, number], self._free_shapes
+        return [free.T @ (matrix @ along) for matrix in (self.stiffness, self.damping, self.mass)]
 
     def forces_at(self, acting: Acting, time: FloatArray) -> FloatArray:
-        """Return the modal forces (T, M) of loads and drives at times."""
-        total = acting.load_at(time, self.shapes)
+        """Return the modal forces (T, M + P) of loads and drives at times."""
+        total = acting.load_at(time, self.all_shapes)
         for number, drive in enumerate(acting.drives.values()):
             for order, part in enumerate(self.driven(number)):
                 total -= np.outer(drive.at(time, order), part)
-        return np.asarray(total)
+        return total
 
     def by_order(self, shown: Sequence[Shown], shapes: FloatArray) -> FloatArray:
         """Return what outputs show of modal coordinates and their derivatives (4, C, M), in shapes (N, M)."""
-        n, found = self.displacements, np.zeros((4, len(shown), shapes.shape[1]))
-        for number, item in enumerate(shown):
-            found[item.order, number] = item.row[:n] @ shapes[:n]
-            if self.states:
-                found[item.further + 1, number] += item.row[n:] @ shapes[n:]
-            if item.speed is not None:
-                found[1, number] += item.speed @ shapes[:n]
+        rows = np.array([item.rows for item in shown]).reshape(len(shown), 4, len(shapes))
+        for own, item in zip(rows, shown, strict=True):
             if item.reaction is not None:
                 along = self.lift[:, item.reaction]
-                for order, matrix in enumerate((self.stiffness, self.damping, self.mass)):
-                    found[order, number] = along @ matrix @ shapes
-        return found
+                own[:3] = [along @ matrix for matrix in (self.stiffness, self.damping, self.mass)]
+        return np.moveaxis(rows @ shapes, 1, 0)
 
     def seen_by(self, shown: Sequence[Shown], shapes: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, in shapes (N, M) of what is free.
@@ -372,8 +358,8 @@ class LinearSystem:
         for number, item in enumerate(shown):
             if item.reaction is not None:
                 force[:, number] = acts @ self.lift[:, item.reaction]
-            elif self.truncated and item.order == 0:
-                force[:, number] = -acts @ self.residual(item.row)
+            elif self.truncated:
+                force[:, number] = -acts @ self.residual(item.rows[0])
         mass, *others = (shapes.T @ matrix @ shapes for matrix in (self.mass, self.damping, self.stiffness))
         sees, acts = sees @ shapes, acts @ shapes
         push, by_damping, by_stiffness = (np.linalg.solve(mass, item) for item in (acts.T, *others))

@@ -264,7 +264,7 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return what each output shows under what acts; None: at rest."""
         check_outputs(self.what, self, outputs, self.quantities)
         drives = {} if acting is None else acting.drives
-        found, padded = [], self.description.padded
+        found, description = [], self.description
         for name, quantity in outputs:
             item = self._outputs[name]
             further = 0 if quantity is item.quantity else quantity.derivatives_of(item.quantity)
@@ -274,13 +274,16 @@ class LumpedModel(DescribedModel, SystemModel):
                         f"The output {name!r} of {self.name!r} is the reaction of {item.reaction!r}, whose "
                         "motion this trial does not prescribe."
                     )
-                found.append(Shown(padded(()), reaction=list(drives).index(item.reaction)))
+                found.append(
+                    Shown.of(description.padded(()))._replace(reaction=list(drives).index(item.reaction))
+                )
             elif item.controller is not None:
                 loop = self.rig(case.state).loops[item.controller]
                 found.append(loop.effort([] if acting is None else self._reference(case, loop)))
             else:
-                row, order = padded(item.vector or ()), order_of(item.quantity) + further
-                found.append(Shown(row, order, further, constant=item.constant * (not further)))
+                row, order = description.padded(item.vector or ()), order_of(item.quantity) + further
+                seen = Shown.of(row, order, further, description.width - description.size)
+                found.append(seen._replace(constant=item.constant * (not further)))
         return found
 
     def _losses(self, trial: Trial, conditions: Conditions) -> list[Losses]:

@@ -29,10 +29,10 @@ class Loop:
         As in the file.
     gains : sequence of float
         Proportional, derivative and integral, times their factors.
-    sees, acts : (N,) ndarray
-        What it measures, and along which it acts.
-    displacements : int
-        n.
+    sees : (4, N) ndarray
+        What it measures, as `Shown.rows`.
+    acts : (N,) ndarray
+        Along which it acts.
     state : int or None
         Unknown that is the integral of its error; None without an integral gain.
     """
@@ -41,34 +41,23 @@ class Loop:
     gains: Sequence[float]
     sees: FloatArray
     acts: FloatArray
-    displacements: int
     state: int | None
 
     @property
-    def of_speed(self) -> bool:
-        """Whether it measures the speed of a displacement."""
-        return order_of(self.section.quantity) == 1
-
-    @property
-    def gives(self) -> tuple[FloatArray, FloatArray]:
-        """Rows (N,) of the unknowns and (n,) of the speeds that it gives without a reference."""
-        n, (proportional, derivative, integral) = self.displacements, self.gains
-        row, speed = -proportional * self.sees, -derivative * self.sees[:n]
-        if self.of_speed:
-            speed, row[:n] = speed + row[:n], 0.0
+    def gives(self) -> FloatArray:
+        """What it gives without a reference, as `Shown.rows`."""
+        proportional, derivative, integral = self.gains
+        rows = -proportional * self.sees - derivative * np.roll(self.sees, 1, axis=0)
         if self.state is not None:
-            row[self.state] += integral
-        return row, speed
+            rows[1, self.state] += integral
+        return np.asarray(rows)
 
-    def close(self, damping: FloatArray, stiffness: FloatArray) -> None:
+    def close(self, stiffness: FloatArray, damping: FloatArray) -> None:
         """Add the feedback to the matrices (N, N) of a rig."""
-        n, (row, speed) = self.displacements, self.gives
-        stiffness[:, :n] -= np.outer(self.acts, row[:n])
-        damping[:, n:] -= np.outer(self.acts, row[n:])
-        damping[:, :n] -= np.outer(self.acts, speed)
-        if self.state is not None:
-            (damping if self.of_speed else stiffness)[self.state, :n] += self.sees[:n]
-            damping[self.state, n:] += self.sees[n:]
+        for matrix, row, seen in zip((stiffness, damping), self.gives[:2], self.sees[:2], strict=True):
+            matrix -= np.outer(self.acts, row)
+            if self.state is not None:
+                matrix[self.state] += seen
 
     def loads(self, trial: Trial, item: RecordedInput, offset: float) -> list[Load]:
         """Return what a recorded reference does, as loads.
@@ -94,10 +83,9 @@ class Loop:
 
     def effort(self, loads: Sequence[Load]) -> Shown:
         """Return what it gives, from the `loads` of its reference (none where there is no reference)."""
-        row, speed = self.gives
         along = self.acts / float(self.acts @ self.acts)
         courses = tuple((float(push @ along), course) for push, course in loads if push @ along != 0.0)
-        return Shown(row, speed=speed, courses=courses)
+        return Shown(self.gives, courses=courses)
 
 
 def _slope(course: Course, trial: Trial, section: ControllerSection) -> Course:
@@ -159,8 +147,9 @@ class LumpedRig:
         for item in description.controller:
             named = (factors.get(f"{item.name}.{gain}", 1.0) * getattr(item, gain) for gain in GAINS)
             gains = [factors.get(item.name, 1.0) * gain for gain in named]
-            sees, acts = description.padded(item.vector), description.padded(item.acts)
-            self.loops[item.name] = Loop(item, gains, sees, acts, n, state if item.integral else None)
+            row, acts = description.padded(item.vector), description.padded(item.acts)
+            sees = Shown.of(row, order_of(item.quantity), states=width - n).rows
+            self.loops[item.name] = Loop(item, gains, sees, acts, state if item.integral else None)
             state += item.integral != 0.0
 
     def _change(self, change: Primitive, mass: FloatArray, stiffness: FloatArray) -> None:
@@ -215,7 +204,7 @@ class LumpedRig:
             if content is not None:
                 into[rows, columns] = -np.array(content)
         for loop in self.loops.values() if closed else ():
-            loop.close(damping, stiffness)
+            loop.close(stiffness, damping)
         beta = description.damping.beta if description.damping is not None else None
         inputs = {item.name: padded(item.vector) for item in description.input}
         return SecondOrderSystem(

@@ -164,13 +164,12 @@ class StructureModel(StructuralModel):
         """
         known = (f"{name} ({quantity.value})" for name, quantity in self.quantities.items())
         check_outputs(self.name, self, outputs, known)
-        size = len(self.model.rows[0])
-        rows = np.array([self._rows[output] for output, _ in outputs]).reshape(len(outputs), size)
-        found, always = shown_rows(rows, outputs), self._always(case.state.parameters)
+        found = shown_rows((self._rows[output] for output, _ in outputs), outputs)
+        always = self._always(case.state.parameters)
         if acting is None or not always.any():
             return found
         still = self.system(case.state).flexibility(always)
-        return [item._replace(constant=float(item.row @ still) * (item.order == 0)) for item in found]
+        return [item._replace(constant=float(item.rows[0] @ still)) for item in found]
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the structure can carry a primitive: sensors, laws at its ports, errors of its forces."""

@@ -62,18 +62,15 @@ class Motion:
     @cached_property
     def acceleration(self) -> FloatArray:
         """Second derivatives (N, M + P) of the modal coordinates, from the equation of motion."""
-        system, count = self.system, len(self.system.angular_frequency)
-        found = np.empty_like(self.q)
-        pull = self.q[:, :count] @ system.free.whole.T
+        system, modal = self.system, self.system.modal
+        pull = self.q @ modal.whole.T
         if self.laws.rate != 0.0:
             pull *= 1.0 + self.laws.rate * self.time[:, None]
-        found[:, :count] = system.forces_at(self.acting, self.time) - pull
-        found[:, :count] -= self.velocity[:, :count] @ system.free.damping.T
+        found = system.forces_at(self.acting, self.time) - pull - self.velocity @ modal.damping.T
         if len(self.laws):
-            rows = self.laws.rows(system.modal.actions or system.modal.ports, self.q.shape[1])
-            found[:, :count] -= self.port_forces @ rows[:, :count]
-        for number, drive in enumerate(self.acting.drives.values()):
-            found[:, count + number] = system.heaviness * drive.at(self.time, 2)
+            found -= self.port_forces @ self.laws.rows(modal.actions or modal.ports, self.q.shape[1])
+        for number, drive in enumerate(self.acting.drives.values(), len(system.angular_frequency)):
+            found[:, number] = system.heaviness * drive.at(self.time, 2)
         found[: self.held] = 0.0
         return found
 
@@ -123,9 +120,8 @@ class Motion:
                 values += self.derivative(order) @ rows.T
                 if order < 3:
                     rates += self.derivative(order + 1) @ rows.T
-        still = [number for number, item in enumerate(shown) if item.order == 0]
-        if system.truncated and still:
-            values[:, still] += self._left_out(np.array([shown[number].row for number in still]))
+        if system.truncated:
+            values += self._left_out(np.array([item.rows[0] for item in shown]))
         for number, item in enumerate(shown):
             if item.constant:
                 values[:, number] += item.constant
@@ -136,7 +132,7 @@ class Motion:
                     values[:, number] += self.port_forces @ (
                         self.laws.rows(system.acting_rows, len(along)) @ along
                     )
-            for factor, course in item.courses:
+            for factor, course in item.courses or ():
                 values[:, number] += factor * course.at(self.time)
             if item.reaction is not None or item.courses:
                 rates[:, number] = np.gradient(values[:, number], self.time)
@@ -277,20 +273,14 @@ class SecondOrderSystem(LinearSystem):
 
     def _backwards(self, q: FloatArray, v: FloatArray, duration: float) -> Begin:
         """Return the state a duration [s] earlier, without internal forces."""
-        step = self.free.exact_steps(np.array([duration]))[0][0]
+        step = self.modal.exact_steps(np.array([duration]))[0][0]
         state = np.linalg.solve(step, np.concatenate((q, v)))
         return Begin(state[: len(q)], state[len(q) :])
 
     # ------------------------------------------------------------ steps
 
     def _followed(
-        self,
-        acting: Acting,
-        laws: Laws,
-        first: float,
-        stamps: FloatArray,
-        begin: Begin,
-        refinement: int,
+        self, acting: Acting, laws: Laws, first: float, stamps: FloatArray, begin: Begin, refinement: int
     ) -> ModalMotion:
         """Return the motion at stamps from a state at a time that may lie before them [s]."""
         if stamps[0] - first > LEAST_LEAD * (stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1):
@@ -320,7 +310,7 @@ class SecondOrderSystem(LinearSystem):
         for number, drive in enumerate(acting.drives.values(), count):
             for order, part in enumerate(self.driven(number - count)):
                 for side, amount in zip((begin, end), drive.ends(time, order), strict=True):
-                    side[:, :count] -= np.outer(amount, part)
+                    side -= np.outer(amount, part)
                     side[:, number] = heaviness * amount
         steps = steps_under(self.modal, boundaries, begin, end, feed)
         if acting.drives:

@@ -216,27 +216,28 @@ class SystemModel(Model):
             rows = slice(start, start + len(list(group)))
             case = case._replace(state=first._replace(losses=lost, warmer=warm))
             shown = [item for number in components for item in self.shown(case, outputs, None, number)]
+            units, amounts = self.acting(case).levels
+            n = units.shape[1] if self.displacements is None else self.displacements
             for (_, quantity), item in zip(outputs, shown, strict=False):
-                if item.further or (quantity.is_rate and np.any(item.row[: self.displacements])):
+                if np.any(item.rows[2:, n:]) or (quantity.is_rate and np.any(item.rows[1:, :n])):
                     raise ModelError(
                         f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
                         "acceleration."
                     )
-            units, amounts = self.acting(case).levels
             ports = laws.rows(self.port_rows, units.shape[1])
-            if self.displacements is not None:
-                ports[:, self.displacements :] = 0.0  # ports of states are at no position
+            ports[:, n:] = 0.0  # ports of states are at no position
             try:
                 found, memory = at_rest(
                     self.rest(case.state), units, amounts[rows], laws, ports, memory, before
                 )
             except ModelError as cause:
                 raise ModelError(f"The trial {trial.name!r} is at rest, but {cause}") from cause
-            values[rows] = found @ np.array([item.row for item in shown]).T
+            seen = [np.concatenate((item.rows[0, :n], item.rows[1, n:])) for item in shown]
+            values[rows] = found @ np.array(seen).T
             values[rows] += [item.constant for item in shown]
             before, start = amounts[rows.stop - 1], rows.stop
-        seen, *further = np.split(values, len(components), axis=1)
-        return Response(seen, None, *further)
+        along, *further = np.split(values, len(components), axis=1)
+        return Response(along, None, *further)
 
     def _losses(self, trial: Trial, conditions: Conditions) -> list[Losses]:
         return losses_of(trial, conditions.health, self.regions, self.name)
@@ -277,18 +278,17 @@ class SystemModel(Model):
         count, moving = len(rig.angular_frequency), rig.moving
         x, v = (np.max(np.abs(item[:, :count]), axis=0) for item in (moved.q, moved.velocity))
         pace = np.maximum(rig.angular_frequency[:moving], 1.0 / float(trial.time[-1] - trial.time[0]))
-        n, shapes = rig.displacements, rig.shapes
         channels = [campaign.channels[name] for name in trial.channels]
         outputs = tuple((channel.output, channel.quantity) for channel in channels)
         shown = self.shown(case, outputs, moved.acting)
         for column, item in enumerate(shown):
             kept = trial.values[trial.used[:, column], column] - item.constant
-            if item.reaction is not None or item.speed is not None or not kept.size:
+            if item.reaction is not None or item.courses is not None or not kept.size:
                 continue
-            size = float(np.max(np.abs(kept)))
-            of_u, of_x = item.row[:n] @ shapes[:n, :moving], item.row[n:] @ shapes[n:, moving:]
+            size, rows = float(np.max(np.abs(kept))), item.rows @ rig.shapes
+            of_u, of_x, order = rows[:, :moving], rows[:, moving:], np.argmax(np.any(rows, axis=1))
             if np.any(of_u):
-                at = size / float(np.linalg.norm(of_u)) / pace**item.order
+                at = size / float(np.linalg.norm(of_u)) / pace**order
                 x[:moving], v[:moving] = np.maximum(x[:moving], at), np.maximum(v[:moving], at * pace)
             if np.any(of_x):
                 v[moving:] = np.maximum(v[moving:], size / float(np.linalg.norm(of_x)))

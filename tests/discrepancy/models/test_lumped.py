@@ -276,7 +276,7 @@ def test_omitted_modes_follow_slow_forces() -> None:
     time = np.arange(500) * 0.01
     course = Course.of(time, 1.0 - np.cos(4.0 * time))
     acting = Acting(time, np.zeros(3), [(np.array([0.0, 1.0, 0.0]), course)])
-    rows = [Shown(row) for row in np.eye(3)]
+    rows = [Shown.of(row) for row in np.eye(3)]
     exact, found = (system.motion(acting, NO_LAWS).seen(rows).values for system in (whole, one))
     bare = one.motion(acting, NO_LAWS).q @ one.shapes.T
     scale = np.max(np.abs(exact))
