@@ -20,6 +20,7 @@ from fe.structure.design import parse_structure
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.companions.damage_growth import DamageGrowth
 from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.slaves.effects import output_channels
 from fmu_asset.structures.binding import structure_binding
 from scenarios import binding_files
 from tests.conftest import BEAM
@@ -192,6 +193,54 @@ BEAM_COURSE = random_course({
     "control": {"load_factor": (-4.0, 6.0), "push": (-50.0, 50.0)},
     "health": {"z1": (0.0, 0.8), "z2": (0.0, 0.8)},
 })  # fmt: skip
+
+
+INTERVAL = 0.01
+CHANNELS = output_channels(24)
+OUTPUTS = [name for name, _ in CHANNELS]
+
+
+def watching(
+    step_size: float = INTERVAL, load: Mapping[str, tuple[str, str]] | None = None, **header: object
+) -> Binding:
+    """Return a binding of a wing that observes all outputs."""
+    return bound(
+        step_size, {"all": (OUTPUTS, ["1"] * 24 + ["m"] * 2)}, header=header,
+        control={"load_factor": ("load_factor", "1")},
+        health={name: (f"health.{name}", "1") for name in ("z1", "z2")},
+        load={"tip_force": ("tip_force", "N"), **(load or {})},
+        parameter={"response": ("response", "1"), "release": ("initial_tip_displacement", "m")},
+        record=["strain_error_bound", "frequency[{1..6}]", "damping_ratio[{1..6}]"],
+    )  # fmt: skip
+
+
+def on(*names: str) -> dict[str, float]:
+    """Return the parameters that switch effects on."""
+    return {f"effect.{name}.active": 1.0 for name in names}
+
+
+WARM = {"temperature": ("temperature_difference", "K")}
+SENDING = watching(
+    0.05, WARM | {"drift": ("effect.gauge_zero_drift.active", "1"),
+                  "time_constant": ("effect.coupling.time_constant[2]", "s")},
+)  # fmt: skip
+
+
+def playing(step_size: float = INTERVAL) -> Binding:
+    """Return a binding that sends switches and a value of effects at every step."""
+    sent = {name: (f"effect.{name}.active", "1") for name in ("root", "play")}
+    return watching(step_size, WARM | sent | {"half_width": ("effect.play.half_width", "m")})
+
+
+HYSTERESIS = ("slip", "bouc_wen", "friction", "local_loss")
+
+
+def with_effects(file: str, binding: Binding, names: tuple[str, ...], switch: str, **given: float) -> Kind:
+    """A wing with effects, of which one comes and goes; what they do is tested beside whole records."""
+    course = wing_course()
+    warm = np.linspace(0.0, 3.0, 24)
+    load = {**course["load"], "temperature": warm, switch: np.arange(24) % 4 > 1}
+    return Kind(file, binding, {**course, "load": load}, parameters=on(*names) | given, state="serialised")
 
 
 # ---------------------------------------------------------------------- others' FMUs
@@ -393,6 +442,12 @@ KINDS: dict[str, Kind] = {
     "three compiled regions in motion": wing("compiled_regions", TRANSIENT, largest=1e-12, **SERIALISED),
     "model exchange wing": exchange("exchange", "health.z{}"),
     "model exchange wing of FMI 3": exchange("exchange3", "health[{}]", fmi_version="3.0"),
+    "effects of sensors": with_effects("sensing", SENDING, ("coupling", "hum"), "drift"),
+    "effects of sensors in motion": with_effects(
+        "sensing", SENDING, ("coupling", "hum"), "drift", response=TRANSIENT, release=0.01
+    ),
+    "hysteresis": with_effects("patched", playing(), HYSTERESIS, "root"),
+    "hysteresis in motion": with_effects("patched", playing(), HYSTERESIS, "root", response=TRANSIENT),
     "beam": Kind(
         "beam", BEAM_BINDING, BEAM_COURSE, statics, largest=1e-12, parameters={"e": 1.06, "pump": 0.03},
         **SERIALISED,

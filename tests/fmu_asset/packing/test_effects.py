@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 from fmpy import read_model_description
-from fmpy.validation import validate_fmu
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -31,7 +30,6 @@ from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.sensors import SensorRecord, apply_sensors
 from fmu_asset.check import check_fmu
-from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
 from fmu_asset.packing.patch_file import PatchFile, load_patch, parse_patch
@@ -39,16 +37,9 @@ from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.effects import active_primitives, effect_rows, numbers_of
 from reporting.provenance import collect_provenance
 from tests.command_line import command, refused, said
-from tests.fmu_asset.packing.naming import (
-    CHANNELS,
-    INTERVAL,
-    close,
-    expected,
-    on,
-    release,
-    trial,
-    watching,
-)
+from tests.fmu_asset.door.kinds import CHANNELS, INTERVAL, SENDING, WARM, on, playing, watching
+from tests.fmu_asset.ours import OurFmus
+from tests.fmu_asset.packing.naming import close, expected, release, trial
 
 HERE = Path(__file__).parent
 SENSORS, WING = (
@@ -57,17 +48,6 @@ SENSORS, WING = (
 )
 DYNAMIC = sorted(set(WING) - {"place", "cell", "washout", "relief", "turned", "warmer"})
 STATIC = sorted(set(WING) - {"washout", "relief", "drifting"})
-WARM = {"temperature": ("temperature_difference", "K")}
-SENDING = watching(
-    0.05, WARM | {"drift": ("effect.gauge_zero_drift.active", "1"),
-                  "time_constant": ("effect.coupling.time_constant[2]", "s")},
-)  # fmt: skip
-
-
-def playing(step_size: float = INTERVAL) -> Binding:
-    """Return a binding that sends switches and a value of effects at every step."""
-    sent = {"root": ("effect.root.active", "1"), "play": ("effect.play.active", "1")}
-    return watching(step_size, WARM | sent | {"half_width": ("effect.play.half_width", "m")})
 
 
 def content(effects: Mapping[str, Sequence[Any]] = SENSORS, **further: object) -> bytes:
@@ -87,14 +67,13 @@ def patch() -> PatchFile:
 
 
 @pytest.fixture(scope="module")
-def sensing(model: ReducedModel, patch: PatchFile, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_fmu(model, tmp_path_factory.mktemp("sensing") / "wing.fmu", patch=patch).path
+def sensing(ours: OurFmus) -> Path:
+    return ours("sensing")
 
 
 @pytest.fixture(scope="module")
-def patched(model: ReducedModel, arrays: PatchArrays, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("patched") / "wing.fmu"
-    return build_fmu(model, path, patch=parse_patch(content(WING)), arrays=arrays).path
+def patched(ours: OurFmus) -> Path:
+    return ours("patched")
 
 
 @pytest.fixture(scope="module")
@@ -136,17 +115,14 @@ def test_the_table_only_grows_at_its_end(fmu: Path, sensing: Path) -> None:
     assert float(added["effect.coupling.active"].start) == 0.0
 
 
-def test_it_is_sound_and_two_builds_are_equal(
+def test_what_is_on_and_how_much_show_in_the_guid(
     model: ReducedModel, patch: PatchFile, sensing: Path, tmp_path: Path
 ) -> None:
-    assert build_fmu(model, tmp_path / "again.fmu", patch=patch).path.read_bytes() == sensing.read_bytes()
     active = build_fmu(model, tmp_path / "on.fmu", patch=patch, activate=True)
     changed = parse_patch(content(SENSORS | {"gauge_gain": SENSORS["gauge_gain"][:1]}))
     other = build_fmu(model, tmp_path / "other.fmu", patch=changed)
     assert len({read_model_description(str(path)).guid for path in (sensing, active.path, other.path)}) == 3
-    assert validate_fmu(str(sensing)) == []
     found = check_fmu(sensing, cycles=120)
-    assert found.passed
     assert [item for item in found.findings if item.verdict != "ok"] == []
 
 
@@ -233,28 +209,6 @@ def test_values_that_cannot_be_are_refused_and_change_nothing(request: Any, whic
         seen = asset.step({"load_factor": 3.0}, load=right)
         asset.restore_state(before)
         assert asset.step({"load_factor": 3.0}).values.tobytes() == seen.values.tobytes()
-
-
-@pytest.mark.parametrize("response", [1.0, 2.0])
-@pytest.mark.parametrize("which", ["sensing", "patched"])
-def test_a_state_goes_on_to_the_bit_in_a_new_process(request: Any, which: str, response: float) -> None:
-    """Also where there is hysteresis."""
-    binding, names, sent = {
-        "sensing": (SENDING, ("coupling", "hum"), "drift"),
-        "patched": (playing(), ("slip", "bouc_wen", "friction", "local_loss"), "root"),
-    }[which]
-    given = on(*names) | {"response": response, "release": 0.01 * (response == 2.0 and which == "sensing")}
-    fmu = request.getfixturevalue(which)
-    with FmiAsset(fmu, binding, parameters=given) as one, FmiAsset(fmu, binding, parameters=given) as other:
-        for n, force in ((1.0, 8.0), (2.0, -11.0), (0.5, 4.0)):
-            one.step({"load_factor": n}, {"z1": 0.1 * n}, load={"tip_force": force})
-        one.step(load={sent: 1.0})
-        other.restore_state(one.save_state())
-        for n, force in ((1.5, 15.0), (3.0, -2.0)):
-            load = {"temperature": n, "tip_force": force, sent: 1.0}
-            seen = [asset.step({"load_factor": n}, load=load) for asset in (one, other)]
-            assert seen[0].values.tobytes() == seen[1].values.tobytes()
-            assert seen[0].extra == seen[1].extra
 
 
 @given(st.data())
@@ -357,7 +311,7 @@ def test_modal_outputs_are_those_of_the_patched_wing(patched: Path, naming_side:
         seen = asset.step({"load_factor": 1.0}, load={"root": 1.0}).extra["frequency[1]"]
         off = asset.step(load={"root": 0.0}).extra["frequency[1]"]
     heavier = patch_of("point_mass", "root")
-    modes = naming_side.wing.structure(1.0, (0.0, 0.0), 0.169, 0.134, heavier).modes(1)
+    modes = naming_side.wing.structure(1.0, (0.0, 0.0), 0.169, 0.134, heavier).modes
     assert seen == pytest.approx(modes.frequency[0])
     assert off > seen
 
