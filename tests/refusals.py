@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from typing import Any
 
 
 class Inputs:
@@ -25,7 +26,7 @@ class Inputs:
             text = text.replace(old, new, 1)
         return text
 
-    def refused(self, table: str) -> list[tuple[str, ...]]:
+    def refused(self, table: str) -> list[tuple[Any, ...]]:
         """Return the rows of a table."""
         tables = tomllib.loads((self.folder / "refused.toml").read_text(encoding="utf-8"))
         return [tuple(row) for row in tables[table]]

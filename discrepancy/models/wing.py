@@ -22,6 +22,7 @@ from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime.errors import FiniteElementError
+from fe.runtime.motion import PLANFORM, STATION_PORTS
 from fe.runtime.patch import (
     PRIMITIVES,
     LocalStiffnessLoss,
@@ -34,7 +35,6 @@ from fe.runtime.patch import (
 )
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import MODE_COUNT, ON_MODES, PatchedWing, motion_basis
-from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
 from fe.runtime.state import wing_names
 from fe.runtime.wing_rows import LOAD_PLACE, PORTS, strain_gauge
 from fe.wing.design import WingDesign, load_design

@@ -157,10 +157,7 @@ class AffineStructure:
             {name: values[name] for name in names if name in values}
             for names in (self.parameters, self.regions, self.masses)
         )
-        chosen = {
-            name: None if control is None else values.get(control) for name, control in self.loads.items()
-        }
-        loads = (self.load(name, value, masses) for name, value in chosen.items())
+        loads = (self.load(name, values.get(control or ""), masses) for name, control in self.loads.items())
         return self.stiffness(parameters, losses), self.mass(masses), sum(loads, np.zeros(self.unknowns))
 
     def full_displacement(self, free: FloatArray) -> FloatArray:

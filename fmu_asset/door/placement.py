@@ -165,6 +165,13 @@ _said: set[object] = set()
 class Extraction:
     """An extracted FMU, at `folder`; it is removed when nothing refers to this any more.
 
+    Attributes
+    ----------
+    folder : Path
+        Where it is.
+    users : int
+        Number of instances that run from there.
+
     Raises
     ------
     FmuFileError
@@ -173,6 +180,7 @@ class Extraction:
 
     def __init__(self, description: FmuDescription) -> None:
         self.folder: Path = extract_fmu(description)
+        self.users = 0
         weakref.finalize(self, remove_folder, self.folder)
 
 
@@ -323,6 +331,7 @@ class Housing:
         except BaseException:
             del shared  # so that its folder goes now, and not with the traceback
             raise
+        shared.users += 1
         self.instance, self._extraction = instance, shared
         # Also at the end of the interpreter, or when the asset is forgotten without being closed.
         self._release = weakref.finalize(self, _release, instance, shared)
@@ -352,7 +361,8 @@ class Housing:
 
 def _release(instance: Instance, extraction: Extraction) -> None:
     instance.close()
-    if isinstance(instance, FmuInstance):
+    extraction.users -= 1
+    if isinstance(instance, FmuInstance) and not extraction.users:  # others may yet import what they need
         forget_modules(str(extraction.folder))
 
 

@@ -17,7 +17,7 @@ from fmu_asset.errors import FmuBuildError
 from scenarios import binding_files
 from tests.conftest import BEAM
 from tests.fmu_asset.chain import chain_arrays, chain_model
-from tests.fmu_asset.making import bound, with_dependencies
+from tests.fmu_asset.making import with_dependencies
 from tests.fmu_asset.ours import OurFmus, three_regions
 from tests.kept import FE, kept
 
@@ -112,12 +112,7 @@ def binding() -> Binding:
 
 @pytest.fixture(scope="session")
 def spring_binding() -> Binding:
-    return bound(
-        0.1, {"motion": (["velocity", "position"], "m")}, header={"name": "spring_mass", "start_time": 2.0},
-        control={"push": ("force", "N")}, health={"spring": ("stiffness", "N/m")},
-        load={"lock": ("locked", "1"), "misbehaviour": ("misbehaviour", "1")},
-        monitor={"steps": ("steps", "1")},
-    )  # fmt: skip
+    return load_binding(Path(__file__).parent / "door" / "bindings" / "spring_mass.toml")
 
 
 @pytest.fixture(scope="session")

@@ -18,16 +18,24 @@ from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.companions.build import companion_bytes
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
+from fmu_asset.packing.patch_file import PatchFile, parse_patch
 from fmu_asset.packing.script import build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import asset_scripts
-from tests.fmu_asset.chain import chain_model
+from tests.fmu_asset.chain import chain_arrays, chain_model
 from tests.kept import FMU, packed
 
 HERE = Path(__file__).parent
 REGIONS = ("z1", "z2", "tip_panel")
 LOST = DigitalState(stiffness_loss=(0.0, 0.0, 0.3))
+
+
+def patch_of(name: str) -> PatchFile:
+    """Return a patch file of the tests: missing effects of sensors, or of the wing."""
+    return parse_patch((HERE / "packing" / name).read_bytes())
+
+
 EXCHANGE = {"interface": "model-exchange"}
 STRUCTURES: dict[str, tuple[str, dict[str, Any]]] = {
     "python": ("chain", {}),
@@ -36,6 +44,8 @@ STRUCTURES: dict[str, tuple[str, dict[str, Any]]] = {
     "fmi3": ("chain", {"kind": "compiled", "fmi": 3}),
     "exchange": ("chain", {"kind": "compiled", **EXCHANGE}),
     "exchange3": ("chain", {"kind": "compiled", "fmi": 3, **EXCHANGE}),
+    "sensing": ("chain", {"patch": patch_of("sensors.json")}),
+    "patched": ("chain", {"patch": patch_of("wing.json"), "arrays": chain_arrays(chain_model())}),
     "regions": ("regions", {"state": LOST}),
     "compiled_regions": ("regions", {"kind": "compiled", "state": LOST}),
     "beam": ("beam", {}),

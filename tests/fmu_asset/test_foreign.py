@@ -20,11 +20,10 @@ from fmu_asset.errors import (
     FmuUnsupportedError,
     FmuWorkerError,
 )
-from tests.fmu_asset.door.kinds import KINDS, bounces
+from tests.fmu_asset.door.kinds import BINDINGS, bounces
 from tests.fmu_asset.making import archive_of, bound, changed, members
 
-LAG, FIXED = KINDS["FMI 1"].binding, KINDS["a fixed step"].binding
-ARRAY, BALL = KINDS["elements of arrays"].binding, KINDS["model exchange of FMI 2 with state events"].binding
+LAG, FIXED, ARRAY, BALL = (BINDINGS[name] for name in ("lag1", "fixed2", "array3", "ball2"))
 
 
 def test_an_error_is_the_end_of_an_instance_and_a_state_goes_on(foreign_fmu: Any, isolated: bool) -> None:
@@ -52,6 +51,11 @@ def test_an_error_is_the_end_of_an_instance_and_a_state_goes_on(foreign_fmu: Any
         pytest.raises(FmuCallError, match=r"(?s)fmi2DoStep returned Error.*the sample time is 0\.01 s"),
     ):
         asset.step()
+
+
+def test_what_is_recorded_is_in_the_units_of_the_fmu(foreign_fmu: Any) -> None:
+    asset = FmiAsset(foreign_fmu("room2"), BINDINGS["room2"])
+    assert asset.recorded_units == {"der(room.T)": "K/s", "room.T": "K"}
 
 
 def test_fmi_3_asks_to_end_or_returns_early(foreign_fmu: Any, isolated: bool) -> None:

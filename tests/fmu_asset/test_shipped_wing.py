@@ -17,7 +17,8 @@ from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
-from tests.fmu_asset.packing.naming import expected, on, release, trial, watching
+from tests.fmu_asset.door.kinds import on, watching
+from tests.fmu_asset.packing.naming import expected, release, trial
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing")]
 

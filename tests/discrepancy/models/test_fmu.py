@@ -20,17 +20,8 @@ from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
-from fe.runtime.patch import (
-    BoucWen,
-    FreePlay,
-    LoadGain,
-    MicroSlip,
-    ModelPatch,
-    PowerDamping,
-    PowerStiffness,
-    Primitive,
-    SensorGain,
-)  # fmt: skip
+from fe.runtime import patch
+from fe.runtime.patch import BoucWen, FreePlay, LoadGain, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from tests.discrepancy.asking import FloatArray, campaign, integrated
 from tests.discrepancy.asking import seen as shown
 from tests.discrepancy.asking import trial as asked
@@ -50,7 +41,7 @@ LAWS: dict[str, Primitive] = {
     "cubic": PowerStiffness("slide", 0.05 * FORCE, 3.0, 0, AMPLITUDE),
     "crack": PowerStiffness("slide", -0.05 * FORCE, 1.0, -1, AMPLITUDE),
     "free play": FreePlay("slide", 0.1 * STIFFNESS, 0.1 * AMPLITUDE),
-    "micro-slip": MicroSlip("slide", 0.05 * FORCE, 0.1 * STIFFNESS, -0.3),
+    "micro-slip": patch.MicroSlip("slide", 0.05 * FORCE, 0.1 * STIFFNESS, -0.3),
     "bouc-wen": BoucWen("slide", 0.1 * STIFFNESS, 0.5 * AMPLITUDE, 2.0),
 }
 
@@ -234,7 +225,7 @@ def test_a_release_can_be_held_by_a_force(rig: FmuModel, variant) -> None:
             (PowerDamping("slide", 0.008 * STIFFNESS * 0.008, 0.0, 0.0, 1.0, 1.0),), VerdictKind.NAMED,
             "Coulomb friction at slide", marks=pytest.mark.long,
         ),
-        ((SensorGain("leaf_strain", 0.08),), VerdictKind.NAMED, "gain error of a sensor at leaf_strain"),
+        ((patch.SensorGain("leaf_strain", 0.08),), VerdictKind.NAMED, "gain error of a sensor at leaf_str"),
         ((), VerdictKind.NOTHING_MISSING, ""),
     ],
 )  # fmt: skip

@@ -17,22 +17,21 @@ from fe.runtime.errors import InvalidPatchError, SolutionError
 from fe.runtime.flexible_ports import settle_port
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
+from fe.runtime.motion import (
+    NO_LAWS,
+    PLANFORM,
+    STATION_COUNT,
+    STATION_PORTS,
+    Laws,
+    at_stations,
+    laws_of,
+    static_solution,
+)
 from fe.runtime.motion_arrays import State
-from fe.runtime.patch import (
-    BoucWen,
-    FreePlay,
-    MicroSlip,
-    ModelPatch,
-    Overflow,
-    PowerDamping,
-    PowerStiffness,
-    Primitive,
-    SineForce,
-)  # fmt: skip
+from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.runtime.patched_wing import PatchedWing
-from fe.runtime.planform_forces import PLANFORM, STATION_COUNT, STATION_PORTS, at_stations, planform_stations
 from fe.runtime.stepwise import substeps
+from fe.runtime.wing_rows import planform_stations
 from tests.fe.runtime.stepping import simulate
 
 A, W = 0.05, 2.0 * np.pi * np.array([5.6, 20.0, 35.0, 60.0])
@@ -47,8 +46,8 @@ AT_EACH = {  # one of each law
         FreePlay(PLANFORM, 90.0, 0.004),
         MicroSlip(PLANFORM, 12.0, 1500.0, -0.3, 8),
         BoucWen(PLANFORM, 800.0, 0.01, 1.5),
-        SineForce(PLANFORM, 3.0, 2.0, 0.1),
-        Overflow(PLANFORM, 5.0, 1.4, 0.2, 0.1),
+        patch.SineForce(PLANFORM, 3.0, 2.0, 0.1),
+        patch.Overflow(PLANFORM, 5.0, 1.4, 0.2, 0.1),
     )
 }
 
@@ -83,7 +82,7 @@ def test_the_slope_is_that_of_the_force(kind: str) -> None:
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5, 2.0])
 @pytest.mark.parametrize(
     ("law", "lowest"),
-    [(Overflow("tip", 0.7, 1.0, 2.0, 1.3), 2.0), (PowerDamping("tip", 0.7, 1.0, 0.5, 1.3, 0.1), 0.0)],
+    [(patch.Overflow("tip", 0.7, 1.0, 2.0, 1.3), 2.0), (PowerDamping("tip", 0.7, 1.0, 0.5, 1.3, 0.1), 0.0)],
 )
 def test_what_a_law_of_speed_takes_is_its_equation(law: Any, lowest: float, exponent: float) -> None:
     """A kick is s' = -w F(x, s), to the level where the law ends and no further."""
@@ -120,7 +119,7 @@ def test_what_a_law_of_speed_takes_is_its_equation(law: Any, lowest: float, expo
         MicroSlip("tip", 10.0, 500.0, -0.5),
         BoucWen("tip", 500.0, 0.03, 1.7),
         BoucWen("tip", 900.0, 0.001, 12.0),
-        SineForce("tip", 40.0, 15.0, 0.4),
+        patch.SineForce("tip", 40.0, 15.0, 0.4),
     ],
 )
 def test_static_levels_are_in_equilibrium_and_follow_the_path(law: Primitive) -> None:
@@ -135,7 +134,7 @@ def test_static_levels_are_in_equilibrium_and_follow_the_path(law: Primitive) ->
     fine = np.interp(np.linspace(0, 7, 7 * 64 + 1), np.arange(8), linear[:, 0])[:, None]
     followed = static_solution(laws(law), fine, compliance, kernel=compiled_kernel())
     np.testing.assert_allclose(followed.positions[::64], solution.positions, atol=3e-6)
-    if isinstance(law, SineForce):
+    if isinstance(law, patch.SineForce):
         np.testing.assert_allclose(
             solution.forces, 40.0 * np.sin(15.0 * solution.positions + 0.4), atol=1e-10
         )
@@ -170,7 +169,7 @@ def test_a_structure_that_softens_away_is_refused() -> None:
 
 @pytest.mark.parametrize("flexibility", [0.1, 0.16])  # from 1/6 m/N on there is more than one root
 def test_a_sine_on_flexibility_is_settled(flexibility: float) -> None:
-    sine = laws(SineForce("tip", 2.0, 3.0, 0.4))
+    sine = laws(patch.SineForce("tip", 2.0, 3.0, 0.4))
     ports = sine.at(np.zeros((1, 0)), np.array([flexibility]), 0.0, np.zeros((2, 1)))
     for y in np.linspace(-9.0, 9.0, 91):
         state = State(np.zeros(0), np.zeros(0), sine.memory(), np.zeros(1))
@@ -269,7 +268,7 @@ def test_laws_without_magnitude_leave_the_linear_structure() -> None:
         (MicroSlip("tip", 1, 1, 0.5), "-chi of 'micro_slip' must not be negative"),
         (MicroSlip("tip", 1, 1, 0.0, 0), "element_count of 'micro_slip' must be positive"),
         (BoucWen("tip", 1, 0, 1), "yield_displacement of 'bouc_wen' must be positive"),
-        (Overflow("tip", 1.0, 1.0, -1.0, 1.0), "level of 'overflow' must not be negative"),
+        (patch.Overflow("tip", 1.0, 1.0, -1.0, 1.0), "level of 'overflow' must not be negative"),
     ],
 )
 def test_a_law_that_cannot_be_is_refused_in_a_sentence(law: Primitive, sentence: str) -> None:

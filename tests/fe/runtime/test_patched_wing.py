@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -18,17 +17,9 @@ from fe.reduction import model_cache
 from fe.reduction.patch_basis import PatchSettings
 from fe.runtime import patch
 from fe.runtime.errors import InvalidPatchError, ReducedModelFileError
-from fe.runtime.patch import (
-    LoadPlace,
-    LocalStiffnessLoss,
-    ModelPatch,
-    ModulusTemperature,
-    PointMass,
-    RootCompliance,
-)
+from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
-from fe.wing.design import WingDesign
 from fe.wing.operators import (
     AffineOperators,
     assemble,
@@ -249,7 +240,7 @@ def test_point_mass_is_a_pitot_tube_that_was_moved(both: Compared, station: floa
 
 
 def test_temperature_is_a_change_of_the_modulus_factor(both: Compared) -> None:
-    warm, cold = (both.structure(ModulusTemperature(2e-3), temperature=t) for t in (25.0, 0.0))
+    warm, cold = (both.structure(patch.ModulusTemperature(2e-3), temperature=t) for t in (25.0, 0.0))
     stiffness = both.operators.stiffness({"young_modulus_factor": STATE[0] * 0.95}, STATE[1])
     both.alike(warm.static(both.load(1.0)), both.solved(both.operators.load_lift, stiffness))
     assert np.array_equal(cold.stiffness, both.structure().stiffness)
@@ -372,8 +363,8 @@ def test_the_span_port_weighs_by_area(both: Compared) -> None:
 
 def test_no_change_is_no_change_to_the_last_bit(both: Compared) -> None:
     nothing = (
-        PointMass(0.0, 1.0), RootCompliance(0.0), LocalStiffnessLoss(0.0, 0.3, 0.2), ModulusTemperature(0.0),
-        patch.PowerDamping("tip", 1.0, 1.0, 0.0, 1.0, 1.0),
+        PointMass(0.0, 1.0), RootCompliance(0.0), LocalStiffnessLoss(0.0, 0.3, 0.2),
+        patch.ModulusTemperature(0.0), patch.PowerDamping("tip", 1.0, 1.0, 0.0, 1.0, 1.0),
     )  # fmt: skip
     one, other = both.structure(*nothing, temperature=10.0), both.structure()
     assert np.array_equal(one.stiffness, other.stiffness)
@@ -407,7 +398,7 @@ def test_softer_is_softer(
     [
         (LocalStiffnessLoss(1.0, 0.2, 0.5), "must leave some stiffness"),
         (RootCompliance(-1.0), "cannot be reduced"),
-        (ModulusTemperature(0.2), "must be positive"),
+        (patch.ModulusTemperature(0.2), "must be positive"),
         (PointMass(0.1, 3.0), "must lie on the wing"),
         (PointMass(0.1, -0.1), "must lie on the wing"),
         (lambda both: both.wing.force_row("nose"), "place 'nose' is not known"),
@@ -441,9 +432,7 @@ def test_a_file_gives_the_arrays_back(coarse_patch_arrays: PatchArrays, tmp_path
         ("stations", lambda stations: stations[::-1].copy(), "must rise"),
     ],
 )
-def test_wrong_arrays_are_refused(
-    coarse_patch_arrays, name: str, change: Callable[[Any], Any], message: str
-) -> None:
+def test_wrong_arrays_are_refused(coarse_patch_arrays, name: str, change, message: str) -> None:
     with pytest.raises(ReducedModelFileError, match=message):
         replace(coarse_patch_arrays, **{name: change(getattr(coarse_patch_arrays, name))})
 
@@ -458,9 +447,7 @@ def test_strips_end_at_mesh_lines_and_shares_of_the_area_integrate_a_parabola_on
     assert mean == pytest.approx((2.0 / 3.0 - 0.25) / 1.5, rel=1e-12)
 
 
-def test_the_cache_builds_once(
-    coarse_design: WingDesign, coarse_patch_arrays: PatchArrays, tmp_path: Path, monkeypatch, caplog
-) -> None:
+def test_the_cache_builds_once(coarse_design, coarse_patch_arrays, tmp_path, monkeypatch, caplog) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     built: list[str] = []
     monkeypatch.setattr(

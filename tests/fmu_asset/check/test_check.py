@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 
 from fmu_asset.check import FmuCheck, check_fmu
-from fmu_asset.door.binding import parse_binding
+from tests.fmu_asset.making import bound
 
 MODELS = ["lag1", "room2", "fixed2", "array3", "ball2", "decay1", "swing3", "hostile2"]
+QUICK = ("array3", "ball2", "hostile2")
 
 
 def verdicts(check: FmuCheck) -> dict[str, str]:
@@ -21,11 +22,7 @@ def texts(check: FmuCheck, name: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "model",
-    [
-        name if name in ("array3", "ball2", "hostile2") else pytest.param(name, marks=pytest.mark.long)
-        for name in MODELS
-    ],
+    "model", [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in MODELS]
 )
 def test_sound_fmus_of_all_kinds_have_no_problem(foreign_fmu: Any, model: str) -> None:
     check = check_fmu(foreign_fmu(model), step_size=0.01 if model == "fixed2" else 0.1)
@@ -66,63 +63,61 @@ def test_one_fault_is_one_problem(foreign_fmu: Any, what: str, check: str, sente
 @pytest.mark.slow
 def test_eighty_instances_in_one_process(foreign_fmu: Any) -> None:
     """Create, run and free: the process does not grow, and one that leaks 256 KiB each is found out."""
-    sound = check_fmu(foreign_fmu("hostile2"), cycles=80)
-    assert verdicts(sound)["instances"] == "ok", texts(sound, "instances")
-    leaking = check_fmu(foreign_fmu("hostile2", "LEAK_IN_FREE"), cycles=60)
-    assert verdicts(leaking)["instances"] == "problem"
-    assert "it leaks" in texts(leaking, "instances")
-    crashing = check_fmu(foreign_fmu("hostile2", "CRASH_IN_FREE"), cycles=3)
-    assert "Instance 1 of 3 in one process" in texts(crashing, "instances")
+    for what, cycles, verdict, sentence in (
+        ((), 80, "ok", ""),
+        (("LEAK_IN_FREE",), 60, "problem", "it leaks"),
+        (("CRASH_IN_FREE",), 3, "problem", "Instance 1 of 3 in one process"),
+    ):
+        check = check_fmu(foreign_fmu("hostile2", *what), cycles=cycles)
+        assert verdicts(check)["instances"] == verdict, texts(check, "instances")
+        assert sentence in texts(check, "instances")
 
 
-def test_a_wrong_step_size_and_a_lie_about_it(foreign_fmu: Any) -> None:
-    wrong = check_fmu(foreign_fmu("fixed2"), step_size=1.0)
-    assert "the sample time is 0.01 s" in texts(wrong, "first flight")
-    assert "It takes 0.01 s only" in texts(check_fmu(foreign_fmu("fixed2")), "step size")
-    claims = ("<CoSimulation ", '<CoSimulation canHandleVariableCommunicationStepSize="true" ')
-    lying = check_fmu(foreign_fmu.changed("fixed2", "lying", claims))
-    assert "declares that it takes any step size, but not 0.005 s" in texts(lying, "step size")
+M = '<Unit name="m"><BaseUnit m="1"'
+TOLD: list[tuple[str, dict[str, Any], tuple[tuple[str, str], ...], str, str]] = [
+    ("fixed2", {"step_size": 1.0}, (), "first flight", "the sample time is 0.01 s"),
+    ("fixed2", {}, (), "step size", "It takes 0.01 s only"),
+    (
+        "fixed2", {},
+        (("<CoSimulation ", '<CoSimulation canHandleVariableCommunicationStepSize="true" '),),
+        "step size", "declares that it takes any step size, but not 0.005 s",
+    ),
+    (
+        "ball2", {}, ((f"{M}/>", f'{M} factor="0.001"/>'),), "units",
+        "'m' is defined with the factor 0.001 and the offset 0; usual are 1 and 0",
+    ),
+    (
+        "room2", {}, (('unit="K/s"', 'unit="bushel"'), ('"K/s"', '"bushel"')), "units",
+        "Nothing can be converted to bushel",
+    ),
+]  # fmt: skip
 
 
-def test_units_that_contradict_what_is_usual(foreign_fmu: Any) -> None:
-    odd = foreign_fmu.changed(
-        "ball2",
-        "units",
-        ('<Unit name="m"><BaseUnit m="1"/>', '<Unit name="m"><BaseUnit m="1" factor="0.001"/>'),
-    )
-    assert "'m' is defined with the factor 0.001 and the offset 0; usual are 1 and 0" in texts(
-        check_fmu(odd), "units"
-    )
-    odd = foreign_fmu.changed("room2", "bushel", ('unit="K/s"', 'unit="bushel"'), ('"K/s"', '"bushel"'))
-    assert "Nothing can be converted to bushel" in texts(check_fmu(odd), "units")
-
-
-def test_the_schema_and_a_binding_of_ones_own(foreign_fmu: Any) -> None:
+def test_step_sizes_and_units_that_contradict(foreign_fmu: Any) -> None:
+    for number, (model, options, changes, check, sentence) in enumerate(TOLD):
+        path = foreign_fmu.changed(model, f"told{number}", *changes)
+        assert sentence in texts(check_fmu(path, **options), check)
     broken = foreign_fmu.changed("fixed2", "schema", ('<Real start="0"/>', "<Real/>"))
     assert any("start value" in problem for problem in check_fmu(broken).problems)
-    own = parse_binding(
-        {
-            "binding": {"name": "own", "step_size": 30.0},
-            "load": {
-                "outside": {"variable": "ambient.T", "unit": "degC", "minimum": -40.0, "maximum": 50.0},
-                "power": {"variable": "heater.u[1].P", "unit": "kW", "maximum": 3.0},
-            },
-            "observation": {"room": {"variables": "room.T", "unit": "degC"}},
+
+
+def test_a_binding_of_ones_own(foreign_fmu: Any) -> None:
+    def own(unit: str) -> Any:
+        load = {
+            "outside": ("ambient.T", "degC", -40.0, 50.0),
+            "power": ("heater.u[1].P", "kW", 0.0, 3.0),
         }
-    )
-    check = check_fmu(foreign_fmu("room2"), own)
+        return bound(30.0, {"room": ("room.T", unit)}, load=load, header={"name": "own"})
+
+    check = check_fmu(foreign_fmu("room2"), own("degC"))
     assert check.passed
     assert texts(check, "binding") == "own fits."
     assert texts(check, "range edges") == "4 ends of ranges give finite outputs."
-    wrong = own.model_copy(
-        update={"observation": {"room": own.observation["room"].model_copy(update={"unit": "m"})}}
-    )
-    problems = check_fmu(foreign_fmu("room2"), wrong).problems
-    assert problems == (
+    sentence = (
         "observation.room is in 'm', but the FMU has 'room.T' in 'K', and there is no conversion between "
-        "the two; "
-        "state the value in 'K'.",
+        "the two; state the value in 'K'."
     )
+    assert check_fmu(foreign_fmu("room2"), own("m")).problems == (sentence,)
 
 
 def test_a_range_that_the_fmu_does_not_keep(foreign_fmu: Any) -> None:
@@ -134,12 +129,10 @@ def test_a_range_that_the_fmu_does_not_keep(foreign_fmu: Any) -> None:
 
 def test_a_binding_with_other_sizes_is_checked_with_them(foreign_fmu: Any) -> None:
     """Three inputs, for which the FMU has two start values."""
-    content = {
-        "binding": {"name": "sized", "step_size": 1.0, "structural_parameters": {"n": 3}},
-        "control": {"u": {"variable": "u", "unit": "1"}},
-        "observation": {"y": {"variables": "y", "unit": "1"}},
-    }
-    check = check_fmu(foreign_fmu("resize3"), parse_binding(content), cycles=2)
+    sized = bound(
+        1.0, {"y": ("y", "1")}, control={"u": ("u", "1")}, header={"structural_parameters": {"n": 3}}
+    )
+    check = check_fmu(foreign_fmu("resize3"), sized, cycles=2)
     assert "3 finite outputs" in texts(check, "first flight")
     found = verdicts(check)
     names = ("binding", "first flight", "determinism", "step size", "reset", "instances")

@@ -3,61 +3,36 @@
 from __future__ import annotations
 
 import ctypes
-import shutil
-import subprocess
-import zipfile
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from fmpy.fmi3 import FMU3Slave, fmi3IntermediateUpdateCallback, fmi3LogMessageCallback
-from fmpy.validation import validate_fmu
 from scipy.linalg import eigh
 
-from fe.reduction.reduced_basis import Reduction
 from fe.runtime.reduced import ReducedModel
-from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
-from fmu_asset.check import check_fmu
-from fmu_asset.door.binding import load_binding
-from fmu_asset.errors import FmuBuildError
-from fmu_asset.packing.structure_fmu import build_fmu, recorded_content_hash
-from scenarios import binding_files
-from tests.kept import compiled_wing
+from tests.fmu_asset.ours import OurFmus
+from tests.fmu_asset.slaves.slave import DISCARD, ERROR, OK, Slave, instantiated
 
-OK, DISCARD, ERROR = 0, 2, 3
-HEALTH, INPUTS = 1, {"load_factor": 0, "tip_force": 3, "young_modulus_factor": 4}
+HEALTH, INPUTS = 1, {"load_factor": 0, "tip_force": 3, "young_modulus_factor": 4, "servo": 7, "pitot": 8}
 STRAIN, TIP, BOUND, STATUS, LOAD_POINT, FREQUENCY, DAMPING_RATIO = 11, 35, 36, 37, 38, 39, 45
 GAUGES = 24
 
 
-@pytest.fixture(scope="module")
-def fmi3(compiler: list[str], model: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return compiled_wing(model, tmp_path_factory.mktemp("fmi3"), fmi=3)
+class Wing:
+    """An instance in this process: every call gives its status, and the log is kept."""
 
-
-class Slave3:
-    """An instance of the wing of FMI 3 in this process: every call gives its status, and the log is kept."""
-
-    def __init__(self, path: Path) -> None:
-        described = read_fmu(path)
-        self.folder, self.log = extract_fmu(described), []
-        self._callback = fmi3LogMessageCallback(lambda _, status, __, text: self.log.append(text.decode()))
-        self.fmu = FMU3Slave(
-            guid=described.guid,
-            modelIdentifier=described.model_identifier,
-            unzipDirectory=str(self.folder),
-            instanceName="wing",
-        )
-        self.fmu.instantiate(logMessage=self._callback)
+    def __init__(self, fmu: Any, log: list[str]) -> None:
+        self.fmu, self.log = fmu, log
 
     def call(self, name: str, *arguments: Any) -> int:
         return int(getattr(self.fmu.dll, f"fmi3{name}")(self.fmu.component, *arguments))
 
-    def start(self, *, response: int = 1, **values: float) -> None:
+    def start(self, *, response: int = 1, damping: tuple[float, ...] = (), **values: float) -> None:
         self.fmu.enterInitializationMode(startTime=0.0)
         self.fmu.setInt64([10], [response])
+        self.fmu.setFloat64([5, 6][: len(damping)], damping)
         for name, value in values.items():
             self.fmu.setFloat64([INPUTS[name]], [value])
         self.fmu.exitInitializationMode()
@@ -72,7 +47,7 @@ class Slave3:
         count = GAUGES + 3 + 12
         return self.fmu.getFloat64([STRAIN, TIP, BOUND, LOAD_POINT, FREQUENCY, DAMPING_RATIO], count)
 
-    def derivative(self, kind: str, unknowns: list[int], knowns: list[int], seed: Any, size: int) -> Any:
+    def derivative(self, unknowns: Any, knowns: Any, seed: Any, size: int, kind: str = "Directional") -> Any:
         result, seeds = (ctypes.c_double * size)(), (ctypes.c_double * len(seed))(*seed)
         references: list[Any] = []
         for each in (unknowns, knowns):
@@ -80,31 +55,23 @@ class Slave3:
         status = self.call(f"Get{kind}Derivative", *references, seeds, len(seed), result, size)
         return np.array(result) if status == OK else status
 
-    def close(self) -> None:
-        self.fmu.freeInstance()
-        shutil.rmtree(self.folder)
-
 
 @pytest.fixture
-def wing3(fmi3: Path) -> Iterator[Slave3]:
-    made = Slave3(fmi3)
-    yield made
-    made.close()
+def wing3(ours: OurFmus) -> Iterator[Wing]:
+    log: list[str] = []
+    callback = fmi3LogMessageCallback(lambda _, status, __, text: log.append(text.decode()))
+    with instantiated(FMU3Slave, ours("fmi3"), logMessage=callback) as (fmu, _):
+        yield Wing(fmu, log)
 
 
 @pytest.mark.parametrize("response", [1, 2], ids=["steady", "transient"])
-def test_it_gives_the_numbers_of_the_wing_of_fmi_2(wing3: Slave3, slave: Any, response: int) -> None:
+def test_it_gives_the_numbers_of_the_wing_of_fmi_2(wing3: Wing, slave: Slave, response: int) -> None:
     """To the last bit, all outputs, under random health, loads and steps."""
-    rng = np.random.default_rng(5)
+    rng, time = np.random.default_rng(5), 0.0
     wing3.start(response=response)
     assert slave.start(response=response) == OK
-    time = 0.0
     for _ in range(40):
-        health, load_factor, tip_force = (
-            rng.uniform(0, 0.8, 2).tolist(),
-            rng.uniform(-1, 4),
-            rng.uniform(-20, 20),
-        )
+        *health, load_factor, tip_force = rng.uniform([0, 0, -1, -20], [0.8, 0.8, 4, 20]).tolist()
         size = float(rng.choice([1e-3, 0.1, 1.0]))
         wing3.step(load_factor, health, tip_force, time, size)
         assert slave.step([load_factor, *health, tip_force], time, size) == OK
@@ -112,48 +79,6 @@ def test_it_gives_the_numbers_of_the_wing_of_fmi_2(wing3: Slave3, slave: Any, re
         assert wing3.everything() == slave.everything()[10:]
         assert wing3.fmu.getFloat64([49 + 2]) == [time]
     assert wing3.fmu.getFloat64([HEALTH], 2) == health
-
-
-def test_nothing_is_found_to_complain_of(fmi3: Path) -> None:
-    assert validate_fmu(str(fmi3)) == []
-    declared, actual = recorded_content_hash(fmi3)
-    assert declared == actual
-    check = check_fmu(fmi3, binding=load_binding(binding_files()["uav_wing_fmi3"]), cycles=20)
-    assert check.passed, check.problems
-    assert "warning" not in {finding.verdict for finding in check.findings}
-
-
-def test_the_sources_are_clean_and_export_all_of_fmi_3(
-    fmi3: Path, compiler: list[str], tmp_path: Path
-) -> None:
-    shutil.unpack_archive(fmi3, tmp_path, "zip")
-    warnings = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
-    for name in ("structure_fmi3.c", "structure_derivative.c", "structure_state.c"):
-        words = [*compiler, "-std=c11", *warnings, "-fsyntax-only", tmp_path / "sources" / name]
-        subprocess.run(words, check=True)
-    header = (tmp_path / "sources" / "fmi3Functions.h").read_text()
-    library = ctypes.CDLL(str(next((tmp_path / "binaries" / "x86_64-linux").iterdir())))
-    exported = [line for line in header.splitlines() if line.startswith("FMI3_Export fmi3")]
-    assert len(exported) == 75
-    assert all(hasattr(library, line.split()[-1].rstrip(";")) for line in exported)
-    assert not (tmp_path / "sources" / "structure_fmi2.c").exists()
-
-
-def test_a_structure_has_arrays_too(beam_reduction: Reduction, tmp_path: Path) -> None:
-    path = build_fmu(beam_reduction.model, tmp_path / "beam.fmu", kind="source", fmi=3).path
-    assert validate_fmu(str(path)) == []
-    with zipfile.ZipFile(path) as archive:
-        text = archive.read("modelDescription.xml").decode()
-    assert '<Float64 name="strain" ' in text
-    assert '<Float64 name="health" ' in text
-
-
-def test_the_python_kind_is_of_fmi_2(model: ReducedModel, tmp_path: Path) -> None:
-    with pytest.raises(
-        FmuBuildError, match=r"'python' is of FMI 2\.0 .* but FMI 3\.0 .* 'compiled' or 'source'"
-    ):
-        build_fmu(model, tmp_path / "wing.fmu", fmi=3)
-    assert not list(tmp_path.iterdir())
 
 
 # ---------------------------------------------------------------- derivatives
@@ -166,7 +91,7 @@ def direction(name: str) -> tuple[list[int], list[float]]:
     """Value references and seed for a change of one value."""
     if name in ("z1", "z2"):
         return [HEALTH], [float(name == each) for each in ("z1", "z2")]
-    return [(INPUTS | {"servo": 7, "pitot": 8})[name]], [1.0]
+    return [INPUTS[name]], [1.0]
 
 
 def outputs(model: ReducedModel, at: dict[str, complex]) -> np.ndarray:
@@ -194,27 +119,23 @@ def slope(function: Callable[[float], np.ndarray], at: float, h: float = 1e-3) -
     return sum(w * (function(at + k * h) - function(at - k * h)) for k, w in weights.items()) / h
 
 
-def flown(wing3: Slave3, response: int = 1) -> Slave3:
+def flown(wing3: Wing, response: int = 1) -> Wing:
     wing3.start(response=response, young_modulus_factor=AT["young_modulus_factor"])
     wing3.step(AT["load_factor"], [AT["z1"], AT["z2"]], AT["tip_force"], 0.0, 1.0)
     return wing3
 
 
 @pytest.mark.parametrize("name", AT)
-def test_static_derivatives_are_those_of_a_complex_step(
-    wing3: Slave3, model: ReducedModel, name: str
-) -> None:
+def test_static_derivatives_are_those_of_a_complex_step(wing3: Wing, model: ReducedModel, name: str) -> None:
     flown(wing3)
     np.testing.assert_allclose(wing3.everything()[:25], outputs(model, AT)[:25], rtol=1e-12)
-    seen = wing3.derivative("Directional", [STRAIN, TIP, LOAD_POINT], *direction(name), 26)
+    seen = wing3.derivative([STRAIN, TIP, LOAD_POINT], *direction(name), 26)
     expected = complex_step(model, name)
     np.testing.assert_allclose(seen, expected, rtol=1e-11, atol=1e-13 * np.abs(expected).max())
 
 
-def test_modal_derivatives_are_those_of_differences(wing3: Slave3, model: ReducedModel) -> None:
-    wing3.fmu.enterInitializationMode(startTime=0.0)
-    wing3.fmu.setFloat64([4, 5, 6], [AT["young_modulus_factor"], 2.0, 3e-4])
-    wing3.fmu.exitInitializationMode()
+def test_modal_derivatives_are_those_of_differences(wing3: Wing, model: ReducedModel) -> None:
+    wing3.start(damping=(2.0, 3e-4), young_modulus_factor=AT["young_modulus_factor"])
     wing3.step(1.0, [AT["z1"], AT["z2"]], 0.0, 0.0, 1.0)
     servo, pitot = wing3.fmu.getFloat64([7, 8])
     at = AT | {"servo": servo, "pitot": pitot}
@@ -225,42 +146,41 @@ def test_modal_derivatives_are_those_of_differences(wing3: Slave3, model: Reduce
         return 0.5 * (2.0 / omega + 3e-4 * omega)
 
     for name in ("young_modulus_factor", "z1", "z2", "servo", "pitot"):
-        seen = wing3.derivative("Directional", [FREQUENCY, DAMPING_RATIO], *direction(name), 12)
+        seen = wing3.derivative([FREQUENCY, DAMPING_RATIO], *direction(name), 12)
         for ours, function in ((seen[:6], lambda at: frequencies(model, at)), (seen[6:], damping_ratios)):
             expected = slope(lambda value: function(at | {name: value}), at[name])  # noqa: B023
             np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
     omega = 2 * np.pi * frequencies(model, at)
     np.testing.assert_allclose(
-        wing3.derivative("Directional", [DAMPING_RATIO], [5, 6], [1.0, 0.0], 6), 0.5 / omega, rtol=1e-10
+        wing3.derivative([DAMPING_RATIO], [5, 6], [1.0, 0.0], 6), 0.5 / omega, rtol=1e-10
     )
-    assert not np.any(wing3.derivative("Directional", [STRAIN, FREQUENCY], [6], [1.0], 30))
+    assert not np.any(wing3.derivative([STRAIN, FREQUENCY], [6], [1.0], 30))
 
 
-def test_the_adjoint_is_the_transpose(wing3: Slave3) -> None:
+def test_the_adjoint_is_the_transpose(wing3: Wing) -> None:
     flown(wing3)
     rng = np.random.default_rng(3)
     unknowns, knowns = [LOAD_POINT, STRAIN, FREQUENCY, TIP], [HEALTH, 0, 4, 7]
     v, w = rng.normal(size=5), rng.normal(size=1 + GAUGES + 6 + 1)
-    forward = wing3.derivative("Directional", unknowns, knowns, v, len(w))
-    backward = wing3.derivative("Adjoint", unknowns, knowns, w, len(v))
+    forward = wing3.derivative(unknowns, knowns, v, len(w))
+    backward = wing3.derivative(unknowns, knowns, w, len(v), "Adjoint")
     assert w @ forward == pytest.approx(backward @ v, rel=1e-12)
 
 
-def test_fmi_2_gives_the_same_derivatives(wing3: Slave3, slave: Any) -> None:
+def test_fmi_2_gives_the_same_derivatives(wing3: Wing, slave: Slave) -> None:
     flown(wing3)
     reference = slave.reference
     slave.start(young_modulus_factor=AT["young_modulus_factor"])
     slave.step([AT["load_factor"], AT["z1"], AT["z2"], AT["tip_force"]], 0.0, 1.0)
     unknowns = [reference[f"strain[{i}]"] for i in range(1, GAUGES + 1)]
     seen = slave.fmu.getDirectionalDerivative(unknowns, [reference["health.z1"], 0], [0.7, -0.2])
-    expected = wing3.derivative("Directional", [STRAIN], [HEALTH, 0], [0.7, 0.0, -0.2], GAUGES)
+    expected = wing3.derivative([STRAIN], [HEALTH, 0], [0.7, 0.0, -0.2], GAUGES)
     np.testing.assert_array_equal(seen, expected)
-    assert slave.description.variables  # the declaration is checked by the schema
 
 
-def test_in_motion_loads_act_at_once_and_health_is_refused(wing3: Slave3) -> None:
+def test_in_motion_loads_act_at_once_and_health_is_refused(wing3: Wing) -> None:
     flown(wing3, response=2)
-    feed_through = wing3.derivative("Directional", [STRAIN, TIP, LOAD_POINT], [0], [1.0], 26)
+    feed_through = wing3.derivative([STRAIN, TIP, LOAD_POINT], [0], [1.0], 26)
     step = 1e-12  # s; the modes have no time to move
     kept = wing3.fmu.getFMUState()
     shown = []
@@ -271,27 +191,27 @@ def test_in_motion_loads_act_at_once_and_health_is_refused(wing3: Slave3) -> Non
     wing3.fmu.freeFMUState(kept)
     scale = np.abs(shown[0]).max()
     np.testing.assert_allclose(feed_through, shown[0] - shown[1], rtol=0, atol=1e-12 * scale)
-    assert wing3.derivative("Directional", [STRAIN], [HEALTH], [1.0, 0.0], GAUGES) == DISCARD
+    assert wing3.derivative([STRAIN], [HEALTH], [1.0, 0.0], GAUGES) == DISCARD
     assert "with respect to health[1] is not offered in motion" in wing3.log[-1]
 
 
-def test_derivatives_that_there_are_not_are_refused_in_a_sentence(wing3: Slave3) -> None:
-    assert wing3.derivative("Directional", [STRAIN], [0], [1.0], GAUGES) == ERROR
+def test_derivatives_that_there_are_not_are_refused_in_a_sentence(wing3: Wing) -> None:
+    assert wing3.derivative([STRAIN], [0], [1.0], GAUGES) == ERROR
     assert "not initialised" in wing3.log[-1]
     flown(wing3)
-    for unknowns, knowns, seed, size, sentence in (
-        ([BOUND], [0], [1.0], 1, "strain_error_bound with respect to load_factor is not offered"),
-        ([TIP], [9], [1.0], 1, "initial_tip_displacement is not offered"),
-        ([TIP], [HEALTH], [1.0], 1, "one number for each value"),
-        ([TIP], [0], [1.0], 2, "one number for each value"),
-        ([STATUS], [0], [1.0], 1, "one number for each value"),
-        ([TIP], [2], [1.0], 1, "one number for each value"),
+    for unknown, known, size, sentence in (
+        (BOUND, 0, 1, "strain_error_bound with respect to load_factor is not offered"),
+        (TIP, 9, 1, "initial_tip_displacement is not offered"),
+        (TIP, HEALTH, 1, "one number for each value"),
+        (TIP, 0, 2, "one number for each value"),
+        (STATUS, 0, 1, "one number for each value"),
+        (TIP, 2, 1, "one number for each value"),
     ):
-        assert wing3.derivative("Directional", unknowns, knowns, seed, size) == DISCARD
+        assert wing3.derivative([unknown], [known], [1.0], size) == DISCARD
         assert sentence in wing3.log[-1]
 
 
-def test_wrong_calls_are_refused_and_change_nothing(wing3: Slave3) -> None:
+def test_wrong_calls_are_refused_and_change_nothing(wing3: Wing) -> None:
     flown(wing3)
     before = wing3.everything()
     refs, values = (ctypes.c_uint * 1)(HEALTH), (ctypes.c_double * 3)(0.1, 0.2, 0.3)
@@ -314,5 +234,5 @@ def test_wrong_calls_are_refused_and_change_nothing(wing3: Slave3) -> None:
     no_update = fmi3IntermediateUpdateCallback()
     for token, path in (("{wrong}", b"x"), (wing3.fmu.guid, b"/nowhere/")):
         words = (b"wing", token.encode(), path, False, False, False, False, None, 0, None)
-        assert not wing3.fmu.dll.fmi3InstantiateCoSimulation(*words, wing3._callback, no_update)
+        assert not wing3.fmu.dll.fmi3InstantiateCoSimulation(*words, wing3.fmu.logMessage, no_update)
     assert "/nowhere//reduced_model.bin" in wing3.log[-1]

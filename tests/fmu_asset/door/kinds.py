@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from fe.structure.design import parse_structure
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.companions.damage_growth import DamageGrowth
 from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.slaves.effects import output_channels
 from fmu_asset.structures.binding import structure_binding
 from scenarios import binding_files
 from tests.conftest import BEAM
@@ -96,6 +98,9 @@ class Kind:
 # ---------------------------------------------------------------------- structures
 
 WING = load_binding(binding_files()["uav_wing"])
+BINDINGS = {path.stem: load_binding(path) for path in Path(__file__).with_name("bindings").glob("*.toml")}
+"""Of others' FMUs and systems, by the name of the model."""
+HOSTILE, SYSTEM_OF_THREE = BINDINGS["hostile2"], BINDINGS["three"]
 QUASI_STATIC, TRANSIENT = 1.0, 2.0
 MOVING = {"response": TRANSIENT, "initial_tip_displacement": 0.03, "damping_alpha": 1.0, "damping_beta": 1e-4}
 
@@ -190,13 +195,55 @@ BEAM_COURSE = random_course({
 })  # fmt: skip
 
 
-# ---------------------------------------------------------------------- others' FMUs
+INTERVAL = 0.01
+CHANNELS = output_channels(24)
+OUTPUTS = [name for name, _ in CHANNELS]
 
-SPRING = bound(
-    0.1, {"motion": (["velocity", "position"], "m")}, header={"name": "spring_mass", "start_time": 2.0},
-    control={"push": ("force", "N")}, health={"spring": ("stiffness", "N/m")},
-    load={"lock": ("locked", "1"), "misbehaviour": ("misbehaviour", "1")}, monitor={"steps": ("steps", "1")},
+
+def watching(
+    step_size: float = INTERVAL, load: Mapping[str, tuple[str, str]] | None = None, **header: object
+) -> Binding:
+    """Return a binding of a wing that observes all outputs."""
+    return bound(
+        step_size, {"all": (OUTPUTS, ["1"] * 24 + ["m"] * 2)}, header=header,
+        control={"load_factor": ("load_factor", "1")},
+        health={name: (f"health.{name}", "1") for name in ("z1", "z2")},
+        load={"tip_force": ("tip_force", "N"), **(load or {})},
+        parameter={"response": ("response", "1"), "release": ("initial_tip_displacement", "m")},
+        record=["strain_error_bound", "frequency[{1..6}]", "damping_ratio[{1..6}]"],
+    )  # fmt: skip
+
+
+def on(*names: str) -> dict[str, float]:
+    """Return the parameters that switch effects on."""
+    return {f"effect.{name}.active": 1.0 for name in names}
+
+
+WARM = {"temperature": ("temperature_difference", "K")}
+SENDING = watching(
+    0.05, WARM | {"drift": ("effect.gauge_zero_drift.active", "1"),
+                  "time_constant": ("effect.coupling.time_constant[2]", "s")},
 )  # fmt: skip
+
+
+def playing(step_size: float = INTERVAL) -> Binding:
+    """Return a binding that sends switches and a value of effects at every step."""
+    sent = {name: (f"effect.{name}.active", "1") for name in ("root", "play")}
+    return watching(step_size, WARM | sent | {"half_width": ("effect.play.half_width", "m")})
+
+
+HYSTERESIS = ("slip", "bouc_wen", "friction", "local_loss")
+
+
+def with_effects(file: str, binding: Binding, names: tuple[str, ...], switch: str, **given: float) -> Kind:
+    """A wing with effects, of which one comes and goes; what they do is tested beside whole records."""
+    course = wing_course()
+    warm = np.linspace(0.0, 3.0, 24)
+    load = {**course["load"], "temperature": warm, switch: np.arange(24) % 4 > 1}
+    return Kind(file, binding, {**course, "load": load}, parameters=on(*names) | given, state="serialised")
+
+
+# ---------------------------------------------------------------------- others' FMUs
 
 
 def spring(kind: Kind, _: OurFmus) -> Shown:
@@ -327,17 +374,10 @@ def following(file: str, *, quarters: bool = False, **header: object) -> Kind:
 
 
 EXCHANGED = {"interface": "model-exchange", "tolerance": 1e-11}
-HOSTILE = bound(1.0, {"y": ("y", "m")}, control={"u": ("u", "m/s")})
 
 
 def integral(kind: Kind, _: OurFmus) -> Shown:
     return np.cumsum(kind.course["control"]["u"])[:, np.newaxis], {}
-
-
-DAMAGE_BINDING = bound(
-    1.0, {"z": (["z1", "z2"], "1")}, control={"load_factor": ("load_factor", "1")},
-    parameter={"p1": ("probability.z1", "1"), "p2": ("probability.z2", "1"), "seed": ("seed", "1")},
-)  # fmt: skip
 
 
 def damage(kind: Kind, ours: OurFmus) -> Shown:
@@ -384,12 +424,6 @@ def recursion(kind: Kind, _: OurFmus) -> Shown:
     return shown, {}
 
 
-SYSTEM_OF_THREE = bound(
-    0.5,
-    {"strain": ("gauges.reading[{1..24}]", "microstrain"), "received": ("gauges.received[{1..24}]", "1")},
-    control={"load_factor": ("load_factor", "1")}, parameter={"seed": ("gauges.seed", "1")},
-    monitor={"z1": ("damage.z1", "%")}, record=["wing.tip_displacement", "damage.z2"],
-)  # fmt: skip
 OSCILLATOR_ENDS = watch("first.y1", "first.y2", "second.y1", step_size=0.05, inputs=["push"])
 PUSHED = {"control": {"push": np.sin(np.arange(24.0))}}
 SERIALISED = {"state": "serialised"}
@@ -408,6 +442,12 @@ KINDS: dict[str, Kind] = {
     "three compiled regions in motion": wing("compiled_regions", TRANSIENT, largest=1e-12, **SERIALISED),
     "model exchange wing": exchange("exchange", "health.z{}"),
     "model exchange wing of FMI 3": exchange("exchange3", "health[{}]", fmi_version="3.0"),
+    "effects of sensors": with_effects("sensing", SENDING, ("coupling", "hum"), "drift"),
+    "effects of sensors in motion": with_effects(
+        "sensing", SENDING, ("coupling", "hum"), "drift", response=TRANSIENT, release=0.01
+    ),
+    "hysteresis": with_effects("patched", playing(), HYSTERESIS, "root"),
+    "hysteresis in motion": with_effects("patched", playing(), HYSTERESIS, "root", response=TRANSIENT),
     "beam": Kind(
         "beam", BEAM_BINDING, BEAM_COURSE, statics, largest=1e-12, parameters={"e": 1.06, "pump": 0.03},
         **SERIALISED,
@@ -417,96 +457,53 @@ KINDS: dict[str, Kind] = {
         parameters={"response": TRANSIENT}, **SERIALISED,
     ),
     "spring": Kind(
-        "spring_mass", SPRING,
+        "spring_mass", BINDINGS["spring_mass"],
         {"control": {"push": np.sin(TURNS)}, "health": {"spring": 2.0}, "load": {"lock": TURNS % 7 == 6}},
         spring, rtol=1e-12,
     ),
     "FMI 1": Kind(
-        "lag1",
-        bound(
-            0.05, {"out": ("Out1", "rad/s")},
-            header={"fmi_version": "1.0", "decimation": 3, "start_time": 1.0},
-            control={"speed": ("In1 (rad/s)", "rad/s", -2000.0, 2000.0)}, load={"hold": ("Hold", "1")},
-            parameter={"gain": ("Lag/Gain [K]", "1"), "time": ("Lag/Time const", "s")},
-            monitor={"count": ("Count", "1")},
-        ),
+        "lag1", BINDINGS["lag1"],
         {"control": {"speed": np.linspace(-2.0, 2.0, 24)}, "load": {"hold": TURNS % 7 == 6}},
         lag, rtol=1e-12, parameters={"gain": 3.0, "time": 0.4},
     ),
     "FMI 2 of a Modelica tool": Kind(
-        "room2",
-        bound(
-            60.0, {"room": (["room.T", "room.sensor.T"], "degC")}, control={"power": ("heater.u[1].P", "kW")},
-            load={"outside": ("ambient.T", "degC", -40.0, 50.0), "on": ("'heater is on'", "1")},
-            parameter={"mode": ("heater.mode", "1")}, record=["der(room.T)", "room.T"],
-        ),
+        "room2", BINDINGS["room2"],
         {"control": {"power": np.linspace(0.0, 3.0, 24)},
          "load": {"outside": np.linspace(-5.0, 9.0, 24), "on": TURNS % 5 != 4}},
         room, rtol=1e-12, parameters={"mode": 2.0},
     ),
     "a fixed step": Kind(
-        "fixed2",
-        bound(
-            0.01, {"y": ("y", "1")}, control={"u": ("u", "1")}, monitor={"calls": ("calls", "1")},
-            header={"decimation": 100, "start_time": 5.0},
-        ),
+        "fixed2", BINDINGS["fixed2"],
         {"control": {"u": np.linspace(3.0, -1.0, 8)}}, fixed, rtol=1e-12, **SERIALISED,
     ),
     "elements of arrays": Kind(
-        "array3",
-        bound(
-            1.0, {"y": ("y", "m")}, control={"first": ("u[1]", "1")},
-            load={"offset": ("offset", "1"), "active": ("active", "1"), "third": ("u[3]", "1")},
-            parameter={"gain": ("gain", "1"), "corner": ("A[2,3]", "1"), "first": ("A[1,1]", "1")},
-            monitor={"calls": ("calls", "1"), "y": ("y_alias", "mm")},
-        ),
+        "array3", BINDINGS["array3"],
         {"control": {"first": np.cos(TURNS)},
          "load": {"offset": TURNS % 5 - 3, "active": TURNS % 4 != 3, "third": np.sin(TURNS)}},
         array, rtol=1e-12, parameters={"gain": 0.5, "corner": 10.0}, **SERIALISED,
     ),
     "whole arrays": Kind(
-        "array3",
-        bound(
-            1.0, {"y": ("y", "m")}, load={"u": ("u", "1"), "offset": ("offset", "1")},
-            parameter={"A": ("A", "1")}, monitor={"calls": ("calls", "1")},
-        ),
+        "array3", BINDINGS["array3_whole"],
         {"load": {"u": np.random.default_rng(2).normal(size=(12, 3)), "offset": np.arange(12) - 5}},
         array, rtol=1e-12, parameters={"A": np.arange(6.0) ** 2}, arrays=("u",), **SERIALISED,
     ),
     "one array for all steps": Kind(
-        "array3",
-        bound(
-            1.0, {"y": ("y", "m")}, load={"u": ("u", "1"), "offset": ("offset", "1")},
-            monitor={"calls": ("calls", "1")},
-        ),
+        "array3", BINDINGS["array3_whole"],
         {"load": {"u": np.array([1.0, -2.0, 3.0]), "offset": np.zeros(4)}}, array, rtol=1e-12,
         arrays=("u",), **SERIALISED,
     ),
     "model exchange of FMI 2 with state events": Kind(
-        "ball2",
-        bound(
-            0.05, {"ball": ("h", "mm"), "speed": ("v", "m/s")}, control={"gravity": ("g", "m/s2")},
-            parameter={"restitution": ("e", "1")}, monitor={"bounces": ("bounces", "1")},
-            header={"tolerance": 1e-8},
-        ),
+        "ball2", BINDINGS["ball2"],
         {"control": {"gravity": np.full(30, 9.81)}}, ball, rtol=1e-5, atol=2e-3,
         parameters={"restitution": 0.8},
     ),
     "model exchange of FMI 1": Kind(
-        "decay1",
-        bound(
-            0.5, {"x": ("x", "K")}, control={"u": ("u", "degC")}, parameter={"k": ("k", "1")},
-            header={"tolerance": 1e-9, "start_time": -1.0},
-        ),
+        "decay1", BINDINGS["decay1"],
         {"control": {"u": np.array([0.0, 0.0, 4.0, 4.0, -2.0, -2.0]) - 273.15}}, decay, atol=1e-7,
         start={"control": {"u": -273.15}}, parameters={"k": 2.0}, resets=False,
     ),
     "model exchange of FMI 3 with a time event": Kind(
-        "swing3",
-        bound(
-            0.3, {"x": (["x"], "1"), "a": ("a", "1")}, parameter={"w": ("w", "rad/s")},
-            header={"tolerance": 1e-9},
-        ),
+        "swing3", BINDINGS["swing3"],
         {"load": {}, "control": {}}, swing, atol=1e-6, parameters={"w": 3.0},
     ),
     "lines of FMI 1": following("follow1"),
@@ -519,7 +516,7 @@ KINDS: dict[str, Kind] = {
         "hostile2", changed(HOSTILE, header={"state": "replay"}), {"control": {"u": TURNS / 4.0}}, integral
     ),
     "damage": Kind(
-        "damage_growth", DAMAGE_BINDING, {"control": {"load_factor": 2.0 + TURNS % 2}}, damage,
+        "damage_growth", BINDINGS["damage_growth"], {"control": {"load_factor": 2.0 + TURNS % 2}}, damage,
         parameters={"p1": 0.4, "p2": 0.3, "seed": 11.0}, **SERIALISED,
     ),
     "a system": Kind("oscillator", OSCILLATOR_ENDS, PUSHED, recursion, rtol=1e-12, atol=1e-13, **SERIALISED),

@@ -15,33 +15,11 @@ from fe.runtime.patch import STRUCTURE, ModelPatch, SensorRotation
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.state import DigitalState
-from fmu_asset.door.binding import Binding
-from fmu_asset.slaves.effects import output_channels
-from tests.fmu_asset.making import bound
+from tests.fmu_asset.door.kinds import CHANNELS, INTERVAL, OUTPUTS
 
-INTERVAL = 0.01
-CHANNELS = output_channels(24)
-OUTPUTS = [name for name, _ in CHANNELS]
 _START = DigitalState()
 STATE = np.array([1.0, *(getattr(_START, name) for name in ("servo_mass", "pitot_mass")),
                   _START.damping_alpha, _START.damping_beta])  # fmt: skip
-
-
-def watching(step_size: float = INTERVAL, load: Any = (), **header: object) -> Binding:
-    """Return a binding of a wing that observes all outputs."""
-    return bound(
-        step_size, {"all": (OUTPUTS, ["1"] * 24 + ["m"] * 2)}, header=header,
-        control={"load_factor": ("load_factor", "1")},
-        health={name: (f"health.{name}", "1") for name in ("z1", "z2")},
-        load={"tip_force": ("tip_force", "N"), **dict(load)},
-        parameter={"response": ("response", "1"), "release": ("initial_tip_displacement", "m")},
-        record=["strain_error_bound", "frequency[{1..6}]", "damping_ratio[{1..6}]"],
-    )  # fmt: skip
-
-
-def on(*names: str) -> dict[str, float]:
-    """Return the parameters that switch effects on."""
-    return {f"effect.{name}.active": 1.0 for name in names}
 
 
 def trial(kind: TrialKind, count: int, **given: Any) -> Trial:

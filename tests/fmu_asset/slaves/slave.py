@@ -5,8 +5,10 @@ from __future__ import annotations
 import ctypes
 import itertools
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from fmpy import calloc, free
 from fmpy.fmi1 import FMICallException
@@ -125,3 +127,20 @@ class Slave:
         self.fmu.freeInstance()
         if self._owns_folder:
             shutil.rmtree(self.folder)
+
+
+@contextmanager
+def instantiated(kind: type, path: Path, **options: Any) -> Iterator[Any]:
+    """Yield an instance of a class of fmpy and the value references of its variables by name."""
+    described = read_fmu(path)
+    folder = extract_fmu(described)
+    made = kind(
+        guid=described.guid,
+        modelIdentifier=described.model_identifier,
+        unzipDirectory=str(folder),
+        instanceName="wing",
+    )
+    made.instantiate(**options)
+    yield made, {variable.name: variable.reference for variable in described.variables}
+    made.freeInstance()
+    shutil.rmtree(folder)

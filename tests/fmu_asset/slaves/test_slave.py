@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import TIP_FORCE
+from fe.runtime.state import TIP_FORCE, DigitalState
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.variables import (
     STATUS_BAD_CALL,
@@ -35,6 +35,7 @@ from fmu_asset.slaves.variables import (
 )
 from tests.fmu_asset.ours import OurFmus
 from tests.fmu_asset.slaves.slave import DISCARD, ERROR, OK, Slave
+from tests.kept import compiled_wing
 from tests.wings import wing_integrator
 
 STRAIN, TIP, BOUND, LOAD_POINT, MODAL = slice(10, 34), 34, 35, 36, slice(37, 49)
@@ -90,6 +91,17 @@ def test_a_start_is_the_equilibrium_and_modal_outputs_follow(slave: Slave, model
     released = integrator.outputs(integrator.released(0.03, (1.0, 0.0), TIP_FORCE))
     scale = np.abs(released[:-1]).max()
     np.testing.assert_allclose(slave.everything()[STRAIN], released[:-1], rtol=0.0, atol=1e-12 * scale)
+
+
+def test_start_values_come_from_the_state(ours: OurFmus, model: ReducedModel, tmp_path: Path) -> None:
+    ours("compiled")  # skips where there is no compiler
+    given = {"young_modulus_factor": 1.0 + 1e-15, "stiffness_loss": (0.1, 1.0 / 3.0)}
+    with closing(Slave(compiled_wing(model, tmp_path, state=DigitalState(**given)))) as slave:
+        assert slave.everything()[1:3] == [0.1, 1.0 / 3.0]
+        assert slave.of("young_modulus_factor") == 1.0 + 1e-15
+        assert slave.start() == OK
+        expected = model.static_response(**given, load_factor=1.0)
+        np.testing.assert_allclose(slave.everything()[STRAIN], expected.strain, rtol=1e-12)
 
 
 @settings(deadline=None)
@@ -204,14 +216,38 @@ def test_outputs_can_be_read_while_initialising(both: tuple[Slave, Slave]) -> No
     assert_same_numbers(both[0].names, *seen)
 
 
+def test_modes_that_coincide_are_those_in_python(
+    compiler: Any, beam_model: ReducedModel, tmp_path: Path
+) -> None:
+    """A double mode, two 1e-7 apart, two 1e-3, whatever the loss: motion and frequencies to 1e-9."""
+    size = beam_model.modal_load.shape[1]
+    turn = np.linalg.qr(np.random.default_rng(5).normal(size=(size, size)))[0]
+    squares = 1e6 * np.arange(1.0, size + 1.0) ** 2
+    squares[2], squares[4] = squares[1], squares[3] * (1.0 + 1e-7)
+    squares[6] = squares[5] * 1.001
+    shares = np.full(len(beam_model.modal_stiffness), 1.0 / len(beam_model.modal_stiffness))
+    masses = np.zeros_like(beam_model.modal_mass)
+    masses[0] = np.eye(size)
+    model = replace(
+        beam_model,
+        modal_stiffness=np.multiply.outer(shares, (turn * squares) @ turn.T),
+        modal_mass=masses,
+        cross_mass=np.zeros_like(beam_model.cross_mass),
+    )
+    kinds: tuple[Literal["compiled", "python"], ...] = ("compiled", "python")
+    files = [build_fmu(model, tmp_path / f"{kind}.fmu", kind=kind).path for kind in kinds]
+    with closing(Slave(files[0])) as one, closing(Slave(files[1])) as two:
+        for seed in range(3):
+            seen, expected = (random_flight(each, seed, 2, overdamped=False) for each in (one, two))
+            scale = np.maximum(np.abs(expected).max(axis=0), 1e-300)
+            assert (np.abs(seen - expected).max(axis=0) <= 1e-9 * scale).all()
+
+
 def test_a_compiled_fmu_bounds_as_the_model_does(
     compiler: Any, plate_model: ReducedModel, tmp_path: Path
 ) -> None:
-    compiled, rng = (
-        build_fmu(plate_model, tmp_path / "compiled.fmu", kind="compiled").path,
-        np.random.default_rng(3),
-    )
-    with closing(Slave(compiled)) as slave:
+    rng = np.random.default_rng(3)
+    with closing(Slave(compiled_wing(plate_model, tmp_path))) as slave:
         assert slave.start() == OK, slave.log
         for number in range(5):
             regions = plate_model.regions
@@ -310,6 +346,8 @@ def test_calls_in_the_wrong_phase(slave: Slave) -> None:
         for unknown in ([999], [49, 50, 51], [0, 999]):
             assert math.isnan(fmu.getReal(unknown)[-1])
         assert fmu.getString([0]) == [b""]
+        assert list(fmu.getReal([])) == []
+        assert any("fixed parameter" in text for _, text in slave.log)
     assert slave.step(still, 0.0, 1.0) == OK
     fmu.terminate()
     assert slave.step(still, 1.0, 1.0) != OK

@@ -172,7 +172,7 @@ FILES = {
     name: (HERE / "theirs" / name).read_text("utf-8")
     for name in ("SystemStructure.ssd", "top.ssv", "top.ssm")
 }
-REFUSED = tomllib.loads((HERE / "refused.toml").read_text("utf-8"))["refused"]
+CASES = tomllib.loads((HERE / "cases.toml").read_text("utf-8"))
 Pack = Callable[..., Path]
 
 
@@ -239,31 +239,18 @@ def test_nested_systems_parameters_and_mappings(theirs: Pack, joined: Callable[.
 
 
 BARE = {name: re.sub(r"ss[mvc]:|xmlns:\w+=\"[^\"]+\"", "", FILES[name]) for name in ("top.ssv", "top.ssm")}
-METRE = ("<ssd:Units>", '<ssd:Units><ssc:Unit name="metre"><ssc:BaseUnit m="1"/></ssc:Unit>')
 # SSP 1.0, section 5.3: the kinds of the connectors say where a value goes, not the ends of the connection.
 TURNED = re.sub(
     r"(start|end)(?=Element=|Connector=)",
     lambda match: {"start": "end", "end": "start"}[match[1]],
     FILES["SystemStructure.ssd"],
 )
-MEAN_THE_SAME: dict[str, tuple[tuple[tuple[str, str], ...], dict[str, str]]] = {
+MEAN_THE_SAME: dict[str, tuple[Any, dict[str, str]]] = {
     "start and end exchanged": ((), {"SystemStructure.ssd": TURNED}),
     "a set without namespace": ((), {"resources/top.ssv": BARE["top.ssv"]}),
     "a mapping without namespace": ((), {"resources/top.ssm": BARE["top.ssm"]}),
-    "an unused text": ((('<ssv:Boolean value="true"/>', '<ssv:String value="x"/>'),), {}),
-    "an empty mapping": (
-        (("</ssd:ParameterValues>", "</ssd:ParameterValues><ssd:ParameterMapping/>"),),
-        {},
-    ),
-    "an empty unit": (
-        (('<ssd:Connector name="health.z1" kind="input"><ssc:Real/>',
-          '<ssd:Connector name="health.z1" kind="input"><ssc:Real unit=""/>'),), {},
-    ),
-    "another name of a unit": (
-        (METRE, ('name="tip_displacement" kind="output"/>',
-                 'name="tip_displacement" kind="output"><ssc:Real unit="metre"/></ssd:Connector>')), {},
-    ),
-}  # fmt: skip
+    **{row["case"]: (row["changes"], {}) for row in CASES["same"]},
+}
 
 
 @pytest.mark.parametrize("case", MEAN_THE_SAME)
@@ -365,7 +352,7 @@ def test_start_values_of_outputs_are_set(foreign_fmu: Any) -> None:
 LONG = {"old": 'name="z1" kind="output"', "new": f'name="z1" kind="{"o" * 5000}"', "sentence": r"^.{,700}$"}
 
 
-@pytest.mark.parametrize("case", [*REFUSED, LONG], ids=lambda case: case["sentence"][:40])
+@pytest.mark.parametrize("case", [*CASES["refused"], LONG], ids=lambda case: case["sentence"][:40])
 def test_what_is_wrong_is_said_in_one_sentence(theirs: Pack, case: dict[str, str]) -> None:
     (sentence,) = check_ssp(theirs((case["old"], case["new"]))).problems
     assert re.search(case["sentence"], sentence), sentence
