@@ -93,7 +93,7 @@ class WingModel(StructuralModel):
         self.name, self.parameters = name, wing_priors(box, **prior)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
         self.port_names = tuple(PORTS)
-        self._stiffnesses, self._systems, self._rows = Memory(), Memory(), Memory()
+        self._stiffnesses, self._systems, self._rows, self._answers = (Memory() for _ in range(4))
 
     @classmethod
     def shipped(cls, progress: Progress | None = None) -> "WingModel":
@@ -195,8 +195,8 @@ class WingModel(StructuralModel):
 
     def rest(self, state: State) -> Resting:
         """Return what gives the rest in a state."""
-        _, solve = self._stiffness(state)
-        return lambda loads: solve(loads.T).T
+        key, (_, solve) = _stiffness_key(state), self._stiffness(state)
+        return lambda loads: self._answers.get((key, loads.tobytes()), lambda: solve(loads.T).T)
 
     def _stiffness(self, state: State) -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
         """Return the stiffness (n, n) in a state, and what gives K^-1 loads (n, k)."""
