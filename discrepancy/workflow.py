@@ -350,6 +350,6 @@ def patch_draws(problem: Problem, fit: CandidateFit, seed: int, count: int = DRA
         draws = fit.point.effect + generator.standard_normal((count, size)) @ root.T
     parts = [fit.candidate.parts(draw) for draw in draws]
     return [
-        [Candidate((term,)).patch(problem.setting, part[number]) for part in parts]
+        [term.patch(problem.setting, part[number]) for part in parts]
         for number, term in enumerate(fit.candidate.terms)
     ]

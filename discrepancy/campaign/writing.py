@@ -20,7 +20,7 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.campaign.schema import FORMAT, OF_REGION, input_columns, parse_campaign
+from discrepancy.campaign.schema import FORMAT, OF_REGION, parse_campaign
 from discrepancy.campaign.units import UNITS, conversion_of
 from discrepancy.errors import CampaignFileError
 from reporting.files import atomic_write_text
@@ -55,16 +55,11 @@ def write_campaign(campaign: Campaign, folder: str | Path, *, si: bool = False) 
     ------
     CampaignFileError
         The campaign cannot be told in the format: temperatures without a reference, noise records with
-        several intervals, or a channel that is called like an input.
+        several intervals, or what `parse_campaign` refuses, such as a channel that is called like an input.
     FileNotWrittenError, DiskFullError
         As `reporting.files.atomic_file`.
     """
     folder = Path(folder)
-    for name in campaign.channels:
-        if name in input_columns(trial.kind for trial in campaign.trials):
-            raise CampaignFileError(
-                f"A channel cannot be called {name!r} in a file, which is an input: rename it."
-            )
     slugs = (re.sub(r"[^a-z0-9]+", "_", trial.name.lower()).strip("_")[:40] for trial in campaign.trials)
     files = [f"{number:02d}_{slug or 'trial'}.csv" for number, slug in enumerate(slugs, start=1)]
     texts = {

@@ -12,8 +12,8 @@ from discrepancy.campaign.records import Channel, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions, Response
 from discrepancy.sentences import SENTENCES, said
+from fe.runtime.motion import PLANFORM
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch, PortForce, Primitive
-from fe.runtime.planform_forces import PLANFORM
 
 from .entry import Setting
 

@@ -1,6 +1,6 @@
 """A candidate explanation: effects at given places, shapes fixed or free; where it stands, what it leaves."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,6 +9,7 @@ from discrepancy.campaign.records import BoolArray, FloatArray, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
 from fe.runtime.patch import ModelPatch
 
+Key = tuple[tuple[str, str], ...]
 FREE_SHAPE = " (free shape)"
 """What marks the identifier of an effect whose shape is free: its family."""
 
@@ -47,6 +48,10 @@ class Term:
             item.name: item.prior.value(float(u)) for item, u in zip(self.parameters, normal, strict=True)
         }
 
+    def patch(self, setting: Setting, normal: Sequence[float] | FloatArray) -> ModelPatch:
+        """Return the patch at standard normal variables, one for each parameter."""
+        return self.effect.patch(setting, self.values(normal), self.place)
+
     def start(self) -> FloatArray:
         """Return the standard normal variables at prior medians and canonical shapes."""
         return np.array(
@@ -67,6 +72,16 @@ class Candidate:
     def identifiers(self) -> tuple[str, ...]:
         """Identifiers of the effects, sorted; those of free shape are marked by `FREE_SHAPE`."""
         return tuple(sorted(term.label for term in self.terms))
+
+    @property
+    def key(self) -> Key:
+        """What tells candidates apart: sorted (identifier, place)."""
+        return tuple(sorted((term.label, term.place) for term in self.terms))
+
+    @property
+    def words(self) -> str:
+        """The effects for a line of progress."""
+        return " and ".join(self.identifiers)
 
     @property
     def is_family(self) -> bool:
@@ -97,7 +112,7 @@ class Candidate:
         """Return the patch at standard normal variables (size,)."""
         patch = ModelPatch()
         for term, part in zip(self.terms, self.parts(normal), strict=True):
-            patch = patch + term.effect.patch(setting, term.values(part), term.place)
+            patch = patch + term.patch(setting, part)
         return patch
 
     def start(self) -> FloatArray:
@@ -108,9 +123,15 @@ class Candidate:
         """Return this set and one more effect."""
         return Candidate((*self.terms, term))
 
-    def without(self, index: int) -> "Candidate":
-        """Return this set less one effect."""
-        return Candidate(self.terms[:index] + self.terms[index + 1 :])
+    def some(self, kept: Iterable[int], normal: FloatArray) -> tuple["Candidate", FloatArray]:
+        """Return some of the effects with their standard normal variables, of those of all (size,)."""
+        chosen, parts = tuple(kept), self.parts(normal)
+        return Candidate(tuple(self.terms[k] for k in chosen)), np.concatenate([parts[k] for k in chosen])
+
+    def each_without(self, normal: FloatArray) -> Iterator[tuple["Candidate", FloatArray]]:
+        """Yield this set less each of its effects, as `some` does; nothing where it has one only."""
+        for index in range(len(self.terms) if len(self.terms) > 1 else 0):
+            yield self.some((k for k in range(len(self.terms)) if k != index), normal)
 
 
 PARAMETER_STEP = 1e-2

@@ -111,7 +111,7 @@ class Screen:
     def change(self, term: Term, start: FloatArray) -> Change:
         """Return what a term does at scaled parameters, besides the effects of the fit."""
         candidate = self.fit.candidate.plus(term)
-        channels = _channels_of(term.effect.patch(self.problem.setting, term.values(start), term.place))
+        channels = _channels_of(term.patch(self.problem.setting, start))
         vector, fits, size = self._moved(
             candidate, np.concatenate((self.fit.point.effect, start)), term.effect.acts_on, channels
         )

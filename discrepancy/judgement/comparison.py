@@ -9,7 +9,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate, Point
+from discrepancy.fits.candidate import Candidate, Key, Point
 from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate
@@ -17,7 +17,6 @@ from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.missing_force.shares import (
     OF_READINGS,
@@ -79,8 +78,8 @@ class ByForce(Court[Explained]):
     def freed(self, item: Explained) -> Explained | None:
         """Return a single law with a shape of its own, where that was compared."""
         (term,) = item.candidate.terms
-        key = key_of(Candidate((replace(term, free_shape=True),)))
-        return next((one for one in self.ranked if key_of(one.candidate) == key), None)
+        key = Candidate((replace(term, free_shape=True),)).key
+        return next((one for one in self.ranked if one.candidate.key == key), None)
 
     def gate(self, item: Explained) -> Gate:
         """Return how well the best simulation leaves noise alone."""
@@ -176,7 +175,7 @@ class ByReadings(Court[CandidateFit]):
     def followed(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:
         """Return a further hypothesis, begun at values (E,) of its unknowns; None: it cannot be."""
         none = self.found.none
-        found = self.found.exact.get(key_of(candidate))
+        found = self.found.exact.get(candidate.key)
         if found is None:
             found = attempt(self.problem, candidate, Point(none.point.shared, none.point.local, effect))
         return None if found is None else refitted(self.problem, self.found.wide or self.problem, found)
@@ -200,14 +199,14 @@ class ByReadings(Court[CandidateFit]):
             free = free_shape(self.problem, item, 0)
             free = None if free is None else refitted(self.problem, self.found.wide or self.problem, free)
             if free is not None:
-                self._free[key_of(item.candidate)] = free
+                self._free[item.candidate.key] = free
                 if free.log_evidence > best.log_evidence + SHAPE_GAIN:
-                    joined[key_of(free.candidate)] = free
+                    joined[free.candidate.key] = free
         self.found.judged = joined
 
     def freed(self, item: CandidateFit) -> CandidateFit | None:
         """Return a single law with a shape of its own, where that was compared."""
-        return item if item.candidate.is_family else self._free.get(key_of(item.candidate))
+        return item if item.candidate.is_family else self._free.get(item.candidate.key)
 
     def gate(self, item: CandidateFit) -> Gate:
         """Return how well the simulation of a hypothesis leaves noise alone."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import NINETY, EffectParameter, ShapeParameter
-from discrepancy.fits.candidate import FREE_SHAPE, Candidate
+from discrepancy.fits.candidate import FREE_SHAPE
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.posterior import with_draws
 from discrepancy.fits.problem import Problem
@@ -140,7 +140,7 @@ def named_effects(problem: Problem, found: Hypothetic) -> tuple[NamedEffect, ...
     for term, part in zip(found.candidate.terms, found.candidate.parts(found.effect), strict=True):
         rows = [_estimate(item, u, *next(bounds)) for item, u in zip(term.parameters, part, strict=True)]
         effect, count = term.effect, len(term.effect.parameters)
-        patch = Candidate((term,)).patch(problem.setting, part)
+        patch = term.patch(problem.setting, part)
         whose = (effect.identifier, effect.name, term.place, effect.family)
         named.append(NamedEffect(*whose, tuple(rows[:count]), tuple(rows[count:]), patch))
     return tuple(named)
@@ -211,7 +211,7 @@ def small_terms(
     """
     sizes: list[float | None] = []
     for term, part in zip(found.candidate.terms, found.candidate.parts(found.point.effect), strict=True):
-        patch = Candidate((term,)).patch(problem.setting, part)
+        patch = term.patch(problem.setting, part)
         known = [_size(problem, item) for item in patch]
         largest = max((size for size in known if size is not None), default=None)
         least = max((_least(problem, item, unstated) for item in patch), default=LEAST_SIZE)

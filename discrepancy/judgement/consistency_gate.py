@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Term
 from discrepancy.fits.elimination import trial_block
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
@@ -280,8 +280,7 @@ def _along_span(problem: Problem, data: TrialData) -> FloatArray | None:
 
 def _own_channel(problem: Problem, term: Term) -> str:
     """Return the channel that a term acts on if it is one alone, else nothing."""
-    candidate = Candidate((term,))
-    patch = candidate.patch(problem.setting, candidate.start() + 1.0)
+    patch = term.patch(problem.setting, term.start() + 1.0)
     channels = {getattr(item, "channel", "") for item in patch if isinstance(item, SENSORS)}
     if len(channels) != 1 or not all(isinstance(item, SENSORS) for item in patch):
         return ""

@@ -15,11 +15,10 @@ from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Key, Term
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import ABSOLUTE_LEVEL
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.missing_force.shares import Share
 from discrepancy.search.hypotheses import acts_within
 from discrepancy.search.strategy import Search
@@ -165,8 +164,8 @@ class Court(ABC, Generic[H]):
         found: dict[Key, tuple[H, float]] = {}
         for item in self.ranked:
             core = self._core(item)
-            if core is not None and key_of(core.candidate) not in found and not self.against(core):
-                found[key_of(core.candidate)] = core, self.score(item)
+            if core is not None and core.candidate.key not in found and not self.against(core):
+                found[core.candidate.key] = core, self.score(item)
         best = max((score for _, score in found.values()), default=0.0)
         return [item for item, score in found.values() if score > best - SEARCH.contenders]
 
@@ -179,20 +178,20 @@ class Court(ABC, Generic[H]):
 
     def _with(self, item: H, kept: Sequence[int]) -> H | None:
         """Return a hypothesis with some of its effects only."""
-        candidate = Candidate(tuple(item.candidate.terms[number] for number in kept))
-        key, parts = key_of(candidate), item.candidate.parts(item.effect)
-        known = next((one for one in self.ranked if key_of(one.candidate) == key), None)
+        candidate, values = item.candidate.some(kept, item.effect)
+        key = candidate.key
+        known = next((one for one in self.ranked if one.candidate.key == key), None)
         if known is not None:
             return known
         if key not in self._followed:
-            self._followed[key] = self.followed(candidate, np.concatenate([parts[k] for k in kept]))
+            self._followed[key] = self.followed(candidate, values)
         return self._followed[key]
 
     def slimmed(self, best: H) -> H:
         """Return the simplest hypothesis that is as much of the missing force."""
         own, count = families(best), len(best.candidate.terms)
         singles = [self._with(best, [number]) for number in range(count)] if count > 1 else []
-        able = {key_of(item.candidate): item for item in (*self.ranked, *singles) if item is not None}
+        able = {item.candidate.key: item for item in (*self.ranked, *singles) if item is not None}
         inside, outside = self.share(best, held_out=False).value, self.told(best).value
         simpler = [
             item for item in able.values()

@@ -15,7 +15,6 @@ from scipy.special import logsumexp
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.hypotheses import key_of
 from discrepancy.missing_force.shares import Share
 from discrepancy.search.honest_evidence import weigh_with_remainders
 from discrepancy.search.strategy import Search
@@ -97,14 +96,14 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
         (term.label, term.place) for term, size in zip(terms, small, strict=True)
         if size is None and (court.acts(term) or not one_channel)
     }  # fmt: skip
-    whole_key, share = set(key_of(fit.candidate)), court.told(fit).value
+    whole_key, share = set(fit.candidate.key), court.told(fit).value
     less = [item for key, item in found.exact.items() if key and set(key) < whole_key]
     if kept == whole_key and not any(court.told(item).value > share - SEARCH.sliver for item in less):
         return Outcome(first, found, fit)
     weigh_with_remainders(found)
-    whole = found.judged.get(key_of(fit.candidate), fit)
+    whole = found.judged.get(fit.candidate.key, fit)
     for item in sorted(found.judged.values(), key=lambda one: len(one.candidate.terms)):
-        own = set(key_of(item.candidate))
+        own = set(item.candidate.key)
         if not own or not own < whole_key or court.told(item).value < share - SEARCH.sliver:
             continue
         if own == kept or found.score(item) > found.score(whole) - SEARCH.sliver_gain:

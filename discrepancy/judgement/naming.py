@@ -137,7 +137,7 @@ class Case:
         """
         candidate, setting = self.best.candidate, self.problem.setting
         parts = zip(candidate.terms, candidate.parts(self.best.effect), strict=True)
-        patches = [Candidate((term,)).patch(setting, part) for term, part in parts]
+        patches = [term.patch(setting, part) for term, part in parts]
         laws = sum(len(patch.of(*INTERNAL_FORCES)) > 0 for patch in patches)
         return laws < 2 and len(candidate.terms) < SEARCH.largest_set
 

@@ -107,9 +107,8 @@ class Columns:
         """Return what a candidate does at standard normal values (E,) of its unknowns; None: it cannot be."""
         found = []
         for term, part in zip(candidate.terms, candidate.parts(values), strict=True):
-            alone = Candidate((term,))
             try:
-                patch = alone.patch(self.problem.setting, part)
+                patch = term.patch(self.problem.setting, part)
             except DiscrepancyError:
                 return None
             column = self.of_patch(view, motions, patch, term.effect.acts_on)

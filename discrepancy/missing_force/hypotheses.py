@@ -17,8 +17,6 @@ from discrepancy.search_settings import SEARCH
 from .filtered import Process
 from .view import Processes
 
-Key = tuple[tuple[str, str], ...]
-
 LEVELS = (-1.3, -0.4, 0.4, 1.3)
 """Standard normal values at which the numbers of an effect that are no magnitudes are tried."""
 MOST_VARIANTS = 16
@@ -33,11 +31,6 @@ def sees_forces(problem: Problem) -> bool:
     model = problem.model
     moving = any(data.trial.is_dynamic for data in problem.trials)
     return moving and model.shows_ports and bool(model.ports())
-
-
-def key_of(candidate: Candidate) -> Key:
-    """Return what tells candidates apart: sorted (identifier, place)."""
-    return tuple(sorted((term.label, term.place) for term in candidate.terms))
 
 
 def log_prior(candidate: Candidate, count: int, setting: Setting) -> float:

@@ -15,12 +15,12 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.fits.candidate import Candidate, Point, Term
+from discrepancy.fits.candidate import Candidate, Key, Point, Term
 from discrepancy.fits.problem import Problem
 
 from .columns import Columns
 from .filtered import Process, Solution
-from .hypotheses import Key, both_signs, key_of, log_prior, scaled, sized, stepped, variants
+from .hypotheses import both_signs, log_prior, scaled, sized, stepped, variants
 from .trial import seen_trial
 from .view import SHARES, Column, Motion, Processes, View, combined
 
@@ -258,25 +258,22 @@ class ForceSearch:
             for base in beam:
                 for _, term, start in self.screened(base, effects)[:width]:
                     candidate = base.candidate.plus(term)
-                    if key_of(candidate) in longer:
+                    if candidate.key in longer:
                         continue
                     one = self.followed(base, candidate, np.concatenate((base.effect, start)))
                     if one is not None:
-                        longer[key_of(candidate)] = one
+                        longer[candidate.key] = one
             found |= longer
             ranked = self._ranked(longer, len(effects))
             if not ranked or self.score(ranked[0], len(effects)) <= self.score(best, len(effects)):
                 break
             beam = ranked[:BEAM]
         best = self._ranked(found, len(effects))[0]
-        parts = best.candidate.parts(best.effect)
-        for index in range(len(parts) if len(parts) > 1 else 0):
-            less = best.candidate.without(index)
-            if key_of(less) not in found:
-                values = np.concatenate(parts[:index] + parts[index + 1 :])
+        for less, values in best.candidate.each_without(best.effect):
+            if less.key not in found:
                 one = self.followed(self.whole, less, values)
                 if one is not None:
-                    found[key_of(less)] = one
+                    found[less.key] = one
         return self._ranked(found, len(effects))
 
     def score(self, found: Explained, count: int) -> float:

@@ -18,7 +18,7 @@ from discrepancy.models.interface import Model
 from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
 
 from .columns import Columns
-from .hypotheses import key_of, scaled, sees_forces
+from .hypotheses import scaled, sees_forces
 from .naming import Explained, ForceSearch
 from .trial import SeenTrial, seen_trial
 from .view import Motion, View
@@ -392,11 +392,11 @@ def _along(
     problem: Problem, force: ForceSearch | None, forces: Sequence[Explained], fit: CandidateFit
 ) -> tuple[ForceSearch, Explained | None]:
     """Return the missing force of a problem, and the hypothesis along it that a fit is."""
-    key = key_of(fit.candidate)
+    key = fit.candidate.key
     if force is None:
         force = ForceSearch(problem)
         force.locate()
-    found = next((item for item in forces if key_of(item.candidate) == key), None)
+    found = next((item for item in forces if item.candidate.key == key), None)
     if found is None and fit.candidate.terms:
         found = force.followed(force.whole, fit.candidate, fit.point.effect)
     return force, found

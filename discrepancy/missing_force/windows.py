@@ -13,7 +13,6 @@ import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray, TrialKind
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
@@ -80,12 +79,10 @@ def _of_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
 
 def _law_at(search: ForceSearch, fit: CandidateFit, port: str) -> Explained | None:
     """Return the hypothesis of the laws that a verdict has at a port; None where it has none."""
-    parts = zip(fit.candidate.terms, fit.candidate.parts(fit.point.effect), strict=True)
-    laws = [(term, part) for term, part in parts if term.place == port]
+    laws = [number for number, term in enumerate(fit.candidate.terms) if term.place == port]
     if not laws:
         return None
-    candidate = Candidate(tuple(term for term, _ in laws))
-    return search.followed(search.at[port], candidate, np.concatenate([part for _, part in laws]))
+    return search.followed(search.at[port], *fit.candidate.some(laws, fit.effect))
 
 
 def residual_windows(

@@ -27,7 +27,6 @@ from discrepancy.models.interface import (
 )
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.port_system import PortSystem
 from discrepancy.models.questions import (
     LoadChange,
     check_carried,
@@ -231,7 +230,12 @@ class FmuModel(DescribedModel):
             If the FMU is not linear, or its answers to forces at the ports do not tell its system.
         """
         means = np.array([item.mean for item in self.declared])
-        base, found = (self._port_system(trial, values) for values in (means, parameters))
+        parts, step = self._parts(self.patch), self.fmu_ports.step(trial)
+        states = (
+            self._trials.state(Asked(trial, Conditions(values, health=trial.health[:1]), parts))
+            for values in (means, parameters)
+        )
+        base, found = (self.fmu_ports.system(state, step, len(trial.time)) for state in states)
         if base is None or found is None or len(base.push) != len(found.push):
             raise ModelError(
                 f"The FMU model {self.name!r} does not tell by its answers to single forces how its ports "
@@ -241,12 +245,6 @@ class FmuModel(DescribedModel):
         position, speed = np.split(found.of_ports(self.fmu_ports.x, self.fmu_ports.v).outputs, 2)
         rows, at_once = found.rows(list(zip(self._columns(outputs), self._orders(outputs), strict=True)))
         return PortedSystem(found.generator, self.ports(), found.push.T, position, speed, rows, at_once.T)
-
-    def _port_system(self, trial: Trial, parameters: FloatArray) -> PortSystem | None:
-        """Return the system of the ports."""
-        conditions = Conditions(parameters, health=trial.health[:1])
-        state = self._trials.state(Asked(trial, conditions, self._parts(self.patch)))
-        return self.fmu_ports.system(state, self.fmu_ports.step(trial), len(trial.time))
 
     def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""

@@ -1,5 +1,6 @@
 """What forces at the ports of an FMU do; as a system of its own where the FMU proves to be linear."""
 
+from functools import cached_property
 from math import ceil
 
 import numpy as np
@@ -41,8 +42,6 @@ class FmuPorts:
         Inputs of the ports' forces.
     x, v : list of int
         Columns of the ports' displacements and velocities; -1: there is no velocity.
-    quiet : bool
-        Whether the FMU was seen to show nothing without excitation.
     """
 
     def __init__(self, motion: FmuMotion, nominal: State) -> None:
@@ -52,7 +51,7 @@ class FmuPorts:
         self.forces = [runs.variable(port.force) for port in description.port]
         self.x = [runs.columns[f"port.{port.name}.displacement"] for port in description.port]
         self.v = [runs.columns.get(f"port.{port.name}.velocity", -1) for port in description.port]
-        self.quiet = False
+        self._quiet = False  # whether it was seen to show nothing without excitation
         self._parts: dict[float, int] = {}
         self._systems, self._frequencies = Memory(KEPT_SYSTEMS), Memory()
         self._linear: bool | None = None
@@ -131,41 +130,35 @@ class FmuPorts:
             parts *= 2
         return None
 
-    def size(self, number: int) -> float:
-        """Return a force at a port that its input can have."""
-        return min(1.0, 0.1 * self._runs.input_limit(self.forces[number]))
+    @cached_property
+    def sizes(self) -> FloatArray:
+        """Forces (P,) at the ports that their inputs can have."""
+        return np.array([min(1.0, 0.1 * self._runs.input_limit(name)) for name in self.forces])
 
     def records(self, state: State, step: float, count: int) -> FloatArray:
         """Return the outputs (count, C, P) after unit forces over the first step, less those without."""
-        sizes = map(self.size, range(len(self.forces)))
-        return np.stack(
-            [
-                self.pulsed(state, step, count, name, size)
-                for name, size in zip(self.forces, sizes, strict=True)
-            ],
-            axis=2,
-        )
-
-    def pulsed(self, state: State, step: float, count: int, name: str, size: float = 1.0) -> FloatArray:
-        """Return the outputs (count, C) after an input of a size over the first step, by its size."""
         zero: FloatArray | float = 0.0
-        if not self.quiet:
+        if not self._quiet:
             zero = self.motion.stepped(Run(state, step, count, []))
-            self.quiet = not np.any(zero)
-        pulse = Excitation("input", name, np.eye(1, count).ravel())
-        return np.asarray((self.motion.stepped(Run(state, step, count, [(pulse, size)])) - zero)[1:] / size)
+            self._quiet = not np.any(zero)
+        pulse, parts = np.eye(1, count).ravel(), []
+        for name, size in zip(self.forces, self.sizes.tolist(), strict=True):
+            moved = self.motion.stepped(Run(state, step, count, [(Excitation("input", name, pulse), size)]))
+            parts.append((moved - zero)[1:] / size)
+        return np.stack(parts, axis=2)
 
     def _confirmed(self, system: PortSystem, state: State, step: float, count: int, tolerance: float) -> bool:
         """Whether the FMU answers to many forces as the system says that was made of single ones."""
         signs = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(self.forces)))
-        sizes = np.array([self.size(number) for number in range(len(self.forces))])
         loads = [
-            (Excitation("input", name, signs[:, number].copy()), float(sizes[number]))
-            for number, name in enumerate(self.forces)
+            (Excitation("input", *of), size)
+            for of, size in zip(
+                zip(self.forces, signs.T.copy(), strict=True), self.sizes.tolist(), strict=True
+            )
         ]
         moved = self.motion.stepped(Run(state, step, count, loads))
         moved -= self.motion.stepped(Run(state, step, count, []))
-        error = np.max(np.abs(moved - system.motion(signs * sizes, step)), axis=0)
+        error = np.max(np.abs(moved - system.motion(signs * self.sizes, step)), axis=0)
         return bool(np.all(error <= tolerance * np.max(np.abs(moved), axis=0) + 1e-300))
 
     # ------------------------------------------------------------ stiffness
@@ -174,10 +167,10 @@ class FmuPorts:
         """Return the displacements (P, P) of the ports at rest under unit forces at each."""
         if not self.forces:  # nothing to push, and loads of zero may be outside of what the FMU takes
             return np.zeros((0, 0))
-        zero, sizes = self.motion.rest(state, {}), map(self.size, range(len(self.forces)))
+        zero = self.motion.rest(state, {})
         moved = [
             (self.motion.rest(state, {name: size}) - zero)[self.x] / size
-            for name, size in zip(self.forces, sizes, strict=True)
+            for name, size in zip(self.forces, self.sizes.tolist(), strict=True)
         ]
         return np.array(moved).T
 
@@ -186,8 +179,7 @@ class FmuPorts:
         system = self.system(state, step, RECORD)
         column = self.x[number]
         if system is None:
-            size = self.size(number)
-            still = []
+            size, still = float(self.sizes[number]), []
             for force in (0.0, size):
                 inputs = self._runs.inputs(state, {self.forces[number]: force})
                 found = self._runs.started(step, dict(state.parameters), inputs, settle=True)[1]

@@ -55,6 +55,7 @@ def at_rest(
     memory: FloatArray | None = None,
     before: FloatArray | None = None,
     held: FloatArray | float = 0.0,
+    seen: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray | None]:
     """Return displacements and states (L, N) under load levels that follow one another from zero.
 
@@ -74,6 +75,8 @@ def at_rest(
         Of the laws, and the amounts (k,) where the first level is reached from; by default never loaded.
     held : (N,) ndarray, optional
         Where something holds the system.
+    seen : (C, N) ndarray, optional
+        What these rows show (L, C) is returned instead.
 
     Raises
     ------
@@ -82,11 +85,13 @@ def at_rest(
     """
     found = resting(np.concatenate((units, rows)))
     answers, flexible = found[: len(units)] + held, found[len(units) :]
+    at_ports, compliance = answers @ rows.T, rows @ flexible.T
+    if seen is not None:
+        answers, flexible = answers @ seen.T, flexible @ seen.T
     if not len(laws):
         return amounts @ answers, None
-    at_ports = answers @ rows.T
     start = None if before is None else before @ at_ports
-    solution = solved(laws, amounts @ at_ports, rows @ flexible.T, memory, start)
+    solution = solved(laws, amounts @ at_ports, compliance, memory, start)
     return amounts @ answers - solution.forces @ flexible, solution.memory
 
 

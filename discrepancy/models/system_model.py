@@ -226,14 +226,12 @@ class SystemModel(Model):
                     )
             ports = laws.rows(self.port_rows, units.shape[1])
             ports[:, n:] = 0.0  # ports of states are at no position
+            seen = np.array([np.concatenate((item.rows[0, :n], item.rows[1, n:])) for item in shown])
+            rest, given = self.rest(case.state), amounts[rows]
             try:
-                found, memory = at_rest(
-                    self.rest(case.state), units, amounts[rows], laws, ports, memory, before
-                )
+                values[rows], memory = at_rest(rest, units, given, laws, ports, memory, before, seen=seen)
             except ModelError as cause:
                 raise ModelError(f"The trial {trial.name!r} is at rest, but {cause}") from cause
-            seen = [np.concatenate((item.rows[0, :n], item.rows[1, n:])) for item in shown]
-            values[rows] = found @ np.array(seen).T
             values[rows] += [item.constant for item in shown]
             before, start = amounts[rows.stop - 1], rows.stop
         along, *further = np.split(values, len(components), axis=1)

@@ -22,6 +22,7 @@ from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime.errors import FiniteElementError
+from fe.runtime.motion import PLANFORM, STATION_PORTS
 from fe.runtime.patch import (
     PRIMITIVES,
     LocalStiffnessLoss,
@@ -34,7 +35,6 @@ from fe.runtime.patch import (
 )
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import MODE_COUNT, ON_MODES, PatchedWing, motion_basis
-from fe.runtime.planform_forces import PLANFORM, STATION_PORTS
 from fe.runtime.state import wing_names
 from fe.runtime.wing_rows import LOAD_PLACE, PORTS, strain_gauge
 from fe.wing.design import WingDesign, load_design
@@ -93,7 +93,7 @@ class WingModel(StructuralModel):
         self.name, self.parameters = name, wing_priors(box, **prior)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
         self.port_names = tuple(PORTS)
-        self._stiffnesses, self._systems, self._rows = Memory(), Memory(), Memory()
+        self._stiffnesses, self._systems, self._rows, self._answers = (Memory() for _ in range(4))
 
     @classmethod
     def shipped(cls, progress: Progress | None = None) -> "WingModel":
@@ -195,8 +195,8 @@ class WingModel(StructuralModel):
 
     def rest(self, state: State) -> Resting:
         """Return what gives the rest in a state."""
-        _, solve = self._stiffness(state)
-        return lambda loads: solve(loads.T).T
+        key, (_, solve) = _stiffness_key(state), self._stiffness(state)
+        return lambda loads: self._answers.get((key, loads.tobytes()), lambda: solve(loads.T).T)
 
     def _stiffness(self, state: State) -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
         """Return the stiffness (n, n) in a state, and what gives K^-1 loads (n, k)."""

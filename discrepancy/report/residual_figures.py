@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -105,28 +106,23 @@ def planform_figure(before: ResidualSet, after: ResidualSet | None, design: Wing
     return figure
 
 
-def _leading_edge(design: WingDesign, station: float) -> float:
-    """Return where the leading edge lies, behind that of the root [m]."""
+def _depth(design: WingDesign, station: float, fraction: float) -> float:
+    """Return how far behind the leading edge of the root a place lies [m]."""
     form = design.planform
-    line = form.straight_chord_line
-    return line * (form.root_chord - form.chord(station / form.semi_span))
+    behind = (fraction - form.straight_chord_line) * form.chord(min(station / form.semi_span, 1.0))
+    return form.straight_chord_line * form.root_chord + behind
 
 
 def _draw_planform(axes: Axes, design: WingDesign) -> None:
     form = design.planform
-    tip = _leading_edge(design, form.semi_span)
-    corners = np.array([
-        (0.0, 0.0), (form.semi_span, tip), (form.semi_span, tip + form.tip_chord), (0.0, form.root_chord)
-    ])  # fmt: skip
-    axes.fill(*corners.T, facecolor="#f4f5f6", edgecolor="#8a939c", lw=0.8)
-    for defect in design.defects:
-        stations = np.array([defect.span_start, defect.span_end, defect.span_end, defect.span_start])
-        fractions = (defect.chord_start, defect.chord_start, defect.chord_end, defect.chord_end)
-        depth = [
-            _leading_edge(design, s) + c * form.chord(s / form.semi_span)
-            for s, c in zip(stations, fractions, strict=True)
-        ]
-        axes.fill(stations, depth, facecolor="none", edgecolor="#b8bec4", lw=0.6, ls="--")
+    wing: dict[str, Any] = {"facecolor": "#f4f5f6", "edgecolor": "#8a939c", "lw": 0.8}
+    region: dict[str, Any] = {"facecolor": "none", "edgecolor": "#b8bec4", "lw": 0.6, "ls": "--"}
+    boxes = [((0.0, form.semi_span), (0.0, 1.0), wing)]
+    boxes += [((d.span_start, d.span_end), (d.chord_start, d.chord_end), region) for d in design.defects]
+    for (root, tip), (front, rear), look in boxes:
+        stations, fractions = (root, tip, tip, root), (front, front, rear, rear)
+        depth = [_depth(design, *place) for place in zip(stations, fractions, strict=True)]
+        axes.fill(stations, depth, **look)
     axes.set_aspect("equal")
     axes.set_xlim(-0.03 * form.semi_span, 1.06 * form.semi_span)
     axes.set_ylim(1.12 * form.root_chord, -0.12 * form.root_chord)
@@ -137,11 +133,10 @@ def _draw_gauges(
     axes: Axes, channels: Mapping[str, Channel], places: dict[str, tuple[float, float]],
     sizes: dict[str, float], norm: Normalize, design: WingDesign,
 ) -> None:  # fmt: skip
-    form = design.planform
     for name, (station, fraction) in places.items():
         if name not in sizes:
             continue
-        depth = _leading_edge(design, station) + fraction * form.chord(min(station / form.semi_span, 1.0))
+        depth = _depth(design, station, fraction)
         marker = "o" if channels[name].quantity is Quantity.STRAIN else "s"
         axes.scatter(
             station, depth, c=[sizes[name]], cmap=LEVELS, norm=norm, s=46, marker=marker,

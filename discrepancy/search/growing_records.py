@@ -19,7 +19,7 @@ from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.fits.trial_data import shortened
 from discrepancy.search_settings import SEARCH
 
-from .hypotheses import Tell, in_silence, starts
+from .hypotheses import Tell, each, in_silence, starts
 
 
 def gap_row(residual: FloatArray) -> int:
@@ -82,9 +82,8 @@ class Beginnings:
     ) -> list[CandidateFit]:
         """Fit effects to the beginnings of the records, the best of them to whole records."""
         begun = []
-        for number, changes in enumerate(ranked):
-            name = changes[0].term.effect.identifier
-            self._tell(f"fitting {name} to the beginnings of the records, {len(ranked) - number - 1} more")
+        words = "fitting {0.identifier} to the beginnings of the records"
+        for changes in each(self._tell, ranked, lambda row: words.format(row[0].term.effect)):
             best = None
             for change in changes:
                 candidate = base.candidate.plus(change.term)
@@ -183,9 +182,7 @@ class Beginnings:
         singles = all(len(item.candidate.terms) == 1 for item in begun)
         count = SEARCH.far_fits if singles else SEARCH.far_extensions
         ranked = sorted(begun, key=lambda start: start.objective)[:count]
-        for number, item in enumerate(ranked):
-            names = " and ".join(item.candidate.identifiers)
-            self._tell(f"fitting {names} to whole records, {len(ranked) - number - 1} more")
+        for item in each(self._tell, ranked, lambda one: f"fitting {one.candidate.words} to whole records"):
             whole = attempt(
                 self.problem, item.candidate, item.point, iterations=SEARCH.far_steps, give_up=least
             )

@@ -16,12 +16,12 @@ import numpy as np
 
 from discrepancy.campaign.noise_tests import SHORTEST_SERIES, combine, ljung_box, variance_p_value
 from discrepancy.campaign.records import BoolArray, FloatArray
-from discrepancy.fits.candidate import Remainder
+from discrepancy.fits.candidate import Key, Remainder
 from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.hypotheses import Key, key_of
 from discrepancy.search_settings import SEARCH
 
+from .hypotheses import each
 from .strategy import Search
 
 LEVEL = 1e-3
@@ -172,7 +172,7 @@ def weigh_with_remainders(found: Search) -> None:
         found.judged = {}
         judged = _judged(found, found.wide, chosen)
         leading = max(judged.values(), key=found.score)
-        if key_of(leading.candidate) == key_of(best.candidate):
+        if leading.candidate.key == best.candidate.key:
             break
         best = leading
     found.judged = judged
@@ -185,13 +185,11 @@ def _judged(found: Search, wide: Problem, chosen: list[CandidateFit]) -> dict[Ke
     able = [item for item in ranked[: SEARCH.weighed_fits] if _promised(found, wide, item) > least]
     judged: dict[Key, CandidateFit] = {}
     _add(judged, found, wide, found.none)
-    for number, item in enumerate(able):
-        words = " and ".join(item.candidate.identifiers)
-        found.tell(f"weighing {words} with its remainder, {len(able) - number - 1} more")
+    for item in each(found.tell, able, lambda one: f"weighing {one.candidate.words} with its remainder"):
         _add(judged, found, wide, found.exactly(item))
     leading = max(judged.values(), key=found.score).candidate.identifiers
     for item in list(found.all().values()):  # what the leading set holds is asked for by itself
-        key, names = key_of(item.candidate), item.candidate.identifiers
+        key, names = item.candidate.key, item.candidate.identifiers
         if names and set(names) < set(leading) and key not in judged:
             _add(judged, found, wide, found.exactly(item))
     return judged
@@ -203,7 +201,7 @@ def _add(judged: dict[Key, CandidateFit], found: Search, wide: Problem, item: Ca
     if again is None and not item.candidate.terms:
         again = refitted(found.problem, wide, item, steps=0)
     if again is not None:
-        judged[key_of(item.candidate)] = again
+        judged[item.candidate.key] = again
 
 
 def _promised(found: Search, wide: Problem, item: CandidateFit) -> float:

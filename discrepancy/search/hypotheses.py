@@ -3,9 +3,10 @@
 Fits begin at the most promising changes of each effect and of pairs of effects, from a screen.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from math import exp, inf
+from typing import TypeVar
 
 import numpy as np
 from scipy.special import logsumexp
@@ -13,19 +14,27 @@ from scipy.special import logsumexp
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Key, Term
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
-from discrepancy.missing_force.hypotheses import Key, key_of, log_prior
+from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import SENSORS, MicroSlip
 
+T = TypeVar("T")
 Tell = Callable[[str], None]
 
 
 def in_silence(what: str) -> None:
     """Tell nobody."""
+
+
+def each(tell: Tell, items: Sequence[T], words: Callable[[T], str]) -> Iterator[T]:
+    """Yield items, and tell of each what is done with it and how many are left."""
+    for number, item in enumerate(items):
+        tell(f"{words(item)}, {len(items) - number - 1} more")
+        yield item
 
 
 @dataclass
@@ -111,7 +120,7 @@ class Hypotheses:
     def keep(self, found: CandidateFit, *, exact: bool) -> None:
         """Keep a fit if it is better than what is known of the same candidate."""
         kept = self.exact if exact else self.rough
-        key = key_of(found.candidate)
+        key = found.candidate.key
         if key not in kept or kept[key].log_evidence < found.log_evidence:
             kept[key] = found
 
@@ -145,7 +154,7 @@ def acts_within(effect: Effect, setting: Setting) -> bool:
     """Whether an effect acts within the structure or on its loads, not on readings only."""
     term = Term(effect, effect.places(setting)[0])
     try:
-        patch = effect.patch(setting, term.values(term.start() + 1.0), term.place)
+        patch = term.patch(setting, term.start() + 1.0)
     except DiscrepancyError:  # a law that cannot be so large
         return True
     return not all(isinstance(item, SENSORS) for item in patch)

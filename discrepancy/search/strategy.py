@@ -15,12 +15,12 @@ from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
-from discrepancy.missing_force.hypotheses import key_of, sees_forces
+from discrepancy.missing_force.hypotheses import sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
 
 from .growing_records import Beginnings
-from .hypotheses import Hypotheses, Tell, acts_within, are_related, in_silence, pairs, slips, starts
+from .hypotheses import Hypotheses, Tell, acts_within, are_related, each, in_silence, pairs, slips, starts
 
 
 @dataclass
@@ -50,9 +50,8 @@ class Search(Hypotheses):
 
     def screened(self, base: CandidateFit, effects: Iterable[Effect]) -> dict[str, list[Change]]:
         """Return for each effect its most promising changes, best first, at different places or values."""
-        screen, found, chosen = Screen(self.problem, base), {}, tuple(effects)
-        for number, effect in enumerate(chosen):
-            self.tell(f"screening {_beside(effect, base)}, {len(chosen) - number - 1} more to screen")
+        screen, found = Screen(self.problem, base), {}
+        for effect in each(self.tell, tuple(effects), lambda one: f"screening {_beside(one, base)}"):
             found[effect.identifier] = starts(screen, effect)
         if not base.candidate.terms:
             self.promised |= {
@@ -95,9 +94,7 @@ class Search(Hypotheses):
         ranked.sort(key=lambda changes: -max(change.gain for change in changes))
         enough = SEARCH.promising * max((change.gain for change in ranked[0]), default=0.0) if ranked else 0.0
         prospect = base.objective - (least if base.candidate.terms else 0.0)
-        for number, changes in enumerate(ranked):
-            left = len(ranked) - number - 1
-            self.tell(f"fitting {_beside(changes[0].term.effect, base)}, {left} more to fit")
+        for changes in each(self.tell, ranked, lambda row: f"fitting {_beside(row[0].term.effect, base)}"):
             fits: list[CandidateFit] = []
             for change in changes:
                 if change.gain < least:
@@ -138,7 +135,7 @@ class Search(Hypotheses):
 
     def exactly(self, rough: CandidateFit) -> CandidateFit:
         """Fit a candidate to convergence from a rough fit, and keep it."""
-        key = key_of(rough.candidate)
+        key = rough.candidate.key
         if key in self.judged:
             return self.judged[key]
         found = self.exact.get(key)
@@ -157,9 +154,7 @@ class Search(Hypotheses):
         margin = max(SEARCH.close, SEARCH.close_share * (top - floor))
         chosen = [item for item in rough[: SEARCH.exact_fits] if self.score(item) > max(top - margin, floor)]
         found = []
-        for number, item in enumerate(chosen):
-            names = " and ".join(item.candidate.identifiers)
-            self.tell(f"fitting {names} to the end, {len(chosen) - number - 1} more")
+        for item in each(self.tell, chosen, lambda one: f"fitting {one.candidate.words} to the end"):
             found.append(self.exactly(item))
         return sorted(found, key=lambda item: -self.score(item))
 
@@ -214,9 +209,7 @@ class Search(Hypotheses):
         scores = [force.score(one, len(self.effects)) for one in able]
         near = zip(able, scores, strict=True)
         close = [one for one, score in near if score > max(scores) - SEARCH.followed][: SEARCH.far_fits]
-        for number, item in enumerate(close):
-            names = " and ".join(item.candidate.identifiers)
-            self.tell(f"fitting {names} to the end, {len(close) - number - 1} more")
+        for item in each(self.tell, close, lambda one: f"fitting {one.candidate.words} to the end"):
             found = attempt(self.problem, item.candidate, force.whole_point(item))
             if found is not None:
                 self.keep(found, exact=True)
@@ -293,10 +286,7 @@ class Search(Hypotheses):
 
     def other_places(self) -> None:
         """Fit the best candidate from other places of the structure."""
-        best = self.best()
-        found = elsewhere(self.problem, best)
-        if found is not best:
-            self.keep(found, exact=True)
+        self.keep(elsewhere(self.problem, self.best()), exact=True)
 
     def _settle_steps(self) -> None:
         """Halve the time steps while they cost the best candidate too much, and fit the best ones again."""
@@ -326,7 +316,7 @@ class Search(Hypotheses):
         for item in rough:
             again = attempt(self.problem, item.candidate, item.point)
             if again is not None:  # else the rough one stands
-                self.exact[key_of(item.candidate)] = again
+                self.exact[item.candidate.key] = again
 
     def _extended(self, current: CandidateFit) -> CandidateFit | None:
         """Return a better set with one more effect, or None."""
@@ -345,11 +335,10 @@ class Search(Hypotheses):
         changes = {effect.identifier: starts(screen, effect) for effect in self.effects}
         ranked = sorted(pairs(changes, screen.sign), key=lambda item: item[0])[: SEARCH.pairs_fitted]
         rough: list[CandidateFit] = []
-        for number, (_, first, second) in enumerate(ranked):
-            pair = f"{first.term.effect.identifier} and {second.term.effect.identifier}"
-            self.tell(f"fitting the pair {pair}, {len(ranked) - number - 1} more to fit")
+        words = "fitting the pair {1.term.effect.identifier} and {2.term.effect.identifier}"
+        for _, first, second in each(self.tell, ranked, lambda pair: words.format(*pair)):
             candidate = Candidate((first.term, second.term))
-            if key_of(candidate) in self.exact:
+            if candidate.key in self.exact:
                 continue
             start = np.concatenate((rescaled(first), rescaled(second)))
             if begun is None:
@@ -368,13 +357,8 @@ class Search(Hypotheses):
     def shorter(self) -> None:
         """Fit the best set less one effect, for each."""
         best = self.best()
-        if len(best.candidate.terms) < 2:
-            return
-        for index in range(len(best.candidate.terms)):
+        for less, effect in best.candidate.each_without(best.effect):
             # from here even a set that was fitted before may find a better optimum
-            less = best.candidate.without(index)
-            parts = best.candidate.parts(best.point.effect)
-            effect = np.concatenate(parts[:index] + parts[index + 1 :])
             found = attempt(self.problem, less, Point(best.point.shared, best.point.local, effect))
             if found is not None:
                 self.keep(found, exact=True)
@@ -413,5 +397,4 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
 
 def _beside(effect: Effect, base: CandidateFit) -> str:
     """Return an effect, and what a fit has already, for a line of progress."""
-    there = " and ".join(base.candidate.identifiers)
-    return f"{effect.identifier} beside {there}" if there else effect.identifier
+    return " beside ".join(filter(None, (effect.identifier, base.candidate.words)))

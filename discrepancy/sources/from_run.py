@@ -16,6 +16,7 @@ from calibration.result.file import load_calibration
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
 from discrepancy.models.wing import WingModel
+from fmu_asset.door.binding import load_binding
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch
 from reporting.errors import DamagedFileError
@@ -23,7 +24,6 @@ from reporting.folders import restore_folder
 from reporting.json_file import read_json
 from reporting.netcdf import read_groups
 from reporting.provenance import hash_file
-from reporting.toml_file import read_toml
 from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
@@ -101,7 +101,9 @@ def _campaign(
     if not observed.sizes["step"]:
         ends = zip(("from {} on", "up to {}"), turns, strict=True)
         wanted = [text.format(turn) for text, turn in ends if turn is not None]
-        raise CampaignDataError(f"{folder.name} has the turns {_ends(run)}, and none {', '.join(wanted)}.")
+        steps = np.asarray(run["observed"]["step"].values).tolist()
+        has = f"{steps[0]} to {steps[-1]}" if steps else "none"
+        raise CampaignDataError(f"{folder.name} has the turns {has}, and none {', '.join(wanted)}.")
     strain = np.asarray(observed[STRAIN].values, dtype=np.float64)
     used = np.isfinite(strain)
     if not used.any():
@@ -264,22 +266,13 @@ def _run(folder: Path) -> xr.DataTree:
     return run
 
 
-def _ends(run: xr.DataTree) -> str:
-    steps = np.asarray(run["observed"]["step"].values).tolist()
-    return f"{steps[0]} to {steps[-1]}" if steps else "none"
-
-
 def _step_size(folder: Path) -> float:
     """Return the seconds of a turn, 1 where the run has no binding of its own."""
     path = folder / BINDING_FILE
-    if not path.exists():
-        return 1.0
-    step = read_toml(path, CampaignFileError, what="binding").get("binding", {}).get("step_size", 1.0)
-    if isinstance(step, bool) or not isinstance(step, int | float) or not 0.0 < step < inf:
-        raise CampaignFileError(
-            f"{path}: `step_size` must be a positive number of seconds, and {step!r} came."
-        )
-    return float(step)
+    try:
+        return load_binding(path).binding.step_size if path.exists() else 1.0
+    except FmuError as cause:
+        raise CampaignFileError(f"The binding of the run cannot be read: {cause}") from cause
 
 
 def _temperature(run: xr.DataTree, since: slice, size: int) -> tuple[FloatArray, bool]:

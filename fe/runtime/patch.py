@@ -73,7 +73,7 @@ class StiffnessDrift(Primitive):
 # x, F in N or N m. Ports of the wing: "root" (flapping rotation of the root), "tip" (upward displacement of
 # the tip's load point), "span" (upward displacement of all stations, weighted by the share of planform area;
 # the weights sum to one), "planform" (the law acts at every place on the place's own upward displacement,
-# with a force by the place's share of the area: `planform_forces`). A lumped model declares its own.
+# with a force by the place's share of the area: `motion.PLANFORM`). A lumped model declares its own.
 
 
 # ---------------------------------------------------------------- loads

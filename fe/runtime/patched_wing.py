@@ -13,9 +13,8 @@ import numpy as np
 
 from .arrays import FloatArray
 from .errors import InvalidPatchError
-from .motion import laws_of
+from .motion import STATION_PORTS, laws_of
 from .patch import LOADS, LoadGain, ModelPatch, ModulusTemperature, PointMass, RootCompliance
-from .planform_forces import STATION_PORTS
 from .reduced import lowest_modes
 from .state import Losses
 from .wing_rows import EMPTY, LOAD_PLACE, WingRows, remaining_skin

@@ -226,7 +226,6 @@ class ReducedArrays(RegionArrays):
             "chosen": len(self.chosen),
             "terms": terms,
             "varied terms": terms - 1,
-            "static": self.static_stiffness.shape[-1],
             "modal": self.modal_stiffness.shape[-1],
             "outputs": self.static_count,
             "all outputs": self.static_count + len(self.accelerations),
@@ -234,7 +233,6 @@ class ReducedArrays(RegionArrays):
             "splits": int(self.dual_counts.sum()) - regions,
             "anchors": anchors,
             "duals": functions or anchors,
-            "functions": functions,
             **dict(zip(("dual rows", "dual columns"), factor, strict=True)),
             "masses": 1 + masses,
         }

@@ -14,6 +14,7 @@ import numpy as np
 
 from .arrays import FloatArray, IntArray
 from .errors import InvalidPatchError
+from .motion import STATION_COUNT, STATION_PORTS, at_stations
 from .patch import (
     INTERNAL_FORCES,
     InertiaRelief,
@@ -24,7 +25,6 @@ from .patch import (
     Washout,
 )
 from .patch_arrays import PatchArrays
-from .planform_forces import STATION_PORTS, PlanformStations, at_stations, planform_stations
 
 TIP_OFFSET = 1.02
 """Where the weight of a part of the skin would vanish, in semi-spans."""
@@ -113,6 +113,29 @@ def strain_gauge(output: str) -> int:
     """Return the row k - 1 of an output strain[k], k from 1; -1 for other outputs."""
     strain = _STRAIN.fullmatch(output)
     return -1 if strain is None else int(strain.group(1)) - 1
+
+
+class PlanformStations(NamedTuple):
+    """Stations of the integral over the planform.
+
+    Attributes
+    ----------
+    distance : (S,) ndarray
+        From the root [m].
+    share : (S,) ndarray
+        Share of the area; sums to one.
+    """
+
+    distance: FloatArray
+    share: FloatArray
+
+
+def planform_stations(semi_span: float, root_chord: float, tip_chord: float) -> PlanformStations:
+    """Return the stations of a wing whose chord is linear along the span, lengths in m."""
+    place, weight = np.polynomial.legendre.leggauss(STATION_COUNT)
+    eta = 0.5 * (1.0 + place)
+    area = weight * (root_chord + (tip_chord - root_chord) * eta)
+    return PlanformStations(semi_span * eta, area / area.sum())
 
 
 class WingRows:
@@ -240,8 +263,7 @@ class WingRows:
     @cached_property
     def planform(self) -> PlanformStations:
         """Stations of forces that are spread over the planform."""
-        arrays = self.arrays
-        return planform_stations(self.span, arrays.root_chord, arrays.tip_chord)
+        return planform_stations(self.span, self.arrays.root_chord, self.arrays.tip_chord)
 
     def internal_forces(self, patch: ModelPatch) -> ModelPatch:
         """Return the internal forces of a patch by ports of `port_rows`, of the planform by station."""

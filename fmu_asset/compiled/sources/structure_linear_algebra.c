@@ -6,6 +6,12 @@
 
 #define MOST_SWEEPS 60
 #define LANES 8
+/* These loops stay loops until the compiler has put what is side by side into one register. */
+#if defined(__GNUC__) && !defined(__clang__)
+#define OVER_LANES _Pragma("GCC unroll 1") for (size_t j = 0; j < LANES; ++j)
+#else
+#define OVER_LANES for (size_t j = 0; j < LANES; ++j)
+#endif
 /* Eigenvalues that lie closer, relative to their size, have vectors that single iterations do not keep apart. */
 #define LEAST_GAP 0.05
 #define MOST_CORRECTIONS 10
@@ -283,61 +289,70 @@ static void reflect(double *restrict vectors, size_t count, const double *restri
 /* Correct approximate eigenvalues x of a tridiagonal matrix, one in each lane, and find their vectors z (size, LANES)
    with squares of their lengths: T - x is factorised from both ends, the vector is one where these meet with the
    least remainder, and the Rayleigh quotient of it is the next x (Dhillon and Parlett, "Orthogonal eigenvectors and
-   relative gaps", SIAM J. Matrix Anal. Appl. 25, 2004). `work` has room for 2 size LANES doubles. */
+   relative gaps", SIAM J. Matrix Anal. Appl. 25, 2004). `work` has room for 4 size LANES doubles. */
 STRUCTURE_WIDE
 static void correct(const double *restrict d, const double *restrict e, size_t size, double *restrict x,
                     double *restrict change, double *restrict z, double *restrict square, double *restrict work) {
-    double *restrict up = work, *restrict down = work + size * LANES;
+    double *restrict up = work, *restrict down = up + size * LANES;
+    double *restrict above = down + size * LANES, *restrict below = above + size * LANES;
     const double tiny = DBL_EPSILON * DBL_EPSILON * fabs(d[0]) + DBL_MIN;
-    double pivot[LANES], least[LANES], remainder[LANES], place[LANES];
-    for (size_t i = 0; i < size; ++i) {
-        const double beside = i == 0 ? 0.0 : e[i - 1] * e[i - 1];
-        for (size_t j = 0; j < LANES; ++j) {
-            const double next = (d[i] - x[j]) - (i == 0 ? 0.0 : beside / pivot[j]);
-            pivot[j] = fabs(next) <= tiny ? tiny : next;
-            up[i * LANES + j] = pivot[j];
+    double top[LANES], bottom[LANES], least[LANES], remainder[LANES], place[LANES];
+    OVER_LANES {
+        top[j] = bottom[j] = 1.0;
+        least[j] = DBL_MAX;
+        remainder[j] = place[j] = square[j] = 0.0;
+    }
+    /* Both ends at once, so that their divisions do not wait for each other; and no branches in loops over lanes. */
+    for (size_t i = 0, k = size - 1; i < size; ++i, --k) {
+        const double before = i == 0 ? 0.0 : e[i - 1], behind = i == 0 ? 0.0 : e[k];
+        OVER_LANES {
+            const double of_top = before / top[j], of_bottom = behind / bottom[j];
+            above[i * LANES + j] = of_top;
+            below[k * LANES + j] = of_bottom;
+            top[j] = (d[i] - x[j]) - before * of_top;
+            bottom[j] = (d[k] - x[j]) - behind * of_bottom;
+        }
+        OVER_LANES {
+            top[j] = fabs(top[j]) <= tiny ? tiny : top[j];
+            bottom[j] = fabs(bottom[j]) <= tiny ? tiny : bottom[j];
+            up[i * LANES + j] = top[j];
+            down[k * LANES + j] = bottom[j];
         }
     }
-    for (size_t j = 0; j < LANES; ++j) {
-        least[j] = DBL_MAX;
-        remainder[j] = place[j] = 0.0;
-    }
-    for (size_t i = size; i-- > 0;) {
-        const double beside = i + 1 == size ? 0.0 : e[i] * e[i], here = (double)i;
-        for (size_t j = 0; j < LANES; ++j) {
-            const double coupled = i + 1 == size ? 0.0 : beside / pivot[j], next = (d[i] - x[j]) - coupled;
-            const double left = up[i * LANES + j] - coupled;
+    for (size_t i = 0; i < size; ++i) {
+        const double here = (double)i;
+        OVER_LANES {
+            const double left = up[i * LANES + j] + (down[i * LANES + j] - (d[i] - x[j]));
             const bool better = fabs(left) < least[j];
-            pivot[j] = fabs(next) <= tiny ? tiny : next;
-            down[i * LANES + j] = pivot[j];
             least[j] = better ? fabs(left) : least[j];
             remainder[j] = better ? left : remainder[j];
             place[j] = better ? here : place[j];
         }
     }
-    for (size_t j = 0; j < LANES; ++j) {
-        z[(size - 1) * LANES + j] = place[j] == (double)(size - 1) ? 1.0 : 0.0;
+    OVER_LANES {
+        top[j] = bottom[j] = 0.0;
     }
-    for (size_t i = size - 1; i-- > 0;) {
-        const double here = (double)i;
-        for (size_t j = 0; j < LANES; ++j) {
-            const double along = -(e[i] / up[i * LANES + j]) * z[(i + 1) * LANES + j];
-            z[i * LANES + j] = here == place[j] ? 1.0 : along;
+    for (size_t i = size - 1, k = 0; k < size; --i, ++k) { /* from the place backwards, and onwards */
+        const double here = (double)i, there = (double)k;
+        OVER_LANES {
+            top[j] = here == place[j] ? 1.0 : top[j];
+            bottom[j] = there == place[j] ? 1.0 : bottom[j];
+        }
+        OVER_LANES {
+            z[i * LANES + j] = top[j];
+            down[k * LANES + j] = there == place[j] ? 0.0 : bottom[j];
+            top[j] *= -above[i * LANES + j]; /* nothing lies above the first, and nothing below the last */
+            bottom[j] *= -below[k * LANES + j];
         }
     }
-    for (size_t j = 0; j < LANES; ++j) {
-        square[j] = z[j] * z[j];
-    }
-    for (size_t i = 1; i < size; ++i) {
-        const double here = (double)i;
-        for (size_t j = 0; j < LANES; ++j) {
-            const double along = -(e[i - 1] / down[i * LANES + j]) * z[(i - 1) * LANES + j];
-            const double kept = here > place[j] ? along : z[i * LANES + j];
+    for (size_t i = 0; i < size; ++i) {
+        OVER_LANES {
+            const double kept = z[i * LANES + j] + down[i * LANES + j];
             z[i * LANES + j] = kept;
             square[j] += kept * kept;
         }
     }
-    for (size_t j = 0; j < LANES; ++j) {
+    OVER_LANES {
         change[j] = remainder[j] / square[j];
         x[j] += change[j];
     }

@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import eigh
+from scipy.linalg import eigh, expm
 
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Shown
+from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
 from discrepancy.models.second_order import SecondOrderSystem
 from fe.runtime import patch as patches
 from fe.runtime.laws.micro_slip import slip_displacements
-from fe.runtime.motion import NO_LAWS
+from fe.runtime.motion import NO_LAWS, laws_of
 from fe.runtime.patch import (
     BoucWen,
     FreePlay,
@@ -32,7 +33,10 @@ from fe.runtime.patch import (
 from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
 from tests.discrepancy.asking import trial as asked
 from tests.discrepancy.rigs import model_of
+from tests.fe.runtime.stepping import simulate
 from tests.refusals import Inputs
+
+pytestmark = pytest.mark.xdist_group("compiling")
 
 INPUTS = Inputs(__file__)
 MASS = np.diag([1.5, 1.2, 0.8])
@@ -297,6 +301,59 @@ def test_closed_form_and_stepped_ringdown_agree_for_any_damping(
         for items in ((), (patches.StiffnessDrift(1e-14),))
     )
     np.testing.assert_allclose(values, stepped, atol=1e-8 * 0.02)
+
+
+# ---------------------------------------------------------------- at uneven stamps
+
+SEEN = (("x1", Quantity.DISPLACEMENT), VELOCITY, ACCELERATION)
+COULOMB = PowerDamping("joint", 0.4, 0.0, 0.0, 1.0, 1.0)
+TOGETHER = PowerDamping("joint", 2.0, 2.0, 0.0, 0.2, 1.0), PowerStiffness("joint", 4.0, 3.0, 0, 0.01)
+
+
+@pytest.mark.parametrize("laws", [(), (COULOMB,), TOGETHER])
+def test_even_stamps_are_those_of_the_even_stepper(laws: tuple[Primitive, ...]) -> None:
+    ports = {"joint": np.array([0.7, -1.1])}
+    system = SecondOrderSystem(np.eye(2), np.diag([0.1, 0.4]), np.diag([81.0, 961.0]), ports)
+    internal = laws_of(patches.ModelPatch(laws), system.ports) if laws else NO_LAWS
+    time, shape = 0.01 * np.arange(300), np.array([0.4, 0.9])
+    force = np.append(0.0, np.random.default_rng(0).normal(size=299))
+    given = {"q": np.zeros(2), "v": np.zeros(2), "shape": shape @ system.shapes, "kernel": compiled_kernel()}
+    even = simulate(system.modal, internal, force=force, interval=0.01, **given)
+    found = system.motion(Acting(time, np.zeros(2), [(shape, Course.of(time, force))]), internal)
+    for one, other in ((found.q, even.q), (found.velocity, even.v), (found.port_forces, even.port_forces)):
+        size = max(1e-9, float(np.abs(other).max(initial=0.0)))
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * size)
+
+
+def test_a_forced_motion_at_uneven_stamps_is_exact(chain: LumpedModel) -> None:
+    time = 0.02 * (np.arange(200) + 0.9 * np.random.default_rng(1).uniform(-0.5, 0.5, 200))
+    time = np.delete(time - time[0], slice(66, 73))  # and a gap
+    force = np.append(0.0, np.random.default_rng(2).normal(size=len(time) - 1))
+    matrix = np.zeros((8, 8))
+    matrix[:3, 3:6] = np.eye(3)
+    matrix[3:6] = np.linalg.solve(MASS, np.hstack((-STIFFNESS, -VISCOUS, np.eye(3)[:, 2:], np.zeros((3, 1)))))
+    matrix[6, 7] = 1.0
+    states = [np.zeros(6)]
+    for k, h in enumerate(np.diff(time)):
+        slope = (force[k + 1] - force[k]) / h
+        states.append((expm(h * matrix) @ np.concatenate((states[-1], [force[k], slope])))[:6])
+    found = np.array(states)
+    acceleration = found @ matrix[5, :6] + force * matrix[5, 6]
+    expected = np.stack([found[:, 0], found[:, 5], acceleration], axis=1)
+    measured = shown(chain, trial(TrialKind.FORCED, time, force=force), outputs=SEEN)
+    np.testing.assert_allclose(measured, expected, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("kind", [TrialKind.RINGDOWN, TrialKind.FORCED])
+@pytest.mark.parametrize("laws", [(), TOGETHER, (COULOMB,)])
+def test_leaving_samples_out_changes_nothing_at_the_others(chain, kind: TrialKind, laws) -> None:
+    time, kept = 0.005 * np.arange(400), np.random.default_rng(5).uniform(size=400) < 0.6
+    kept[[0, 399]] = True
+    force = 0.5 * np.interp(time, time[kept], np.sin(20.0 * time[kept]))
+    whole = ringdown(time) if kind is TrialKind.RINGDOWN else trial(kind, time, force=force)
+    part = ringdown(time[kept]) if kind is TrialKind.RINGDOWN else trial(kind, time[kept], force=force[kept])
+    dense, found = (shown(chain, what, *laws, outputs=SEEN, refinement=8) for what in (whole, part))
+    np.testing.assert_allclose(found, dense[kept], atol=2e-4 * np.abs(dense).max())
 
 
 # ---------------------------------------------------------------- what it says of itself

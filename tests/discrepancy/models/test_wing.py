@@ -20,6 +20,7 @@ from discrepancy.models.wing import WingModel
 from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import entry
 from fe.runtime import patch
+from fe.runtime.motion import STATION_PORTS
 from fe.runtime.patch import (
     LocalStiffnessLoss,
     ModelPatch,
@@ -29,7 +30,6 @@ from fe.runtime.patch import (
     RootCompliance,
 )
 from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.planform_forces import STATION_PORTS
 from fe.runtime.wing_rows import strain_gauge
 from fe.wing.design import load_design
 from tests.discrepancy.asking import FloatArray, campaign, integrated, trial

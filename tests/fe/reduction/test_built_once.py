@@ -63,9 +63,7 @@ def ours(path: Path) -> str:
     return built_once(path, path.read_text, lambda: "ours", path.write_text)
 
 
-def test_a_wait_is_said_and_ends_with_what_the_other_made(
-    path: Path, other: Start, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_wait_is_said_and_ends_with_what_the_other_made(path, other, caplog) -> None:
     process = other(2.0)
     begin = time.monotonic()
     found: list[str] = []
@@ -79,9 +77,7 @@ def test_a_wait_is_said_and_ends_with_what_the_other_made(
     assert len(caplog.messages) == 1
 
 
-def test_when_the_other_is_killed_it_is_made_here(
-    path: Path, other: Start, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_when_the_other_is_killed_it_is_made_here(path, other, caplog) -> None:
     process = other(60.0)
     threading.Timer(1.5, process.kill).start()
     begin = time.monotonic()
@@ -108,9 +104,7 @@ def test_a_full_disk_stops_no_build(path: Path, monkeypatch: pytest.MonkeyPatch)
     assert ours(path) == "ours"
 
 
-def test_a_lock_without_a_number_is_waited_for(
-    path: Path, other: Start, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_lock_without_a_number_is_waited_for(path, other, monkeypatch, caplog) -> None:
     other(60.0)
     os.truncate(path.with_suffix(".lock"), 0)
     monkeypatch.setattr(module, "_PAUSE", 0.001)

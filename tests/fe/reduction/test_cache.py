@@ -80,9 +80,7 @@ def test_what_is_changed_is_built_anew(builds, coarse_design: WingDesign, monkey
 
 @pytest.mark.parametrize("victim", ["wing", "fields"])
 @pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "missing"])
-def test_damaged_entry_is_built_anew(
-    builds, coarse_design: WingDesign, caplog, victim: str, damage: str
-) -> None:
+def test_damaged_entry_is_built_anew(builds, coarse_design, caplog, victim: str, damage: str) -> None:
     good = reduced_model(coarse_design).to_bytes()
     path, other = (entry(kind, coarse_design.hash, None) for kind in (victim, "fields"))
     content = bytearray(path.read_bytes())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -220,8 +219,6 @@ def limited(most: int) -> dict[str, str]:
         ({'"beam.vtu"': '"gone.vtu"'}, r"gone\.vtu"),
     ],
 )
-def test_what_cannot_be_reduced_is_refused(
-    changes, sentence: str, write_beam: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_what_cannot_be_reduced_is_refused(changes, sentence: str, write_beam, tmp_path) -> None:
     with pytest.raises(FiniteElementError, match=sentence):
         reduced_structure(write_beam(tmp_path, changes, cells=2))

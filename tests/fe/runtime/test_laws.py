@@ -17,12 +17,21 @@ from fe.runtime.errors import InvalidPatchError, SolutionError
 from fe.runtime.flexible_ports import settle_port
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
+from fe.runtime.motion import (
+    NO_LAWS,
+    PLANFORM,
+    STATION_COUNT,
+    STATION_PORTS,
+    Laws,
+    at_stations,
+    laws_of,
+    static_solution,
+)
 from fe.runtime.motion_arrays import State
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.runtime.patched_wing import PatchedWing
-from fe.runtime.planform_forces import PLANFORM, STATION_COUNT, STATION_PORTS, at_stations, planform_stations
 from fe.runtime.stepwise import substeps
+from fe.runtime.wing_rows import planform_stations
 from tests.fe.runtime.stepping import simulate
 
 A, W = 0.05, 2.0 * np.pi * np.array([5.6, 20.0, 35.0, 60.0])

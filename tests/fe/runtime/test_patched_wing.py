@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from fe.runtime.errors import InvalidPatchError, ReducedModelFileError
 from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
-from fe.wing.design import WingDesign
 from fe.wing.operators import (
     AffineOperators,
     assemble,
@@ -434,9 +432,7 @@ def test_a_file_gives_the_arrays_back(coarse_patch_arrays: PatchArrays, tmp_path
         ("stations", lambda stations: stations[::-1].copy(), "must rise"),
     ],
 )
-def test_wrong_arrays_are_refused(
-    coarse_patch_arrays, name: str, change: Callable[[Any], Any], message: str
-) -> None:
+def test_wrong_arrays_are_refused(coarse_patch_arrays, name: str, change, message: str) -> None:
     with pytest.raises(ReducedModelFileError, match=message):
         replace(coarse_patch_arrays, **{name: change(getattr(coarse_patch_arrays, name))})
 
@@ -451,9 +447,7 @@ def test_strips_end_at_mesh_lines_and_shares_of_the_area_integrate_a_parabola_on
     assert mean == pytest.approx((2.0 / 3.0 - 0.25) / 1.5, rel=1e-12)
 
 
-def test_the_cache_builds_once(
-    coarse_design: WingDesign, coarse_patch_arrays: PatchArrays, tmp_path: Path, monkeypatch, caplog
-) -> None:
+def test_the_cache_builds_once(coarse_design, coarse_patch_arrays, tmp_path, monkeypatch, caplog) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     built: list[str] = []
     monkeypatch.setattr(

@@ -207,6 +207,19 @@ def test_rates_through_the_high_pass(order: float) -> None:
     assert np.array_equal(settled, VALUES)
 
 
+def test_a_high_pass_follows_uneven_stamps() -> None:
+    time = 0.01 * (np.arange(400) + 0.6 * np.random.default_rng(1).uniform(-0.5, 0.5, 400))
+    time = np.delete(time - time[0], slice(133, 140))  # and a gap
+    wave = 2.0 * np.pi * 1.3
+    record = SensorRecord((("x", "velocity"),), "forced", time, 0.0, np.zeros(len(time)))
+    signal, rates = np.sin(wave * time)[:, None], wave * np.cos(wave * time)[:, None]
+    found, _ = applied(ModelPatch((HighPass("x", 0.3),)), record, signal, rates)
+    # y' = x' - y / tau from rest: steady part and what the begin leaves
+    steady = np.imag(1j * wave * 0.3 / (1.0 + 1j * wave * 0.3) * np.exp(1j * wave * time))
+    # the gap of eight intervals is bridged by a straight line
+    np.testing.assert_allclose(found[:, 0], steady - steady[0] * np.exp(-time / 0.3), atol=8e-3)
+
+
 # ---------------------------------------------------------------- sample by sample
 
 STREAMED = ModelPatch(

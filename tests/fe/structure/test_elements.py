@@ -66,16 +66,15 @@ def test_shape_functions_are_those_of_scikit_fem(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["tetra", "tetra10", "hexahedron", "hexahedron20"])
-def test_element_arrays_are_those_of_scikit_fems_forms(name: str, box: Callable[..., Any]) -> None:
-    points, cells = box(name, (1, 1, 1))
-    kind = KINDS[name]
+def test_element_arrays_are_those_of_scikit_fems_forms(name: str, box) -> None:
+    (points, cells), kind = box(name, (1, 1, 1)), KINDS[name]
     points = points + 0.1 * points[:, [1, 2, 0]]  # sheared: straight, and no two edges alike
     corners = len(kind.corners)
     mesh = MeshTet if corners == 4 else MeshHex
     order = [int(np.flatnonzero((np.array(kind.corners) == p).all(axis=1))[0]) for p in mesh.elem.refdom.p.T]
     used, vertices = np.unique(cells[:, order], return_inverse=True)
-    vertices = vertices.reshape(len(cells), corners)
-    body = mesh(np.ascontiguousarray(points[used].T), np.ascontiguousarray(vertices.T), sort_t=False)
+    vertices = np.ascontiguousarray(vertices.reshape(len(cells), corners).T)
+    body = mesh(np.ascontiguousarray(points[used].T), vertices, sort_t=False)
     basis = Basis(body, ElementVector(SKFEM[name]), intorder=6)
     stress = linear_stress(*lame_parameters(2.0, 0.3))
     stiffness = BilinearForm(lambda u, v, w: ddot(stress(sym_grad(u)), sym_grad(v))).assemble(basis)
@@ -85,12 +84,10 @@ def test_element_arrays_are_those_of_scikit_fems_forms(name: str, box: Callable[
     M = mass_blocks(kind, nodes, 1.0, kind.mass_rule)
     # Unknowns of both are told by the places of their nodes: compare the energies of one smooth field.
     field = np.sin(points @ np.array([[1.0, 2.0, 0.5], [0.3, -1.0, 2.0], [0.7, 0.2, 1.0]]))
-    ours = field[cells].reshape(len(cells), -1)
-    theirs = np.zeros(basis.N)
+    ours, theirs = field[cells].reshape(len(cells), -1), np.zeros(basis.N)
     for row, unknowns in enumerate(basis.element_dofs):
-        for unknown in unknowns:
-            node = int(np.linalg.norm(points - basis.doflocs[:, unknown], axis=1).argmin())
-            theirs[unknown] = field[node, row % 3]
+        apart = np.linalg.norm(points[:, :, None] - basis.doflocs[:, unknowns], axis=1)
+        theirs[unknowns] = field[apart.argmin(axis=0), row % 3]
     assert np.einsum("ni,nij,nj->", ours, K, ours) == pytest.approx(theirs @ stiffness @ theirs, rel=1e-12)
     scalar = np.einsum("nai,nab,nbi->", field[cells], M, field[cells])
     assert scalar == pytest.approx(theirs @ mass @ theirs, rel=1e-12)

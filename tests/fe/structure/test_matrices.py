@@ -45,9 +45,7 @@ def tables(free: list[int], forces: list[tuple[int, Point]], gauge: tuple[int, i
     ("build", "kind"),
     [(decks.stiffened_skin, "S8R"), (decks.stiffened_skin, "S4"), (decks.frame, "B32"), (decks.frame, "B31")],
 )
-def test_shells_and_beams_are_calculixs_own(
-    build: Callable[..., decks.Deck], kind: str, tmp_path: Path
-) -> None:
+def test_shells_and_beams_are_calculixs_own(build: Callable[..., decks.Deck], kind: str, tmp_path) -> None:
     """Displacements, an extension, six frequencies, also in a state of which no matrix was made."""
     deck = build(kind)
     places = [*PARTS[build]]

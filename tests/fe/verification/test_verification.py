@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 
@@ -5,6 +7,7 @@ from fe.verification.known_answers import (
     cantilever_check,
     macneal_harder_beam,
     mesh_convergence,
+    observed_order,
     patch_test,
     rigid_body_residual,
     rigid_body_values,
@@ -65,3 +68,15 @@ def test_the_mesh_converges(shipped_design):
         assert one == pytest.approx(half, rel=0.025)
         assert half == pytest.approx(coarse, rel=0.025)
     assert np.sqrt(np.mean((found["strain"][2] / found["strain"][1] - 1.0) ** 2)) < 0.05
+
+
+@pytest.mark.parametrize("order", [0.5, 1.0, 2.0, 3.7])
+@pytest.mark.parametrize("refinements", [(0.5, 1.0, 2.0), (1.0, 1.5, 2.25), (0.25, 0.5, 1.5, 4.5)])
+def test_the_order_of_a_power_law_is_found(refinements, order):
+    values = [7.0 - 0.3 * refinement**-order for refinement in refinements]
+    assert observed_order(refinements[-1] / refinements[-2], values) == pytest.approx(order, abs=1e-6)
+
+
+@pytest.mark.parametrize("values", [(1.0, 2.0, 1.5), (1.0, 2.0, 4.0), (1.0, 1.0, 1.0)])
+def test_no_order_where_values_do_not_settle(values):  # to and fro, running away, standing still
+    assert math.isnan(observed_order(2.0, values))

@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -214,6 +214,33 @@ def test_outputs_can_be_read_while_initialising(both: tuple[Slave, Slave]) -> No
         one.fmu.exitInitializationMode()
         assert one.step([3.5, 0.4, 0.0, 0.0], 3.0, 0.5) == OK
     assert_same_numbers(both[0].names, *seen)
+
+
+def test_modes_that_coincide_are_those_in_python(
+    compiler: Any, beam_model: ReducedModel, tmp_path: Path
+) -> None:
+    """A double mode, two 1e-7 apart, two 1e-3, whatever the loss: motion and frequencies to 1e-9."""
+    size = beam_model.modal_load.shape[1]
+    turn = np.linalg.qr(np.random.default_rng(5).normal(size=(size, size)))[0]
+    squares = 1e6 * np.arange(1.0, size + 1.0) ** 2
+    squares[2], squares[4] = squares[1], squares[3] * (1.0 + 1e-7)
+    squares[6] = squares[5] * 1.001
+    shares = np.full(len(beam_model.modal_stiffness), 1.0 / len(beam_model.modal_stiffness))
+    masses = np.zeros_like(beam_model.modal_mass)
+    masses[0] = np.eye(size)
+    model = replace(
+        beam_model,
+        modal_stiffness=np.multiply.outer(shares, (turn * squares) @ turn.T),
+        modal_mass=masses,
+        cross_mass=np.zeros_like(beam_model.cross_mass),
+    )
+    kinds: tuple[Literal["compiled", "python"], ...] = ("compiled", "python")
+    files = [build_fmu(model, tmp_path / f"{kind}.fmu", kind=kind).path for kind in kinds]
+    with closing(Slave(files[0])) as one, closing(Slave(files[1])) as two:
+        for seed in range(3):
+            seen, expected = (random_flight(each, seed, 2, overdamped=False) for each in (one, two))
+            scale = np.maximum(np.abs(expected).max(axis=0), 1e-300)
+            assert (np.abs(seen - expected).max(axis=0) <= 1e-9 * scale).all()
 
 
 def test_a_compiled_fmu_bounds_as_the_model_does(
