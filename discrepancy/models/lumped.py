@@ -121,8 +121,9 @@ class LumpedModel(DescribedModel, SystemModel):
         check_no_inputs(trial, f"the lumped model {self.name!r}")
 
     def own_laws(self, parameters: FloatArray) -> ModelPatch:
-        """Return the laws of ports that it has as it is."""
-        return self.description.own_laws(self._factors(parameters))
+        """Return the laws of ports that it has as it is, each times its factor."""
+        factors = self._factors(parameters)
+        return ModelPatch(tuple(law.scaled(factors.get(law.name, 1.0)) for law in self.description.law))
 
     def system(self, state: State) -> SecondOrderSystem:
         """Return the rig, with prescribed motions and controllers as the state says."""

@@ -29,7 +29,6 @@ from discrepancy.models.lumped_sections import (
     ScaledParameter,
 )
 from discrepancy.models.model_file import ModelDescription, check_unique
-from fe.runtime.patch import ModelPatch
 from reporting.section import Positive, checked
 from reporting.toml_file import read_toml
 from reporting.words import counted
@@ -183,10 +182,6 @@ class LumpedDescription(ModelDescription):
         for part in self.parts(kind):
             whole = whole + factors.get(part.name, 1.0) * np.array(part.matrix)
         return np.asarray(whole * factors.get(kind, 1.0))
-
-    def own_laws(self, factors: Mapping[str, float]) -> ModelPatch:
-        """Return the laws of ports that the model has as it is, each times its factor."""
-        return ModelPatch(tuple(law.scaled(factors.get(law.name, 1.0)) for law in self.law))
 
     def _check_vectors(self, kind: str, item: NamedVector | OutputSection | ControllerSection) -> None:
         """Refuse vectors of another length and zero ones, and what sees both displacements and states."""

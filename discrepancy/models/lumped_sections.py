@@ -153,8 +153,7 @@ class LawSection(Section):
         """The law."""
         row = {"kind": self.kind, "port": self.port, **(self.model_extra or {})}
         (found,) = ModelPatch.from_list([row], f"the law {self.name!r}")
-        if not isinstance(found, PortForce):
-            raise InvalidPatchError(f"the kind {self.kind!r} is no law of a port")
+        assert isinstance(found, PortForce)  # the kind is checked
         return found
 
     @model_validator(mode="after")
@@ -173,8 +172,6 @@ class LawSection(Section):
     def scaled(self, factor: float) -> PortForce:
         """Return the law with the numbers that its force is in proportion to times a factor."""
         law = self.primitive
-        if factor == 1.0:
-            return law
         return replace(law, **{name: factor * getattr(law, name) for name in law.proportional})
 
 

@@ -98,7 +98,8 @@ class Kind:
 # ---------------------------------------------------------------------- structures
 
 WING = load_binding(binding_files()["uav_wing"])
-BINDINGS = {path.stem: load_binding(path) for path in Path(__file__).with_name("bindings").glob("*.toml")}
+BINDINGS_FOLDER = Path(__file__).with_name("bindings")
+BINDINGS = {path.stem: load_binding(path) for path in BINDINGS_FOLDER.glob("*.toml")}
 """Of others' FMUs and systems, by the name of the model."""
 HOSTILE, SYSTEM_OF_THREE = BINDINGS["hostile2"], BINDINGS["three"]
 QUASI_STATIC, TRANSIENT = 1.0, 2.0

@@ -72,7 +72,25 @@ def onwards(asset: FmiAsset, kind: Kind) -> Bits:
     return [bits(asset.step()), *flown(asset, kind, range(kind.steps // 2, kind.steps))]
 
 
-every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+ONLY_HERE = (
+    "three",
+    "beam",
+    "model exchange wing",
+    "one array",
+    "integrator by",
+    "quarters",
+    "compiled wing",
+    "a system",
+)
+"""Beginnings and parts of names of kinds that are the same to a worker as others are."""
+IN_A_WORKER = ("compiled wing in motion", "a system with a wing")
+CASES = [
+    pytest.param(kind, isolated, id=f"{name}-{'worker' if isolated else 'in process'}")
+    for name, kind in KINDS.items()
+    for isolated in (True, False)
+    if not isolated or name in IN_A_WORKER or not any(part in name for part in ONLY_HERE)
+]
+every_kind = pytest.mark.parametrize(("kind", "isolated"), CASES)
 
 
 @every_kind

@@ -16,26 +16,12 @@ from fmu_asset.coupling.structure import Component
 from fmu_asset.door import placement
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuStateError
-from tests.fmu_asset.door.kinds import HOSTILE
+from tests.fmu_asset.door.kinds import BINDINGS_FOLDER, HOSTILE
 from tests.fmu_asset.making import bound, system
 from twin_master.library.grid import GridSampler, SamplingGrid
 
 PUSH = {"push": ("force", "N")}
 SPRING = bound(0.1, {"motion": (["position", "velocity"], ["m", "m/s"])}, control=PUSH)
-BINDING = """
-[binding]
-name = "spring"
-step_size = 0.1
-[control.push]
-variable = "force"
-unit = "N"
-[health.spring]
-variable = "stiffness"
-unit = "N/m"
-[observation.motion]
-variables = ["position"]
-unit = "m"
-"""
 
 
 def motion(pushes: list[float]) -> list[float]:
@@ -122,10 +108,9 @@ def test_what_never_starts_alike_is_not_started_in_ever_new_processes(foreign_fm
         assert len(set(seen[7:])) == 1
 
 
-def test_a_library_is_sampled_from_fresh_starts(foreign_fmu: Any, tmp_path: Path) -> None:
+def test_a_library_is_sampled_from_fresh_starts(foreign_fmu: Any) -> None:
     """Every point is the equilibrium; without a new start the mass would stay where it was."""
-    binding = tmp_path / "spring.toml"
-    binding.write_text(BINDING)
+    binding = BINDINGS_FOLDER / "spring2.toml"
     fmu = foreign_fmu("spring2", "RESET_DOES_NOTHING", "STANDS_STILL_ONCE_TERMINATED", "FRICTION=4.0")
     grid = SamplingGrid(
         fmu=str(fmu), binding=str(binding), role="motion", parameter="", draws=(0.0,), settling_steps=200,

@@ -25,7 +25,7 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuCallError, FmuInputError, FmuWorkerError
 from fmu_asset.folders import remove_folder
 from fmu_asset.worker.sandbox import landlock_version
-from tests.fmu_asset.door.kinds import HOSTILE
+from tests.fmu_asset.door.kinds import BINDINGS_FOLDER, HOSTILE
 from tests.fmu_asset.making import ROOT, bound, changed, run_python, system
 from tests.fmu_asset.worker.test_hostile import MISBEHAVIOURS
 from twin_master.errors import InvalidObservationLibraryError
@@ -289,26 +289,10 @@ def test_what_is_not_confined_is_said_once(foreign_fmu, caplog, monkeypatch: pyt
     assert len(said) == 2
 
 
-SAMPLED = """
-[binding]
-name = "hostile"
-step_size = 1.0
-[control.u]
-variable = "u"
-unit = "m/s"
-[health.damage]
-variable = "d"
-unit = "1"
-[observation.y]
-variables = "y"
-unit = "m"
-"""
-
-
 def sampled(fmu: Path, folder: Path, more: str = "") -> SamplingGrid:
     """Return a grid of two points."""
     file = folder / "hostile.toml"
-    file.write_text(SAMPLED + more)
+    file.write_text((BINDINGS_FOLDER / "hostile2_damaged.toml").read_text("utf-8") + more)
     return SamplingGrid(
         fmu=str(fmu), binding=str(file), role="y", parameter="", draws=(0.0,), settling_steps=5,
         states={"damage": (0.0, 0.1)}, controls={"go": {"u": 1.0}},
