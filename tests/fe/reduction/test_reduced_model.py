@@ -139,6 +139,21 @@ def test_many_states_at_once_equal_one_by_one(pair: Pair) -> None:
     assert model.static_outputs(model.vectors({name: 0.1})).shape == (1, len(model.static_output))
 
 
+@pytest.mark.parametrize("regions", [1, 4])
+def test_loads_that_act_against_each_other_keep_a_bound_of_their_own(regions: int) -> None:
+    full, model = springs(regions), reduced_springs(regions).model
+    random = np.random.default_rng(regions)
+    for _ in range(40):
+        e, losses = random.uniform(0.9, 1.1), random.choice((0.0, 0.3, 0.8), regions)
+        for lift, force in ((1.0, 0.0), (0.0, 1.0), (3.0, -20.0)):
+            chosen = {"young_modulus_factor": e, "load_factor": lift, "tip_force": force}
+            found = model.static_response(chosen, losses)
+            given = chosen | dict(zip(full.regions, losses.tolist(), strict=True))
+            wanted = static_response(full, given).strain
+            error = np.abs(found.strain - wanted).max()
+            assert error <= found.strain_error_bound <= 0.05 * np.abs(wanted).max()
+
+
 def test_without_a_load_there_is_no_strain_and_no_bound(pair: Pair) -> None:
     response = pair.model.static_response(load=np.zeros(len(pair.model.static_load)))
     assert not response.strain.any()
