@@ -1,6 +1,6 @@
 """Patch files as an FMU takes them: effects with an id and primitives, channels named as outputs.
 
-The file may hold more (posterior, data hash); what is read here, in the names of `discrepancy.files.patch` or
+The file may hold more (posterior, data hash); what is read here, in the names of `discrepancy.files.verdict` or
 in shorter ones, is
 
 ```json
