@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.sampling import is_even, nearly_even
+from discrepancy.campaign.sampling import IntArray, is_even, nearly_even
 from discrepancy.errors import CampaignDataError
 from reporting.words import brief
 
@@ -334,11 +334,21 @@ class Trial:
         }  # fmt: skip
         return cls(name, kind, channels, time=time, **{**usual, **given})
 
-    def rows(self, rows: BoolArray, **changes: Any) -> "Trial":
-        """Return the trial with some of its rows (N,) only, and other fields changed."""
-        parts = ("values", "used", "time", "force", "load_factor", "temperature")
-        of_rows = {part: getattr(self, part)[rows] for part in (*parts, "health", "health_deviation")}
-        return replace(self, **of_rows, **changes)
+    def rows(self, rows: BoolArray | IntArray | slice, **changes: Any) -> "Trial":
+        """Return the trial with its rows as an index chooses them, and other fields changed."""
+        parts = (
+            "values",
+            "used",
+            "time",
+            "force",
+            "load_factor",
+            "temperature",
+            "health",
+            "health_deviation",
+        )
+        of_rows: dict[str, Any] = {part: getattr(self, part)[rows] for part in parts}
+        inputs = tuple(replace(item, values=item.values[rows]) for item in self.inputs)
+        return replace(self, inputs=inputs, **{**of_rows, **changes})
 
     @property
     def input_names(self) -> tuple[str, ...]:

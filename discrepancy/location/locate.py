@@ -117,7 +117,7 @@ def _largest_singular_squares(rows: int, columns: int, generator: np.random.Gene
 
 
 def _meaning(residuals: ResidualSet, items: Sequence[FittedTrial], weights: FloatArray) -> tuple[str, str]:
-    """Return "sensor", "dynamics or load", "common" or "mixed" of a pattern over channels, and it in words."""
+    """Return "sensor", "dynamics or load", "common" or "mixed" of a pattern, and it in words."""
     channels = items[0].trial.channels
     largest = int(np.argmax(np.abs(weights)))
     noise, alone = items[0].noise_deviation, np.eye(len(weights))[largest]

@@ -24,8 +24,6 @@ from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance
 from reporting.words import counted
 
-FloatArray = NDArray[np.float64]
-
 SAMPLES = 1000
 
 

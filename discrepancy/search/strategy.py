@@ -9,7 +9,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
-from discrepancy.fits.candidate import Base, Candidate, Point
+from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit, attempt, fit
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
@@ -124,14 +124,8 @@ class Search(Hypotheses):
     ) -> CandidateFit | None:
         """Fit a candidate by chord steps from a base, None where it cannot; see `fit` for `give_up`."""
         start = Point(base.point.shared, base.point.local, np.concatenate((base.point.effect, added)))
-        return attempt(
-            self.problem,
-            candidate,
-            start,
-            base=Base(base.point, base.linearisations),
-            iterations=SEARCH.chord_steps,
-            give_up=give_up,
-        )
+        steps = SEARCH.chord_steps
+        return attempt(self.problem, candidate, start, base=base, iterations=steps, give_up=give_up)
 
     def exactly(self, rough: CandidateFit) -> CandidateFit:
         """Fit a candidate to convergence from a rough fit, and keep it."""

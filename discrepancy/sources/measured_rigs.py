@@ -8,7 +8,6 @@ from math import inf
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import helmert
 from scipy.signal import savgol_filter
 
@@ -159,8 +158,6 @@ RIGS: dict[str, Callable[[Path], dict[str, str]]] = {
 
 # ---------------------------------------------------------------- the wing of Kapteyn et al. 2021
 
-
-FloatArray = NDArray[np.float64]
 
 SIGNAL, TIP = "spanwise", "tip"
 """Names of the channels: the strain signal of the ring-downs, the displacement of the loading runs."""
