@@ -60,10 +60,7 @@ def test_steps_of_any_length_are_matrix_exponentials(coupled: bool) -> None:
     duration=st.floats(1e-6, 10.0),
 )
 def test_two_half_steps_are_one_step(omega: float, zeta: float, duration: float) -> None:
-    half, whole = (
-        transition(omega, 2.0 * zeta * omega, part * duration, omega)
-        for part in (0.5, 1.0)
-    )
+    half, whole = (transition(omega, 2.0 * zeta * omega, part * duration, omega) for part in (0.5, 1.0))
     np.testing.assert_allclose(half @ half, whole, atol=1e-9 * (1 + zeta))
     assert np.abs(whole).max() <= 1.0 + 1e-9 + 2 * zeta  # and so finite
 
