@@ -70,7 +70,7 @@ import numpy as np
 from scipy.sparse.linalg import splu
 from skfem import MeshTet
 
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation
 from fe.reduction.reduced_basis import reduce_structure
 from fe.elements.kinds import KINDS
 from fe.structure.operators import load_and_assemble

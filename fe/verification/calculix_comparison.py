@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fe.elements.cells import gradients, strain_matrix
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import TIP_FORCE, DigitalState

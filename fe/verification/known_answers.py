@@ -13,8 +13,7 @@ from scipy import sparse
 
 from fe.elements.cells import CellMesh, centre_strains, gradients, hexahedra_20, isotropic_compliance
 from fe.elements.kinds import HEXAHEDRA_20, gauss_points
-from fe.full.modes import most_moved
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, most_moved
 from fe.runtime.arrays import FloatArray
 from fe.structure.field import natural_frequencies, static_response
 from fe.structure.location import face_areas
