@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation
 from fe.runtime.errors import InvalidStateError, OutsideModelError
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
