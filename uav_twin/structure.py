@@ -185,15 +185,11 @@ def verify(
     json: terminal.Json = False,
 ) -> None:
     """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
-    from fe.runtime.errors import CalculixError
     from fe.verification.calculix_comparison import structure_agreement
-    from fe.verification.calculix_job import calculix_program
+    from fe.verification.calculix_job import required_calculix
     from reporting.files import refuse_filled
 
-    if calculix_program() is None:
-        raise CalculixError(
-            "CalculiX ('ccx') is not installed; on Debian and Ubuntu: apt-get install calculix-ccx."
-        )
+    required_calculix()
     refuse_filled(out)
     structure = assembled(file, memory_limit, mass_as_stiffness=True)
     with (

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from fe.elements.cells import centre_strains
 from fe.elements.kinds import meshio_with_wedges
-from fe.full.modes import lowest_eigenpairs
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import SolutionError
 from reporting.files import atomic_file

@@ -13,9 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
-from fe.full.cholesky import Cholesky
-from fe.full.modes import lowest_eigenpairs
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError, SolutionError
 
@@ -298,7 +296,7 @@ def _part_of(
 
 def _check_definite(matrix: sparse.csr_array, sentence: str) -> None:
     try:
-        Cholesky(sparse.csr_array(matrix))
+        Factorisation(sparse.csr_array(matrix))
     except SolutionError:
         raise MeshError(f"{sentence}.") from None
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fe.full.modes import most_moved
+from fe.full.factorisation import most_moved
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.state import Losses, losses_of
 from fe.structure.field import StaticResponse, natural_frequencies, static_response

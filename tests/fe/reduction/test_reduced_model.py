@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation
 from fe.reduction.certified_basis import compressed
 from fe.reduction.reduced_basis import reduce_structure
 from fe.reduction.structure_errors import measured_errors

@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import io, sparse
 
-from fe.full.modes import lowest_eigenpairs
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import load_structure
 from fe.structure.field import natural_frequencies, static_responses
