@@ -16,18 +16,11 @@ from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
 from discrepancy.models.fmu_laws import FmuLaws
 from discrepancy.models.fmu_motion import FmuMotion, sampled
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State
-from discrepancy.models.interface import (
-    Conditions,
-    Outputs,
-    PortedSystem,
-    PortScale,
-    Response,
-    Scales,
-    campaign_sizes,
-)
+from discrepancy.models.interface import Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.questions import LoadChange, laws_at, place_among, release_of
+from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.patch import (
     INTERNAL_FORCES,

@@ -11,21 +11,11 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown
-from discrepancy.models.interface import (
-    NO_PATCH,
-    Conditions,
-    Model,
-    Outputs,
-    Place,
-    PortedSystem,
-    PortScale,
-    Response,
-    Scales,
-    campaign_sizes,
-)
+from discrepancy.models.interface import NO_PATCH, Conditions, Model, Outputs, Place, PortedSystem, Response
 from discrepancy.models.linear_system import Resting, at_rest
 from discrepancy.models.natural_scales import PortSizes
 from discrepancy.models.questions import laws_at
+from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws

@@ -13,10 +13,11 @@ from calibration.result.record import STATE
 from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown, shown_rows
-from discrepancy.models.interface import Outputs, Place, PortScale
+from discrepancy.models.interface import Outputs, Place
 from discrepancy.models.linear_system import Resting, springs
 from discrepancy.models.memory import Memory
 from discrepancy.models.reduced_structure import StructuralModel
+from discrepancy.models.scales import PortScale
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State
 from fe.reduction.model_cache import patch_arrays
