@@ -37,7 +37,7 @@ FALLING = 3.0
 """While the reading of the sensor's z is below this share of a rest's, it falls [m/s^2]."""
 CUT = 0.04
 """Left out at both ends of a fall: hands let go, and the ground comes [s]."""
-HELD_OUT = ("fall_14", "fall_5")
+HELD_OUT_FALLS = ("fall_14", "fall_5")
 LARGEST_LEVEL = 10.0
 """Where the tank's level sensor ends: readings there are left out [V]."""
 SMOOTHED = 0.12
@@ -75,7 +75,7 @@ def write_rig_campaign(rig: str, data: Path, folder: Path) -> Path:
     )
     for name in (name for name in tables if name.startswith("fall_")):  # as many as were published
         trial = name.removesuffix(".csv")
-        campaign += TRIAL.format(name=trial) + ("held_out = true\n" if trial in HELD_OUT else "")
+        campaign += TRIAL.format(name=trial) + ("held_out = true\n" if trial in HELD_OUT_FALLS else "")
     for name, text in {"model.toml": model, **tables, "campaign.toml": campaign}.items():
         atomic_write_text(folder / name, text)
     return folder

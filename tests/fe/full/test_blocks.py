@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from fe.full.affine import AffineSum, affine_sum
 from fe.full.subspace import FunctionalBasis, Norm, conjugate_gradients
+from fe.structure.affine import AffineSum, affine_sum
 
 SIZE = 60
 

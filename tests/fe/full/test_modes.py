@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from fe.full.modes import lowest_eigenpairs
+from fe.full.factorisation import lowest_eigenpairs
 from fe.runtime.errors import SolutionError
 from fe.wing.operators import assemble, point_masses
 from fe.wing.responses import eigenmodes

@@ -6,7 +6,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy import sparse
 
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation
 from fe.runtime.errors import SolutionError
 from fe.wing.responses import solve_static
 from tests.wings import tip_stiffness

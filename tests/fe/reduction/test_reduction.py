@@ -17,7 +17,6 @@ from pymor.parameters.functionals import MinThetaParameterFunctional, Projection
 from pymor.reductors.coercive import CoerciveRBReductor
 
 from benchmarks.study_regions import bracket, plate, tube
-from fe.full.affine import affine_sum
 from fe.full.subspace import Norm, ProjectedBasis, conjugate_gradients
 from fe.reduction.certified_basis import compressed
 from fe.reduction.model_cache import reduced_structure
@@ -26,8 +25,8 @@ from fe.reduction.settings import ModalSettings, StructureSettings, loss_splits,
 from fe.reduction.structure_errors import measured_errors
 from fe.reduction.terms import ReductionTerms
 from fe.runtime.errors import FiniteElementError, ReductionError, SolutionError
+from fe.structure.affine import affine_sum, static_response
 from fe.structure.design import load_structure, structure_hash
-from fe.structure.field import static_response
 from fe.structure.operators import load_and_assemble
 from tests.fe.springs import SETTINGS, reduced_springs, springs
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation
 from fe.reduction import model_cache
 from fe.reduction.patch_basis import PatchSettings
 from fe.runtime import patch

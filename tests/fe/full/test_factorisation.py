@@ -8,10 +8,9 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from threadpoolctl import threadpool_limits
 
-from fe.full import cholesky
-from fe.full.cholesky import Cholesky, analyse
+from fe.full import factorisation
 from fe.full.dissection import best_cut, elimination_blocks
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, analyse
 from fe.runtime.errors import SolutionError
 
 seeds = st.integers(0, 999)
@@ -69,7 +68,7 @@ def test_a_slender_body_is_cut_across():
 def test_fronts_hold_the_fill_of_the_elimination(seed, size, share, copies):
     matrix = random_matrix(seed, size, share, copies)
     with pytest.MonkeyPatch.context() as small:
-        small.setattr(cholesky, "LEAF_UNKNOWNS", 12)
+        small.setattr(factorisation, "LEAF_UNKNOWNS", 12)
         found = analyse(matrix)
     n = matrix.shape[0]
     assert sorted(found.order) == list(range(n))
@@ -105,7 +104,7 @@ def test_solutions_are_those_of_a_general_solver(seed, size, share, copies, colu
     shape = (matrix.shape[0], columns) if columns else (matrix.shape[0],)
     right = np.random.default_rng(seed).standard_normal(shape)
     given_side = right.copy()
-    found = Cholesky(matrix).riesz(right)
+    found = Factorisation(matrix).riesz(right)
     assert np.array_equal(right, given_side)
     assert found.shape == shape
     expected = spsolve(matrix.tocsc(), right).reshape(shape)
@@ -115,9 +114,9 @@ def test_solutions_are_those_of_a_general_solver(seed, size, share, copies, colu
 def test_a_body_of_many_fronts():
     matrix = grid(40, 12, 9)
     right = np.random.default_rng(5).standard_normal((matrix.shape[0], 3))
-    found = Cholesky(matrix).riesz(right)
+    found = Factorisation(matrix).riesz(right)
     assert found == pytest.approx(spsolve(matrix.tocsc(), right), rel=1e-11, abs=1e-11)
-    single = Cholesky(matrix).riesz(right[:, 0])
+    single = Factorisation(matrix).riesz(right[:, 0])
     assert single == pytest.approx(found[:, 0], rel=1e-12, abs=1e-12)
 
 
@@ -136,7 +135,7 @@ def test_factors_are_the_same_bytes_whatever_the_number_of_threads(coarse_operat
     found = []
     for threads in (1, 2, 2):
         with threadpool_limits(threads):
-            factors = Cholesky(stiffness)
+            factors = Factorisation(stiffness)
             found.append((factors.riesz(load).tobytes(), factors.riesz(np.eye(len(load), 3)).tobytes()))
     assert found[0] == found[1] == found[2]
 
@@ -162,17 +161,17 @@ def test_what_is_not_positive_definite_is_refused(matrix, sentence):
 
 def test_a_pattern_met_before_is_not_analysed_again(monkeypatch):
     calls = []
-    monkeypatch.setattr(cholesky, "analyse", lambda matrix: calls.append(1) or analyse(matrix))
+    monkeypatch.setattr(factorisation, "analyse", lambda matrix: calls.append(1) or analyse(matrix))
     first = grid(9, 7, 3)
     second = first.copy()
     second.data = second.data * np.where(second.data < 0.0, 0.5, 2.0)
     third = grid(7, 9, 3)
     right = np.arange(189.0)
     for matrix in (first, second, third, first):
-        assert matrix @ Cholesky(matrix).riesz(right) == pytest.approx(right, abs=1e-10)
+        assert matrix @ Factorisation(matrix).riesz(right) == pytest.approx(right, abs=1e-10)
     assert len(calls) == 2
     second.indices[:] = third.indices  # what is kept does not follow a matrix that is changed in place
     second.indptr[:] = third.indptr
     second.data[:] = third.data
-    assert second @ Cholesky(second).riesz(right) == pytest.approx(right, abs=1e-10)
+    assert second @ Factorisation(second).riesz(right) == pytest.approx(right, abs=1e-10)
     assert len(calls) == 2
