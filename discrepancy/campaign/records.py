@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.sampling import IntArray, is_even, nearly_even
+from discrepancy.campaign.sampling import IntArray, nearly_even
 from discrepancy.errors import CampaignDataError
 from reporting.words import brief
 
@@ -366,11 +366,6 @@ class Trial:
     def interval(self) -> float:
         """Sampling interval [s] of a dynamic trial; the mean one where stamps are uneven."""
         return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
-
-    @cached_property
-    def is_even(self) -> bool:
-        """Whether the stamps of a dynamic trial are even to a thousandth of the interval."""
-        return is_even(self.time)
 
     @cached_property
     def whitened_at(self) -> float | None:

@@ -177,7 +177,7 @@ class Search(Hypotheses):
         if self._open and 0 < len(self.best().candidate.terms) < self.longest:
             self._extended(self.best())  # what stood in for a smaller set hid what is beside it
         self.settle()
-        self.other_places()
+        self.keep(elsewhere(self.problem, self.best()), exact=True)  # from other places of the structure
 
     @property
     def _open(self) -> bool:
@@ -189,9 +189,8 @@ class Search(Hypotheses):
         if not sees_forces(self.problem) or not all(data.trial.is_dynamic for data in self.problem.trials):
             return False
         self.tell("looking for the missing force")
-        force = ForceSearch(self.problem)
         try:
-            force.locate()
+            force = ForceSearch(self.problem)
             self.forces = force.name(self.effects)
         except (ModelError, np.linalg.LinAlgError) as cause:
             self.tell(f"the missing force cannot be seen: {cause}")
@@ -277,10 +276,6 @@ class Search(Hypotheses):
                 kept[key] = family
         for family in kept.values():
             self.keep(family, exact=True)
-
-    def other_places(self) -> None:
-        """Fit the best candidate from other places of the structure."""
-        self.keep(elsewhere(self.problem, self.best()), exact=True)
 
     def _settle_steps(self) -> None:
         """Halve the time steps while they cost the best candidate too much, and fit the best ones again."""
