@@ -33,7 +33,7 @@ from fe.runtime.state import DigitalState
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
 from fmu_asset.packing.wing_packing import pack_wing
 from reporting.errors import FileNotWrittenError
-from reporting.files import atomic_write_text
+from reporting.files import atomic_write_text, refuse_existing
 from reporting.folders import restore_folder
 from reporting.progress import Progress
 from reporting.toml_file import read_toml, toml_text
@@ -118,8 +118,7 @@ def apply_verdict(
     made_of = (choice.file, *choice.beneath, choice.path or "", file, file.parent / PATCH_NAME)
     if path.exists() and path.resolve() in (Path(item).resolve() for item in made_of):
         raise FileNotWrittenError(f"{path} is what the patched model is made of: choose another --out.")
-    if path.exists() and not replace:
-        raise FileNotWrittenError(f"{path} exists: choose another --out or give --replace.")
+    refuse_existing(path, replace=replace)
     what = " and ".join(f"{item.name}{item.place and f' at {item.place}'}" for item in found.effects)
     sure = said(f"applied.{found.verdict.name.lower()}", group=", ".join(stored.verdict.group))
     sentence = f"{capital(what)}, {sure}."

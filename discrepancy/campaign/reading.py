@@ -37,6 +37,7 @@ from discrepancy.campaign.schema import (
 )
 from discrepancy.campaign.units import conversion_of
 from discrepancy.errors import CampaignDataError, CampaignFileError
+from discrepancy.sentences import said
 from reporting.provenance import hash_file, hash_record
 from reporting.table_file import TableErrors, TextTable, read_table
 from reporting.toml_file import read_toml
@@ -134,9 +135,9 @@ def _unused(section: CampaignSection, tables: Mapping[str, TextTable]) -> list[s
         for column in tables[name].columns:
             if column not in known and not column.startswith(OF_REGION):
                 files.setdefault(column, []).append(name)
+    more = {column: f" and {len(where) - 1} more" if where[1:] else "" for column, where in files.items()}
     return [
-        f"{where[0]}{f' and {len(where) - 1} more' if where[1:] else ''}: no channel has the column "
-        f"{column!r}, which is left out; if that is not meant, check its spelling."
+        said("remarks.no_channel", file=where[0], more=more[column], column=column)
         for column, where in files.items()
     ]
 
@@ -190,9 +191,9 @@ def _trial(section: TrialSection, table: TextTable, campaign: CampaignSection, r
     held = section.kind is TrialKind.STATIC and inputs and "force" not in table.columns
     forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED) and not held
     pushing = (item.values for item in inputs if item.quantity in (Quantity.FORCE, Quantity.TORQUE))
-    said = section.model_dump(include={*SAID})
+    given = section.model_dump(include={*SAID})
     return Trial(
-        **said,
+        **given,
         channels=tuple(channel.name for channel in chosen),
         values=np.stack(columns, axis=1),
         used=np.stack(used, axis=1),
@@ -281,10 +282,9 @@ def _readings(
     if not used.all():
         rows = np.arange(len(values))
         values[~used] = np.interp(rows[~used], rows[used], values[used])
-        remarks.append(
-            f"{int((~used).sum())} of {len(values)} readings of {channel.name!r} in the trial "
-            f"{section.name!r} {be(int((~used).sum()))} empty and left out."
-        )
+        count, told = int((~used).sum()), {"channel": channel.name, "trial": section.name}
+        are = f"{be(count)} empty"
+        remarks.append(said("remarks.left_out", count=count, total=len(values), are=are, **told))
     for row in section.left_out.get(channel.name, ()):
         if row > len(values):
             raise CampaignFileError(
