@@ -156,7 +156,8 @@ class FmuRuns:
     def _made_binding(self) -> Binding:
         given, base = self.description, self._base
         wanted = given.inputs
-        self.input_factors: dict[str, float] = {}
+        self.input_factors, self.columns = dict[str, float](), dict[str, int]()
+        self.quantities = dict[str, Quantity]()
         units: dict[str | None, str] = {
             **dict.fromkeys(wanted.forces.values(), "N"),
             **dict.fromkeys((wanted.load_factor, *wanted.regions.values()), "1"),
@@ -173,60 +174,48 @@ class FmuRuns:
             units[driven] = unit if turning or held.quantity is Quantity.SIGNAL else _si(held.quantity)
         named = ((self.variable(name), unit) for name, unit in units.items() if name is not None)
         inputs = {variable: Input(variable=variable, unit=unit) for variable, unit in named}
-        parameters = {
-            key: Parameter(variable=item.variable, unit=item.unit, value=item.value)
-            for key, item in (base.parameter if base is not None else {}).items()
-        }
-        effects = (f"effect.{identifier}.active" for identifier in given.effects.values())
-        further = (*given.static.parameters, *given.motion.parameters, *effects)
-        own: list[tuple[str | None, str]] = [
-            *((name, self._own_unit(name)) for name in further if self.parameter(name) not in parameters),
-            *((item.variable or item.name, item.unit) for item in given.parameter),
-        ]
+        # as they are: a parameter without a unit here has that of the binding, or its own
+        own = dict[str | None, str | None].fromkeys((*given.static.parameters, *given.motion.parameters))
+        own |= {f"effect.{identifier}.active": None for identifier in given.effects.values()}
+        own |= {item.variable or item.name: item.unit for item in given.parameter}
         if given.release is not None:
-            own += [(given.release.displacement, "m"), (given.release.velocity, "m/s")]
-        for name, unit in own:
+            own |= {given.release.displacement: "m", given.release.velocity: "m/s"}
+        parameters = {} if base is None else dict(base.parameter)
+        for name, unit in own.items():
             if name is None:
                 continue
             key = self.parameter(name)
-            known = parameters.get(key)
-            parameters[key] = Parameter(
-                variable=key if known is None else known.variable,
-                unit=unit,
-                value=None if known is None or known.unit != unit else known.value,
-            )
-        columns: dict[tuple[str, str], int] = {}
-        self.columns, self.quantities = dict[str, int](), dict[str, Quantity]()
-
-        def column(variable: str, unit: str) -> int:
-            return columns.setdefault((self.variable(variable), unit), len(columns))
-
+            known = parameters.get(key) or Parameter(variable=key, unit=self._own_unit(key))
+            if unit not in (None, known.unit):  # a value of another unit is none of this
+                known = known.model_copy(update={"unit": unit, "value": None})
+            parameters[key] = known
+        shown = list[tuple[str, str | None, str]]()
         for item in given.output:
-            names = expand(item.name)
-            variables = expand(item.variable or item.name)
+            names, variables = expand(item.name), expand(item.variable or item.name)
             if len(names) != len(variables):
                 raise ModelError(
                     f"The FMU model {given.name!r}: the output {item.name!r} stands for "
                     f"{counted(len(names), 'name')}, but its variable for {len(variables)}; give as many."
                 )
-            for name, variable in zip(names, variables, strict=True):
-                unit = "" if item.quantity is Quantity.SIGNAL else _si(item.quantity)
-                self.columns[name], self.quantities[name] = column(variable, unit), item.quantity
+            self.quantities |= dict.fromkeys(names, item.quantity)
+            unit = "" if item.quantity is Quantity.SIGNAL else _si(item.quantity)  # what the FMU gives it
+            shown += [(name, variable, unit) for name, variable in zip(names, variables, strict=True)]
         for port in given.port:
-            for quantity, name, unit in (
-                ("displacement", port.displacement, "rad" if port.rotation else "m"),
-                ("velocity", port.velocity, "rad/s" if port.rotation else "m/s"),
-            ):
-                if name is not None:
-                    self.columns[f"port.{port.name}.{quantity}"] = column(name, unit)
-        if given.release is not None and given.release.output is not None:
-            self.columns["release"] = column(given.release.output, "m")
+            unit = "rad" if port.rotation else "m"
+            shown.append((f"port.{port.name}.displacement", port.displacement, unit))
+            shown.append((f"port.{port.name}.velocity", port.velocity, f"{unit}/s"))
+        if given.release is not None:
+            shown.append(("release", given.release.output, "m"))
+        columns: dict[tuple[str, str], int] = {}
+        for name, variable, unit in shown:
+            if variable is not None:
+                key = self.variable(variable), unit
+                self.columns[name] = columns.setdefault(key, len(columns))
         header: dict[str, Any] = {} if base is None else base.binding.model_dump(exclude={"decimation"})
         header |= {"name": given.name, "step_size": given.motion.step or given.static.step}
         content: dict[str, Any] = {"binding": header, "load": inputs, "parameter": parameters}
         if base is not None:
             content["limits"] = base.limits
-        # A signal has whatever unit the FMU gives it.
         content["observation"] = {
             f"y{at}": Vector(variables=(variable,), unit=unit or self._own_unit(variable))
             for (variable, unit), at in columns.items()
