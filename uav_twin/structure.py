@@ -17,7 +17,7 @@ from uav_twin.verify import Check, end_with, print_checks
 if TYPE_CHECKING:
     from fe.reduction.structure_errors import MeasuredErrors
     from fe.runtime.reduced import ReducedModel
-    from fe.structure.affine import DesignedStructure
+    from fe.structure.affine import AffineStructure
     from fe.structure.operators import Structure
     from fe.verification.calculix_comparison import Agreement
 
@@ -73,7 +73,7 @@ def assembled(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool
         return load_and_assemble(located(file), memory_limit, mass_as_stiffness=mass_as_stiffness)
 
 
-def assembled_of_any(file: Path, memory_limit: float | None) -> "DesignedStructure":
+def assembled_of_any(file: Path, memory_limit: float | None) -> "AffineStructure":
     """Return the full model of a mesh or of matrices."""
     from fe.structure.operators import assemble_structure
 
@@ -147,7 +147,7 @@ def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         yield title, ", ".join(f"{value:.6g}" for value in record[key]), unit
 
 
-def structure_record(structure: "DesignedStructure", modes: int) -> dict[str, Any]:
+def structure_record(structure: "AffineStructure", modes: int) -> dict[str, Any]:
     """Return what is known of a structure without damage, at nominal values, by name.
 
     Lengths carry the unit of the mesh where `length_unit` stands beside them; everything else is in SI units.

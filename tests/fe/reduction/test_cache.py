@@ -13,7 +13,7 @@ from fe.reduction import model_cache
 from fe.reduction.built_once import cache_folder
 from fe.reduction.fields import WingFields, field_basis
 from fe.reduction.model_cache import MODELLING_ROOMS, entry, reduced_model, wing_fields
-from fe.reduction.settings import ReductionSettings
+from fe.reduction.settings import StructureSettings
 from fe.wing.design import WingDesign
 
 ROOT = Path(__file__).parents[3]
@@ -71,7 +71,7 @@ def test_what_is_changed_is_built_anew(builds, coarse_design: WingDesign, monkey
     for design in (coarse_design, changed):
         reduced_model(design)
     assert len(builds) == 2
-    reduced_model(coarse_design, settings=ReductionSettings(bound_tolerance=1e-3))
+    reduced_model(coarse_design, settings=StructureSettings(bound_tolerance=1e-3))
     assert len(builds) == 3
     monkeypatch.setattr(model_cache, "modelling_hash", lambda: "another")
     reduced_model(coarse_design)
