@@ -18,8 +18,7 @@ from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError, SolutionError
 
 from .affine import DesignedStructure, StiffnessTerm, designed
-from .design import unit_vector
-from .matrix_design import Extension, MatrixDesign, MatrixLoad, MatrixMass, NodeOutput
+from .design import Extension, MatrixDesign, MatrixLoad, MatrixMass, NodeOutput, unit_vector
 from .matrix_files import Place, read_matrix, read_unknowns, read_vector
 from .tables import MOTIONS, Vector
 

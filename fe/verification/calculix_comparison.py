@@ -12,7 +12,7 @@ from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import TIP_FORCE, DigitalState
-from fe.structure.field import natural_frequencies
+from fe.structure.affine import natural_frequencies
 from fe.structure.operators import Structure
 from fe.wing.operators import AffineOperators
 

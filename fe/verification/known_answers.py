@@ -15,7 +15,7 @@ from fe.elements.cells import CellMesh, centre_strains, gradients, hexahedra_20,
 from fe.elements.kinds import HEXAHEDRA_20, gauss_points
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
-from fe.structure.field import static_response
+from fe.structure.affine import static_response
 from fe.structure.location import face_areas
 from fe.structure.mesh import Surface
 from fe.structure.supports import rigid_motions

@@ -20,8 +20,7 @@ from fe.runtime import kept_arrays
 from fe.runtime.errors import OutsideModelError, ReducedModelFileError
 from fe.runtime.kept_arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.reduced import ReducedModel
-from fe.structure.affine import AffineStructure
-from fe.structure.field import natural_frequencies, static_response
+from fe.structure.affine import AffineStructure, natural_frequencies, static_response
 from fe.structure.operators import load_and_assemble
 from fe.wing.responses import eigenmodes
 from tests.fe.springs import SETTINGS, reduced_springs, springs

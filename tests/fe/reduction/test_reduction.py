@@ -24,9 +24,8 @@ from fe.reduction.settings import ModalSettings, StructureSettings, loss_splits,
 from fe.reduction.structure_errors import measured_errors
 from fe.reduction.terms import ReductionTerms
 from fe.runtime.errors import FiniteElementError, ReductionError, SolutionError
-from fe.structure.affine import affine_sum
+from fe.structure.affine import affine_sum, static_response
 from fe.structure.design import load_structure, structure_hash
-from fe.structure.field import static_response
 from fe.structure.operators import load_and_assemble
 from tests.fe.springs import SETTINGS, reduced_springs, springs
 
