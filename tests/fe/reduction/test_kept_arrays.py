@@ -1,4 +1,4 @@
-"""Arrays in files, of every kind that is kept: reproducible, read to the last bit, or refused in a sentence."""
+"""Arrays in files, of every kind that is kept: reproducible, read to the last bit, or refused in words."""
 
 from __future__ import annotations
 
