@@ -33,7 +33,9 @@ _Kept = TypeVar("_Kept", bound=KeptArrays)
 
 def modelling_hash() -> str:
     """Return the SHA-256 of the modelling code, hexadecimal."""
-    rooms = (hash_tree(Path(__file__).parents[1] / room, suffixes=[".py"]) for room in MODELLING_ROOMS)
+    rooms = (
+        hash_tree(Path(__file__).parents[1] / room, suffixes=[".py", ".toml"]) for room in MODELLING_ROOMS
+    )
     return hash_bytes("".join(rooms).encode())
 
 
