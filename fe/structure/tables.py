@@ -249,4 +249,5 @@ class StructureDesign(Part):
     def ranges(self) -> dict[str, tuple[float, float]]:
         """Least and largest value for which a reduced model is to hold of all that can be chosen, by name."""
         free = (part for part in self.mass if part.free)
-        return {part.name: part.range for part in (*self.parameter, *self.damage, *free, *self.control)}
+        chosen: tuple[Ranged | Region, ...] = (*self.parameter, *self.damage, *free, *self.control)
+        return {part.name: part.range for part in chosen}
