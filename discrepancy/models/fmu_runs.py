@@ -155,9 +155,15 @@ class FmuRuns:
 
     def _made_binding(self) -> Binding:
         given, base = self.description, self._base
-        wanted = given.inputs
-        self.input_factors, self.columns = dict[str, float](), dict[str, int]()
-        self.quantities = dict[str, Quantity]()
+        header: dict[str, Any] = {} if base is None else base.binding.model_dump(exclude={"decimation"})
+        header |= {"name": given.name, "step_size": given.motion.step or given.static.step}
+        content = {"binding": header, "load": self._inputs(), "parameter": self._parameters()}
+        if base is not None:
+            content["limits"] = base.limits
+        return Binding.model_validate(content | {"observation": self._observed()})
+
+    def _inputs(self) -> dict[str, Input]:
+        given, wanted = self.description, self.description.inputs
         units: dict[str | None, str] = {
             **dict.fromkeys(wanted.forces.values(), "N"),
             **dict.fromkeys((wanted.load_factor, *wanted.regions.values()), "1"),
@@ -166,6 +172,7 @@ class FmuRuns:
             given.release.hold if given.release else None: "N",
         }  # fmt: skip
         units |= {port.force: "N.m" if port.rotation else "N" for port in given.port}
+        self.input_factors = dict[str, float]()
         for held in given.input:
             driven = held.variable or held.name
             unit = self._own_unit(self.variable(driven))
@@ -173,23 +180,28 @@ class FmuRuns:
             self.input_factors[self.variable(driven)] = 30.0 / pi if turning else 1.0
             units[driven] = unit if turning or held.quantity is Quantity.SIGNAL else _si(held.quantity)
         named = ((self.variable(name), unit) for name, unit in units.items() if name is not None)
-        inputs = {variable: Input(variable=variable, unit=unit) for variable, unit in named}
-        # as they are: a parameter without a unit here has that of the binding, or its own
-        own = dict[str | None, str | None].fromkeys((*given.static.parameters, *given.motion.parameters))
-        own |= {f"effect.{identifier}.active": None for identifier in given.effects.values()}
-        own |= {item.variable or item.name: item.unit for item in given.parameter}
+        return {variable: Input(variable=variable, unit=unit) for variable, unit in named}
+
+    def _parameters(self) -> dict[str, Parameter]:
+        given, found = self.description, {} if self._base is None else dict(self._base.parameter)
+        # without a unit here, one has that of the binding, or its own
+        units: dict[str | None, str | None] = {
+            **dict.fromkeys((*given.static.parameters, *given.motion.parameters)),
+            **{f"effect.{identifier}.active": None for identifier in given.effects.values()},
+            **{item.variable or item.name: item.unit for item in given.parameter},
+        }
         if given.release is not None:
-            own |= {given.release.displacement: "m", given.release.velocity: "m/s"}
-        parameters = {} if base is None else dict(base.parameter)
-        for name, unit in own.items():
-            if name is None:
-                continue
-            key = self.parameter(name)
-            known = parameters.get(key) or Parameter(variable=key, unit=self._own_unit(key))
+            units |= {given.release.displacement: "m", given.release.velocity: "m/s"}
+        for key, unit in ((self.parameter(name), unit) for name, unit in units.items() if name is not None):
+            known = found.get(key) or Parameter(variable=key, unit=self._own_unit(key))
             if unit not in (None, known.unit):  # a value of another unit is none of this
                 known = known.model_copy(update={"unit": unit, "value": None})
-            parameters[key] = known
-        shown = list[tuple[str, str | None, str]]()
+            found[key] = known
+        return found
+
+    def _observed(self) -> dict[str, Vector]:
+        given, shown = self.description, list[tuple[str, str | None, str]]()
+        self.columns, self.quantities = dict[str, int](), dict[str, Quantity]()
         for item in given.output:
             names, variables = expand(item.name), expand(item.variable or item.name)
             if len(names) != len(variables):
@@ -207,20 +219,13 @@ class FmuRuns:
         if given.release is not None:
             shown.append(("release", given.release.output, "m"))
         columns: dict[tuple[str, str], int] = {}
-        for name, variable, unit in shown:
-            if variable is not None:
-                key = self.variable(variable), unit
-                self.columns[name] = columns.setdefault(key, len(columns))
-        header: dict[str, Any] = {} if base is None else base.binding.model_dump(exclude={"decimation"})
-        header |= {"name": given.name, "step_size": given.motion.step or given.static.step}
-        content: dict[str, Any] = {"binding": header, "load": inputs, "parameter": parameters}
-        if base is not None:
-            content["limits"] = base.limits
-        content["observation"] = {
+        for name, wanted, unit in shown:
+            if wanted is not None:
+                self.columns[name] = columns.setdefault((self.variable(wanted), unit), len(columns))
+        return {
             f"y{at}": Vector(variables=(variable,), unit=unit or self._own_unit(variable))
             for (variable, unit), at in columns.items()
         }
-        return Binding.model_validate(content)
 
     def _own_unit(self, variable: str) -> str:
         found = self._fmu.variable(variable)
