@@ -60,8 +60,6 @@ class Kind:
         Parameters by the binding's names.
     arrays : tuple of str
         Inputs that are whole arrays.
-    resets : bool
-        Whether the FMU's own reset is held to work; if not, each start takes a new instance.
     """
 
     file: str
@@ -75,7 +73,6 @@ class Kind:
     start: Inputs = field(default_factory=dict)
     parameters: Mapping[str, Any] = field(default_factory=dict)
     arrays: tuple[str, ...] = ()
-    resets: bool = True
 
     @property
     def steps(self) -> int:
@@ -370,7 +367,6 @@ def following(file: str, *, quarters: bool = False, **header: object) -> Kind:
     return Kind(
         file, binding, {"control": {"u": LINE[1:]}}, follower, atol=1e-8 if exchanged else 1e-13,
         state="replay" if exchanged or file == "follow1" else "serialised", start={"control": {"u": LINE[0]}},
-        resets=not (exchanged and quarters),  # in this process the solver's last digits tell a reset apart
     )  # fmt: skip
 
 
@@ -501,7 +497,7 @@ KINDS: dict[str, Kind] = {
     "model exchange of FMI 1": Kind(
         "decay1", BINDINGS["decay1"],
         {"control": {"u": np.array([0.0, 0.0, 4.0, 4.0, -2.0, -2.0]) - 273.15}}, decay, atol=1e-7,
-        start={"control": {"u": -273.15}}, parameters={"k": 2.0}, resets=False,
+        start={"control": {"u": -273.15}}, parameters={"k": 2.0},
     ),
     "model exchange of FMI 3 with a time event": Kind(
         "swing3", BINDINGS["swing3"],
