@@ -1,7 +1,5 @@
 """Our FMUs and others', packed once; a small wing of springs and masses stands for the real one."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 from typing import Any

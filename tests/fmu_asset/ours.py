@@ -1,7 +1,5 @@
 """Our own FMUs by name, each packed once and kept between runs where that takes a compiler."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

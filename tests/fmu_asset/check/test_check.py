@@ -1,7 +1,5 @@
 """What the checks say of sound FMUs and of FMUs with one fault each."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest
@@ -24,7 +22,7 @@ def texts(check: FmuCheck, name: str) -> str:
 @pytest.mark.parametrize(
     "model", [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in MODELS]
 )
-def test_sound_fmus_of_all_kinds_have_no_problem(foreign_fmu: Any, model: str) -> None:
+def test_sound_fmus_of_all_kinds_have_no_problem(foreign_fmu, model) -> None:
     check = check_fmu(foreign_fmu(model), step_size=0.01 if model == "fixed2" else 0.1)
     assert check.passed, check.problems
     found = verdicts(check)
@@ -49,7 +47,7 @@ def test_sound_fmus_of_all_kinds_have_no_problem(foreign_fmu: Any, model: str) -
         ("CRASH_AT_LOAD", "first flight", "SIGSEGV"),
     ],
 )
-def test_one_fault_is_one_problem(foreign_fmu: Any, what: str, check: str, sentence: str) -> None:
+def test_one_fault_is_one_problem(foreign_fmu, what, check, sentence) -> None:
     result = check_fmu(foreign_fmu("hostile2", what), step_timeout=1.0)
     assert not result.passed
     assert verdicts(result)[check] == "problem"
@@ -61,7 +59,7 @@ def test_one_fault_is_one_problem(foreign_fmu: Any, what: str, check: str, sente
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_eighty_instances_in_one_process(foreign_fmu: Any) -> None:
+def test_eighty_instances_in_one_process(foreign_fmu) -> None:
     """Create, run and free: the process does not grow, and one that leaks 256 KiB each is found out."""
     for what, cycles, verdict, sentence in (
         ((), 80, "ok", ""),
@@ -93,7 +91,7 @@ TOLD: list[tuple[str, dict[str, Any], tuple[tuple[str, str], ...], str, str]] = 
 ]  # fmt: skip
 
 
-def test_step_sizes_and_units_that_contradict(foreign_fmu: Any) -> None:
+def test_step_sizes_and_units_that_contradict(foreign_fmu) -> None:
     for number, (model, options, changes, check, sentence) in enumerate(TOLD):
         path = foreign_fmu.changed(model, f"told{number}", *changes)
         assert sentence in texts(check_fmu(path, **options), check)
@@ -101,7 +99,7 @@ def test_step_sizes_and_units_that_contradict(foreign_fmu: Any) -> None:
     assert any("start value" in problem for problem in check_fmu(broken).problems)
 
 
-def test_a_binding_of_ones_own(foreign_fmu: Any) -> None:
+def test_a_binding_of_ones_own(foreign_fmu) -> None:
     def own(unit: str) -> Any:
         load = {
             "outside": ("ambient.T", "degC", -40.0, 50.0),
@@ -120,14 +118,14 @@ def test_a_binding_of_ones_own(foreign_fmu: Any) -> None:
     assert check_fmu(foreign_fmu("room2"), own("m")).problems == (sentence,)
 
 
-def test_a_range_that_the_fmu_does_not_keep(foreign_fmu: Any) -> None:
+def test_a_range_that_the_fmu_does_not_keep(foreign_fmu) -> None:
     check = check_fmu(foreign_fmu("hostile2", "REFUSE", "AFTER=0"))
     assert check.passed
     assert "1 of 4 ends of ranges fail, such as u = 10 m/s" in texts(check, "range edges")
     assert "u is too large" in texts(check, "range edges")
 
 
-def test_a_binding_with_other_sizes_is_checked_with_them(foreign_fmu: Any) -> None:
+def test_a_binding_with_other_sizes_is_checked_with_them(foreign_fmu) -> None:
     """Three inputs, for which the FMU has two start values."""
     sized = bound(
         1.0, {"y": ("y", "1")}, control={"u": ("u", "1")}, header={"structural_parameters": {"n": 3}}

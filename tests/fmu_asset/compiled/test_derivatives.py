@@ -1,7 +1,5 @@
 """Exact derivatives of the compiled wing, of FMI 2 and of FMI 3."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import closing
 
@@ -60,7 +58,7 @@ def modal(model: ReducedModel, at: dict[str, float]) -> np.ndarray:
     return np.concatenate((omega / (2 * np.pi), 0.5 * (2.0 / omega + 3e-4 * omega)))
 
 
-def test_static_derivatives_are_those_of_a_complex_step(wing: Slave, model: ReducedModel) -> None:
+def test_static_derivatives_are_those_of_a_complex_step(wing, model) -> None:
     flown(wing)
     np.testing.assert_allclose(wing.get(*STATIC), outputs(model, AT), rtol=1e-12)
     for name, value in AT.items():
@@ -72,7 +70,7 @@ def test_static_derivatives_are_those_of_a_complex_step(wing: Slave, model: Redu
     np.testing.assert_allclose(together, np.array([0.7, -0.2]) @ [*parts], rtol=1e-12)
 
 
-def test_modal_derivatives_are_those_of_differences(wing: Slave, model: ReducedModel) -> None:
+def test_modal_derivatives_are_those_of_differences(wing, model) -> None:
     flown(wing, **DAMPED)
     names = [*FREQUENCIES, *RATIOS]
     at = AT | {name: wing.of(name) for name in ("mass.servo", "mass.pitot")}
@@ -90,7 +88,7 @@ def test_modal_derivatives_are_those_of_differences(wing: Slave, model: ReducedM
     assert not np.any(wing.derivative([*STRAINS, *FREQUENCIES], {"damping.beta": 1.0}))
 
 
-def test_in_motion_loads_act_at_once_and_health_is_refused(wing: Slave) -> None:
+def test_in_motion_loads_act_at_once_and_health_is_refused(wing) -> None:
     flown(wing, response=2)
     feed_through = wing.derivative(STATIC, {"load_factor": 1.0})
     kept, shown = wing.saved(), []
@@ -105,7 +103,7 @@ def test_in_motion_loads_act_at_once_and_health_is_refused(wing: Slave) -> None:
     assert "is not offered in motion" in wing.log[-1][1]
 
 
-def test_the_adjoint_is_the_transpose(ours: OurFmus) -> None:
+def test_the_adjoint_is_the_transpose(ours) -> None:
     with closing(Slave(ours("fmi3"))) as wing:
         flown(wing)
         rng = np.random.default_rng(3)
@@ -122,7 +120,7 @@ def test_the_adjoint_is_the_transpose(ours: OurFmus) -> None:
         assert w @ forward == pytest.approx(np.array(backward) @ v, rel=1e-12)
 
 
-def test_derivatives_that_there_are_not_are_refused_in_a_sentence(ours: OurFmus) -> None:
+def test_derivatives_that_there_are_not_are_refused_in_a_sentence(ours) -> None:
     with closing(Slave(ours("fmi3"))) as wing:
 
         def status(unknown: str, known: str, size: int) -> int:

@@ -1,7 +1,5 @@
 """The compiled wing for model exchange: its states under CVODE are the motion of the co-simulation one."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Iterator
 from contextlib import closing
@@ -44,7 +42,7 @@ def jacobian(wing: Slave) -> np.ndarray:
     return np.array([wing.derivative([*RATES, *SEEN], {known: 1.0}) for known in [*STATES, *LOADS]]).T
 
 
-def test_cvode_moves_it_as_the_co_simulation_moves(ours: OurFmus) -> None:
+def test_cvode_moves_it_as_the_co_simulation_moves(ours) -> None:
     """Loads jump and health grows on the way; compared where nothing jumps."""
     start = {"load_factor": 1.0, "initial_tip_displacement": 0.05, "damping.alpha": 1.0, "damping.beta": 1e-4}
     times, losses, factors = (0.0, 0.1, 0.1, 0.2, 0.2, 1.0), (0, 0, 0, 0, 0.4, 0.4), (1, 1, 2, 2, 2, 2)
@@ -64,7 +62,7 @@ def test_cvode_moves_it_as_the_co_simulation_moves(ours: OurFmus) -> None:
         np.testing.assert_allclose(shown[smooth], theirs[name][smooth], rtol=0, atol=within)
 
 
-def test_rates_and_outputs_are_linear_with_the_derivatives_that_it_gives(wing: Slave) -> None:
+def test_rates_and_outputs_are_linear_with_the_derivatives_that_it_gives(wing) -> None:
     fmu, matrix, rng, rates = wing.fmu, jacobian(wing), np.random.default_rng(1), Doubles()
     assert (fmu.getNumberOfContinuousStates() if wing.three else wing.description.states) == COUNT
     for _ in range(3):
@@ -83,7 +81,7 @@ def test_rates_and_outputs_are_linear_with_the_derivatives_that_it_gives(wing: S
 
 
 @pytest.mark.parametrize("wing", ["exchange"], indirect=True)
-def test_loads_in_straight_lines_are_those_of_the_linear_system(wing: Slave, ours: OurFmus) -> None:
+def test_loads_in_straight_lines_are_those_of_the_linear_system(wing, ours) -> None:
     """The co-simulation FMU along ramps, against the matrix exponential of what model exchange gives."""
     matrix, time = jacobian(wing), 0.0
     x, load = np.array(wing.get(*STATES)), np.array(wing.get(*LOADS))
@@ -118,7 +116,7 @@ def test_loads_in_straight_lines_are_those_of_the_linear_system(wing: Slave, our
         assert asset.step({"load_factor": low}, {"z1": 0.4}).time == 0.04
 
 
-def test_health_is_discrete_and_wrong_calls_are_refused(wing: Slave) -> None:
+def test_health_is_discrete_and_wrong_calls_are_refused(wing) -> None:
     before = wing.get(*STRAINS)
     assert wing.status_of(wing.set, {"health.z1": 0.5}) == DISCARD
     assert wing.status_of(wing.set, {"load_factor": 99.0}) == OK

@@ -1,9 +1,6 @@
 """What cannot be joined is said in one sentence; units and types of connections."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -58,7 +55,7 @@ UNSET: list[tuple[str, dict[str, Setting], str]] = [
 ]
 
 
-def test_what_does_not_fit_is_one_sentence(base: SystemStructure, tmp_path: Path) -> None:
+def test_what_does_not_fit_is_one_sentence(base, tmp_path) -> None:
     first = base.components[0]
     refused: list[tuple[dict[str, Any], type[Exception], str]] = [
         *(({"connections": tuple(link(*pair) for pair in ends)}, CouplingError, w) for ends, w in UNJOINED),
@@ -84,7 +81,7 @@ def test_what_does_not_fit_is_one_sentence(base: SystemStructure, tmp_path: Path
             expand(source, target, ["a", "b"])
 
 
-def test_units_and_types_are_converted(base: SystemStructure) -> None:
+def test_units_and_types_are_converted(base) -> None:
     """The value of a connection is converted first, and transformed in the unit of the target."""
     seen = link("wing.tip_displacement", "seen", factor=2.0, offset=0.5)
     for options, conversion in (
@@ -105,7 +102,7 @@ def test_units_and_types_are_converted(base: SystemStructure) -> None:
     assert next(iter(joined.feeds.values())).conversion == (1.0, 0.0)
 
 
-def test_an_input_that_is_only_set_keeps_its_value(base: SystemStructure) -> None:
+def test_an_input_that_is_only_set_keeps_its_value(base) -> None:
     """A start value of an input that nothing feeds holds; without one it is the FMU's own."""
     wing, shown = base.component("wing"), []
     for given in ({"health.z1": Setting(0.4)}, {}):
@@ -132,7 +129,7 @@ UNBOUND: list[tuple[str, tuple[str, str], str]] = [
 ]
 
 
-def test_bindings_that_do_not_fit(base: SystemStructure) -> None:
+def test_bindings_that_do_not_fit(base) -> None:
     ends = ("push", "wing.load_factor"), ("damage.z1", "wing.health.z1"), ("damage.z1", "percent")
     wiring = Wiring(replace(base, connections=tuple(link(*pair) for pair in ends)))
     observed = {"y": ("damage.z1", "1")}

@@ -1,7 +1,5 @@
 """What holds of every asset behind the door, whatever its FMU is: of our own, of others, of systems."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,8 +14,7 @@ from fmu_asset.door.layout import Observation
 from fmu_asset.door.saved_state import SavedState
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError, FmuStateError
-from tests.fmu_asset.coupling.systems import oscillator, three
-from tests.fmu_asset.door.kinds import KINDS, Kind
+from tests.fmu_asset.door.kinds import KINDS, Kind, oscillator, three
 from tests.fmu_asset.ours import NAMES, OurFmus
 
 Open = Callable[..., FmiAsset]
@@ -76,9 +73,7 @@ every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
 
 @every_kind
-def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(
-    open_asset: Open, ours: OurFmus, kind: Kind
-) -> None:
+def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(open_asset, ours, kind) -> None:
     with (
         open_asset(kind, isolated=False) as one,
         open_asset(kind, isolated=False) as here,
@@ -111,9 +106,7 @@ def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(
 
 
 @every_kind
-def test_a_state_goes_on_to_the_bit_and_copies_go_their_own_way(
-    open_asset: Open, kind: Kind, isolated: bool
-) -> None:
+def test_a_state_goes_on_to_the_bit_and_copies_go_their_own_way(open_asset, kind, isolated) -> None:
     half = range(kind.steps // 2)
     with (
         open_asset(kind, isolated=isolated) as asset,
@@ -165,9 +158,7 @@ REFUSED: list[tuple[str, dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("name", "inputs", "sentence"), REFUSED)
-def test_what_is_refused_is_not_sent(
-    open_asset: Open, name: str, inputs: dict[str, Any], sentence: str, isolated: bool
-) -> None:
+def test_what_is_refused_is_not_sent(open_asset, name, inputs, sentence, isolated) -> None:
     kind = KINDS[name]
     with open_asset(kind, isolated=isolated) as asset, open_asset(kind, isolated=False) as other:
         for one in (asset, other):
@@ -180,7 +171,7 @@ def test_what_is_refused_is_not_sent(
 
 
 @pytest.mark.parametrize("name", ["wing", "spring", "a system with a wing"])
-def test_a_state_of_something_else_is_refused(open_asset: Open, name: str) -> None:
+def test_a_state_of_something_else_is_refused(open_asset, name) -> None:
     kind, foreign = KINDS[name], KINDS["spring" if name == "wing" else "wing"]
     with open_asset(foreign, isolated=False) as other:
         other.step(**foreign.at(0))

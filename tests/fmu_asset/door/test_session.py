@@ -1,9 +1,6 @@
 """What is particular in a session: refusals in one sentence, units, what happens in the midst of a run."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,33 +8,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fe.runtime.reduced import ReducedModel
+from fmu_asset import errors
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door import session
-from fmu_asset.door.binding import Binding
 from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import (
-    BindingError,
-    FmuCallError,
-    FmuInputError,
-    FmuOutputError,
-    FmuStateError,
-    FmuTimeoutError,
-    FmuWorkerError,
-)
 from tests.fmu_asset.making import bound, changed
 
 # ---------------------------------------------------------------------- the wing
 
 
-def test_a_state_that_the_fmu_refuses_breaks_the_asset(fmu: Path, binding: Binding) -> None:
+def test_a_state_that_the_fmu_refuses_breaks_the_asset(fmu, binding) -> None:
     with FmiAsset(fmu, binding) as asset:
         asset.step({"load_factor": 2.0})
         saved = asset.save_state()
-        with pytest.raises(FmuStateError, match=r"refused the state"):
+        with pytest.raises(errors.FmuStateError, match=r"refused the state"):
             asset.restore_state(saved[:-40] + b"\0" * 8)
-        with pytest.raises(FmuStateError, match="reset the asset"):
+        with pytest.raises(errors.FmuStateError, match="reset the asset"):
             asset.step()
         asset.reset()
         assert asset.step({"load_factor": 2.0}).time == 1.0
@@ -53,25 +40,28 @@ UNFIT: list[tuple[dict[str, Any], str]] = [
     ({"observation": {"s": {"variables": "strain[{1..25}]", "unit": "1"}}}, r"'strain\[25\]', which is"),
 ]
 WRONG_PARAMETERS: list[tuple[dict[str, float], type[Exception], str]] = [
-    ({"young_modulus_factor": 3.0}, FmuInputError, r"parameter\.young_modulus_factor = 3\.0 lies"),
-    ({"response": 1.5}, FmuInputError, "whole number"),
-    ({"e": 1.0}, BindingError, "no parameter 'e'"),
+    ({"young_modulus_factor": 3.0}, errors.FmuInputError, r"parameter\.young_modulus_factor = 3\.0 lies"),
+    ({"response": 1.5}, errors.FmuInputError, "whole number"),
+    ({"e": 1.0}, errors.BindingError, "no parameter 'e'"),
 ]
 
 
-def test_what_does_not_fit_the_fmu_is_one_sentence(fmu: Path, binding: Binding) -> None:
+def test_what_does_not_fit_the_fmu_is_one_sentence(fmu, binding) -> None:
     for table, sentence in UNFIT:
-        with pytest.raises(BindingError, match=sentence):
+        with pytest.raises(errors.BindingError, match=sentence):
             FmiAsset(fmu, changed(binding, **table))
     for parameters, kind, sentence in WRONG_PARAMETERS:
         with pytest.raises(kind, match=sentence):
             FmiAsset(fmu, binding, parameters=parameters)
-    with FmiAsset(fmu, binding, isolated=False) as asset, pytest.raises(BindingError, match="no control 'n'"):
+    with (
+        FmiAsset(fmu, binding, isolated=False) as asset,
+        pytest.raises(errors.BindingError, match="no control 'n'"),
+    ):
         asset.step({"n": 1.0})
 
 
 def test_units_are_converted_and_parameters_reach_the_fmu_at_the_next_start(
-    model: ReducedModel, fmu: Path, binding: Binding, isolated: bool
+    model, fmu, binding, isolated
 ) -> None:
     units = bound(
         1.0, {"strain": ("strain[{1..24}]", "microstrain")}, control={"load_factor": ("load_factor", "1")},
@@ -82,7 +72,7 @@ def test_units_are_converted_and_parameters_reach_the_fmu_at_the_next_start(
     with FmiAsset(fmu, units, isolated=isolated, parameters={"young_modulus_factor": 1.05}) as asset:
         for factor in (1.05, 0.95):
             seen = asset.step(*inputs)
-            with pytest.raises(FmuInputError, match=r"0 to 0\.85"):
+            with pytest.raises(errors.FmuInputError, match=r"0 to 0\.85"):
                 asset.step({}, {"z1": 85.1})
             chosen = {"young_modulus_factor": factor, "z1": 0.85, "z2": 0.2}
             expected = model.static_response({**chosen, "load_factor": 3.0, "tip_force": 5.0})
@@ -97,16 +87,14 @@ def test_units_are_converted_and_parameters_reach_the_fmu_at_the_next_start(
         assert point == pytest.approx(1e3 * 10.0 / model.tip_stiffness(1.0, (0.2, 0.0)), rel=1e-9)
 
 
-def test_the_fmu_itself_refuses_and_says_why(
-    fmu: Path, binding: Binding, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_fmu_itself_refuses_and_says_why(fmu, binding, monkeypatch) -> None:
     """With the door's own check out of the way, the FMU's is seen: Discard, a sentence, nothing changed."""
     monkeypatch.setattr("fmu_asset.door.layout.Slot.numbers", lambda slot, value: np.array([value]))
     with FmiAsset(fmu, binding) as asset:
         before = asset.step({"load_factor": 3.0})
         for value, sentence in ((99, "lies outside its range"), (float("nan"), "not finite")):
             said = rf"(?s)step 1 from t = 1 s.*Discard.*load_factor.*{sentence}"
-            with pytest.raises(FmuCallError, match=said):
+            with pytest.raises(errors.FmuCallError, match=said):
                 asset.step({"load_factor": value})
         after = asset.step()
         np.testing.assert_array_equal(before.values, after.values)
@@ -117,16 +105,16 @@ def test_the_fmu_itself_refuses_and_says_why(
 
 NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD = 1, 2, 3, 4, 5
 GOES_WRONG: dict[int, tuple[type[Exception], str]] = {
-    NOT_A_NUMBER: (FmuOutputError, r"not finite at t = .* s: position"),
-    RAISE: (FmuCallError, r"(?s)returned Fatal.*the spring broke"),
-    DISCARD: (FmuCallError, r"step \d+ from t = .* returned Discard"),
+    NOT_A_NUMBER: (errors.FmuOutputError, r"not finite at t = .* s: position"),
+    RAISE: (errors.FmuCallError, r"(?s)returned Fatal.*the spring broke"),
+    DISCARD: (errors.FmuCallError, r"step \d+ from t = .* returned Discard"),
 }
 
 
 @pytest.mark.parametrize("bad", [0, 1, 9])
 @pytest.mark.parametrize("behaviour", GOES_WRONG)
 def test_a_step_that_goes_wrong_ends_a_run_there(
-    spring_mass: Path, spring_binding: Binding, isolated: bool, behaviour: int, bad: int, monkeypatch: Any
+    spring_mass, spring_binding, isolated, behaviour, bad, monkeypatch
 ) -> None:
     """Whatever blocks it is made in; as single steps end there."""
     monkeypatch.setattr(session, "_BLOCK_BYTES", 3 * 6 * 8)
@@ -150,7 +138,7 @@ def test_a_step_that_goes_wrong_ends_a_run_there(
             assert asset.step().values.tobytes() == other.step().values.tobytes()
         elif behaviour == RAISE:
             for going_on in (asset.step, lambda: asset.simulate(steps=2)):
-                with pytest.raises(FmuWorkerError, match="reset the asset"):
+                with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
                     going_on()
         for one in (asset, other):
             one.reset()
@@ -158,17 +146,19 @@ def test_a_step_that_goes_wrong_ends_a_run_there(
         assert history.values.tobytes() == np.array([other.step({"push": p}).values for p in push]).tobytes()
 
 
-def test_a_step_that_hangs_or_dies_ends_the_worker(spring_mass: Path, spring_binding: Binding) -> None:
+def test_a_step_that_hangs_or_dies_ends_the_worker(spring_mass, spring_binding) -> None:
     with FmiAsset(spring_mass, spring_binding, step_timeout=0.4) as asset:
         # The limit is that of a step: thousands in one message take longer than one may.
         assert asset.simulate({"push": 1.0}, steps=20_000).extra["steps"][-1] == 20_000
         misbehaviour = np.where(np.arange(500) == 300, SLEEP, 0)
         asset.reset()
-        with pytest.raises(FmuTimeoutError, match=r"step \d+ from .* took longer than 0\.4 s for a step"):
+        with pytest.raises(
+            errors.FmuTimeoutError, match=r"step \d+ from .* took longer than 0\.4 s for a step"
+        ):
             asset.simulate(load={"misbehaviour": misbehaviour})
         assert asset.step_index <= 300
         asset.reset()
-        with pytest.raises(FmuWorkerError, match="SIGABRT"):
+        with pytest.raises(errors.FmuWorkerError, match="SIGABRT"):
             asset.simulate(load={"misbehaviour": [0, 0, 0, DIE, 0]})
         asset.reset()
         assert asset.simulate(steps=3).extra["steps"].tolist() == [1.0, 2.0, 3.0]
@@ -190,12 +180,12 @@ WRONG: list[tuple[dict[str, Any], str]] = [
 ]  # fmt: skip
 
 
-def test_histories_that_are_refused(foreign_fmu: Any, spring_mass: Path, spring_binding: Binding) -> None:
+def test_histories_that_are_refused(foreign_fmu, spring_mass, spring_binding) -> None:
     with FmiAsset(spring_mass, spring_binding, isolated=False) as asset:
         for inputs, sentence in WRONG:
-            with pytest.raises(FmuInputError, match=sentence):
+            with pytest.raises(errors.FmuInputError, match=sentence):
                 asset.simulate(**inputs)
-        with pytest.raises(BindingError, match=r"has no control 'pull'; it has push"):
+        with pytest.raises(errors.BindingError, match=r"has no control 'pull'; it has push"):
             asset.simulate({"pull": 1.0})
         assert asset.step_index == 0
         assert asset.simulate(steps=1).extra["steps"].tolist() == [1.0]
@@ -205,7 +195,7 @@ def test_histories_that_are_refused(foreign_fmu: Any, spring_mass: Path, spring_
     array = bound(1.0, {"y": (["y[2]", "y[1]"], "mm")}, load={"u": ("u", "1")})
     with (
         FmiAsset(foreign_fmu("array3"), array, isolated=False) as asset,
-        pytest.raises(FmuInputError, match=r"load\.u must be 3 values, .* has the shape \(12, 2\)"),
+        pytest.raises(errors.FmuInputError, match=r"load\.u must be 3 values, .* has the shape \(12, 2\)"),
     ):
         asset.simulate(load={"u": np.ones((12, 2))})
 
@@ -214,7 +204,7 @@ def test_histories_that_are_refused(foreign_fmu: Any, spring_mass: Path, spring_
     power=st.lists(st.floats(-1e3, 1e3) | st.sampled_from([-0.0, 0, 1e-320, True]), min_size=1, max_size=6),
     outside=st.floats(-40.0, 50.0) | st.sampled_from([-40.0, 50.0]),
 )
-def test_what_is_sent_is_what_a_step_sends(foreign_fmu: Any, power: list[float], outside: float) -> None:
+def test_what_is_sent_is_what_a_step_sends(foreign_fmu, power, outside) -> None:
     ends = {"power": ("heater.u[1].P", "kW")}, {"outside": ("ambient.T", "degC", -40.0, 50.0)}
     binding = bound(60.0, {"room": ("room.T", "degC")}, control=ends[0], load=ends[1])
     exchange = Exchange(read_fmu(foreign_fmu("room2")), binding)
@@ -224,10 +214,10 @@ def test_what_is_sent_is_what_a_step_sends(foreign_fmu: Any, power: list[float],
         for value in power:
             exchange.place(target, {"control": {"power": value}, "load": {"outside": outside}})
             sent.append(list(target))
-    except FmuInputError as error:
+    except errors.FmuInputError as error:
         refused = error.sentence
     if refused:
-        with pytest.raises(FmuInputError, match=re.escape(refused)):
+        with pytest.raises(errors.FmuInputError, match=re.escape(refused)):
             exchange.rows(held, roles, None)
     else:
         assert exchange.rows(held, roles, None).tobytes() == np.array(sent).tobytes()

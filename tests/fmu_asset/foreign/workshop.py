@@ -1,7 +1,5 @@
 """Builds small FMUs of FMI 1, 2 and 3 from C sources, as other people's tools export them."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -3,8 +3,6 @@
 The wing is the chain of springs and masses, which both sides hold exactly; what can differ is the physics.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import tomllib
@@ -19,16 +17,18 @@ from fmpy import read_model_description
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from discrepancy.campaign.records import Campaign, Channel, Quantity, TrialKind
+from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
 from discrepancy.files.document import Origin
 from discrepancy.files.patch import StoredPatch, fmu_outputs, patch_effects, read_patch, write_patch
 from discrepancy.models.high_pass import filtered_record
+from discrepancy.models.interface import Conditions
 from discrepancy.models.wing import WingModel
 from discrepancy.verdict import NamedEffect, VerdictKind
-from fe.runtime.patch import ModelPatch, SensorGain
+from fe.runtime.patch import STRUCTURE, ModelPatch, SensorGain, SensorRotation
 from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.reduced import ReducedModel
+from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.sensors import SensorRecord, apply_sensors
+from fe.runtime.state import DigitalState
 from fmu_asset.check import check_fmu
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
@@ -37,9 +37,8 @@ from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.effects import active_primitives, effect_rows, numbers_of
 from reporting.provenance import collect_provenance
 from tests.command_line import command, refused, said
-from tests.fmu_asset.door.kinds import CHANNELS, INTERVAL, SENDING, WARM, on, playing, watching
+from tests.fmu_asset.door.kinds import CHANNELS, INTERVAL, OUTPUTS, SENDING, WARM, on, playing, watching
 from tests.fmu_asset.ours import OurFmus
-from tests.fmu_asset.packing.naming import close, expected, release, trial
 
 HERE = Path(__file__).parent
 SENSORS, WING = (
@@ -59,6 +58,58 @@ def content(effects: Mapping[str, Sequence[Any]] = SENSORS, **further: object) -
 
 def patch_of(*names: str) -> ModelPatch:
     return ModelPatch.from_list([primitive for name in names for primitive in WING[name]])
+
+
+# ---------------------------------------------------------------------- what the naming side says
+
+_START = DigitalState()
+STATE = np.array([1.0, *(getattr(_START, name) for name in ("servo_mass", "pitot_mass")),
+                  _START.damping_alpha, _START.damping_beta])  # fmt: skip
+
+
+def trial(kind: TrialKind, count: int, **given: Any) -> Trial:
+    """Return a trial of many moments under no load but what is given."""
+    zero, empty = np.zeros(count), np.zeros((count, 0))
+    values: dict[str, Any] = {
+        "name": "trial", "kind": kind, "channels": (), "values": empty, "used": empty.astype(bool),
+        "time": INTERVAL * np.arange(count), "force": zero, "load_factor": zero, "load_place": "tip_load",
+        "temperature": zero, "start": 0.0, "run": "", "health": np.zeros((count, 2)),
+        "health_deviation": np.zeros((count, 2)), "release": None,
+    }  # fmt: skip
+    return Trial(**(values | given))
+
+
+def release(arrays: PatchArrays, patch: ModelPatch, tip: float, z1: float = 0.0) -> Release:
+    """Return the force near the tip that moves it so far."""
+    structure = PatchedWing(arrays).structure(1.0, (z1, 0.0), STATE[1], STATE[2], patch.of(*STRUCTURE))
+    shape = structure.static(arrays.load_tip)
+    return Release(tip * float(arrays.load_tip @ shape) / float(arrays.tip_row @ shape))
+
+
+def expected(
+    model: WingModel, given: Trial, patch: ModelPatch, health: Sequence[Any] = ((0.0, 0.0),)
+) -> np.ndarray:
+    """Return all outputs of the naming side; a rotated gauge is turned here."""
+    bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SensorRotation)))
+    conditions = Conditions(STATE, health=np.array(health))
+    outputs = tuple((name, Quantity(quantity)) for name, quantity in CHANNELS)
+    found = model.respond(given, outputs, bare, replace(conditions, components=len(bare) < len(patch)))
+    values = found.values.copy()
+    for item in patch.of(SensorRotation):
+        c, s, gauge = np.cos(item.angle), np.sin(item.angle), OUTPUTS.index(item.channel)
+        across, sheared = found.transverse[:, gauge], found.shear[:, gauge]
+        values[:, gauge] = c**2 * values[:, gauge] + s**2 * across + s * c * sheared
+    return values
+
+
+def close(shown: Any, wanted: np.ndarray, tolerance: float = 1e-6) -> None:
+    """Compare with the largest strain and the largest displacement."""
+    for part in (slice(24), slice(24, None)):
+        apart = np.abs(np.asarray(shown)[:, part] - wanted[:, part]).max()
+        assert apart <= tolerance * np.abs(wanted[:, part]).max()
+
+
+# ---------------------------------------------------------------------- the FMU
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +148,7 @@ def flown(
 # ---------------------------------------------------------------------- files
 
 
-def test_the_table_only_grows_at_its_end(fmu: Path, sensing: Path) -> None:
+def test_the_table_only_grows_at_its_end(fmu, sensing) -> None:
     plain, more = (read_model_description(str(path)).modelVariables for path in (fmu, sensing))
     for one, other in zip(plain, more, strict=False):
         assert (one.name, one.valueReference, one.start) == (other.name, other.valueReference, other.start)
@@ -115,9 +166,7 @@ def test_the_table_only_grows_at_its_end(fmu: Path, sensing: Path) -> None:
     assert float(added["effect.coupling.active"].start) == 0.0
 
 
-def test_what_is_on_and_how_much_show_in_the_guid(
-    model: ReducedModel, patch: PatchFile, sensing: Path, tmp_path: Path
-) -> None:
+def test_what_is_on_and_how_much_show_in_the_guid(model, patch, sensing, tmp_path) -> None:
     active = build_fmu(model, tmp_path / "on.fmu", patch=patch, activate=True)
     changed = parse_patch(content(SENSORS | {"gauge_gain": SENSORS["gauge_gain"][:1]}))
     other = build_fmu(model, tmp_path / "other.fmu", patch=changed)
@@ -136,15 +185,13 @@ ROW = st.tuples(
 @settings(max_examples=12, deadline=None)
 @given(rows=st.lists(ROW, min_size=1, max_size=6), response=st.sampled_from([1.0, 2.0]))
 @pytest.mark.long
-def test_off_is_the_plain_wing_to_the_bit(fmu: Path, sensing: Path, rows: Any, response: float) -> None:
+def test_off_is_the_plain_wing_to_the_bit(fmu, sensing, rows, response) -> None:
     given = {"response": response, "release": 0.02 if response == 2.0 else 0.0}
     assert flown(fmu, rows, **given).tobytes() == flown(sensing, rows, **given).tobytes()
 
 
 @pytest.mark.parametrize("response", [1.0, 2.0], ids=["quasi-static", "transient"])
-def test_effects_of_sensors_are_those_of_whole_records(
-    fmu: Path, sensing: Path, patch: PatchFile, response: float
-) -> None:
+def test_effects_of_sensors_are_those_of_whole_records(fmu, sensing, patch, response) -> None:
     """From the first step on, or from the release on."""
     moving = response == 2.0
     rows = [(0.0, 0.0, 0.0, 0.0)] * 80 if moving else [(n, 0.1, 0.0, 0.0) for n in (1.0, 2.0, -1.0, 3.0)]
@@ -167,7 +214,7 @@ def test_effects_of_sensors_are_those_of_whole_records(
     assert not np.allclose(shown, plain)
 
 
-def test_switches_and_values_change_between_steps(sensing: Path, fmu: Path) -> None:
+def test_switches_and_values_change_between_steps(sensing, fmu) -> None:
     with FmiAsset(sensing, SENDING, isolated=False) as asset:
         plain = flown(fmu, [(2.0, 0.0, 0.0, 0.0)])[1, :26]
         seen = [asset.step({"load_factor": 2.0}, load={"drift": k}).values[16] for k in (0.0, 1.0, 0.0, 1.0)]
@@ -198,7 +245,7 @@ IMPOSSIBLE = {
 
 
 @pytest.mark.parametrize("which", IMPOSSIBLE)
-def test_values_that_cannot_be_are_refused_and_change_nothing(request: Any, which: str) -> None:
+def test_values_that_cannot_be_are_refused_and_change_nothing(request, which) -> None:
     binding, parameters, wrong, right, sentence = IMPOSSIBLE[which]
     on_first = {"play": 1.0} if which == "patched" else {}
     with FmiAsset(request.getfixturevalue(which), binding, isolated=False, parameters=parameters) as asset:
@@ -212,7 +259,7 @@ def test_values_that_cannot_be_are_refused_and_change_nothing(request: Any, whic
 
 
 @given(st.data())
-def test_values_and_patch_belong_together(data: st.DataObject) -> None:
+def test_values_and_patch_belong_together(data) -> None:
     effects = parse_patch(content()).for_gauges(24).plain
     rows = effect_rows(effects, 7, {})
     assert [row.reference for row in rows] == list(range(7, 7 + len(rows)))
@@ -235,9 +282,7 @@ def test_values_and_patch_belong_together(data: st.DataObject) -> None:
 
 
 @pytest.mark.parametrize("name", DYNAMIC)
-def test_ring_downs_are_those_of_the_naming_side(
-    name: str, patched: Path, naming_side: WingModel, arrays: PatchArrays
-) -> None:
+def test_ring_downs_are_those_of_the_naming_side(name, patched, naming_side, arrays) -> None:
     steps, patch = 60, patch_of(name)
     given = trial(TrialKind.RINGDOWN, steps + 1, release=release(arrays, patch, 0.03, 0.1))
     shown = flown(patched, [(0.0, 0.1, 0.0, 0.0)] * steps, INTERVAL, response=2.0, release=0.03, **on(name))[
@@ -252,7 +297,7 @@ FORCES = np.array([2.0, 9.0, 15.0, 6.0, -3.0, -14.0, -5.0, 8.0])
 
 
 @pytest.mark.parametrize("name", STATIC)
-def test_static_states_are_those_of_the_naming_side(name: str, patched: Path, naming_side: WingModel) -> None:
+def test_static_states_are_those_of_the_naming_side(name, patched, naming_side) -> None:
     warm = 5.0 * np.arange(len(FORCES)) / len(FORCES)
     given = trial(TrialKind.STATIC, len(FORCES), force=FORCES, temperature=warm)
     with FmiAsset(patched, watching(load=WARM), isolated=False, parameters=on(name)) as asset:
@@ -262,7 +307,7 @@ def test_static_states_are_those_of_the_naming_side(name: str, patched: Path, na
 
 
 @pytest.mark.parametrize("name", ["washout", "relief", "play", "local_loss", "both"])
-def test_flights_are_those_of_the_naming_side(name: str, patched: Path, naming_side: WingModel) -> None:
+def test_flights_are_those_of_the_naming_side(name, patched, naming_side) -> None:
     factors = np.array([1.0, 2.0, 3.5, -0.5, 2.5])
     damage = np.column_stack((0.15 * np.arange(5), 0.1 * np.ones(5)))
     given = trial(TrialKind.FLIGHT, 5, load_factor=factors, time=np.arange(5.0))
@@ -273,9 +318,7 @@ def test_flights_are_those_of_the_naming_side(name: str, patched: Path, naming_s
 
 
 @pytest.mark.parametrize("response", [1.0, 2.0])
-def test_effects_that_are_off_or_have_no_magnitude_change_nothing(
-    model: ReducedModel, patched: Path, response: float, tmp_path: Path
-) -> None:
+def test_effects_that_are_off_or_have_no_magnitude_change_nothing(model, patched, response, tmp_path) -> None:
     """A wing that can be patched moves in six modes, which are iterated; the plain one has six here, too."""
     plain = build_fmu(replace(model, mode_count=6), tmp_path / "wing.fmu").path
     nothing = on("root", "play") | {"effect.root.compliance": 0.0, "effect.play.stiffness": 0.0}
@@ -288,7 +331,7 @@ def test_effects_that_are_off_or_have_no_magnitude_change_nothing(
             close(seen, wanted, 1e-9 if response == 1.0 else 5e-4)
 
 
-def test_the_wing_stays_where_it_is_when_effects_come_and_go(patched: Path) -> None:
+def test_the_wing_stays_where_it_is_when_effects_come_and_go(patched) -> None:
     given = {"response": 2.0, "release": 0.03}
     switches = [
         {},
@@ -306,7 +349,7 @@ def test_the_wing_stays_where_it_is_when_effects_come_and_go(patched: Path) -> N
     assert np.abs(np.diff(seen)).max() < 0.003 * 0.03
 
 
-def test_modal_outputs_are_those_of_the_patched_wing(patched: Path, naming_side: WingModel) -> None:
+def test_modal_outputs_are_those_of_the_patched_wing(patched, naming_side) -> None:
     with FmiAsset(patched, playing(), isolated=False, parameters=on("point_mass")) as asset:
         seen = asset.step({"load_factor": 1.0}, load={"root": 1.0}).extra["frequency[1]"]
         off = asset.step(load={"root": 0.0}).extra["frequency[1]"]
@@ -316,7 +359,7 @@ def test_modal_outputs_are_those_of_the_patched_wing(patched: Path, naming_side:
     assert off > seen
 
 
-def test_whole_numbers_are_whole_and_what_has_no_bounds_is_refused(patched: Path) -> None:
+def test_whole_numbers_are_whole_and_what_has_no_bounds_is_refused(patched) -> None:
     many = on("slip", "crack")
     pushed = [(0.0, 0.0, 0.0, force) for force in (14.0, -6.0)]
     single = many | {"effect.slip.element_count": 1, "effect.crack.side": 0}
@@ -337,9 +380,7 @@ def test_whole_numbers_are_whole_and_what_has_no_bounds_is_refused(patched: Path
         asset.simulate({"load_factor": 0.0}, steps=2000)
 
 
-def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(
-    model: ReducedModel, arrays: PatchArrays, fmu: Path, tmp_path: Path
-) -> None:
+def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(model, arrays, fmu, tmp_path) -> None:
     seen = {"g3": "strain[3]", "tip": "tip_displacement", "rate": "tip_displacement"}
     quantities = Quantity.STRAIN, Quantity.DISPLACEMENT, Quantity.VELOCITY
     channels = {
@@ -386,9 +427,7 @@ REFUSED: dict[str, tuple[bytes, str]] = {
 
 
 @pytest.mark.parametrize("case", sorted(REFUSED))
-def test_patches_that_mean_nothing_are_refused_in_one_sentence(
-    case: str, model: ReducedModel, arrays: PatchArrays, tmp_path: Path
-) -> None:
+def test_patches_that_mean_nothing_are_refused_in_one_sentence(case, model, arrays, tmp_path) -> None:
     given, words = REFUSED[case]
     options = {"arrays": arrays} if case in ("beside the wing", "at no place", "on no side") else {}
     with pytest.raises(PatchFileError) as caught:
@@ -405,7 +444,7 @@ def test_a_byte_order_mark_means_nothing_and_an_id_that_comes_twice_is_numbered(
     assert [effect.id for effect in again.effects] == ["gain", "gain_2", "gain_3"]
 
 
-def test_the_command_line_refuses_before_it_models_a_wing(tmp_path: Path) -> None:
+def test_the_command_line_refuses_before_it_models_a_wing(tmp_path) -> None:
     good, broken, out = tmp_path / "patch.json", tmp_path / "broken.json", tmp_path / "wing.fmu"
     good.write_bytes(content())
     broken.write_bytes(b"{")
@@ -421,7 +460,7 @@ def test_the_command_line_refuses_before_it_models_a_wing(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_the_command_line_packs_a_patch_and_lists_its_effects(tmp_path: Path) -> None:
+def test_the_command_line_packs_a_patch_and_lists_its_effects(tmp_path) -> None:
     patch, out = tmp_path / "patch.json", tmp_path / "wing.fmu"
     patch.write_bytes(content())
     said("fmu", "build", "--out", out, "--patch", patch, "--activate")

@@ -1,7 +1,5 @@
 """An FMU of FMI 2 or 3 in this process, call by call, through fmpy."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -33,7 +31,7 @@ class Slave:
     array's. With `like`, another instance of the FMU that one has extracted.
     """
 
-    def __init__(self, path: Path, *, like: Slave | None = None) -> None:
+    def __init__(self, path: Path, *, like: "Slave | None" = None) -> None:
         self.description = read_fmu(path) if like is None else like.description
         self.folder = extract_fmu(self.description) if like is None else like.folder
         self._owns_folder = like is None

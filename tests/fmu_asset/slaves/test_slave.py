@@ -3,8 +3,6 @@
 Phases, refusals that change nothing, lazy outputs, serialised state; and that all give the same numbers.
 """
 
-from __future__ import annotations
-
 import ctypes
 import math
 import os
@@ -23,7 +21,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fe.runtime.modal_system import rayleigh_damping_ratio
-from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE, DigitalState
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.variables import (
@@ -65,7 +62,7 @@ def is_compiled(slave: Slave) -> bool:
 # ---------------------------------------------------------------------- numbers
 
 
-def test_a_start_is_the_equilibrium_and_modal_outputs_follow(slave: Slave, model: ReducedModel) -> None:
+def test_a_start_is_the_equilibrium_and_modal_outputs_follow(slave, model) -> None:
     assert slave.start(load_factor=2.0, health__z1=0.3, **PARAMETERS) == OK
     expected = model.static_response({"z1": 0.3, "load_factor": 2.0})
     everything = slave.everything()
@@ -86,7 +83,7 @@ def test_a_start_is_the_equilibrium_and_modal_outputs_follow(slave: Slave, model
     np.testing.assert_allclose(slave.everything()[STRAIN], released, rtol=0.0, atol=1e-12 * scale)
 
 
-def test_start_values_come_from_the_state(compiler: Any, model: ReducedModel, tmp_path: Path) -> None:
+def test_start_values_come_from_the_state(compiler, model, tmp_path) -> None:
     given = {"young_modulus_factor": 1.0 + 1e-15, "stiffness_loss": (0.1, 1.0 / 3.0)}
     with closing(Slave(compiled_wing(model, tmp_path / "wing.fmu", state=DigitalState(**given)))) as slave:
         shown = slave.get("health.z1", "health.z2", "young_modulus_factor")
@@ -98,7 +95,7 @@ def test_start_values_come_from_the_state(compiler: Any, model: ReducedModel, tm
 
 @settings(deadline=None)
 @given(size=st.floats(1e-4, 0.5), parts=st.integers(2, 7))
-def test_the_transient_does_not_depend_on_the_step_size(pair: Any, size: float, parts: int) -> None:
+def test_the_transient_does_not_depend_on_the_step_size(pair, size, parts) -> None:
     whole, split = pair
     for slave in pair:
         slave.start(response=2, initial_tip_displacement=0.02)
@@ -165,9 +162,7 @@ def assert_same_numbers(
 
 @pytest.mark.parametrize("response", ["steady", "transient", "overdamped", "undamped"])
 @pytest.mark.parametrize("file", ["compiled", "fmi3", "compiled_beam"])
-def test_the_compiled_ones_give_the_numbers_of_that_in_python(
-    ours: OurFmus, file: str, response: str
-) -> None:
+def test_the_compiled_ones_give_the_numbers_of_that_in_python(ours, file, response) -> None:
     """Strains, displacements, accelerations, bounds, frequencies, damping ratios."""
     beam, moving = file == "compiled_beam", response != "steady"
     damping = response.removesuffix("damped").replace("un", "none") if "damped" in response else ""
@@ -180,7 +175,7 @@ def test_the_compiled_ones_give_the_numbers_of_that_in_python(
                 assert (np.abs(shaken).max() > 0.0) == moving
 
 
-def test_outputs_can_be_read_while_initialising(slave: Slave, ours: OurFmus) -> None:
+def test_outputs_can_be_read_while_initialising(slave, ours) -> None:
     seen = []
     with closing(Slave(ours("python"))) as python:
         for one in (slave, python):
@@ -195,9 +190,7 @@ def test_outputs_can_be_read_while_initialising(slave: Slave, ours: OurFmus) -> 
         assert_same_numbers(python.names, *seen)
 
 
-def test_modes_that_coincide_are_those_in_python(
-    compiler: Any, beam_model: ReducedModel, tmp_path: Path
-) -> None:
+def test_modes_that_coincide_are_those_in_python(compiler, beam_model, tmp_path) -> None:
     """A double mode, two 1e-7 apart, two 1e-3, whatever the loss: motion and frequencies to 1e-9."""
     size, terms = beam_model.modal_load.shape[1], len(beam_model.modal_stiffness)
     turn = np.linalg.qr(np.random.default_rng(5).normal(size=(size, size)))[0]
@@ -220,9 +213,7 @@ def test_modes_that_coincide_are_those_in_python(
             assert (np.abs(seen - expected).max(axis=0) <= 1e-9 * scale).all()
 
 
-def test_a_compiled_fmu_bounds_as_the_model_does(
-    compiler: Any, plate_model: ReducedModel, tmp_path: Path
-) -> None:
+def test_a_compiled_fmu_bounds_as_the_model_does(compiler, plate_model, tmp_path) -> None:
     rng = np.random.default_rng(3)
     with closing(Slave(compiled_wing(plate_model, tmp_path / "wing.fmu"))) as slave:
         assert slave.start() == OK, slave.log
@@ -267,7 +258,7 @@ def assert_refused(pair: tuple[Slave, Slave], step: tuple[Any, ...], status: int
 
 @settings(deadline=None)
 @given(index=st.integers(0, 3), value=WRONG_VALUES, response=st.sampled_from([1, 2]))
-def test_refused_inputs_change_nothing(pair: Any, index: int, value: float, response: int) -> None:
+def test_refused_inputs_change_nothing(pair, index, value, response) -> None:
     for one in pair:
         one.start(response=response, initial_tip_displacement=0.01)
     both_step(pair, *ONCE)
@@ -286,7 +277,7 @@ def test_refused_inputs_change_nothing(pair: Any, index: int, value: float, resp
     both_step(pair, *AGAIN)
 
 
-def test_steps_of_no_size_or_from_another_time_are_refused(pair: tuple[Slave, Slave]) -> None:
+def test_steps_of_no_size_or_from_another_time_are_refused(pair) -> None:
     for one in pair:
         one.start(response=2, initial_tip_displacement=0.01)
     both_step(pair, *ONCE)
@@ -296,7 +287,7 @@ def test_steps_of_no_size_or_from_another_time_are_refused(pair: tuple[Slave, Sl
     both_step(pair, *AGAIN)
 
 
-def test_calls_in_the_wrong_phase(slave: Slave) -> None:
+def test_calls_in_the_wrong_phase(slave) -> None:
     fmu, reference, compiled = slave.fmu, slave.reference, is_compiled(slave)
     get, set_whole = (getattr(fmu, f"get{slave.real}"), getattr(fmu, f"set{slave.whole}"))
     set_real = getattr(fmu, f"set{slave.real}")
@@ -341,7 +332,7 @@ def test_calls_in_the_wrong_phase(slave: Slave) -> None:
         assert slave.status_of(fmu.setupExperiment, None, math.nan) == ERROR
 
 
-def test_wrong_calls_of_fmi_3_are_refused_and_change_nothing(ours: OurFmus) -> None:
+def test_wrong_calls_of_fmi_3_are_refused_and_change_nothing(ours) -> None:
     with closing(Slave(ours("fmi3"))) as wing:
 
         def call(name: str, *arguments: Any) -> int:
@@ -381,7 +372,7 @@ def test_wrong_calls_of_fmi_3_are_refused_and_change_nothing(ours: OurFmus) -> N
     ("name", "value", "right"),
     [("mass.servo", 9.0, 0.17), ("damping.alpha", math.nan, 0.0), ("response", 3, 1)],
 )
-def test_parameters_that_are_refused_stop_the_start(slave: Slave, name: str, value: Any, right: Any) -> None:
+def test_parameters_that_are_refused_stop_the_start(slave, name, value, right) -> None:
     key = name.replace(".", "__")
     slave.start(**{key: value})
     assert slave.status in (STATUS_OUTSIDE_RANGE, STATUS_NOT_FINITE)
@@ -392,9 +383,7 @@ def test_parameters_that_are_refused_stop_the_start(slave: Slave, name: str, val
 
 
 @pytest.mark.parametrize("kind", ["python", "compiled"])
-def test_a_computation_that_fails_is_a_refusal(
-    compiler: Any, model: ReducedModel, tmp_path: Path, kind: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_computation_that_fails_is_a_refusal(compiler, model, tmp_path, kind, monkeypatch) -> None:
     """A model that is not positive definite within its own validity box: nothing changes, nothing crashes."""
     box = model.validity_box.copy()
     box[1] = (0.0, 5.0)
@@ -438,9 +427,7 @@ def fly(slave: Slave, time: float, course: list[tuple[float, ...]]) -> float:
     st.lists(STEPS, max_size=2),
     st.sampled_from([1, 2]),
 )
-def test_a_restored_state_has_the_same_future(
-    pair: Any, steps: Any, later: Any, elsewhere: Any, response: int
-) -> None:
+def test_a_restored_state_has_the_same_future(pair, steps, later, elsewhere, response) -> None:
     """To the bit, whatever the other instance did before."""
     slave, other = pair
     slave.start(response=response, initial_tip_displacement=0.02, mass__pitot=0.11, damping__alpha=1.5)
@@ -457,7 +444,7 @@ def test_a_restored_state_has_the_same_future(
 
 @settings(deadline=None, max_examples=20)
 @given(past=st.lists(STEPS, max_size=12), course=st.lists(STEPS, min_size=1, max_size=6))
-def test_the_past_of_an_instance_does_not_show(pair: Any, past: Any, course: Any) -> None:
+def test_the_past_of_an_instance_does_not_show(pair, past, course) -> None:
     """What an instance has kept of other states of health never changes a bit of its outputs."""
     pair[0].start(response=2, young_modulus_factor=1.05, mass__pitot=0.11)
     fly(pair[0], 0.0, past)
@@ -468,7 +455,7 @@ def test_the_past_of_an_instance_does_not_show(pair: Any, past: Any, course: Any
     assert pair[0].everything() == pair[1].everything()
 
 
-def test_states_of_something_else_are_refused(slave: Slave, ours: OurFmus) -> None:
+def test_states_of_something_else_are_refused(slave, ours) -> None:
     compiled = is_compiled(slave)
     foreign = []
     for name in ("python" if compiled else "compiled", "compiled_regions" if compiled else "regions"):
@@ -492,7 +479,7 @@ def test_states_of_something_else_are_refused(slave: Slave, ours: OurFmus) -> No
     assert slave.step(STILL, 0.0, 1.0) == OK
 
 
-def test_many_instances_of_one_library(ours: OurFmus) -> None:
+def test_many_instances_of_one_library(ours) -> None:
     """Two in threads give what each gives alone; six hundred leave no memory behind."""
 
     def flown(one: Slave, seed: int) -> bytes:
