@@ -9,7 +9,7 @@ import pytest
 from fmu_asset import errors
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.session import FmiAsset
-from tests.fmu_asset.door.kinds import BINDINGS, bounces
+from tests.fmu_asset.door.kinds import BINDINGS, INPUTS, bounces
 from tests.fmu_asset.making import archive_of, bound, changed, members
 
 LAG, FIXED, ARRAY, BALL = (BINDINGS[name] for name in ("lag1", "fixed2", "array3", "ball2"))
@@ -71,23 +71,21 @@ def test_a_nominal_of_zero_counts_as_one_and_an_identifier_may_have_a_hyphen(for
 SECOND_BOUNCE = math.sqrt(2.0 / 9.81) * 2.4
 
 
-@pytest.mark.parametrize(
-    ("model", "observed", "size", "end", "value"),
-    [
-        ("hostile2", ("y", "m"), 1.0, 2.5, 2.5),
-        ("ball2", ("h", "m"), 0.1, SECOND_BOUNCE, 0.0),
-        ("decay1", ("x", "K"), 0.3, 1.0, math.exp(-1.0)),
-        ("swing3", ("a", "1"), 0.3, 1.0, 1.0),
-    ],
-)
-def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(
-    foreign_fmu, isolated, model, observed, size, end, value
-) -> None:
+ENDS = {  # what is observed, the step, where it ends, and what is seen there
+    "hostile2": ("y", "m", 1.0, 2.5, 2.5),
+    "ball2": ("h", "m", 0.1, SECOND_BOUNCE, 0.0),
+    "decay1": ("x", "K", 0.3, 1.0, math.exp(-1.0)),
+    "swing3": ("a", "1", 0.3, 1.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("model", ENDS)
+def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(foreign_fmu, isolated, model) -> None:
     """Discard and `fmi2Terminated`; events of model exchange in FMI 2, 1 and 3."""
+    name, unit, size, end, value = ENDS[model]
     sent = {"control": {"u": ("u", "m/s")}} if model == "hostile2" else {}
-    with FmiAsset(
-        foreign_fmu(model, "ENDS"), bound(size, {"y": observed}, **sent), isolated=isolated
-    ) as asset:
+    binding = bound(size, {"y": (name, unit)}, **sent)
+    with FmiAsset(foreign_fmu(model, "ENDS"), binding, isolated=isolated) as asset:
         history = asset.simulate(steps=50)
         assert f"ended at t = {end:g} s" in history.ended
         whole = int(end / size)
@@ -109,34 +107,7 @@ def port(force: Any, force_unit: str, **motion: tuple[Any, str]) -> dict[str, An
     return {"port": {"p": {name: {"variables": v, "unit": unit} for name, (v, unit) in ends.items()}}}
 
 
-UNBOUND: list[tuple[dict[str, Any], str]] = [
-    *(
-        ({"load": {"it": (variable, "1")}}, rf"load\.it of the binding bound .*{sentence}")
-        for variable, sentence in (
-            ("ticked", "which changes with a clock; clocks are not supported"),
-            ("blob", "is of type Binary; only numbers can be bound"),
-            ("tick", "is of type Clock; only numbers can be bound"),
-            ("u[4]", "but 'u' has 3 elements, counted from 1"),
-            ("u[0]", "but 'u' has 3 elements, counted from 1"),
-            ("u[1,1]", "but 'u' has 3 elements, counted from 1"),
-            ("n", "must be of causality input, but 'n' is declared as structuralParameter"),
-            ("activ", "not a variable of .*did you mean 'active'"),
-        )
-    ),
-    (
-        {"load": {"all": ("u", "1"), "one": ("u[2]", "1")}},
-        r"load\.one and load\.all set the same value of 'u'; keep one",
-    ),
-    (
-        port(["u[2]", "u[2]"], "N", displacement=(["y[1]", "y[2]"], "mm")),
-        r"port\.p\.force and port\.p\.force set the same value of 'u'; keep one",
-    ),
-    (port("u", "1"), "needs a displacement or a velocity"),
-    (port("u", "N", velocity=("v", "m")), "velocity is in 'm', but must be in m/s or rad/s"),
-]
-
-
-@pytest.mark.parametrize(("roles", "sentence"), UNBOUND, ids=[sentence[-30:] for _, sentence in UNBOUND])
+@pytest.mark.parametrize(("roles", "sentence"), INPUTS["unbound"])
 def test_what_cannot_be_bound_is_named(foreign_fmu, roles, sentence) -> None:
     with pytest.raises(errors.BindingError, match=sentence):
         FmiAsset(foreign_fmu("array3"), bound(1.0, {"y": ("y", "mm")}, **roles))

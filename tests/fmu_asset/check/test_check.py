@@ -1,13 +1,16 @@
 """What the checks say of sound FMUs and of FMUs with one fault each."""
 
+import tomllib
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from fmu_asset.check import FmuCheck, check_fmu
+from tests.fmu_asset.foreign.workshop import MODELS
 from tests.fmu_asset.making import bound
 
-MODELS = ["lag1", "room2", "fixed2", "array3", "ball2", "decay1", "swing3", "hostile2"]
+FAULTS = tomllib.loads(Path(__file__).with_name("faults.toml").read_text("utf-8"))
 QUICK = ("array3", "ball2", "hostile2")
 
 
@@ -32,21 +35,7 @@ def test_sound_fmus_of_all_kinds_have_no_problem(foreign_fmu, model) -> None:
     assert found["reset"] == ("warning" if model == "decay1" else "ok")
 
 
-@pytest.mark.parametrize(
-    ("what", "check", "sentence"),
-    [
-        ("STATE_HIDDEN", "state", "declares canGetAndSetFMUstate but keeps part of its state elsewhere"),
-        ("STATE_NOT_RESTORED", "state", "does not restore all of its state"),
-        ("STATE_ERROR", "state", "fmi2GetFMUstate is not implemented"),
-        ("NOT_DETERMINISTIC", "determinism", "Two flights with the same inputs differ"),
-        ("NOT_A_NUMBER", "first flight", "values that are not finite at t = 3 s"),
-        ("SEGFAULT", "first flight", "SIGSEGV"),
-        ("EXIT", "first flight", "exit status 3"),
-        ("HANG", "first flight", "longer than 1 s for the step"),
-        ("NO_INSTANCE", "first flight", "no licence"),
-        ("CRASH_AT_LOAD", "first flight", "SIGSEGV"),
-    ],
-)
+@pytest.mark.parametrize(("what", "check", "sentence"), FAULTS["fault"])
 def test_one_fault_is_one_problem(foreign_fmu, what, check, sentence) -> None:
     result = check_fmu(foreign_fmu("hostile2", what), step_timeout=1.0)
     assert not result.passed
@@ -71,28 +60,8 @@ def test_eighty_instances_in_one_process(foreign_fmu) -> None:
         assert sentence in texts(check, "instances")
 
 
-M = '<Unit name="m"><BaseUnit m="1"'
-TOLD: list[tuple[str, dict[str, Any], tuple[tuple[str, str], ...], str, str]] = [
-    ("fixed2", {"step_size": 1.0}, (), "first flight", "the sample time is 0.01 s"),
-    ("fixed2", {}, (), "step size", "It takes 0.01 s only"),
-    (
-        "fixed2", {},
-        (("<CoSimulation ", '<CoSimulation canHandleVariableCommunicationStepSize="true" '),),
-        "step size", "declares that it takes any step size, but not 0.005 s",
-    ),
-    (
-        "ball2", {}, ((f"{M}/>", f'{M} factor="0.001"/>'),), "units",
-        "'m' is defined with the factor 0.001 and the offset 0; usual are 1 and 0",
-    ),
-    (
-        "room2", {}, (('unit="K/s"', 'unit="bushel"'), ('"K/s"', '"bushel"')), "units",
-        "Nothing can be converted to bushel",
-    ),
-]  # fmt: skip
-
-
 def test_step_sizes_and_units_that_contradict(foreign_fmu) -> None:
-    for number, (model, options, changes, check, sentence) in enumerate(TOLD):
+    for number, (model, options, changes, check, sentence) in enumerate(FAULTS["told"]):
         path = foreign_fmu.changed(model, f"told{number}", *changes)
         assert sentence in texts(check_fmu(path, **options), check)
     broken = foreign_fmu.changed("fixed2", "schema", ('<Real start="0"/>', "<Real/>"))

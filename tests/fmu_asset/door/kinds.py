@@ -94,6 +94,8 @@ class Kind:
 # ---------------------------------------------------------------------- structures
 
 WING = load_binding(binding_files()["uav_wing"])
+INPUTS = tomllib.loads(Path(__file__).with_name("inputs.toml").read_text("utf-8"))
+"""Tables of what is refused."""
 BINDINGS_FOLDER = Path(__file__).with_name("bindings")
 BINDINGS = {path.stem: load_binding(path) for path in BINDINGS_FOLDER.glob("*.toml")}
 """Of others' FMUs and systems, by the name of the model."""

@@ -19,9 +19,10 @@ from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.placement import limits_of
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.units import Conversion, Meaning, contradictions, conversion, meaning_of, same_dimension
+from fmu_asset.door.units import Meaning, contradictions, conversion, meaning_of, same_dimension
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
+from tests.fmu_asset.foreign.workshop import MODELS
 from tests.fmu_asset.making import changed
 
 HERE = Path(__file__).parent
@@ -67,14 +68,9 @@ def test_missing_or_unreadable_file(tmp_path) -> None:
     with pytest.raises(BindingError, match="cannot be read: No such file"):
         load_binding(tmp_path / "none.toml")
     path = tmp_path / "x.toml"
-    for content, sentence in (
-        (b"\xff\xfe", "not text in UTF-8"),
-        (b"x = " + 20_000 * b"[" + 20_000 * b"]", r"x\.toml"),
-        (b'[binding]\nname = "a"\nstep_size = 1.0\n', r"no \[observation"),
-    ):
-        path.write_bytes(content)
-        with pytest.raises(BindingError, match=sentence):
-            load_binding(path)
+    path.write_text('[binding]\nname = "a"\nstep_size = 1.0\n')
+    with pytest.raises(BindingError, match=r"no \[observation"):
+        load_binding(path)
 
 
 @given(st.integers(0, 500), st.integers(0, 50))
@@ -171,18 +167,19 @@ def test_dimensions_are_compared_and_contradictions_told() -> None:
     assert ["another dimension" in text for text in told] == [False, True]
 
 
-@pytest.mark.parametrize(
-    ("unit", "of_fmu", "value", "in_fmu"),
-    [
-        ("microstrain", "1", 2500.0, 2.5e-3),
-        ("percent", "1", 40.0, 0.4),
-        ("degC", "K", 20.0, 293.15),
-        ("degF", "K", 68.0, 293.15),
-        ("mm", "m", 12.0, 0.012),
-        ("anything", None, 3.0, 3.0),
-    ],
-)
-def test_units_convert_both_ways(unit, of_fmu, value, in_fmu) -> None:
+IN_FMU = {
+    ("microstrain", "1"): (2500.0, 2.5e-3),
+    ("percent", "1"): (40.0, 0.4),
+    ("degC", "K"): (20.0, 293.15),
+    ("degF", "K"): (68.0, 293.15),
+    ("mm", "m"): (12.0, 0.012),
+    ("anything", None): (3.0, 3.0),
+}
+
+
+@pytest.mark.parametrize("units", IN_FMU)
+def test_units_convert_both_ways(units) -> None:
+    (unit, of_fmu), (value, in_fmu) = units, IN_FMU[units]
     scale = conversion(unit, variable("v", "input", unit=of_fmu), DEFINED, where="here")
     assert scale.to_fmu(value) == pytest.approx(in_fmu, rel=1e-12)
     assert scale.from_fmu(in_fmu) == pytest.approx(value, rel=1e-12)
@@ -194,19 +191,10 @@ def test_units_that_do_not_fit(unit, of_fmu) -> None:
         conversion(unit, variable("v", "input", unit=of_fmu), DEFINED, where="here")
 
 
-@given(st.floats(1e-6, 1e6), st.floats(-1e3, 1e3), st.floats(-1e6, 1e6))
-def test_conversions_are_inverse(factor, offset, value) -> None:
-    scale = Conversion(factor, offset)
-    there_and_back = scale.from_fmu(scale.to_fmu(value))
-    assert there_and_back == pytest.approx(value, rel=1e-9, abs=1e-9 * (1.0 + abs(offset) / factor))
-
-
 # ---------------------------------------------------------------------- drafts
 
 
-@pytest.mark.parametrize(
-    "model", ["lag1", "room2", "fixed2", "array3", "ball2", "decay1", "swing3", "hostile2"]
-)
+@pytest.mark.parametrize("model", MODELS)
 def test_a_draft_flies(foreign_fmu, model, tmp_path) -> None:
     path, file = foreign_fmu(model), tmp_path / "binding.toml"
     file.write_text(draft_binding(read_fmu(path)), encoding="utf-8")

@@ -14,7 +14,7 @@ from fmu_asset.door.layout import Observation
 from fmu_asset.door.saved_state import SavedState
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError, FmuStateError
-from tests.fmu_asset.door.kinds import KINDS, Kind, oscillator, three
+from tests.fmu_asset.door.kinds import INPUTS, KINDS, Kind, oscillator, three
 from tests.fmu_asset.ours import NAMES, OurFmus
 
 Open = Callable[..., FmiAsset]
@@ -142,22 +142,7 @@ def test_a_state_goes_on_to_the_bit_and_copies_go_their_own_way(open_asset, kind
         assert asset.observe().time == kind.binding.binding.start_time
 
 
-REFUSED: list[tuple[str, dict[str, Any], str]] = [
-    ("wing", {"control": {"load_factor": 9.0}}, r"load_factor = 9\.0 lies outside .*, -1 to 4;"),
-    ("wing", {"control": {"load_factor": float("nan")}}, r"control\.load_factor must be finite, but is nan"),
-    ("wing", {"control": {"load_factor": float("inf")}}, r"must be finite, but is inf"),
-    ("wing", {"health": {"z1": -0.1}}, r"health\.z1 = -0\.1 lies outside"),
-    ("wing", {"control": {"load_factor": "fast"}}, r"must be a number, but is 'fast'"),
-    ("FMI 2 of a Modelica tool", {"load": {"outside": -41.0}}, r"load\.outside = -41\.0 lies outside"),
-    ("FMI 2 of a Modelica tool", {"load": {"on": 2}}, r"load\.on = 2 lies outside .* 0 to 1"),
-    ("elements of arrays", {"load": {"offset": 200}}, r"load\.offset = 200 lies outside .* -128 to 127"),
-    ("elements of arrays", {"control": {"first": 11.0}}, r"control\.first = 11\.0 lies outside .* -10 to 10"),
-    ("whole arrays", {"load": {"u": 1.0}}, r"load\.u takes 3 values, but 1 came"),
-    ("whole arrays", {"load": {"u": [1.0, 2.0]}}, r"load\.u takes 3 values, but 2 came"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "inputs", "sentence"), REFUSED)
+@pytest.mark.parametrize(("name", "inputs", "sentence"), INPUTS["refused"])
 def test_what_is_refused_is_not_sent(open_asset, name, inputs, sentence, isolated) -> None:
     kind = KINDS[name]
     with open_asset(kind, isolated=isolated) as asset, open_asset(kind, isolated=False) as other:

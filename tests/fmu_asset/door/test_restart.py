@@ -205,20 +205,3 @@ def test_after_a_crash_the_files_are_extracted_again(foreign_fmu, extractions) -
         asset.restore_state(saved)
         assert len(extractions) == 2
         assert fork.step().values[0] == 1.0
-
-
-@pytest.mark.long
-@pytest.mark.slow
-def test_three_hundred_cycles_leave_nothing(foreign_fmu, scratch) -> None:
-    """Create, run and free in this process: neither memory nor folders nor descriptors grow."""
-    pages, descriptors = [], []
-    with FmiAsset(foreign_fmu("hostile2"), HOSTILE, isolated=False) as first:
-        for number in range(300):
-            with first.sibling() as asset:
-                asset.step()
-            if number in (99, 299):
-                pages.append(int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]))
-                descriptors.append(len(list(Path("/proc/self/fd").iterdir())))
-    assert pages[1] - pages[0] < 200  # 4 KiB for each cycle would be 200 pages
-    assert descriptors[0] == descriptors[1]
-    assert not list(scratch.iterdir())

@@ -13,6 +13,7 @@ from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door import session
 from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.session import FmiAsset
+from tests.fmu_asset.door.kinds import INPUTS
 from tests.fmu_asset.making import bound, changed
 
 # ---------------------------------------------------------------------- the wing
@@ -30,15 +31,6 @@ def test_a_state_that_the_fmu_refuses_breaks_the_asset(fmu, binding) -> None:
         assert asset.step({"load_factor": 2.0}).time == 1.0
 
 
-UNFIT: list[tuple[dict[str, Any], str]] = [
-    ({"control": {"n": {"variable": "load_facto", "unit": "1"}}}, r"did you mean 'load_factor'"),
-    ({"control": {"n": {"variable": "load_factor", "unit": "N"}}}, r"is in 'N', but the FMU has"),
-    ({"control": {"n": {"variable": "load_factor", "unit": "furlong"}}}, "no conversion between the two"),
-    ({"control": {"n": {"variable": "strain[1]", "unit": "1"}}}, r"must be of causality input"),
-    ({"parameter": {"a": {"variable": "load_factor", "unit": "1"}}, "control": {}}, "ity parameter"),
-    ({"monitor": {"a": {"variable": "load_factor", "unit": "1"}}}, r"must be of causality output"),
-    ({"observation": {"s": {"variables": "strain[{1..25}]", "unit": "1"}}}, r"'strain\[25\]', which is"),
-]
 WRONG_PARAMETERS: list[tuple[dict[str, float], type[Exception], str]] = [
     ({"young_modulus_factor": 3.0}, errors.FmuInputError, r"parameter\.young_modulus_factor = 3\.0 lies"),
     ({"response": 1.5}, errors.FmuInputError, "whole number"),
@@ -47,7 +39,7 @@ WRONG_PARAMETERS: list[tuple[dict[str, float], type[Exception], str]] = [
 
 
 def test_what_does_not_fit_the_fmu_is_one_sentence(fmu, binding) -> None:
-    for table, sentence in UNFIT:
+    for table, sentence in INPUTS["unfit"]:
         with pytest.raises(errors.BindingError, match=sentence):
             FmiAsset(fmu, changed(binding, **table))
     for parameters, kind, sentence in WRONG_PARAMETERS:

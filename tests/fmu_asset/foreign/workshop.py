@@ -12,6 +12,8 @@ from tests.fmu_asset.making import DESCRIPTION, archive_of, edited
 from tests.kept import packed
 
 HERE = Path(__file__).parent
+MODELS = ["lag1", "room2", "fixed2", "array3", "ball2", "decay1", "swing3", "hostile2"]
+"""One of each version and interface."""
 HEADERS = Path(fmpy.__file__).parent / "c-code"
 
 

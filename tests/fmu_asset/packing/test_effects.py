@@ -32,7 +32,7 @@ from fe.runtime.state import DigitalState
 from fmu_asset.check import check_fmu
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
-from fmu_asset.packing.patch_file import PatchFile, load_patch, parse_patch
+from fmu_asset.packing.patch_file import load_patch, parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.effects import active_primitives, effect_rows, numbers_of
 from reporting.provenance import collect_provenance
@@ -62,28 +62,25 @@ def patch_of(*names: str) -> ModelPatch:
 
 # ---------------------------------------------------------------------- what the naming side says
 
-_START = DigitalState()
-STATE = np.array([1.0, *(getattr(_START, name) for name in ("servo_mass", "pitot_mass")),
-                  _START.damping_alpha, _START.damping_beta])  # fmt: skip
+START = DigitalState()
+STATE = np.array([1.0, START.servo_mass, START.pitot_mass, START.damping_alpha, START.damping_beta])
 
 
 def trial(kind: TrialKind, count: int, **given: Any) -> Trial:
     """Return a trial of many moments under no load but what is given."""
-    zero, empty = np.zeros(count), np.zeros((count, 0))
-    values: dict[str, Any] = {
-        "name": "trial", "kind": kind, "channels": (), "values": empty, "used": empty.astype(bool),
-        "time": INTERVAL * np.arange(count), "force": zero, "load_factor": zero, "load_place": "tip_load",
-        "temperature": zero, "start": 0.0, "run": "", "health": np.zeros((count, 2)),
-        "health_deviation": np.zeros((count, 2)), "release": None,
-    }  # fmt: skip
-    return Trial(**(values | given))
-
-
-def release(arrays: PatchArrays, patch: ModelPatch, tip: float, z1: float = 0.0) -> Release:
-    """Return the force near the tip that moves it so far."""
-    structure = PatchedWing(arrays).structure(1.0, (z1, 0.0), STATE[1], STATE[2], patch.of(*STRUCTURE))
-    shape = structure.static(arrays.load_tip)
-    return Release(tip * float(arrays.load_tip @ shape) / float(arrays.tip_row @ shape))
+    named, zeros = (
+        {"name": "trial", "run": ""},
+        dict.fromkeys(("force", "load_factor", "temperature"), np.zeros(count)),
+    )
+    none = {
+        "channels": (),
+        "values": np.zeros((count, 0)),
+        "used": np.zeros((count, 0), bool),
+        "release": None,
+    }
+    health = dict.fromkeys(("health", "health_deviation"), np.zeros((count, 2)))
+    told = {"kind": kind, "time": INTERVAL * np.arange(count), "load_place": "tip_load", "start": 0.0}
+    return Trial(**(named | zeros | none | health | told | given))
 
 
 def expected(
@@ -91,9 +88,9 @@ def expected(
 ) -> np.ndarray:
     """Return all outputs of the naming side; a rotated gauge is turned here."""
     bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SensorRotation)))
-    conditions = Conditions(STATE, health=np.array(health))
+    conditions = Conditions(STATE, health=np.array(health), components=len(bare) < len(patch))
     outputs = tuple((name, Quantity(quantity)) for name, quantity in CHANNELS)
-    found = model.respond(given, outputs, bare, replace(conditions, components=len(bare) < len(patch)))
+    found = model.respond(given, outputs, bare, conditions)
     values = found.values.copy()
     for item in patch.of(SensorRotation):
         c, s, gauge = np.cos(item.angle), np.sin(item.angle), OUTPUTS.index(item.channel)
@@ -102,19 +99,14 @@ def expected(
     return values
 
 
-def close(shown: Any, wanted: np.ndarray, tolerance: float = 1e-6) -> None:
+def close(shown: np.ndarray, wanted: np.ndarray, tolerance: float = 1e-6) -> None:
     """Compare with the largest strain and the largest displacement."""
-    for part in (slice(24), slice(24, None)):
-        apart = np.abs(np.asarray(shown)[:, part] - wanted[:, part]).max()
-        assert apart <= tolerance * np.abs(wanted[:, part]).max()
+    for part in (slice(24), slice(24, shown.shape[1])):
+        apart = np.abs(shown[:, part] - wanted[:, part]).max(initial=0.0)
+        assert apart <= tolerance * np.abs(wanted[:, part]).max(initial=0.0)
 
 
 # ---------------------------------------------------------------------- the FMU
-
-
-@pytest.fixture(scope="module")
-def patch() -> PatchFile:
-    return parse_patch(content())
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +158,8 @@ def test_the_table_only_grows_at_its_end(fmu, sensing) -> None:
     assert float(added["effect.coupling.active"].start) == 0.0
 
 
-def test_what_is_on_and_how_much_show_in_the_guid(model, patch, sensing, tmp_path) -> None:
+def test_what_is_on_and_how_much_show_in_the_guid(model, sensing, tmp_path) -> None:
+    patch = parse_patch(content())
     active = build_fmu(model, tmp_path / "on.fmu", patch=patch, activate=True)
     changed = parse_patch(content(SENSORS | {"gauge_gain": SENSORS["gauge_gain"][:1]}))
     other = build_fmu(model, tmp_path / "other.fmu", patch=changed)
@@ -191,7 +184,7 @@ def test_off_is_the_plain_wing_to_the_bit(fmu, sensing, rows, response) -> None:
 
 
 @pytest.mark.parametrize("response", [1.0, 2.0], ids=["quasi-static", "transient"])
-def test_effects_of_sensors_are_those_of_whole_records(fmu, sensing, patch, response) -> None:
+def test_effects_of_sensors_are_those_of_whole_records(fmu, sensing, response) -> None:
     """From the first step on, or from the release on."""
     moving = response == 2.0
     rows = [(0.0, 0.0, 0.0, 0.0)] * 80 if moving else [(n, 0.1, 0.0, 0.0) for n in (1.0, 2.0, -1.0, 3.0)]
@@ -201,7 +194,9 @@ def test_effects_of_sensors_are_those_of_whole_records(fmu, sensing, patch, resp
         flown(path, rows, **given, **switched)[first:, :26]
         for path, switched in ((fmu, {}), (sensing, on(*SENSORS)))
     )
-    whole = ModelPatch(tuple(item for effect in patch.for_gauges(24).effects for item in effect.patch))
+    whole = ModelPatch(
+        tuple(item for effect in parse_patch(content()).for_gauges(24).effects for item in effect.patch)
+    )
     time, kind = 0.05 * np.arange(first, len(rows) + 1), "ringdown" if moving else "flight"
     more = {"release": 0.03} if moving else {}
     record = SensorRecord(CHANNELS, kind, time, 2.0 * moving, np.zeros(len(time)), **more)
@@ -281,40 +276,40 @@ def test_values_and_patch_belong_together(data) -> None:
 # ---------------------------------------------------------------------- the wing
 
 
-@pytest.mark.parametrize("name", DYNAMIC)
-def test_ring_downs_are_those_of_the_naming_side(name, patched, naming_side, arrays) -> None:
-    steps, patch = 60, patch_of(name)
-    given = trial(TrialKind.RINGDOWN, steps + 1, release=release(arrays, patch, 0.03, 0.1))
-    shown = flown(patched, [(0.0, 0.1, 0.0, 0.0)] * steps, INTERVAL, response=2.0, release=0.03, **on(name))[
-        :, :26
-    ]
-    wanted, plain = (expected(naming_side, given, each, ((0.1, 0.0),)) for each in (patch, ModelPatch()))
-    close(shown, wanted)
-    assert np.abs(shown - plain).max() > 1e-3 * np.abs(plain).max()
-
-
 FORCES = np.array([2.0, 9.0, 15.0, 6.0, -3.0, -14.0, -5.0, 8.0])
+FACTORS = np.array([1.0, 2.0, 3.5, -0.5, 2.5])
+NAMED = [
+    *((TrialKind.RINGDOWN, name) for name in DYNAMIC),
+    *((TrialKind.STATIC, name) for name in STATIC),
+    *((TrialKind.FLIGHT, name) for name in ("washout", "relief", "play", "local_loss", "both")),
+]
 
 
-@pytest.mark.parametrize("name", STATIC)
-def test_static_states_are_those_of_the_naming_side(name, patched, naming_side) -> None:
-    warm = 5.0 * np.arange(len(FORCES)) / len(FORCES)
-    given = trial(TrialKind.STATIC, len(FORCES), force=FORCES, temperature=warm)
-    with FmiAsset(patched, watching(load=WARM), isolated=False, parameters=on(name)) as asset:
-        asset.reset(control={"load_factor": 0.0})
-        shown = asset.simulate(load={"tip_force": FORCES, "temperature": warm}).values
-    close(shown, expected(naming_side, given, patch_of(name)))
-
-
-@pytest.mark.parametrize("name", ["washout", "relief", "play", "local_loss", "both"])
-def test_flights_are_those_of_the_naming_side(name, patched, naming_side) -> None:
-    factors = np.array([1.0, 2.0, 3.5, -0.5, 2.5])
-    damage = np.column_stack((0.15 * np.arange(5), 0.1 * np.ones(5)))
-    given = trial(TrialKind.FLIGHT, 5, load_factor=factors, time=np.arange(5.0))
-    rows = [(n, z1, z2, 0.0) for n, (z1, z2) in zip(factors, damage, strict=True)]
-    shown = flown(patched, rows, INTERVAL, **on(name))[1:, :24]
-    wanted = expected(naming_side, given, patch_of(name), damage)[:, :24]
-    assert np.abs(shown - wanted).max() <= 1e-6 * np.abs(wanted).max()
+@pytest.mark.parametrize(("kind", "name"), NAMED)
+def test_records_are_those_of_the_naming_side(kind, name, patched, naming_side, arrays) -> None:
+    patch, chosen, damage, columns = patch_of(name), on(name), np.zeros((1, 2)), slice(26)
+    if kind == TrialKind.RINGDOWN:
+        damage, chosen = np.array([[0.1, 0.0]]), chosen | {"response": 2.0, "release": 0.03}
+        structure = PatchedWing(arrays).structure(1.0, damage[0], STATE[1], STATE[2], patch.of(*STRUCTURE))
+        shape = structure.static(arrays.load_tip)
+        force = 0.03 * float(arrays.load_tip @ shape) / float(arrays.tip_row @ shape)
+        given, course = trial(kind, 61, release=Release(force)), {"steps": 60}
+    elif kind == TrialKind.STATIC:
+        warm = 5.0 * np.arange(len(FORCES)) / len(FORCES)
+        given = trial(kind, len(FORCES), force=FORCES, temperature=warm)
+        course = {"load": {"tip_force": FORCES, "temperature": warm}}
+    else:
+        damage = np.column_stack((0.15 * np.arange(5), 0.1 * np.ones(5)))
+        given, columns = trial(kind, 5, load_factor=FACTORS, time=np.arange(5.0)), slice(24)
+        health = dict(zip(("z1", "z2"), damage.T, strict=True))
+        course = {"control": {"load_factor": FACTORS}, "health": health}
+    with FmiAsset(patched, watching(load=WARM), isolated=False, parameters=chosen) as asset:
+        asset.reset(control={"load_factor": 0.0}, health={"z1": damage[0, 0], "z2": damage[0, 1]})
+        begin = [asset.observe().values] * (kind == TrialKind.RINGDOWN)
+        shown = np.array([*begin, *asset.simulate(**course).values])[:, columns]
+    wanted, plain = (expected(naming_side, given, each, damage)[:, columns] for each in (patch, ModelPatch()))
+    close(shown, wanted)
+    assert np.abs(shown - plain).max() > 1e-3 * np.abs(plain).max() or kind != TrialKind.RINGDOWN
 
 
 @pytest.mark.parametrize("response", [1.0, 2.0])
@@ -333,14 +328,8 @@ def test_effects_that_are_off_or_have_no_magnitude_change_nothing(model, patched
 
 def test_the_wing_stays_where_it_is_when_effects_come_and_go(patched) -> None:
     given = {"response": 2.0, "release": 0.03}
-    switches = [
-        {},
-        {"play": 1.0},
-        {"play": 1.0, "root": 1.0},
-        {"half_width": 0.002},
-        {"play": 0.0},
-        {"root": 0.0},
-    ]
+    both = {"play": 1.0, "root": 1.0}
+    switches = [{}, {"play": 1.0}, both, {"half_width": 0.002}, {"play": 0.0}, {"root": 0.0}]
     with FmiAsset(patched, playing(1e-5), isolated=False, parameters=given) as asset:
         asset.reset(control={"load_factor": 1.0})
         seen = [asset.observe().values[-2]]
@@ -373,25 +362,19 @@ def test_whole_numbers_are_whole_and_what_has_no_bounds_is_refused(patched) -> N
     with pytest.raises(FmuCallError, match="takes more stiffness than the structure has"):
         FmiAsset(patched, watching(), parameters=soft).reset()
     wild = on("drifting") | moving | {"effect.drifting.rate": -1e6}
-    with (
-        FmiAsset(patched, watching(), parameters=wild) as asset,
-        pytest.raises(FmuCallError, match="is not finite"),
-    ):
+    asset = FmiAsset(patched, watching(), parameters=wild)
+    with asset, pytest.raises(FmuCallError, match="is not finite"):
         asset.simulate({"load_factor": 0.0}, steps=2000)
 
 
 def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(model, arrays, fmu, tmp_path) -> None:
     seen = {"g3": "strain[3]", "tip": "tip_displacement", "rate": "tip_displacement"}
-    quantities = Quantity.STRAIN, Quantity.DISPLACEMENT, Quantity.VELOCITY
-    channels = {
-        name: Channel(name, quantity, output, None)
-        for (name, output), quantity in zip(seen.items(), quantities, strict=True)
-    }
+    quantities = {"g3": Quantity.STRAIN, "tip": Quantity.DISPLACEMENT, "rate": Quantity.VELOCITY}
+    channels = {name: Channel(name, quantities[name], output, None) for name, output in seen.items()}
     outputs = fmu_outputs(Campaign("chain", channels, (), None, {}, "").channels)
     assert outputs == {"g3": "strain[3]", "tip": "tip_displacement"}
-    named = NamedEffect(
-        "gauge_gain", "Gauge gain", "g3", "gain", (), (), ModelPatch((SensorGain("g3", 0.25),))
-    )
+    gain = ModelPatch((SensorGain("g3", 0.25),))
+    named = NamedEffect("gauge_gain", "Gauge gain", "g3", "gain", (), (), gain)
     origin = Origin("chain", "wing", "ab" * 32, "cd" * 32, "uav-twin", collect_provenance(1))
     stored = StoredPatch(VerdictKind.NAMED, "", patch_effects((named,)), outputs, (), origin)
     path = write_patch(tmp_path / "patch.json", stored)
@@ -418,11 +401,7 @@ REFUSED: dict[str, tuple[bytes, str]] = {
     "nothing to do": (content({"gain": []}), "no primitives"),
     "a wrong primitive": (TEXT.replace(b"thermal_strain", b"magic"), "kind 'magic'"),
     "no JSON": (b"{", "is not valid JSON"),
-    "a long number": (TEXT.replace(b'"schema"', b'"n": ' + b"1" * 5000 + b', "schema"'), "5000 digits"),
-    "a number that is none": (content(ONE).replace(b"0.1", b"NaN"), "NaN"),
-    "a nest": (b"[" * 5000 + b"]" * 5000, "nested deeper than 32"),
     "a list for a kind": (TEXT.replace(b'"kind": "thermal_strain"', b'"kind": []'), "the kind []"),
-    "two bytes a letter": (TEXT.decode().encode("utf-16"), "not text in UTF-8"),
 }
 
 

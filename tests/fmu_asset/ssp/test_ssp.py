@@ -34,6 +34,7 @@ from fmu_asset.ssp.check import check_ssp, join_ssp, left_out_sentence
 from fmu_asset.ssp.reader import read_ssp
 from fmu_asset.ssp.writer import write_ssp
 from tests.fmu_asset.making import archive_of, bound, system
+from tests.fmu_asset.ours import OurFmus
 
 HERE = Path(__file__).parent
 NAMES = ("damage", "wing", "gauges")
@@ -45,8 +46,8 @@ BINDING = bound(
 
 
 @pytest.fixture(scope="module")
-def fmus(companions: dict[str, Path], fmu: Path) -> dict[str, Path]:
-    return {"damage": companions["damage_growth"], "wing": fmu, "gauges": companions["strain_gauges"]}
+def fmus(ours: OurFmus) -> dict[str, Path]:
+    return {"damage": ours("damage_growth"), "wing": ours("python"), "gauges": ours("strain_gauges")}
 
 
 @pytest.fixture(scope="module")
@@ -322,19 +323,19 @@ def test_fmus_of_other_versions_are_joined(foreign_fmu, tmp_path) -> None:
         Wiring(replace(wiring.structure, connections=(array,)))
 
 
-@pytest.mark.parametrize(
-    ("model", "name", "words"),
-    [
-        ("array3", "u", "it is an array; only single numbers"),
-        ("array3", "ticked", "it changes with a clock; only single numbers"),
-        ("array3", "blob", "it is of the type Binary; only single numbers"),
-        ("ball2", r"der(h)", "it is declared as local"),
-    ],
-)
-def test_what_is_no_single_number_or_no_start_is_not_set(foreign_fmu, model, name, words) -> None:
-    wrong = Component("a", foreign_fmu(model), {name: Setting(1.0)})
-    with pytest.raises(CouplingError, match=re.escape(f"a.{name} cannot be set: {words}")):
-        Wiring(SystemStructure("one", (wrong,)))
+NOT_SET = {
+    ("array3", "u"): "it is an array; only single numbers",
+    ("array3", "ticked"): "it changes with a clock; only single numbers",
+    ("array3", "blob"): "it is of the type Binary; only single numbers",
+    ("ball2", "der(h)"): "it is declared as local",
+}
+
+
+def test_what_is_no_single_number_or_no_start_is_not_set(foreign_fmu) -> None:
+    for (model, name), words in NOT_SET.items():
+        wrong = Component("a", foreign_fmu(model), {name: Setting(1.0)})
+        with pytest.raises(CouplingError, match=re.escape(f"a.{name} cannot be set: {words}")):
+            Wiring(SystemStructure("one", (wrong,)))
 
 
 def test_start_values_of_outputs_are_set(foreign_fmu) -> None:
@@ -358,33 +359,21 @@ def test_what_is_wrong_is_said_in_one_sentence(theirs, case) -> None:
 
 
 def test_archives_that_are_unsafe_or_damaged(theirs, tmp_path) -> None:
+    """Checked as those of FMUs are."""
     (sentence,) = check_ssp(theirs(**{"resources/wing.fmu": "no FMU"})).problems
     assert "resources/wing.fmu is not a sound FMU archive" in sentence
     with pytest.raises(SspError, match="There is no SSP file"):
         check_ssp(tmp_path / "none.ssp")
-    for options, words in (
-        ({"../outside.txt": "x"}, "extracted outside its folder"),
-        ({"/etc/passwd": "x"}, "extracted outside its folder"),
-        ({"without": "SystemStructure.ssd"}, "so it is no SSP file"),
+    good, damaged = theirs().read_bytes(), tmp_path / "damaged.ssp"
+    # Half of the file ends with one of its FMUs, which is an archive as well.
+    damaged.write_bytes(good[: len(good) // 2])
+    for path, words in (
+        (lambda: theirs(**{"../outside.txt": "x"}), "extracted outside its folder"),
+        (lambda: theirs(without="SystemStructure.ssd"), "so it is no SSP file"),
+        (lambda: damaged, "not a sound SSP archive|so it is no SSP file"),
     ):
         with pytest.raises(SspError, match=words):
-            read_ssp(theirs(**options), tmp_path / "fmus")
-    good, kept = theirs().read_bytes(), tmp_path / "kept.ssp"
-    place = len(good) // 2
-    with zipfile.ZipFile(kept, "w", zipfile.ZIP_LZMA) as archive:
-        archive.writestr("SystemStructure.ssd", FILES["SystemStructure.ssd"] * 50)
-    compressed = bytearray(kept.read_bytes())
-    compressed[200:260] = bytes(60)
-    for content, words in (
-        (b"no archive", "not a sound SSP archive|so it is no SSP file"),
-        # Half of the file ends with one of its FMUs, which is an archive as well.
-        (good[:place], "not a sound SSP archive|so it is no SSP file"),
-        (good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :], "damaged|not a sound"),
-        (compressed, "not a sound SSP archive"),
-    ):
-        kept.write_bytes(content)
-        with pytest.raises(SspError, match=words):
-            read_ssp(kept, tmp_path / "fmus")
+            read_ssp(path(), tmp_path / "fmus")
     assert not (tmp_path / "fmus").exists()
     assert not (tmp_path.parent / "outside.txt").exists()
 
