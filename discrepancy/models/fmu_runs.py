@@ -157,7 +157,7 @@ class FmuRuns:
         given, base = self.description, self._base
         header: dict[str, Any] = {} if base is None else base.binding.model_dump(exclude={"decimation"})
         header |= {"name": given.name, "step_size": given.motion.step or given.static.step}
-        content = {"binding": header, "load": self._inputs(), "parameter": self._parameters()}
+        content: dict[str, Any] = {"binding": header, "load": self._inputs(), "parameter": self._parameters()}
         if base is not None:
             content["limits"] = base.limits
         return Binding.model_validate(content | {"observation": self._observed()})
