@@ -205,7 +205,7 @@ class Model(ABC):
     def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial under a patch that holds what is added, see `respond`.
 
-        All of it was checked: the model has the outputs and carries the patch.
+        The model has the outputs and carries the patch.
         """
 
     def ports(self) -> tuple[str, ...]:
@@ -239,8 +239,6 @@ class Model(ABC):
     def unit_of_state(self, port: str) -> str:
         """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""
         return ""
-
-    # ------------------------------------------------------------ what is asked of it
 
     def check(self, trial: Trial) -> None:
         """Refuse a trial that it cannot follow."""

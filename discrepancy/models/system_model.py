@@ -326,8 +326,7 @@ class SystemModel(Model):
         shape, still = np.zeros(0), [0.0] * len(names)
         if held:
             places = (self.reference, *(trial.load_place for trial in trials), *(self.load_places or ()))
-            row = self.force_row(next(place for place in places if place), state)
-            shape = system.shapes[:, 0]
+            row, shape = self.force_row(next(filter(None, places)), state), system.shapes[:, 0]
             shape = shape if system.basis is None else system.basis @ shape
             still = [1.0 / float(own @ rest(own[None])[0]) for own in rows]
             frequency, participation = float(system.angular_frequency[0]), float(row @ shape) ** 2
