@@ -325,8 +325,8 @@ class SystemModel(Model):
         (peak, speed, weight), sizes = largest, campaign_sizes(campaign)
         shape, still = np.zeros(0), [0.0] * len(names)
         if held:
-            places = (self.reference, *(trial.load_place for trial in trials), *(self.load_places or ()))
-            row, shape = self.force_row(next(filter(None, places)), state), system.shapes[:, 0]
+            known = [*(trial.load_place for trial in trials), *(self.load_places or ())]
+            row, shape = self.force_row(self.reference or known[0], state), system.shapes[:, 0]
             shape = shape if system.basis is None else system.basis @ shape
             still = [1.0 / float(own @ rest(own[None])[0]) for own in rows]
             frequency, participation = float(system.angular_frequency[0]), float(row @ shape) ** 2
