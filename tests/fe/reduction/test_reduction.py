@@ -31,7 +31,7 @@ from tests.fe.springs import SETTINGS, reduced_springs, springs
 
 SYSTEM = springs()
 STIFFNESS = tuple(term.matrix for term in SYSTEM.stiffness_terms)
-TERMS = ReductionTerms(replace(SYSTEM, ranges=SETTINGS.named_ranges(SYSTEM.regions)))
+TERMS = ReductionTerms(SYSTEM)
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +160,7 @@ def test_anchors_part_the_losses_in_equal_ratios() -> None:
 @pytest.mark.parametrize("make", [plate, bracket, tube])
 def test_six_regions_by_default(tmp_path: Path, make: Any) -> None:
     structure = load_and_assemble(make(tmp_path, 6))
-    errors = measured_errors(structure, reduce_structure(structure, structure.design.name).model, 60)
+    errors = measured_errors(structure, reduce_structure(structure).model, 60)
     assert max(errors.strain, errors.displacement) <= errors.bound < 1e-3
 
 
