@@ -110,33 +110,48 @@ void structure_sum_terms(double *restrict result, size_t size, const double *res
     structure_add_columns(result, size * size, terms, size * size, count, theta);
 }
 
-STRUCTURE_WIDE
-static bool cholesky(double *matrix, size_t size) {
-    for (size_t k = 0; k < size; ++k) {
-        double *row = matrix + k * size;
-        /* Column k of the factor, negative, moves to the lower triangle, where it lies in one piece. */
-        for (size_t i = 0; i < k; ++i) {
-            row[i] = -matrix[i * size + k];
-        }
-        inline_add_columns(row + k, size - k, matrix + k, size, k, row);
-        if (!(row[k] > 0.0)) { /* also NaN */
-            return false;
-        }
-        const double scale = sqrt(row[k]) * (1.0 / row[k]); /* neither waits for the other */
-        row[k] = scale;
-        for (size_t j = k + 1; j < size; ++j) {
-            row[j] *= scale;
-        }
-    }
-    return true;
+/* Compiled for the registers that every processor has, and for wider ones where they are. */
+#define TARGET
+#define IN_LANES(name) name##_narrow
+#if defined(__GNUC__)
+#define WIDTH 2
+#else
+#define WIDTH 1
+#endif
+#include "structure_factor.h"
+#define factorise factorise_narrow
+#if defined(__GNUC__) && defined(__x86_64__) && !defined(_WIN32)
+#undef TARGET
+#undef IN_LANES
+#undef WIDTH
+#undef factorise
+#define TARGET __attribute__((target("avx2")))
+#define IN_LANES(name) name##_wide
+#define WIDTH 4
+#include "structure_factor.h"
+#define factorise (__builtin_cpu_supports("avx2") ? factorise_wide : factorise_narrow)
+#endif
+
+size_t structure_padded(size_t size) { return (size + 3) / 4 * 4; }
+
+bool structure_cholesky(double *factor, size_t size, size_t stride, const double *base, const double *terms,
+                        size_t count, const double *theta) {
+    return factorise(factor, size, stride, base, terms, count, theta);
 }
 
-bool structure_cholesky(double *matrix, size_t size) { return cholesky(matrix, size); }
+void structure_pad(double *padded, const double *matrix, size_t size) {
+    const size_t stride = structure_padded(size);
+    for (size_t i = 0; i < stride; ++i) {
+        for (size_t j = 0; j < stride; ++j) {
+            padded[i * stride + j] = i < size && j < size ? matrix[i * size + j] : i == j ? 1.0 : 0.0;
+        }
+    }
+}
 
 STRUCTURE_WIDE
-static void solve_lower(const double *restrict factor, size_t size, double *restrict right) {
+static void solve_lower(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
     for (size_t k = 0; k < size; ++k) {
-        const double *row = factor + k * size, found = right[k] * row[k];
+        const double *row = factor + k * stride, found = right[k] * row[k];
         right[k] = found;
         for (size_t i = k + 1; i < size; ++i) {
             right[i] -= found * row[i];
@@ -144,14 +159,14 @@ static void solve_lower(const double *restrict factor, size_t size, double *rest
     }
 }
 
-void structure_solve_lower(const double *restrict factor, size_t size, double *restrict right) {
-    solve_lower(factor, size, right);
+void structure_solve_lower(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
+    solve_lower(factor, size, stride, right);
 }
 
 STRUCTURE_WIDE
-static void solve_upper(const double *restrict factor, size_t size, double *restrict right) {
+static void solve_upper(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
     for (size_t k = size; k-- > 0;) {
-        const double *row = factor + k * size, found = right[k] * row[k];
+        const double *row = factor + k * stride, found = right[k] * row[k];
         right[k] = found;
         for (size_t i = 0; i < k; ++i) { /* column k, negative */
             right[i] += found * row[i];
@@ -159,14 +174,14 @@ static void solve_upper(const double *restrict factor, size_t size, double *rest
     }
 }
 
-void structure_solve_upper(const double *restrict factor, size_t size, double *restrict right) {
-    solve_upper(factor, size, right);
+void structure_solve_upper(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
+    solve_upper(factor, size, stride, right);
 }
 
 STRUCTURE_WIDE
-static void solve_lower_columns(const double *restrict factor, size_t size, double *restrict right) {
+static void solve_lower_columns(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
     for (size_t k = 0; k < size; ++k) {
-        const double *row = factor + k * size;
+        const double *row = factor + k * stride;
         const double scale = row[k];
         double *solved = right + k * size;
         for (size_t j = 0; j < size; ++j) {
@@ -181,8 +196,8 @@ static void solve_lower_columns(const double *restrict factor, size_t size, doub
     }
 }
 
-void structure_solve_lower_columns(const double *restrict factor, size_t size, double *restrict right) {
-    solve_lower_columns(factor, size, right);
+void structure_solve_lower_columns(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
+    solve_lower_columns(factor, size, stride, right);
 }
 
 /* Bring a symmetric matrix to tridiagonal form by Householder reflections H = I - factor v v' (Golub & Van Loan,
