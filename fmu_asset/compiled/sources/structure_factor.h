@@ -87,6 +87,79 @@ TARGET static bool IN_LANES(factorise)(double *factor, size_t size, size_t strid
     return true;
 }
 
+TARGET static void IN_LANES(solve_upper)(const double *factor, size_t size, size_t stride, double *right) {
+    size_t k = size;
+    while (k % 4 > 0) {
+        const double *row = factor + --k * stride, found = right[k] * row[k];
+        right[k] = found;
+        for (size_t i = 0; i < k; ++i) { /* column k, negative */
+            right[i] += found * row[i];
+        }
+    }
+    while (k > 0) {
+        k -= 4;
+        const double *p = factor + k * stride, *q = p + stride, *r = q + stride, *s = r + stride;
+        double *x = right + k;
+        const double d = x[3] * s[k + 3], c = (x[2] + d * s[k + 2]) * r[k + 2];
+        const double b = ((x[1] + d * s[k + 1]) + c * r[k + 1]) * q[k + 1];
+        const double a = (((x[0] + d * s[k]) + c * r[k]) + b * q[k]) * p[k];
+        x[0] = a, x[1] = b, x[2] = c, x[3] = d;
+        for (size_t i = 0; i < k; i += WIDTH) {
+            AT(right + i) += (a * OF(p + i) + b * OF(q + i)) + (c * OF(r + i) + d * OF(s + i));
+        }
+    }
+}
+
+/* sum += columns times coefficients, in the registers of one or several vectors: four columns at a time */
+#define SUM(place, c) ((fa * OF(a + place) + fb * OF(b + place)) + (fc * OF(c + place) + fd * OF(d + place)))
+
+TARGET static void IN_LANES(add_columns)(double *sum, size_t size, const double *columns, size_t stride, size_t count,
+                                         const double *factors) {
+    size_t i = 0;
+    for (; i + 4 * WIDTH <= size; i += 4 * WIDTH) {
+        VECTOR p = OF(sum + i), q = OF(sum + i + WIDTH), r = OF(sum + i + 2 * WIDTH), s = OF(sum + i + 3 * WIDTH);
+        const double *a = columns + i;
+        size_t k = 0;
+        for (; k + 4 <= count; k += 4, a += 4 * stride) {
+            const double *b = a + stride, *c = b + stride, *d = c + stride;
+            const double fa = factors[k], fb = factors[k + 1], fc = factors[k + 2], fd = factors[k + 3];
+            p += SUM(0, c), q += SUM(WIDTH, c), r += SUM(2 * WIDTH, c), s += SUM(3 * WIDTH, c);
+        }
+        for (; k < count; ++k, a += stride) {
+            p += factors[k] * OF(a), q += factors[k] * OF(a + WIDTH);
+            r += factors[k] * OF(a + 2 * WIDTH), s += factors[k] * OF(a + 3 * WIDTH);
+        }
+        AT(sum + i) = p, AT(sum + i + WIDTH) = q, AT(sum + i + 2 * WIDTH) = r, AT(sum + i + 3 * WIDTH) = s;
+    }
+    for (; i + WIDTH <= size; i += WIDTH) {
+        VECTOR p = OF(sum + i);
+        const double *a = columns + i;
+        size_t k = 0;
+        for (; k + 4 <= count; k += 4, a += 4 * stride) {
+            const double *b = a + stride, *c = b + stride, *d = c + stride;
+            const double fa = factors[k], fb = factors[k + 1], fc = factors[k + 2], fd = factors[k + 3];
+            p += SUM(0, c);
+        }
+        for (; k < count; ++k, a += stride) {
+            p += factors[k] * OF(a);
+        }
+        AT(sum + i) = p;
+    }
+    for (; i < size; ++i) {
+        double p = sum[i];
+        const double *a = columns + i;
+        size_t k = 0;
+        for (; k + 4 <= count; k += 4, a += 4 * stride) {
+            p += (factors[k] * a[0] + factors[k + 1] * a[stride]) +
+                 (factors[k + 2] * a[2 * stride] + factors[k + 3] * a[3 * stride]);
+        }
+        for (; k < count; ++k, a += stride) {
+            p += factors[k] * *a;
+        }
+        sum[i] = p;
+    }
+}
+
 #undef AT
 #undef OF
 #undef VECTOR

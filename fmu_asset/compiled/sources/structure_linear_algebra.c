@@ -36,44 +36,6 @@ void structure_add(double *restrict sum, size_t size, double factor, const doubl
     }
 }
 
-static inline void inline_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
-                        size_t count, const double *restrict coefficients) {
-    size_t c = 0;
-    for (; c + 4 <= count; c += 4) { /* four at a time, so that the sum is loaded and stored less often */
-        const double *a = columns + c * stride, *b = a + stride, *d = b + stride, *e = d + stride;
-        const double fa = coefficients[c], fb = coefficients[c + 1], fd = coefficients[c + 2],
-                     fe = coefficients[c + 3];
-        for (size_t i = 0; i < size; ++i) {
-            sum[i] += (fa * a[i] + fb * b[i]) + (fd * d[i] + fe * e[i]);
-        }
-    }
-    if (c + 2 <= count) {
-        const double *a = columns + c * stride, *b = a + stride;
-        const double fa = coefficients[c], fb = coefficients[c + 1];
-        for (size_t i = 0; i < size; ++i) {
-            sum[i] += fa * a[i] + fb * b[i];
-        }
-        c += 2;
-    }
-    if (c < count) {
-        const double *a = columns + c * stride, fa = coefficients[c];
-        for (size_t i = 0; i < size; ++i) {
-            sum[i] += fa * a[i];
-        }
-    }
-}
-
-STRUCTURE_WIDE
-static void add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
-                        size_t count, const double *restrict coefficients) {
-    inline_add_columns(sum, size, columns, stride, count, coefficients);
-}
-
-void structure_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
-                      size_t count, const double *restrict coefficients) {
-    add_columns(sum, size, columns, stride, count, coefficients); /* the clones themselves would be exported */
-}
-
 static inline double inline_dot(const double *first, const double *second, size_t size) {
     /* Four sums that do not wait for each other. */
     double a = 0.0, b = 0.0, c = 0.0, d = 0.0;
@@ -119,24 +81,29 @@ void structure_sum_terms(double *restrict result, size_t size, const double *res
 #define WIDTH 1
 #endif
 #include "structure_factor.h"
-#define factorise factorise_narrow
+#define CHOOSE(name) name##_narrow
 #if defined(__GNUC__) && defined(__x86_64__) && !defined(_WIN32)
 #undef TARGET
 #undef IN_LANES
 #undef WIDTH
-#undef factorise
+#undef CHOOSE
 #define TARGET __attribute__((target("avx2")))
 #define IN_LANES(name) name##_wide
 #define WIDTH 4
 #include "structure_factor.h"
-#define factorise (__builtin_cpu_supports("avx2") ? factorise_wide : factorise_narrow)
+#define CHOOSE(name) (__builtin_cpu_supports("avx2") ? name##_wide : name##_narrow)
 #endif
+
+void structure_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
+                           size_t count, const double *restrict coefficients) {
+    CHOOSE(add_columns)(sum, size, columns, stride, count, coefficients);
+}
 
 size_t structure_padded(size_t size) { return (size + 3) / 4 * 4; }
 
 bool structure_cholesky(double *factor, size_t size, size_t stride, const double *base, const double *terms,
                         size_t count, const double *theta) {
-    return factorise(factor, size, stride, base, terms, count, theta);
+    return CHOOSE(factorise)(factor, size, stride, base, terms, count, theta);
 }
 
 void structure_pad(double *padded, const double *matrix, size_t size) {
@@ -163,19 +130,8 @@ void structure_solve_lower(const double *restrict factor, size_t size, size_t st
     solve_lower(factor, size, stride, right);
 }
 
-STRUCTURE_WIDE
-static void solve_upper(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
-    for (size_t k = size; k-- > 0;) {
-        const double *row = factor + k * stride, found = right[k] * row[k];
-        right[k] = found;
-        for (size_t i = 0; i < k; ++i) { /* column k, negative */
-            right[i] += found * row[i];
-        }
-    }
-}
-
 void structure_solve_upper(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
-    solve_upper(factor, size, stride, right);
+    CHOOSE(solve_upper)(factor, size, stride, right);
 }
 
 STRUCTURE_WIDE

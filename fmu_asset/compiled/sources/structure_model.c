@@ -176,26 +176,27 @@ static size_t end_of(const double *values, size_t count) {
 
 static size_t larger(size_t first, size_t second) { return first > second ? first : second; }
 
-/* Find how far each block of columns of the residuals goes, which were made triangular. */
-static bool find_ends(structure_model *model, structure_problem *problem) {
-    const size_t n = model->static_size, r = model->residual_size;
-    const size_t blocks = (n + STRUCTURE_BLOCK - 1) / STRUCTURE_BLOCK;
-    model->residual_ends = calloc((1 + model->terms - model->lasting) * blocks, sizeof *model->residual_ends);
-    if (model->residual_ends == NULL) {
+/* Find with which column each tile of the residuals begins, which were made triangular. */
+static bool find_begins(structure_model *model, structure_problem *problem) {
+    const size_t n = model->static_size, r = model->residual_size, tiles = (r + STRUCTURE_TILE - 1) / STRUCTURE_TILE;
+    model->residual_begins = calloc((model->terms - model->lasting) * tiles, sizeof *model->residual_begins);
+    if (model->residual_begins == NULL) {
         return structure_fail(problem, "there is no memory for the model");
     }
     model->health_residual = 0;
     for (size_t k = 0; k < model->loads; ++k) {
         model->health_residual = larger(model->health_residual, end_of(model->load_residual + k * r, r));
     }
-    for (size_t i = 1; i < model->terms; ++i) {
-        const size_t part = i < model->lasting ? 0 : 1 + i - model->lasting; /* those that last are joined */
-        for (size_t column = 0; column < n; ++column) {
-            size_t *end = model->residual_ends + part * blocks + column / STRUCTURE_BLOCK;
-            *end = larger(*end, end_of(model->stiffness_residual + ((i - 1) * n + column) * r, r));
-            if (part > 0) {
-                model->health_residual = larger(model->health_residual, *end);
+    for (size_t i = model->lasting; i < model->terms; ++i) {
+        const double *columns = model->stiffness_residual + (i - 1) * n * r;
+        size_t *begin = model->residual_begins + (i - model->lasting) * tiles;
+        for (size_t tile = 0; tile < tiles; ++tile) {
+            while (begin[tile] < n && end_of(columns + begin[tile] * r, r) <= tile * STRUCTURE_TILE) {
+                ++begin[tile];
             }
+        }
+        for (size_t column = 0; column < n; ++column) {
+            model->health_residual = larger(model->health_residual, end_of(columns + column * r, r));
         }
     }
     return true;
@@ -290,11 +291,11 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
 
     structure_arena count = {NULL, 0};
     lay_out(model, anchors, &count);
-    model->memory = calloc(count.used, sizeof *model->memory);
+    model->memory = calloc(count.used + STRUCTURE_SPARE, sizeof *model->memory);
     if (model->memory == NULL) {
         return structure_fail(problem, "there is no memory for the model");
     }
-    structure_arena arena = {model->memory, 0};
+    structure_arena arena = structure_arena_of(model->memory);
     lay_out(model, anchors, &arena);
     transpose(model->output_columns, static_output, outputs, n, n, 1.0);
     transpose(model->load_residual, load_residual + n * loads, r, loads, loads, 1.0);
@@ -333,7 +334,7 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
             }
         }
     }
-    return find_ends(model, problem);
+    return find_begins(model, problem);
 }
 
 static double value_at(const double *chosen, size_t place) { return place == 0 ? 1.0 : chosen[place - 1]; }
@@ -389,7 +390,7 @@ void structure_model_free(structure_model *model) {
     structure_data_free(&model->data);
     free(model->memory);
     free(model->places);
-    free(model->residual_ends);
+    free(model->residual_begins);
     free(model->factors);
     memset(model, 0, sizeof *model);
 }

@@ -14,7 +14,7 @@
 #endif
 
 #define STRUCTURE_MOST_REGIONS 8
-#define STRUCTURE_BLOCK 4 /* columns of residuals that are added at once */
+#define STRUCTURE_TILE 16 /* directions of residuals that are found at once */
 
 /* Two positions in the vector of what can be chosen, counted from one; zero for none. */
 typedef struct {
@@ -65,7 +65,7 @@ typedef struct {
     double *output_columns;     /* (N, O) */
     double *load_residual;      /* (L, R) */
     double *stiffness_residual; /* (T - 1, N, R) in the order of `order`, without the first of it */
-    size_t *residual_ends;      /* (1 + damaged terms, blocks of columns) behind which only zeros follow */
+    size_t *residual_begins;    /* (damaged terms, tiles of R) columns before which a tile has only zeros */
     double *correction_columns; /* (A, R, O) or, as they are in the file, (M, O, R) */
     double *dual_factor;        /* (A, dual columns, dual rows, O) */
     structure_data data;        /* owns the arrays */

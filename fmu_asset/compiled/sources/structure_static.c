@@ -7,6 +7,8 @@
 
 static size_t larger(size_t first, size_t second) { return first > second ? first : second; }
 
+static size_t smaller_size(size_t first, size_t second) { return first < second ? first : second; }
+
 static double smaller(double first, double second) { return first < second ? first : second; }
 
 void structure_static_lay_out(structure_static *steady, const structure_model *model, structure_arena *arena) {
@@ -212,36 +214,33 @@ static void combine_duals(structure_static *steady) {
     }
 }
 
-/* residual += columns (N, R) times coefficients (N), up to the end of each block of them */
-static void add_blocks(double *residual, const structure_model *model, const double *columns, const size_t *ends,
-                       const double *coefficients) {
-    const size_t n = model->static_size, r = model->residual_size;
-    for (size_t c = 0; c < n; c += STRUCTURE_BLOCK) {
-        const size_t count = n - c < STRUCTURE_BLOCK ? n - c : STRUCTURE_BLOCK;
-        structure_add_columns(residual, ends[c / STRUCTURE_BLOCK], columns + c * r, r, count, coefficients + c);
-    }
-}
-
 /* Make a residual of that of the loads, which it holds, and find its product with the approximate dual solutions. */
 static void take_residual(structure_static *steady, const double *coordinates, double *residual, double *correction) {
     const structure_model *model = steady->model;
     const size_t n = model->static_size, r = model->residual_size, outputs = model->output_count;
-    const size_t lasting = model->lasting, damaged = model->terms - lasting;
-    const size_t blocks = (n + STRUCTURE_BLOCK - 1) / STRUCTURE_BLOCK;
-    if (steady->residual_size > model->health_residual) {
-        add_blocks(residual, model, steady->lasting_residual, model->residual_ends, coordinates);
-    }
+    const size_t lasting = model->lasting, damaged = model->terms - lasting, rows = steady->residual_size;
+    const size_t tiles = (r + STRUCTURE_TILE - 1) / STRUCTURE_TILE;
     for (size_t k = 0; k < damaged; ++k) {
         for (size_t i = 0; i < n; ++i) {
-            steady->work[i] = steady->theta_change[lasting - 1 + k] * coordinates[i];
+            steady->work[k * n + i] = steady->theta_change[lasting - 1 + k] * coordinates[i];
         }
-        add_blocks(residual, model, model->stiffness_residual + (lasting - 1 + k) * n * r,
-                   model->residual_ends + (1 + k) * blocks, steady->work);
+    }
+    for (size_t i = 0, tile = 0; i < rows; i += STRUCTURE_TILE, ++tile) {
+        const size_t size = smaller_size(rows - i, STRUCTURE_TILE);
+        for (size_t k = 0; k < damaged; ++k) {
+            const size_t begin = model->residual_begins[k * tiles + tile];
+            structure_add_columns(residual + i, size,
+                                  model->stiffness_residual + ((lasting - 1 + k) * n + begin) * r + i, r, n - begin,
+                                  steady->work + k * n + begin);
+        }
+        if (rows > model->health_residual) {
+            structure_add_columns(residual + i, size, steady->lasting_residual + i, r, n, coordinates);
+        }
     }
     memset(correction, 0, outputs * sizeof *correction);
     const double *columns =
         model->functions ? steady->dual_correction : model->correction_columns + anchor_of(steady) * r * outputs;
-    structure_add_columns(correction, outputs, columns, outputs, steady->residual_size, residual);
+    structure_add_columns(correction, outputs, columns, outputs, rows, residual);
 }
 
 /* The same of one unit response, which is kept. */
