@@ -1,7 +1,5 @@
 """A small wing of springs and masses with the interface of the real one, exact in both of its forms."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import numpy as np
