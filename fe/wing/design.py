@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from fe.runtime.errors import DesignFileError, InvalidDesignError
 from fe.runtime.state import MOST_REGIONS, Geometry, region_names, wing_names
-from fe.structure.tables import Part
+from fe.structure.tables import Part, StructureDesign
 from reporting.section import checked
 from reporting.toml_file import read_toml
 
@@ -40,6 +40,16 @@ from .parts import (
 
 SHIPPED_DESIGN = Path(__file__).parents[1] / "designs" / "uav_wing.toml"
 """The design of the wing of Kapteyn et al. 2021."""
+_NAMES = Path(__file__).with_name("names.toml")
+
+
+def wing_structure(regions: tuple[str, ...], gauges: int) -> StructureDesign:
+    """Return a wing as a structure: by name what can be chosen, from where to where, and what can be read."""
+    content = read_toml(_NAMES, DesignFileError) | {
+        "damage": [{"name": name} for name in regions],
+        "gauge": [{"name": f"gauge_{number}"} for number in range(1, gauges + 1)],
+    }
+    return checked(StructureDesign, content, str(_NAMES), InvalidDesignError, what="a wing's names")
 
 
 TAKEN_NAMES = frozenset((*wing_names(()), "skin", "webs", "ribs"))

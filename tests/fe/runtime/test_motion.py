@@ -215,15 +215,6 @@ def whole_force(law: Primitive, path: np.ndarray[Any, Any]) -> np.ndarray[Any, A
     return forces + law.stiffness * path
 
 
-def test_a_jenkins_element_slips_at_its_force_and_takes_the_area_of_its_loop() -> None:
-    law = MicroSlip("mass", slip_force=3.0, stiffness=10.0, chi=0.0, element_count=1)
-    loop = np.concatenate((np.linspace(0, 1, 101), np.linspace(1, -1, 201), np.linspace(-1, 1, 201)))
-    whole = whole_force(law, loop)
-    assert (whole.min(), whole.max()) == pytest.approx((-3.0, 3.0))
-    area = np.trapezoid(whole[101:], loop[101:])
-    assert area == pytest.approx(4.0 * 3.0 * (1.0 - 0.3), rel=2e-3)  # 4 F (A - F/k)
-
-
 @pytest.mark.parametrize("chi", [0.0, -0.5])
 def test_an_iwan_joint_loses_the_energy_of_its_density_and_obeys_masing(chi: float) -> None:
     law = MicroSlip("mass", slip_force=1.0, stiffness=4.0, chi=chi, element_count=400)
