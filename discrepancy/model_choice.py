@@ -123,10 +123,10 @@ def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
     if path.suffix == ".json":
         return _patched(path, progress)
     if path.suffix not in ("", ".toml"):
-        shipped = sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml"))
+        names = sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml"))
         raise ModelError(
             f"{path} is no model: a calibration (.nc), a wing design, a structure or a lumped model (.toml), "
-            f"a patch (.json), or the name of a shipped lumped model ({', '.join(shipped)}) is expected."
+            f"a patch (.json), or the name of a shipped lumped model ({', '.join(names)}) is expected."
         )
     if path.suffix == ".toml":
         content = read_toml(path, ModelError, what="model")

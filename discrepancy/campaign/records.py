@@ -213,11 +213,6 @@ class Release:
         Modes whose initial state is free, at least 1: the first entry is the amplitude, within `deviation`.
     time_zero_deviation : float
         Prior standard deviation of the time between release and first sample [s].
-
-    Raises
-    ------
-    CampaignDataError
-        If no mode is free.
     """
 
     displacement: float

@@ -266,14 +266,14 @@ def prove(before: ResidualSet, after: ResidualSet, *, seed: int = 0) -> Proof:
         If no sample of one of the roles is used.
     """
     outside = (before.held_out, after.held_out)
-    held = [one and scores(one, seed=seed) for one in outside]
+    held = [None if one is None else scores(one, seed=seed) for one in outside]
     fitted = [scores(one.fitted or one, seed=seed) for one in (before, after)]
-    closed, reason = gap_closed(*held)
+    closed, reason = gap_closed(held[0], held[1])
     gain, error = nan, nan
     if outside[0] is not None and outside[1] is not None:
         gain, error = score_gain(outside[0], outside[1])
     remaining = _remaining(outside[1] or after.fitted or after, held[1] or fitted[1])
-    return Proof(*held, *fitted, closed, gain, error, remaining, reason)
+    return Proof(held[0], held[1], fitted[0], fitted[1], closed, gain, error, remaining, reason)
 
 
 def _remaining(residuals: ResidualSet, after: Scores) -> str:

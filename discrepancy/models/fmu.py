@@ -11,7 +11,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Course
+from discrepancy.models.acting import Course, LoadChange, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
 from discrepancy.models.fmu_laws import FmuLaws
 from discrepancy.models.fmu_motion import FmuMotion, sampled
@@ -19,7 +19,6 @@ from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State
 from discrepancy.models.interface import Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.questions import LoadChange, laws_at, place_among, release_of
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.patch import (
@@ -98,6 +97,9 @@ class FmuModel(DescribedModel):
         self._inputs = {
             item.name: self.runs.variable(item.variable or item.name) for item in description.input
         }
+        self.load_places = tuple(self._forces)
+        limits = (self.runs.asset.input_range("load", name)[1] for name in self._forces.values())
+        self.largest_force = 0.5 * min(limits, default=np.inf)
         self._check_ranges()
         nominal = self._state(Asked(_any_trial(TrialKind.RINGDOWN, 1.0), Conditions(self.prior_mean())))
         self._shown = Memory(KEPT_SHOWN)
@@ -303,7 +305,7 @@ class FmuModel(DescribedModel):
                 )
             values = {key: value for key, value in item.to_mapping().items() if key != "kind"}
             settings |= {f"{effect}.{key}": float(value) for key, value in {"active": 1.0, **values}.items()}
-        laws = laws_at(rest.of(*INTERNAL_FORCES), self.ports(), in_windows=False)
+        laws = self.laws_at(rest.of(*INTERNAL_FORCES), self.ports())
         return FmuPatch(laws, tuple(sorted(settings.items())), load)
 
     def _columns(self, outputs: Outputs) -> list[int]:

@@ -1,6 +1,6 @@
 """Motion of an FMU without laws at its ports, and what forces there do, as a system where it is linear."""
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from functools import cached_property
 from math import ceil, log2
 
@@ -69,7 +69,7 @@ class FmuMotion:
         self.v = [runs.columns.get(f"port.{port.name}.velocity", -1) for port in ports]
         self._linear, self._silent = dict[Hashable, bool](), dict[Hashable, bool]()
         self._units = dict[Hashable, float]()
-        self._resting: State | None = None
+        self._resting: tuple[tuple[str, float], ...] | None = None
         self._quiet = False  # whether it was seen to show nothing without excitation
         self._parts: dict[float, int] = {}
         self._systems, self._frequencies = Memory(KEPT_SYSTEMS), Memory()
@@ -77,31 +77,59 @@ class FmuMotion:
 
     def rest(self, state: State, loads: Mapping[str, float]) -> FloatArray:
         """Return the outputs (C,) at rest under inputs; what is not given is zero."""
-        given = [(Excitation("rest", name), value) for name, value in sorted(loads.items())]
-        return self._superposed(
-            ("rest", state),
-            lambda loads: self._rest(state, {part.name: value for part, value in loads}),
-            given,
-            self._description.static.settle,
-        )
-
-    def _rest(self, state: State, loads: Mapping[str, float]) -> FloatArray:
-        table = self._description.static
-        inputs = self.runs.inputs(state, loads)
-        if table.settle:
-            return self.runs.started(table.step, dict(state.parameters), inputs, settle=True)[1]
-        only = State(state.parameters, ())
-        if self._resting != only:  # inputs change from step to step, parameters need a reset
-            self.runs.started(table.step, dict(state.parameters), inputs, settle=False)
-            self._resting = only
-        asset = self.runs.open(table.step)
-        return self.runs.stepped(asset, inputs)
+        given = [(Excitation("input", name, begin=1.0), value) for name, value in sorted(loads.items())]
+        return self.free(Run(state, self._description.static.step, 0, given))
 
     def free(self, run: Run) -> FloatArray:
-        """Return the outputs (steps + 1, C) of a motion."""
-        return self._superposed(
-            ("free", *run[:3]), lambda loads: self.stepped(run._replace(loads=loads)), run.loads
+        """Return the outputs (steps + 1, C) of a motion, of no steps those at rest (C,).
+
+        They are put together from answers to units where that is proven to be right.
+        """
+        parts = [part for part, value in run.loads if value != 0.0]
+        values = [value for _, value in run.loads if value != 0.0]
+        kind = (run.steps == 0, tuple((part.kind, part.name) for part in parts))
+
+        def asked(values: Sequence[float]) -> FloatArray:
+            given = run._replace(loads=list(zip(parts, values, strict=True)))
+            key = tuple((part.key, value) for part, value in given.loads if value != 0.0)
+            answer = self.stepped if run.steps else self._rest
+            return self.runs.remembered((run[:3], key or kind), lambda: answer(given))
+
+        possible = self._description.superposition and (run.steps or self._description.static.settle)
+        if not (possible and parts) or self._linear.get(kind) is False:
+            return asked(values)
+        units = [
+            self._units.setdefault((kind[0], part.kind, part.name), 2.0 ** round(log2(abs(value))))
+            for part, value in zip(parts, values, strict=True)
+        ]
+        moved = [asked(one) for one in np.diag(units).tolist()]
+        zero = np.zeros_like(moved[0])
+        if not self._silent.get(kind):  # an FMU that shows nothing without excitation does so always
+            zero = asked([0.0] * len(parts))
+            self._silent.setdefault(kind, not np.any(zero))
+        moved, result = [part - zero for part in moved], zero.copy()
+        if kind not in self._linear:  # half of all excitations gives half of the sum of what each gives
+            half = asked([0.5 * size for size in units]) - zero
+            size = np.atleast_2d(np.sum(np.abs(moved), axis=0)).max(axis=0)
+            allowed = LINEAR * size + 1e-12 * np.atleast_2d(np.abs(zero)).max(axis=0)
+            self._linear[kind] = bool(np.all(np.abs(half - 0.5 * np.sum(moved, axis=0)) <= allowed))
+            if not self._linear[kind]:
+                return asked(values)
+        for value, unit, part in zip(values, units, moved, strict=True):
+            result += value / unit * part
+        return result
+
+    def _rest(self, run: Run) -> FloatArray:
+        parameters, inputs = (
+            run.state.parameters,
+            self.runs.inputs(run.state, {part.name: value for part, value in run.loads}),
         )
+        if self._description.static.settle:
+            return self.runs.started(run.step, dict(parameters), inputs, settle=True)[1]
+        if self._resting != parameters:  # inputs change from step to step, parameters need a reset
+            self.runs.started(run.step, dict(parameters), inputs, settle=False)
+            self._resting = parameters
+        return self.runs.stepped(self.runs.open(run.step), inputs)
 
     def stepped(self, run: Run) -> FloatArray:
         """Return the outputs (steps + 1, C) of a motion by the FMU itself."""
@@ -159,7 +187,7 @@ class FmuMotion:
         first = displacement if way.hold is None else min(1.0, 0.1 * self.runs.input_limit(way.hold))
         if displacement == 0.0:
             return 0.0
-        kind = ("free", (("hold", ""),))
+        kind = (False, (("hold", ""),))
         if way.hold is not None and self._linear.get(kind) and self._silent.get(kind):
             return displacement * first / shown(first)
         zero = shown(0.0)
@@ -179,46 +207,6 @@ class FmuMotion:
             f"Nothing that [release] names puts {way.output!r} of the FMU model "
             f"{self._description.name!r} at {displacement:g} m; correct displacement, hold or output there."
         )
-
-    def _superposed(
-        self,
-        key: tuple[Hashable, ...],
-        answer: Callable[[Loads], FloatArray],
-        loads: Loads,
-        possible: bool = True,
-    ) -> FloatArray:
-        """Return the answer to loads, put together from answers to units where that is proven to be right."""
-        parts = [part for part, value in loads if value != 0.0]
-        values = [value for _, value in loads if value != 0.0]
-        kind = (key[0], tuple((part.kind, part.name) for part in parts))
-
-        def asked(values: Sequence[float]) -> FloatArray:
-            given = list(zip(parts, values, strict=True))
-            full = tuple((part.key, value) for part, value in given if value != 0.0)
-            return self.runs.remembered((key, full or kind), lambda: answer(given))
-
-        if not (possible and parts and self._description.superposition) or self._linear.get(kind) is False:
-            return asked(values)
-        units = [
-            self._units.setdefault((part.kind, part.name), 2.0 ** round(log2(abs(value))))
-            for part, value in zip(parts, values, strict=True)
-        ]
-        moved = [asked(one) for one in np.diag(units).tolist()]
-        zero = np.zeros_like(moved[0])
-        if not self._silent.get(kind):  # an FMU that shows nothing without excitation does so always
-            zero = asked([0.0] * len(parts))
-            self._silent.setdefault(kind, not np.any(zero))
-        moved, result = [part - zero for part in moved], zero.copy()
-        if kind not in self._linear:  # half of all excitations gives half of the sum of what each gives
-            half = asked([0.5 * size for size in units]) - zero
-            size = np.atleast_2d(np.sum(np.abs(moved), axis=0)).max(axis=0)
-            allowed = LINEAR * size + 1e-12 * np.atleast_2d(np.abs(zero)).max(axis=0)
-            self._linear[kind] = bool(np.all(np.abs(half - 0.5 * np.sum(moved, axis=0)) <= allowed))
-            if not self._linear[kind]:
-                return asked(values)
-        for value, unit, part in zip(values, units, moved, strict=True):
-            result += value / unit * part
-        return result
 
     # ------------------------------------------------------------ pace
 
@@ -314,12 +302,8 @@ class FmuMotion:
     def _confirmed(self, system: PortSystem, state: State, step: float, count: int, tolerance: float) -> bool:
         """Whether the FMU answers to many forces as the system says that was made of single ones."""
         signs = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(self.forces)))
-        loads = [
-            (Excitation("input", *of), size)
-            for of, size in zip(
-                zip(self.forces, signs.T.copy(), strict=True), self.sizes.tolist(), strict=True
-            )
-        ]
+        series = zip(self.forces, signs.T.copy(), self.sizes.tolist(), strict=True)
+        loads = [(Excitation("input", name, values), size) for name, values, size in series]
         moved = self.stepped(Run(state, step, count, loads))
         moved -= self.stepped(Run(state, step, count, []))
         error = np.max(np.abs(moved - system.motion(signs * self.sizes, step)), axis=0)
@@ -343,12 +327,9 @@ class FmuMotion:
         system = self.system(state, step, RECORD)
         column = self.x[number]
         if system is None:
-            size, still = float(self.sizes[number]), []
-            for force in (0.0, size):
-                inputs = self.runs.inputs(state, {self.forces[number]: force})
-                found = self.runs.started(step, dict(state.parameters), inputs, settle=True)[1]
-                still.append(float(found[column]))
-            stiffness = size / (still[1] - still[0])
+            size, push = float(self.sizes[number]), Excitation("input", self.forces[number], begin=1.0)
+            still = [self.begin(Run(state, step, 0, [(push, force)]))[1][column] for force in (-size, size)]
+            stiffness = 2.0 * size / float(still[1] - still[0])
             return stiffness, stiffness
         at_rest = 1.0 / float(system.gain()[column, number])
         frequency, shape = system.most_flexible(column, number) or (1.0, 0.0)
