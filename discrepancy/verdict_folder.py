@@ -2,8 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from discrepancy.files.residuals import RESIDUALS_NAME, write_residuals
@@ -32,21 +31,6 @@ from reporting.folders import fresh_folder, lock_folder, replace_folder, restore
 REPORT_NAME = "report.html"
 FMU_NAME = "patched.fmu"
 FIGURES = "figures"
-Pack = Callable[[Path, Path], str]
-"""(patch.json, FMU to be written) -> what to say about it."""
-
-
-@dataclass(frozen=True)
-class VerdictContent(ReportInput):
-    """What is written: what the report shows, and more.
-
-    Attributes
-    ----------
-    pack : callable, optional
-        Makes the patched FMU; called where an effect is named.
-    """
-
-    pack: Pack | None = None
 
 
 def check_folder(folder: Path, *, replace_it: bool) -> None:
@@ -73,7 +57,7 @@ def check_folder(folder: Path, *, replace_it: bool) -> None:
 
 
 def write_verdict_folder(
-    folder: Path, content: VerdictContent, *, replace_it: bool = False, report: bool = True
+    folder: Path, content: ReportInput, *, replace_it: bool = False, report: bool = True
 ) -> Path:
     """Write everything beside the folder first, and move it into place when it is complete.
 
@@ -81,7 +65,7 @@ def write_verdict_folder(
     ----------
     folder : Path
         Where; an empty folder is as good as none.
-    content : VerdictContent
+    content : ReportInput
         What is written.
     replace_it : bool
         Put it in the place of an existing folder of a verdict. Anything else is never replaced.
@@ -124,7 +108,7 @@ def _move(fresh: Path, folder: Path) -> None:
         os.close(held)
 
 
-def _write(folder: Path, content: VerdictContent, *, report: bool) -> None:
+def _write(folder: Path, content: ReportInput, *, report: bool) -> None:
     found, origin = content.investigation, content.origin
     verdict = found.verdict
     write_verdict(folder / VERDICT_NAME, verdict, found.proof, origin)

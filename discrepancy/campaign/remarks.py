@@ -33,9 +33,9 @@ def _begins(trials: tuple[Trial, ...]) -> list[str]:
             groups.setdefault((trial.begins, trial.begin_assumed), []).append(repr(trial.name))
     found = []
     for (begins, assumed), names in groups.items():
-        trial, are = ("trial", "is") if len(names) == 1 else ("trials", "are")
+        several, are = ("", "is") if len(names) == 1 else ("s", "are")
         how = _BEGINS[begins] + (_ASSUMED if assumed else "")
-        found.append(f"The {trial} {', '.join(names)} {are} {how}.")
+        found.append(f"The trial{several} {', '.join(names)} {are} {how}.")
     return found
 
 
