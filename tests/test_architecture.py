@@ -68,7 +68,6 @@ LONGEST_MODULE, LONGEST_FUNCTION = 450, 60
 
 LONGER: dict[str, str] = {
     "discrepancy/workflow.py:investigate": "The whole way, one stage after the other.",
-    "discrepancy/models/fmu_runs.py:_made_binding": "One binding, its tables in the order of the file.",
     "fmu_asset/slaves/table.py:structure_table": "A table: one call a variable.",
 }
 """What may be longer, each with its reason."""

@@ -249,22 +249,23 @@ class View:
         Where a climb ends a rounding decides; the top does not depend on it.
         """
         first = np.log([(one.size, one.time) for one in begin.values()])
-        unit, logs = NEAR * np.eye(first.size), np.zeros(first.size)
+        unit, logs, far = NEAR * np.eye(first.size), np.zeros(first.size), np.inf
 
         def at(move: FloatArray) -> dict[int, Process]:
             items = zip(begin.items(), np.exp(first + move.reshape(first.shape)).tolist(), strict=True)
             return {port: replace(one, size=size, time=time) for (port, one), (size, time) in items}
 
         for _ in range(MOST_STEPS):
-            top, ahead, back = (
-                np.array([self.evidence(about, at(logs + step)) for step in steps])
-                for steps in (np.zeros((1, first.size)), unit, -unit)
+            ahead, back = (
+                np.array([self.evidence(about, at(logs + step)) for step in steps]) for steps in (unit, -unit)
             )
-            bend = np.diag(ahead + back - 2.0 * top)
-            for i, k in zip(*np.triu_indices(first.size, 1), strict=True):
-                both = self.evidence(about, at(logs + unit[i] + unit[k]))
-                bend[i, k] = bend[k, i] = both - ahead[i] - ahead[k] + top[0]
-            if not np.isfinite(bend).all():
+            if far > NEAR:
+                top = self.evidence(about, at(logs))
+                bend = np.diag(ahead + back - 2.0 * top)
+                for i, k in zip(*np.triu_indices(first.size, 1), strict=True):
+                    both = self.evidence(about, at(logs + unit[i] + unit[k]))
+                    bend[i, k] = bend[k, i] = both - ahead[i] - ahead[k] + top
+            if not np.isfinite((*bend.flat, *ahead, *back)).all():
                 break
             values, axes = np.linalg.eigh(bend)  # uphill where it is hollow, too
             step = axes @ (axes.T @ (0.5 * NEAR * (ahead - back)) / np.maximum(np.abs(values), 1e-300))

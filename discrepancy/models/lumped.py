@@ -1,28 +1,29 @@
 """A lumped linear structure as a model: masses, springs, dampers with named inputs, outputs and ports."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, Self
 
 import numpy as np
 
-from discrepancy.campaign.records import Campaign, FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
+from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, Shown, order_of
-from discrepancy.models.interface import Conditions, Outputs, Place
+from discrepancy.models.acting import (
+    Acting,
+    Course,
+    FormulaCourse,
+    Load,
+    LoadChange,
+    Shown,
+    order_of,
+    place_among,
+)
+from discrepancy.models.interface import NO_PATCH, Outputs, Place
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped
 from discrepancy.models.lumped_rig import Loop, LumpedRig
 from discrepancy.models.lumped_sections import InputSection
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.questions import (
-    LoadChange,
-    check_no_inputs,
-    check_outputs,
-    place_among,
-    release_of,
-)
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.runtime.laws import LAWS
@@ -42,7 +43,6 @@ from fe.runtime.patch import (
 )
 from fe.runtime.state import Losses
 
-UNCHANGED = LoadChange()
 KEPT_RIGS = 128
 """Values of the parameters and structures that are remembered."""
 LEAST_STIFFNESS = 0.05
@@ -66,6 +66,10 @@ class LumpedModel(DescribedModel, SystemModel):
     def __init__(self, description: LumpedDescription) -> None:
         self.description = description
         super().__init__(description, {item.name: item.quantity for item in description.output})
+        self.load_places = tuple(item.name for item in description.input)
+        self.kinds = frozenset(TrialKind) - {TrialKind.FLIGHT}
+        if not description.is_plain:
+            self.kinds -= {TrialKind.RINGDOWN}
         self.displacements, self.length = description.size, description.characteristic_length
         self.port_rows = {item.name: description.padded(item.vector) for item in description.port}
         self._stations = sorted(place.station for place in description.place)
@@ -82,21 +86,19 @@ class LumpedModel(DescribedModel, SystemModel):
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
-        description, n = self.description, self.description.size
+        description, ports = self.description, list(self.port_rows.values())
+        if primitive in LAWS and not primitive.of_speed:  # the position of a state's port means nothing
+            return bool(ports) and all(np.any(row[: description.size]) for row in ports)
         carried: dict[type[Primitive], bool] = {
-            StiffnessDrift: n > 0,
+            StiffnessDrift: description.size > 0,
             ModulusTemperature: True,
             PointMass: bool(self._stations),
             RootCompliance: description.root is not None,
             LoadGain: True,
             LoadPlace: any(item.station_derivative is not None for item in description.input),
-            PortLoad: bool(self.port_rows),
+            PortLoad: bool(ports),
         }
-        if primitive in carried:
-            return carried[primitive]
-        if primitive in LAWS and not primitive.of_speed:  # the position of a state's port means nothing
-            return bool(self.port_rows) and all(np.any(row[:n]) for row in self.port_rows.values())
-        return primitive in SENSORS or (primitive in INTERNAL_FORCES and bool(self.port_rows))
+        return carried.get(primitive, primitive in SENSORS or (primitive in INTERNAL_FORCES and bool(ports)))
 
     follows_windows: ClassVar[bool] = True
 
@@ -105,20 +107,6 @@ class LumpedModel(DescribedModel, SystemModel):
         return (self._stations[0], self._stations[-1]) if self._stations else None
 
     # ------------------------------------------------------------ in a trial
-
-    @property
-    def what(self) -> str:
-        """What it is called where a sentence begins."""
-        return f"The lumped model {self.name!r}"
-
-    def check(self, trial: Trial) -> None:
-        """Refuse a flight, and a static trial under other inputs than a force."""
-        if trial.kind is TrialKind.FLIGHT:
-            raise ModelError(
-                f"The trial {trial.name!r} is a flight, but the lumped model {self.name!r} has no lift; "
-                "leave it out."
-            )
-        check_no_inputs(trial, f"the lumped model {self.name!r}")
 
     def own_laws(self, parameters: FloatArray) -> ModelPatch:
         """Return the laws of ports that it has as it is, each times its factor."""
@@ -129,14 +117,16 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the rig, with prescribed motions and controllers as the state says."""
         return self.rig(state).system(state.drives, closed=state.closed)
 
-    def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
-        """Return the load (N,) at whose place stiffness and modal mass are the natural ones."""
-        places = [trial.load_place for trial in campaign.trials]
-        item = self._input_at(places[0]) if places else self.description.input[0]
-        return self._moved_row(self.rig(State(parameters)), item)
+    def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
+        """Return the load (N,) of 1 N, or of what else an input is, at its place."""
+        return self._moved_row(self.rig(state), self._input_at(place), LoadChange.of(change))
 
-    def acting(self, case: Case) -> Acting:
-        """Return what acts in a dynamic trial.
+    def constant(self, case: Case) -> FloatArray:
+        """Return the load (N,) that always acts."""
+        return self.rig(case.state).constant
+
+    def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
+        """Return loads and prescribed motions in a trial.
 
         Every motion that an input can prescribe and that the trial does not record is held at zero, if an
         output is its reaction; else it is free.
@@ -146,15 +136,8 @@ class LumpedModel(DescribedModel, SystemModel):
         ModelError
             If the trial records an input that the model does not have or that is of another quantity.
         """
-        trial, conditions, patch, _ = case
-        rig, change = self.rig(case.state), LoadChange.of(patch)
-        at_ports = [item for item in patch if isinstance(item, PortLoad)]
-        if trial.kind is TrialKind.RINGDOWN:
-            self._check_released(trial, at_ports)
-            release = self._moved_row(rig, self._input_at(trial.load_place)), release_of(trial)
-            return Acting(
-                trial.time, rig.constant, initial=conditions.initial, clock=conditions.clock, release=release
-            )
+        trial, _, patch, state = case
+        rig, change = self.rig(state), LoadChange.of(patch)
         loads = [load for loop in rig.loops.values() for load in self._reference(case, loop)]
         followed = {loop.section.reference for loop in rig.loops.values()}
         reactions = {item.reaction for item in self.description.output}
@@ -178,16 +161,8 @@ class LumpedModel(DescribedModel, SystemModel):
             if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
                 values = change.changed(values, item.values)
             loads.append((self._moved_row(rig, section, change), Course.of(trial.time, values, item.hold)))
-        loads += [self._at_port(rig, item) for item in at_ports]
-        return Acting(
-            trial.time,
-            rig.constant,
-            loads,
-            drives,
-            trial.begins,
-            conditions.initial.ravel(),
-            conditions.clock,
-        )
+        loads += [self._at_port(rig, item) for item in patch if isinstance(item, PortLoad)]
+        return loads, drives
 
     def _recorded(self, case: Case) -> list[tuple[RecordedInput, float]]:
         """Return the recorded inputs of a trial, or its force at its place, and what each lacks."""
@@ -210,9 +185,9 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the input of a load place; raises `ModelError` if there is none."""
         forces = [name for name, item in self._inputs.items() if not item.quantity.moving]
         known = [*self._inputs] if place in self._inputs else forces
-        return self._inputs[place_among(known, place, f"the lumped model {self.name!r}")]
+        return self._inputs[place_among(known, place, self.what)]
 
-    def _moved_row(self, rig: LumpedRig, item: InputSection, change: LoadChange = UNCHANGED) -> FloatArray:
+    def _moved_row(self, rig: LumpedRig, item: InputSection, change: LoadChange) -> FloatArray:
         """Return the row (N,) along which an input acts, where its place has been moved to."""
         row = np.array(item.vector)
         if change.along_span or change.along_chord:
@@ -230,25 +205,15 @@ class LumpedModel(DescribedModel, SystemModel):
         section = self._inputs.get(item.name)
         if section is None:
             raise ModelError(
-                f"The trial {trial.name!r} records the input {item.name!r}, which the lumped model "
-                f"{self.name!r} does not have; it has {', '.join(self._inputs) or 'none'}."
+                f"The trial {trial.name!r} records the input {item.name!r}, which {self.what} does "
+                f"not have; it has {', '.join(self._inputs) or 'none'}."
             )
         if item.quantity is not section.quantity and item.quantity not in section.quantity.moving:
             raise ModelError(
-                f"The input {item.name!r} of the lumped model {self.name!r} is {section.quantity.value}, but "
+                f"The input {item.name!r} of {self.what} is {section.quantity.value}, but "
                 f"the trial {trial.name!r} records {item.quantity.value}."
             )
         return section
-
-    def _check_released(self, trial: Trial, at_ports: Sequence[PortLoad]) -> None:
-        """Refuse a ring-down that the model cannot begin."""
-        why = "which no force with a course in time can act on" if at_ports else ""
-        if not self.description.is_plain:
-            why = f"which the lumped model {self.name!r} cannot begin: it is free, driven or has states"
-        if why:
-            raise ModelError(
-                f'The trial {trial.name!r} is a ring-down, {why}; say kind = "driven" and begins = "unknown".'
-            )
 
     def _at_port(self, rig: LumpedRig, load: PortLoad) -> Load:
         """Return the row and the course of a load at a port."""
@@ -263,7 +228,6 @@ class LumpedModel(DescribedModel, SystemModel):
 
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
         """Return what each output shows under what acts; None: at rest."""
-        check_outputs(self.what, self, outputs, self.quantities)
         drives = {} if acting is None else acting.drives
         found, description = [], self.description
         for name, quantity in outputs:
@@ -287,13 +251,14 @@ class LumpedModel(DescribedModel, SystemModel):
                 found.append(seen._replace(constant=item.constant * (not further)))
         return found
 
-    def _losses(self, trial: Trial, conditions: Conditions) -> list[Losses]:
+    def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
+        """Return none: health has no meaning here."""
         return [()]
 
     @property
     def oscillates(self) -> bool:
         """Whether it has a mode that vibrates."""
-        return bool(np.any(self.system(State(self._mean)).angular_frequency > 0.0))
+        return bool(np.any(self.system(State(self.prior_mean())).angular_frequency > 0.0))
 
     # ------------------------------------------------------------ ports
 
@@ -307,7 +272,7 @@ class LumpedModel(DescribedModel, SystemModel):
         linear, laws = super().apart()
         description = self.description.model_copy(update={"law": []})
         linear = linear._changed(description=description, _rigs=Memory(KEPT_RIGS))
-        return linear, self.own_laws(self._mean) + laws
+        return linear, self.own_laws(self.prior_mean()) + laws
 
     def unit_of_state(self, port: str) -> str:
         """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""

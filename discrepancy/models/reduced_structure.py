@@ -2,25 +2,24 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import inv
 
 from calibration.result.record import ParameterPrior
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Course, Shown, shown_rows
+from discrepancy.models.acting import (
+    Acting,
+    Course,
+    Load,
+    LoadChange,
+    Shown,
+    place_among,
+    shown_rows,
+)
 from discrepancy.models.interface import NO_PATCH, Outputs, Place
 from discrepancy.models.memory import Memory
-from discrepancy.models.questions import (
-    LoadChange,
-    check_no_inputs,
-    check_outputs,
-    check_plain,
-    place_among,
-    release_of,
-)
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.runtime.patch import INTERNAL_FORCES, LOADS, SENSORS, LoadGain, ModelPatch, PointMass, Primitive
@@ -36,49 +35,27 @@ SAME = 1e-9
 
 
 class StructuralModel(SystemModel):
-    """A structure that springs hold, under a force or lift.
+    """A structure that springs hold, under a force or lift."""
 
-    Attributes
-    ----------
-    reference : str
-        Place whose stiffness and modal mass are the natural ones.
-    """
-
-    reference: str
+    kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
 
     @abstractmethod
-    def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
-        """Return the load (n,) of 1 N at a place, as load primitives have it."""
+    def lift(self, state: State, change: ModelPatch) -> FloatArray:
+        """Return the loads (2, n) of a load factor and of its square, as load primitives have them."""
 
-    @abstractmethod
-    def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
-        """Return the loads (2, n) of a load factor and of its square in a flight, as load primitives do."""
-
-    def check(self, trial: Trial) -> None:
-        """Refuse a trial that is driven, begins otherwise than settled, or holds other inputs at rest."""
-        check_plain(trial, self.name)
-        check_no_inputs(trial, self.name)
-
-    def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
-        """Return the load (n,) at whose place stiffness and modal mass are the natural ones."""
-        return self.force_row(self.reference, parameters, NO_PATCH)
-
-    def acting(self, case: Case) -> Acting:
-        """Return what acts in a trial: a force at a place, lift, or what holds it until it is let go."""
-        trial, conditions, patch, state = case
-        loads = NO_PATCH if trial.kind is TrialKind.RINGDOWN else patch.of(*LOADS)
+    def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
+        """Return what acts in a trial: a force at a place, or lift."""
+        trial, _, patch, state = case
+        loads = patch.of(*LOADS)
         if trial.kind is TrialKind.FLIGHT:
             # where a mass has weight; other zeros are read with it in place
-            rows = self.lift(trial, state.parameters, patch.of(*LOADS, PointMass))
+            rows = self.lift(state, patch.of(*LOADS, PointMass))
             amounts = [trial.load_factor, trial.load_factor**2]
         else:
-            rows = self.force_row(trial.load_place, state.parameters, loads)[None]
+            rows = self.force_row(trial.load_place, state, loads)[None]
             amounts = [LoadChange.of(loads).changed(trial.force, trial.force)]
-        acting = Acting(trial.time, np.zeros(rows.shape[1]), clock=conditions.clock)
-        if trial.kind is TrialKind.RINGDOWN:
-            return replace(acting, release=(rows[0], release_of(trial)), initial=conditions.initial)
         courses = [Course.of(trial.time, values, trial.hold) for values in amounts]
-        return replace(acting, loads=list(zip(rows, courses, strict=True)))
+        return list(zip(rows, courses, strict=True)), {}
 
 
 class StructureModel(StructuralModel):
@@ -116,7 +93,10 @@ class StructureModel(StructuralModel):
                 'load that is recorded: give a [[control]] with unit = "N" and a [[load]] of 1 N tied to it, '
                 "or a [[control]] load_factor."
             )
-        self.reference = (*self.forces, LOAD_FACTOR)[0]
+        if LOAD_FACTOR not in model.controls:
+            self.kinds -= {TrialKind.FLIGHT}
+        self.reference, self.load_places = (*self.forces, LOAD_FACTOR)[0], self.forces
+        self.largest_force = 0.5 * min((model.validity[name][1] for name in self.forces), default=np.inf)
         _, outputs, accelerations = model.rows
         strains, displacements = np.split(outputs, [len(model.gauges)])
         named = (
@@ -127,8 +107,7 @@ class StructureModel(StructuralModel):
         self.quantities = {name: quantity for names, quantity, _ in named for name in names}
         self._rows = {name: row for names, _, rows in named for name, row in zip(names, rows, strict=True)}
         self._systems = Memory()
-        means = np.array([item.mean for item in self.parameters])
-        along = [self._load(means, force) for force in self.forces]
+        along = [self._load(self.prior_mean(), force) for force in self.forces]
         self.port_rows = {
             name: row
             for push in along
@@ -156,14 +135,7 @@ class StructureModel(StructuralModel):
         """Return what outputs show.
 
         Loads that always act shift what a motion shows.
-
-        Raises
-        ------
-        ModelError
-            If there is no such output, or it is of another quantity.
         """
-        known = (f"{name} ({quantity.value})" for name, quantity in self.quantities.items())
-        check_outputs(self.name, self, outputs, known)
         found = shown_rows((self._rows[output] for output, _ in outputs), outputs)
         always = self._always(case.state.parameters)
         if acting is None or not always.any():
@@ -176,7 +148,7 @@ class StructureModel(StructuralModel):
         forces = primitive is LoadGain and bool(self.forces)
         return primitive in SENSORS or forces or (primitive in INTERNAL_FORCES and bool(self.port_names))
 
-    def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+    def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
         """Return the load (n,) of 1 N of a force, or, where there is none, of the load factor.
 
         Raises
@@ -184,15 +156,11 @@ class StructureModel(StructuralModel):
         ModelError
             If there is no such force, or none is named of several.
         """
-        return self._load(parameters, place_among(self.forces or (self.reference,), place, self.name))
+        return self._load(state.parameters, place_among(self.forces or (LOAD_FACTOR,), place, self.what))
 
-    def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+    def lift(self, state: State, change: ModelPatch) -> FloatArray:
         """Return the loads (2, n) of the load factor and of its square, which is zero."""
-        if LOAD_FACTOR not in self.model.controls:
-            raise ModelError(
-                f"The trial {trial.name!r} is a flight, but {self.name} has no control {LOAD_FACTOR}."
-            )
-        row = self._load(parameters, LOAD_FACTOR)
+        row = self._load(state.parameters, LOAD_FACTOR)
         return np.stack((row, np.zeros_like(row)))
 
     def _always(self, parameters: FloatArray) -> FloatArray:
@@ -201,12 +169,9 @@ class StructureModel(StructuralModel):
         coefficients = self.model.load_coefficients(self._vector(parameters, recorded))
         return np.asarray(self.model.rows[0] @ coefficients)
 
-    def acting(self, case: Case) -> Acting:
-        """Return what acts in a trial; what always acts is in what a motion shows."""
-        acting = super().acting(case)
-        return (
-            acting if case.trial.is_dynamic else replace(acting, constant=self._always(case.state.parameters))
-        )
+    def constant(self, case: Case) -> FloatArray:
+        """Return the load (n,) that always acts at rest; in motion it is in what is shown."""
+        return self._always(case.state.parameters) * (not case.trial.is_dynamic)
 
     def system(self, state: State) -> SecondOrderSystem:
         """Return the structure at parameters and losses, in the coordinates of `ReducedModel.at`.

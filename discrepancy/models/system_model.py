@@ -10,22 +10,11 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Shown
-from discrepancy.models.interface import (
-    NO_PATCH,
-    Conditions,
-    Model,
-    Outputs,
-    Place,
-    PortedSystem,
-    PortScale,
-    Response,
-    Scales,
-    campaign_sizes,
-)
+from discrepancy.models.acting import Acting, Course, Load, Shown, release_of
+from discrepancy.models.interface import NO_PATCH, Conditions, Model, Outputs, Place, PortedSystem, Response
 from discrepancy.models.linear_system import Resting, at_rest
 from discrepancy.models.natural_scales import PortSizes
-from discrepancy.models.questions import check_carried, check_parameters, laws_at, losses_of, prior_mean
+from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws
@@ -78,35 +67,26 @@ class SystemModel(Model):
 
     Attributes
     ----------
-    regions : tuple of str
-        Damage regions.
     port_rows : mapping of str to (N,) ndarray
         Rows of all ports where laws act.
     missing : tuple of str
         Further ports of `port_rows` where missing forces are looked for.
+    reference : str or None
+        Place whose stiffness and modal mass are the natural ones; None: that of the first trial.
     displacements : int or None
         How many of the coordinates are displacements, the others being states; None: all.
     components : int
         3 if it tells transverse and shear strain, too; else 1.
     """
 
-    regions: tuple[str, ...] = ()
     port_rows: Mapping[str, FloatArray]
     missing: tuple[str, ...] = ()
+    reference: str | None = None
     displacements: int | None = None
     components: ClassVar[int] = 1
     shows_ports: ClassVar[bool] = True
 
     # ------------------------------------------------------------ what each says
-
-    @property
-    def what(self) -> str:
-        """What it is called where a sentence begins."""
-        return self.name
-
-    @abstractmethod
-    def check(self, trial: Trial) -> None:
-        """Refuse a trial of a kind that it cannot follow."""
 
     @abstractmethod
     def system(self, state: State) -> SecondOrderSystem:
@@ -117,8 +97,16 @@ class SystemModel(Model):
         return self.system(state).resting
 
     @abstractmethod
-    def acting(self, case: Case) -> Acting:
-        """Return what acts in a trial; at rest the values of the loads' courses count, one for each row."""
+    def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
+        """Return the load (N,) of 1 N at a place, as load primitives have it."""
+
+    @abstractmethod
+    def constant(self, case: Case) -> FloatArray:
+        """Return the load (N,) that always acts."""
+
+    @abstractmethod
+    def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
+        """Return loads and prescribed motions in a trial; at rest the values of their courses are by row."""
 
     @abstractmethod
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
@@ -126,10 +114,6 @@ class SystemModel(Model):
 
         `component` 1 and 2: transverse and shear strain.
         """
-
-    @abstractmethod
-    def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
-        """Return the load (N,) at whose place stiffness and modal mass are the natural ones."""
 
     def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
         """Return the scales of forces that are spread over the structure, by the first mode (N,)."""
@@ -144,14 +128,29 @@ class SystemModel(Model):
     def laws(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> Laws:
         """Return the laws at its ports, its own and those of a patch."""
         forces = self.at_ports(self.own_laws(parameters) + patch.of(*INTERNAL_FORCES))
-        return laws_at(forces, self.port_rows, in_windows=self.follows_windows)
+        return self.laws_at(forces, self.port_rows)
 
     def case(self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH) -> Case:
         """Return a trial as it is at its begin."""
-        losses, warmer = self._losses(trial, conditions)[0], float(trial.temperature[0])
+        losses, warmer = self.losses(trial, conditions.health)[0], float(trial.temperature[0])
         return Case(
             trial, conditions, patch, State(conditions.parameters, losses, patch.of(*STRUCTURE), warmer)
         )
+
+    def acting(self, case: Case) -> Acting:
+        """Return what acts in a trial."""
+        trial, conditions, patch, state = case
+        acting = Acting(trial.time, self.constant(case), begins=trial.begins, clock=conditions.clock)
+        if trial.kind is TrialKind.RINGDOWN:
+            if len(patch.of(PortLoad)):
+                raise ModelError(
+                    f"The trial {trial.name!r} is a ring-down, which no force with a course in time can act "
+                    'on; say kind = "driven" and begins = "unknown".'
+                )
+            release = self.force_row(trial.load_place, state), release_of(trial)
+            return replace(acting, release=release, initial=conditions.initial)
+        loads, drives = self.pushes(case)
+        return replace(acting, loads=loads, drives=drives, initial=conditions.initial.ravel())
 
     def begun(self, case: Case, ports: tuple[str, ...]) -> tuple[SecondOrderSystem, Acting]:
         """Return what moves under forces at ports, and what acts on it."""
@@ -184,10 +183,6 @@ class SystemModel(Model):
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero. In a
         dynamic trial the structure is that at its first temperature.
         """
-        self.check(trial)
-        check_parameters(self.what, self.parameters, conditions.parameters)
-        patch = patch.in_trial(trial.name)
-        check_carried(patch, self, self.what)
         components = range(self.components if conditions.components else 1)
         try:
             laws, case = self.laws(conditions.parameters, patch), self.case(trial, conditions, patch)
@@ -207,7 +202,7 @@ class SystemModel(Model):
             raise ModelError(
                 f"The trial {trial.name!r} has no time, which a law or a force in time asks for."
             )
-        count, losses = len(trial.force), self._losses(trial, conditions)
+        count, losses = len(trial.force), self.losses(trial, conditions.health)
         losses = losses * count if len(losses) == 1 else losses
         warmer = trial.temperature.tolist() if len(patch.of(ModulusTemperature)) else [0.0] * count
         values = np.empty((count, len(components) * len(outputs)))
@@ -237,21 +232,14 @@ class SystemModel(Model):
         along, *further = np.split(values, len(components), axis=1)
         return Response(along, None, *further)
 
-    def _losses(self, trial: Trial, conditions: Conditions) -> list[Losses]:
-        return losses_of(trial, conditions.health, self.regions, self.name)
-
     # ------------------------------------------------------------ ports
-
-    @property
-    def _mean(self) -> FloatArray:
-        return np.array([item.mean for item in self.declared])
 
     def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, in the modes of the prior means."""
         patch = self.patch.in_trial(trial.name)
         at_mean, case = (
             self.case(trial, Conditions(values, health=trial.health[:1]), patch)
-            for values in (self._mean, parameters)
+            for values in (self.prior_mean(), parameters)
         )
         (base, _), (system, acting) = (self.begun(item, self.missing) for item in (at_mean, case))
         shapes = base.shapes
@@ -269,7 +257,7 @@ class SystemModel(Model):
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of a state at the begin of a trial: of motion from rest, and of data."""
-        parameters = prior_mean(campaign, self.declared)
+        parameters = self.prior_mean(campaign)
         case = self.case(trial, Conditions(parameters))
         moved = self.moved(case, self.laws(parameters), still=True)
         rig = moved.system
@@ -278,6 +266,7 @@ class SystemModel(Model):
         pace = np.maximum(rig.angular_frequency[:moving], 1.0 / float(trial.time[-1] - trial.time[0]))
         channels = [campaign.channels[name] for name in trial.channels]
         outputs = tuple((channel.output, channel.quantity) for channel in channels)
+        self.check_outputs(outputs)
         shown = self.shown(case, outputs, moved.acting)
         for column, item in enumerate(shown):
             kept = trial.values[trial.used[:, column], column] - item.constant
@@ -299,7 +288,7 @@ class SystemModel(Model):
         A structure that springs hold, which only forces move from rest, has scales of its own; for others
         what acts and moves is the measure.
         """
-        trials, parameters = campaign.trials, prior_mean(campaign, self.declared)
+        trials, parameters = campaign.trials, self.prior_mean(campaign)
         state, names = State(parameters, (0.0,) * len(self.regions)), self.ports()
         system, rest, laws = self.system(state), self.rest(state), self.laws(parameters)
         held = system.mode_count is not None and all(
@@ -336,7 +325,8 @@ class SystemModel(Model):
         (peak, speed, weight), sizes = largest, campaign_sizes(campaign)
         shape, still = np.zeros(0), [0.0] * len(names)
         if held:
-            row, shape = self.reference_load(parameters, campaign), system.shapes[:, 0]
+            known = [*(trial.load_place for trial in trials), *(self.load_places or ())]
+            row, shape = self.force_row(self.reference or known[0], state), system.shapes[:, 0]
             shape = shape if system.basis is None else system.basis @ shape
             still = [1.0 / float(own @ rest(own[None])[0]) for own in rows]
             frequency, participation = float(system.angular_frequency[0]), float(row @ shape) ** 2

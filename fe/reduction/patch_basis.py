@@ -17,7 +17,8 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedState, PatchedWing
-from fe.wing.operators import AffineOperators, point_masses
+from fe.runtime.state import DigitalState
+from fe.wing.operators import AffineOperators
 from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
 from reporting.progress import Progress, SilentProgress
 
@@ -101,8 +102,7 @@ def _responses(full: PatchOperators, norm: Norm, settings: PatchSettings, *, mai
     solutions = norm.riesz(loads)
     gauges = solutions[:, -operators.gauge_output.shape[0] :]
     solutions = _unit_energy(solutions, stiffness)
-    mean = settings.ranges
-    mass = operators.mass(point_masses(*map(float, map(np.mean, (mean.servo_mass, mean.pitot_mass)))))
+    mass = operators.mass({name: float(np.mean(operators.ranges[name])) for name in operators.masses})
     vectors = np.random.default_rng(settings.seed).normal(size=(operators.unknowns, MODES + 6))
     for _ in range(SUBSPACE_ITERATIONS):
         vectors = np.linalg.qr(norm.riesz(np.asarray(mass @ vectors)))[0]
@@ -158,12 +158,12 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
         for terms in ([term.matrix for term in operators.stiffness_terms], operators.mass_terms)
     )
     whole, tip = stiffness.sum(axis=0), rows["load_tip"]
-    nominal = np.tensordot((1.0, *settings.ranges.nominal_masses), mass, 1)
+    nominal = np.tensordot((1.0, *operators.masses.values()), mass, 1)
     shapes = eigh(whole, nominal, subset_by_index=[0, START_SHAPES - 1])[1]
     return PatchArrays(
         design_hash=operators.design_hash,
         region_names=" ".join(operators.regions),
-        validity_box=np.array(list(settings.ranges.named_ranges(operators.regions).values())),
+        validity_box=np.array(list(operators.ranges.values())),
         largest_loss=settings.largest_loss,
         largest_compliance=settings.compliance_share
         * float(tip @ np.linalg.solve(whole, tip))
@@ -227,7 +227,7 @@ def _patched_state(
     exponent, stations = generator.uniform(0.5, 4.0), arrays.stations
     outboard = int(generator.integers(int(0.55 * len(stations)), len(stations)))
     if plain:
-        e, servo, pitot = 1.0, *settings.ranges.nominal_masses
+        e, servo, pitot = DigitalState().values.values()
         damaged, changed = False, [False] * len(changes)
     patch = ModelPatch(tuple(change for change, taken in zip(changes, changed, strict=True) if taken))
     structure = wing.structure(e, tuple(losses) if damaged else (), servo, pitot, patch)

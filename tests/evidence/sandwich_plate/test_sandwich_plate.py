@@ -12,7 +12,7 @@ from evidence.sandwich_plate.plate_comparison import (
 )
 from evidence.sandwich_plate.plate_layout import PlateLayout
 from evidence.sandwich_plate.sandwich_plate import assemble_plate
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation
 from fe.verification.known_answers import wing_balance
 from fe.wing.operators import assemble, point_masses
 from fe.wing.turn_load import STANDARD_GRAVITY
@@ -53,7 +53,7 @@ def shipped_layout(shipped_design):
 
 def test_the_free_unknowns_hold_every_rigid_motion_that_the_root_allows(plate):
     x, y = plate.plate.node_points.T
-    root = plate.design.root
+    root = plate.wing_design.root
     springs = (root.transverse_spring, root.flap_spring, root.yaw_spring)
     stiffness = plate.stiffness()
     for number, motion in enumerate(({W: 1.0 + 0 * x}, {W: y, B: -1.0 + 0 * x}, {U: -y, V: x})):

@@ -17,8 +17,6 @@ from pymor.parameters.functionals import MinThetaParameterFunctional, Projection
 from pymor.reductors.coercive import CoerciveRBReductor
 
 from benchmarks.study_regions import bracket, plate, tube
-from fe.full.affine import affine_sum
-from fe.full.subspace import Norm, ProjectedBasis, conjugate_gradients
 from fe.reduction.certified_basis import compressed
 from fe.reduction.model_cache import reduced_structure
 from fe.reduction.reduced_basis import Reduction, reduce_model, reduce_structure
@@ -26,14 +24,14 @@ from fe.reduction.settings import ModalSettings, StructureSettings, loss_splits,
 from fe.reduction.structure_errors import measured_errors
 from fe.reduction.terms import ReductionTerms
 from fe.runtime.errors import FiniteElementError, ReductionError, SolutionError
+from fe.structure.affine import affine_sum, static_response
 from fe.structure.design import load_structure, structure_hash
-from fe.structure.field import static_response
 from fe.structure.operators import load_and_assemble
 from tests.fe.springs import SETTINGS, reduced_springs, springs
 
 SYSTEM = springs()
 STIFFNESS = tuple(term.matrix for term in SYSTEM.stiffness_terms)
-TERMS = ReductionTerms(replace(SYSTEM, ranges=SETTINGS.named_ranges(SYSTEM.regions)))
+TERMS = ReductionTerms(SYSTEM)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +84,9 @@ def test_pymor_reduces_and_bounds_alike(reduction: Reduction) -> None:
         mu = reduced.parameters.parse({"theta": theta})
         ours = model.static_response({"young_modulus_factor": e, "load_factor": 1.0}, (z1, z2)).coordinates
         np.testing.assert_allclose(reduced.solve(mu).to_numpy().ravel(), ours, rtol=1e-8)
-        residual = model.residual_load[:, 0] - np.einsum("rqj,q,j->r", model.residual_stiffness, theta, ours)
+        change = (theta - reference["theta"])[:-1]
+        residual = model.residual_load[:, 0] - np.einsum("rqj,q,j->r", model.residual_stiffness, change, ours)
+        residual = residual[len(ours) :]
         energy_bound = float(reduced.estimate_error(mu).ravel()[0])
         coercivity = min(theta / reference["theta"])
         assert np.linalg.norm(residual) / coercivity == pytest.approx(energy_bound, rel=1e-6)
@@ -96,12 +96,6 @@ def test_search_ends_below_the_tolerance_and_starts_high(reduction: Reduction) -
     assert reduction.bound_history[-1] <= SETTINGS.bound_tolerance < reduction.bound_history[0]
     assert len(reduction.bound_history) <= len(reduction.snapshots)
     assert len(set(reduction.snapshots)) == len(reduction.snapshots)
-    for state in TERMS.training():
-        for unit in np.eye(2):
-            found = reduction.model.static_response(values(state), load=unit)
-            for what in ("strain", "displacement"):
-                largest = np.abs(getattr(found, what)).max()
-                assert getattr(found, f"{what}_error_bound") <= SETTINGS.bound_tolerance * largest
 
 
 def test_same_system_gives_the_same_bytes(reduction: Reduction) -> None:
@@ -153,28 +147,6 @@ def test_progress_is_told() -> None:
     assert {"Reducing the modes", "full solution 1"} <= set(told)
 
 
-def test_conjugate_gradients_solve_and_give_up() -> None:
-    norm = Norm(affine_sum((1, 0.45, 0.45, 1), STIFFNESS))
-    matrix = affine_sum((0.9, 1.0, 0.2, 1), STIFFNESS)
-    right = np.stack((SYSTEM.load_lift, SYSTEM.load_tip, np.zeros(60)), axis=1)
-    found = conjugate_gradients([matrix], norm, right, np.zeros_like(right), tolerance=1e-12)
-    np.testing.assert_allclose(found, np.linalg.solve(matrix.toarray(), right), rtol=1e-9, atol=1e-15)
-    with pytest.raises(SolutionError, match="Conjugate gradients reached"):
-        conjugate_gradients([matrix], norm, right, np.zeros_like(right), tolerance=1e-12, most_iterations=2)
-
-
-def test_basis_stays_orthonormal_with_nearly_dependent_vectors() -> None:
-    whole, random = affine_sum((1, 1, 1, 1), STIFFNESS), np.random.default_rng(5)
-    basis = ProjectedBasis(Norm(whole), [(whole,)], drop=1e-9)
-    first = random.normal(size=(60, 5))
-    basis.extend(first)
-    assert basis.vectors.shape[1] == 5
-    near = first + 1e-6 * random.normal(size=first.shape)
-    basis.extend(np.concatenate((near, first @ random.normal(size=(5, 3)), np.zeros((60, 1))), axis=1))
-    np.testing.assert_allclose(basis.vectors.T @ whole @ basis.vectors, np.eye(10), atol=1e-9)
-    np.testing.assert_allclose(basis.inner[0][0], np.eye(10), atol=1e-9)
-
-
 def test_anchors_part_the_losses_in_equal_ratios() -> None:
     np.testing.assert_allclose(1 - loss_splits((0.0, 0.8), 2), [np.sqrt(0.2)])
     np.testing.assert_allclose(remaining_levels((0.0, 0.8), 1), [np.sqrt(0.2)])
@@ -190,7 +162,7 @@ def test_anchors_part_the_losses_in_equal_ratios() -> None:
 @pytest.mark.parametrize("make", [plate, bracket, tube])
 def test_six_regions_by_default(tmp_path: Path, make: Any) -> None:
     structure = load_and_assemble(make(tmp_path, 6))
-    errors = measured_errors(structure, reduce_structure(structure, structure.design.name).model, 60)
+    errors = measured_errors(structure, reduce_structure(structure).model, 60)
     assert max(errors.strain, errors.displacement) <= errors.bound < 1e-3
 
 
