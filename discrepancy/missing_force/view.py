@@ -277,14 +277,11 @@ class View:
         )
         return at(found.x), -float(found.fun)
 
-    def smoothed(self, processes: Processes) -> tuple[Solution, list[FloatArray], list[Motion]]:
-        """Return the unknowns, those of the trials alone, and motion and missing forces of each trial."""
-        return self.along(processes, self.solve(processes))
-
-    def along(
-        self, processes: Processes, solution: Solution
+    def smoothed(
+        self, processes: Processes, given: Solution | None = None
     ) -> tuple[Solution, list[FloatArray], list[Motion]]:
-        """Return what `smoothed` does, for unknowns that are given."""
+        """Return the unknowns, those of the trials alone, and motion and missing forces of each trial."""
+        solution = given or self.solve(processes)
         motions, local = [], []
         count = len(self.shared_precision)
         for number, one in enumerate(self.filtered(processes)):

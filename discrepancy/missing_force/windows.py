@@ -63,8 +63,7 @@ def gap_windows(
 def _of_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
     """Return when a force is missing at the port, or the reading, that tells most."""
     search = ForceSearch(problem)
-    at = search.locate()
-    port = max(at, key=lambda name: at[name].evidence)
+    port = max(search.at, key=lambda name: search.at[name].evidence)
     law = _law_at(search, fit, port)
     number, found = _most_telling(search.ports.index(port), search.rough(port))
     if found.evidence < of_nothing(found) + GROUND:
