@@ -5,9 +5,10 @@ evidence of a hypothesis, and the share that it is of what is missing, in trials
 that were not.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 from scipy.special import logsumexp
@@ -32,7 +33,7 @@ COUNTER = -0.1
 H = TypeVar("H", bound=Hypothetic)
 
 
-class Court(Protocol[H]):
+class Court(ABC, Generic[H]):
     """Hypotheses that are compared in one way, with the share that each is of what is missing.
 
     Parameters
@@ -61,33 +62,43 @@ class Court(Protocol[H]):
     # ---------------------------------------------------------------- how they are compared
 
     @property
+    @abstractmethod
     def ranked(self) -> Sequence[H]:
         """Hypotheses, the most probable first."""
 
+    @abstractmethod
     def score(self, item: H) -> float:
         """Return ln (evidence times prior) [nat]."""
 
+    @abstractmethod
     def sizes(self, item: H) -> tuple[float, float, float]:
         """Return log evidence [nat], chi^2 of the readings and its degrees of freedom; nan: not known."""
 
+    @abstractmethod
     def gain(self, item: H) -> float:
         """Return the log evidence over no effect at all [nat]."""
 
+    @abstractmethod
     def share_of(self, item: H, *, held_out: bool) -> Share:
         """Return the share that a hypothesis is of what is missing."""
 
+    @abstractmethod
     def followed(self, candidate: Candidate, effect: FloatArray) -> H | None:
         """Return a further hypothesis, begun at values (E,) of its unknowns; None: it cannot be."""
 
+    @abstractmethod
     def freed(self, item: H) -> H | None:
         """Return a single law with a shape of its own, where that was compared."""
 
+    @abstractmethod
     def gate(self, item: H) -> Gate:
         """Return how well the simulation beside a name leaves noise alone."""
 
+    @abstractmethod
     def fitted(self, item: H) -> CandidateFit:
         """Return the simulation that stands for a hypothesis."""
 
+    @abstractmethod
     def left(self, item: H, share: Share) -> str:
         """Return in words what is left beside a hypothesis."""
 

@@ -131,8 +131,8 @@ def plan_for(
     bare = replace(bare, channels=channels)
     period = 2.0 * np.pi / scales.angular_frequency
     motion = min(0.02 * scales.length, largest_force / scales.tip_stiffness)
-    times, force = {"duration": 20.0 * period, "interval": period / 50.0}, motion * scales.tip_stiffness
-    plan = ExamplePlan(tuple(channels.values()), force, motion, load_place=load_place, **times)
+    force, plan = motion * scales.tip_stiffness, ExamplePlan(tuple(channels.values()), load_place=load_place)
+    plan = replace(plan, force=force, release=motion, duration=20.0 * period, interval=period / 50.0)
     trial = _blank("", TrialKind.STATIC, plan, np.array([force]), 0.0)
     seen = np.abs(observe(model, bare, trial, ModelPatch(), prior_mean(bare, model, trial)).values[0])
     noises = 1e-3 * np.where(seen > 0.0, seen, seen.max() or 1.0)
