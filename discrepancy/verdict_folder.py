@@ -1,7 +1,5 @@
 """The folder that an investigation leaves: verdict, patch, residuals, figures, report; whole or not."""
 
-import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,8 +23,8 @@ from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import patch_draws
 from reporting.errors import FileNotWrittenError
 from reporting.figures import save_figure
-from reporting.files import atomic_write_text, write_error
-from reporting.folders import fresh_folder, lock_folder, replace_folder, restore_folder
+from reporting.files import atomic_write_text
+from reporting.folders import restore_folder, whole_folder
 
 REPORT_NAME = "report.html"
 FMU_NAME = "patched.fmu"
@@ -83,29 +81,9 @@ def write_verdict_folder(
         As `check_folder`, or if the disk is full or the place not writable; the folder is as it was.
     """
     check_folder(folder, replace_it=replace_it)
-    try:
-        fresh = fresh_folder(folder)
-        try:
-            _write(fresh, content, report=report)
-            _move(fresh, folder)
-        finally:
-            shutil.rmtree(fresh, ignore_errors=True)
-    except OSError as error:
-        raise write_error(error, folder) from error
+    with whole_folder(folder) as fresh:
+        _write(fresh, content, report=report)
     return folder / REPORT_NAME if report else folder
-
-
-def _move(fresh: Path, folder: Path) -> None:
-    if not folder.is_dir():
-        fresh.rename(folder)
-        return
-    held = lock_folder(folder)
-    if held is None:
-        raise FileNotWrittenError(f"another process is replacing {folder}: look at what it leaves.")
-    try:
-        replace_folder(fresh, folder)
-    finally:
-        os.close(held)
 
 
 def _write(folder: Path, content: ReportInput, *, report: bool) -> None:
