@@ -3,17 +3,8 @@
 from dataclasses import replace
 from pathlib import Path
 
+from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, write_residuals
-from discrepancy.files.verdict import (
-    PATCH_NAME,
-    PATCHED,
-    VERDICT_NAME,
-    StoredPatch,
-    fmu_outputs,
-    patch_effects,
-    write_patch,
-    write_verdict,
-)
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import render_report
@@ -44,9 +35,9 @@ def check_folder(folder: Path, *, replace_it: bool) -> None:
         raise FileNotWrittenError(f"{folder} exists and is no folder: choose another --out.")
     if not folder.is_dir() or not any(folder.iterdir()):
         return
-    if not (folder / VERDICT_NAME).is_file():
+    if not (folder / files.VERDICT_NAME).is_file():
         raise FileNotWrittenError(
-            f"{folder} exists and holds no {VERDICT_NAME}, so it is not touched: choose another --out."
+            f"{folder} exists and holds no {files.VERDICT_NAME}, so it is not touched: choose another --out."
         )
     if not replace_it:
         raise FileNotWrittenError(
@@ -89,17 +80,19 @@ def write_verdict_folder(
 def _write(folder: Path, content: ReportInput, *, report: bool) -> None:
     found, origin = content.investigation, content.origin
     verdict = found.verdict
-    write_verdict(folder / VERDICT_NAME, verdict, found.proof, origin)
+    files.write_verdict(folder / files.VERDICT_NAME, verdict, found.proof, origin)
     if found.problem is not None and found.fit is not None and found.fit.candidate.terms:
-        if verdict.kind in PATCHED:
+        if verdict.kind in files.PATCHED:
             draws = patch_draws(found.problem, found.fit, origin.provenance.seed or 0)
-            effects = patch_effects(named_effects(found.problem, found.fit), draws)
+            effects = files.patch_effects(named_effects(found.problem, found.fit), draws)
             content = replace(content, intervals=[effect.intervals for effect in effects])
-            outputs = fmu_outputs(found.campaign.channels)
-            patch = StoredPatch(verdict.kind, verdict.sentence, effects, outputs, verdict.parameters, origin)
-            write_patch(folder / PATCH_NAME, patch)
+            outputs = files.fmu_outputs(found.campaign.channels)
+            patch = files.StoredPatch(
+                verdict.kind, verdict.sentence, effects, outputs, verdict.parameters, origin
+            )
+            files.write_patch(folder / files.PATCH_NAME, patch)
         if verdict.kind is VerdictKind.NAMED and content.pack is not None:
-            content = replace(content, fmu=content.pack(folder / PATCH_NAME, folder / FMU_NAME))
+            content = replace(content, fmu=content.pack(folder / files.PATCH_NAME, folder / FMU_NAME))
     if found.after is not None:
         label = added_label(found) or "nothing added"
         write_residuals(

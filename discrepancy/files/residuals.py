@@ -105,8 +105,8 @@ def read_residuals(path: Path) -> ResidualSet:
             return _residuals(tree)
     except _DAMAGED as error:
         raise VerdictFileError(
-            f"{path} is damaged or no file of residuals ({type(error).__name__}: {one_line(error)}); write it "
-            "again."
+            f"{path} is damaged or no file of residuals ({type(error).__name__}: {one_line(error)}); write "
+            "it again."
         ) from error
     raise VerdictFileError(f"{path} has the schema {schema!r}, but {SCHEMA!r} is needed.")
 
