@@ -12,7 +12,7 @@ from math import inf
 
 import numpy as np
 
-from discrepancy.campaign.noise import NoiseModel
+from discrepancy.campaign.noise import NoiseModel, noise_model
 from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
@@ -22,7 +22,7 @@ from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
 from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Candidate, Linearisation, Point, State, moved
-from .trial_data import GlobalUnknowns, TrialData, TrialDerivatives, global_unknowns, noise_models
+from .trial_data import GlobalUnknowns, TrialData, TrialDerivatives, global_unknowns, stand_in
 
 KEPT = 2000
 """Responses that a problem keeps."""
@@ -81,7 +81,10 @@ class Problem:
             )
         self.channel_names = tuple(campaign.channels)
         self.refinement: int = 1 if like is None else like.refinement
-        self.noise: dict[str, NoiseModel] = like.noise if like is not None else noise_models(campaign)
+        self.noise: dict[str, NoiseModel] = {
+            name: noise_model(channel, stand_in(campaign, name)) if like is None else like.noise[name]
+            for name, channel in campaign.channels.items()
+        }
         self.trials = tuple(TrialData.of(campaign, trial, self.noise, model) for trial in chosen)
         counts = np.zeros(len(self.channel_names))
         for data in self.trials:

@@ -134,11 +134,6 @@ class ResidualSet:
         noise = self.channels[channel].noise
         return 0.0 if noise is None else noise.degrees_of_freedom
 
-    @property
-    def parameter_count(self) -> int:
-        """Number of fitted parameters P as far as sensitivities tell; zero without."""
-        return next((i.sensitivity.shape[2] for i in self.trials if i.sensitivity is not None), 0)
-
     def white(self, generator: np.random.Generator) -> tuple[FloatArray, ...]:
         """Return residuals that are white with unit variance if the model is right, (N, C) by trial.
 
@@ -148,7 +143,8 @@ class ResidualSet:
         residuals are divided by their expected deviation. Samples that are not used are drawn from the noise,
         so that series keep their even spacing.
         """
-        draw = generator.standard_normal(self.parameter_count)
+        columns = (item.sensitivity.shape[2] for item in self.trials if item.sensitivity is not None)
+        draw = generator.standard_normal(next(columns, 0))
         outside = self._held_out_draw(draw)
         white = []
         for item in self.trials:
