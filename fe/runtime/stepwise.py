@@ -117,8 +117,8 @@ class ModalMotion(NamedTuple):
     q: FloatArray
     v: FloatArray
     port_forces: FloatArray
-    memory: FloatArray
     lagged: FloatArray
+    memory: FloatArray
 
 
 class Begin(NamedTuple):
@@ -168,7 +168,7 @@ def advance(
         before = acting
     if laws.spans:
         out = Samples(*(item[steps.sample] for item in out))
-    return ModalMotion(out.q, out.v, out.forces, kept, out.lagged)
+    return ModalMotion(*out, kept)
 
 
 def _sections(laws: Laws, time: FloatArray) -> Iterator[tuple[int, int, BoolArray]]:
