@@ -192,7 +192,8 @@ class SecondOrderSystem(LinearSystem):
         held = int(np.searchsorted(times, 0.0)) if release.at_rest else 0
         stamps = times[held:] if held < len(times) else np.zeros(1)  # which nobody looks at
         if stamps[0] < 0.0:
-            begin = self._backwards(q, v, -float(stamps[0]))
+            back = self.modal.exact_steps(-stamps[:1])[0][0]
+            begin = Begin(*np.split(np.linalg.solve(back, np.concatenate((q, v))), 2))
         found = self._followed(acting, laws, 0.0, stamps, begin, refinement)
         parts = list(found[:4])
         if held:
@@ -271,12 +272,6 @@ class SecondOrderSystem(LinearSystem):
         deviation = given[:, 0] * unit
         deviation[0] = 0.0
         return Begin(acts @ self.shapes / w**2 + deviation, np.zeros(len(w)), memory), holding * row
-
-    def _backwards(self, q: FloatArray, v: FloatArray, duration: float) -> Begin:
-        """Return the state a duration [s] earlier, without internal forces."""
-        step = self.modal.exact_steps(np.array([duration]))[0][0]
-        state = np.linalg.solve(step, np.concatenate((q, v)))
-        return Begin(state[: len(q)], state[len(q) :])
 
     # ------------------------------------------------------------ steps
 

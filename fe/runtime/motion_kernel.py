@@ -262,28 +262,13 @@ def second_half(
         end = speed - before.lost[j]
         can_hold = holds(ports.numbers[j], ports.values[j])
         if can_hold and before.freed[j] == 0.0 and before.speed[j] != 0.0 and before.speed[j] * end <= 0.0:
-            slopes = slopes_at_port(linear, ports, state, before, j, time, h)
-            turn_over(ports, acting, state, before, j, now, slopes, h)
+            turn_over(linear, ports, acting, state, before, j, now, time, h)
         else:
             after = kick(ports.numbers[j], ports.values[j], speed, now, half, False)
             if after == 0.0 and can_hold and now > 0.0:
                 state.memory[j, 0] = 1.0
                 state.memory[j, 1] = x
             add(state.v, acting.pull[j], after - speed, 1.0)
-
-
-def slopes_at_port(
-    linear: Linear, ports: Ports, state: State, before: Before, j: int, time: float, h: float
-) -> tuple[float, float]:  # fmt: skip
-    """Return the acceleration of a port at both ends of a step, as friction of the first sign has it."""
-    at_begin = -2.0 * before.lost[j] / h
-    at_end = -2.0 * before.lost[j] / h
-    for m in range(len(state.q)):
-        first = acceleration(linear, ports, before.q, before.v, before.forces, linear.begin[m], time, m)
-        last = acceleration(linear, ports, state.q, state.v, state.current, linear.end[m], time + h, m)
-        at_begin += ports.rows[j, m] * first
-        at_end += ports.rows[j, m] * last
-    return at_begin, at_end
 
 
 def acceleration(
@@ -300,14 +285,21 @@ def acceleration(
 
 
 def turn_over(
-    ports: Ports, acting: Acting, state: State, before: Before, j: int, now: float,
-    slopes: tuple[float, float], h: float,
+    linear: Linear, ports: Ports, acting: Acting, state: State, before: Before, j: int, now: float,
+    time: float, h: float,
 ) -> None:  # fmt: skip
     """Correct speed and position of a port whose friction turned over within a step."""
+    at_begin = -2.0 * before.lost[j] / h  # acceleration at both ends, as friction of the first sign has it
+    at_end = at_begin
+    for m in range(len(state.q)):
+        first = acceleration(linear, ports, before.q, before.v, before.forces, linear.begin[m], time, m)
+        last = acceleration(linear, ports, state.q, state.v, state.current, linear.end[m], time + h, m)
+        at_begin += ports.rows[j, m] * first
+        at_end += ports.rows[j, m] * last
     speed = at_port(ports.rows, j, state.v)
     change, way, held = crossing(
-        ports.numbers[j], ports.values[j], before.speed[j], speed - before.lost[j], slopes, before.lost[j],
-        now, h,
+        ports.numbers[j], ports.values[j], before.speed[j], speed - before.lost[j], (at_begin, at_end),
+        before.lost[j], now, h,
     )  # fmt: skip
     if held == 1.0:
         change = -speed
