@@ -1,6 +1,6 @@
 """Motion of a linear system with laws at its ports, at any time stamps: exact between them without laws.
 
-Steps are those of `fe.runtime.modal_system.exact_step`; lengths that differ by less than `ALIKE` of the
+Steps are those of `ModalSystem.exact_steps`; lengths that differ by less than `ALIKE` of the
 usual one are one. NumPy and relative imports only: this file is copied into the FMU.
 """
 
