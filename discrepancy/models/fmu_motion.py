@@ -139,27 +139,20 @@ class FmuMotion:
     def begin(self, run: Run) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
         """Return an instance at the begin of a motion, its outputs there, and the inputs (steps,) to come."""
         state, step, steps, loads = run
-        parameters = dict(state.parameters)
+        parameters, held = dict(state.parameters), dict[str, float]()
         histories = {name: np.full(steps, value) for name, value in self.runs.inputs(state).items()}
-        held: dict[str, float] = {}
-        way = self._description.release
         for part, value in loads:
-            if part.kind in ("displacement", "velocity"):
-                amount = value if part.kind == "velocity" else self._released(state, step, value)
-                parameters[self.runs.parameter(str(getattr(way, part.kind)))] = amount
-            elif part.kind == "hold":
-                assert way is not None
-                name = self.runs.variable(str(way.hold))
-                held[name] = held.get(name, 0.0) + self._released(state, step, value)
+            if part.kind == "parameter":
+                parameters[part.name] = value
             else:
                 histories[part.name][: len(part.series)] += value * part.series[:steps]
                 held[part.name] = held.get(part.name, 0.0) + value * part.begin
-        settle = any(value != 0.0 for value in held.values())
+        settle = any(part.begin for part, _ in loads)
         asset, first = self.runs.started(step, parameters, self.runs.inputs(state, held), settle=settle)
         return asset, first, histories
 
-    def _released(self, state: State, step: float, displacement: float) -> float:
-        """Return force [N] or parameter [m] that puts the release point at a displacement [m].
+    def let_go(self, state: State, step: float, displacement: float) -> tuple[Excitation, float]:
+        """Return the force and its size [N], or the parameter [m], that put the release point somewhere [m].
 
         Raises
         ------
@@ -168,28 +161,21 @@ class FmuMotion:
         """
         way = self._description.release
         assert way is not None
-        if way.output is None:
-            return displacement
-        column = self.runs.columns["release"]
+        what, first = Excitation("parameter", self.runs.parameter(str(way.displacement))), displacement
+        if way.hold is not None:
+            what = Excitation("hold", self.runs.variable(way.hold), begin=1.0)
+            first = min(1.0, 0.1 * self.runs.input_limit(way.hold))
+        if way.output is None or displacement == 0.0:
+            return what, displacement
 
         def shown(amount: float) -> float:
-            def start() -> FloatArray:
-                parameters, held = dict(state.parameters), {}
-                if way.hold is not None:
-                    held = {self.runs.variable(way.hold): amount}
-                else:
-                    parameters[self.runs.parameter(str(way.displacement))] = amount
-                inputs = self.runs.inputs(state, held)
-                return self.runs.started(step, parameters, inputs, settle=bool(held))[1]
+            run = Run(state, step, 0, [(what, amount)])
+            found = self.runs.remembered(("begin", run.key), lambda: self.begin(run)[1])
+            return float(found[self.runs.columns["release"]])
 
-            return float(self.runs.remembered(("released", state, amount), start)[column])
-
-        first = displacement if way.hold is None else min(1.0, 0.1 * self.runs.input_limit(way.hold))
-        if displacement == 0.0:
-            return 0.0
-        kind = (False, (("hold", ""),))
+        kind = (False, ((what.kind, what.name),))
         if way.hold is not None and self._linear.get(kind) and self._silent.get(kind):
-            return displacement * first / shown(first)
+            return what, displacement * first / shown(first)
         zero = shown(0.0)
         amount, reached = first, shown(first) - zero
         slope = reached / first
@@ -202,7 +188,7 @@ class FmuMotion:
                 slope = (now - reached) / (new - amount)
             amount, reached = new, now
         if abs(reached - displacement) <= 1e-6 * abs(displacement):
-            return amount
+            return what, amount
         raise ModelError(
             f"Nothing that [release] names puts {way.output!r} of the FMU model "
             f"{self._description.name!r} at {displacement:g} m; correct displacement, hold or output there."
@@ -236,9 +222,8 @@ class FmuMotion:
             return mode[0]
         way = self._description.release
         if way is not None:
-            kind = "displacement" if way.displacement is not None else "hold"
             size = trial.release.displacement if trial.release is not None else 1e-3
-            loads: Loads = [(Excitation(kind), size)]
+            loads: Loads = [self.let_go(state, step, size)]
         else:
             name = self.forces[0] if self.forces else next(iter(self.runs.asset.binding.load))
             loads = [(Excitation("input", name, np.eye(1, len(trial.time)).ravel()), 1.0)]
