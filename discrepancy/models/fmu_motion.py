@@ -102,12 +102,12 @@ class FmuMotion:
             self._units.setdefault((kind[0], part.kind, part.name), 2.0 ** round(log2(abs(value))))
             for part, value in zip(parts, values, strict=True)
         ]
-        moved = [asked(one) for one in np.diag(units).tolist()]
+        moved = np.array([asked(one) for one in np.diag(units).tolist()])
         zero = np.zeros_like(moved[0])
         if not self._silent.get(kind):  # an FMU that shows nothing without excitation does so always
             zero = asked([0.0] * len(parts))
             self._silent.setdefault(kind, not np.any(zero))
-        moved, result = [part - zero for part in moved], zero.copy()
+        moved -= zero
         if kind not in self._linear:  # half of all excitations gives half of the sum of what each gives
             half = asked([0.5 * size for size in units]) - zero
             size = np.atleast_2d(np.sum(np.abs(moved), axis=0)).max(axis=0)
@@ -115,15 +115,11 @@ class FmuMotion:
             self._linear[kind] = bool(np.all(np.abs(half - 0.5 * np.sum(moved, axis=0)) <= allowed))
             if not self._linear[kind]:
                 return asked(values)
-        for value, unit, part in zip(values, units, moved, strict=True):
-            result += value / unit * part
-        return result
+        return zero + np.tensordot(np.array(values) / units, moved, 1)
 
     def _rest(self, run: Run) -> FloatArray:
-        parameters, inputs = (
-            run.state.parameters,
-            self.runs.inputs(run.state, {part.name: value for part, value in run.loads}),
-        )
+        parameters = run.state.parameters
+        inputs = self.runs.inputs(run.state, {part.name: value for part, value in run.loads})
         if self._description.static.settle:
             return self.runs.started(run.step, dict(parameters), inputs, settle=True)[1]
         if self._resting != parameters:  # inputs change from step to step, parameters need a reset
@@ -274,23 +270,27 @@ class FmuMotion:
 
     def records(self, state: State, step: float, count: int) -> FloatArray:
         """Return the outputs (count, C, P) after unit forces over the first step, less those without."""
-        zero: FloatArray | float = 0.0
-        if not self._quiet:
-            zero = self.stepped(Run(state, step, count, []))
-            self._quiet = not np.any(zero)
-        pulse, parts = np.eye(1, count).ravel(), []
+        pulse, parts = np.eye(1, count).ravel(), list[FloatArray]()
         for name, size in zip(self.forces, self.sizes.tolist(), strict=True):
-            moved = self.stepped(Run(state, step, count, [(Excitation("input", name, pulse), size)]))
-            parts.append((moved - zero)[1:] / size)
+            run = Run(state, step, count, [(Excitation("input", name, pulse), size)])
+            parts.append(self._moved(run)[1:] / size)
         return np.stack(parts, axis=2)
+
+    def _moved(self, run: Run) -> FloatArray:
+        """Return the outputs (steps + 1, C) of a motion by the FMU itself, less those without loads."""
+        moved, still = self.stepped(run), run._replace(loads=[])
+        if self._quiet:
+            return moved
+        zero = self.runs.remembered(("without", still.key), lambda: self.stepped(still))
+        self._quiet = not np.any(zero)
+        return moved - zero
 
     def _confirmed(self, system: PortSystem, state: State, step: float, count: int, tolerance: float) -> bool:
         """Whether the FMU answers to many forces as the system says that was made of single ones."""
         signs = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(self.forces)))
         series = zip(self.forces, signs.T.copy(), self.sizes.tolist(), strict=True)
         loads = [(Excitation("input", name, values), size) for name, values, size in series]
-        moved = self.stepped(Run(state, step, count, loads))
-        moved -= self.stepped(Run(state, step, count, []))
+        moved = self._moved(Run(state, step, count, loads))
         error = np.max(np.abs(moved - system.motion(signs * self.sizes, step)), axis=0)
         return bool(np.all(error <= tolerance * np.max(np.abs(moved), axis=0) + 1e-300))
 
