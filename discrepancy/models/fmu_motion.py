@@ -115,7 +115,7 @@ class FmuMotion:
             self._linear[kind] = bool(np.all(np.abs(half - 0.5 * np.sum(moved, axis=0)) <= allowed))
             if not self._linear[kind]:
                 return asked(values)
-        return zero + np.tensordot(np.array(values) / units, moved, 1)
+        return np.asarray(zero + np.tensordot(np.array(values) / units, moved, 1))
 
     def _rest(self, run: Run) -> FloatArray:
         parameters = run.state.parameters
