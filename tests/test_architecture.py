@@ -56,7 +56,7 @@ ROOMS = {
     ),
     "discrepancy": (
         "errors", "sentences", "campaign", "models", "lumped_models", "location", "catalogue",
-        "document_types", "verdict", "files", "search_settings", "fits", "missing_force", "search",
+        "document", "verdict", "files", "search_settings", "fits", "missing_force", "search",
         "judgement", "checks",
         "sources", "model_choice", "workflow", "parameters", "application", "self_calibration", "report",
         "verdict_folder",

@@ -117,8 +117,7 @@ def test_the_law_of_the_missing_force_is_ahead_of_all_others(
 ) -> None:
     problem = problem_of(tmp_path, number)
     search = ForceSearch(problem)
-    at = search.locate()
-    assert max(at, key=lambda name: at[name].evidence) == port
+    assert max(search.at, key=lambda name: search.at[name].evidence) == port
     ranked = [item for item in search.name(available(problem)) if len(item.candidate.terms) == 1]
     (term,) = ranked[0].candidate.terms
     assert (term.effect.identifier, term.place) == (effect, port)
@@ -204,7 +203,7 @@ def assert_alike(campaign: Campaign, one: Model, other: Model, share: float) -> 
     """Two models that are the same miss the same force with the same evidence."""
     scales = one.scales(campaign)
     first, second = (
-        next(iter(ForceSearch(Problem(campaign, item, Setting(campaign, item, scales))).locate().values()))
+        next(iter(ForceSearch(Problem(campaign, item, Setting(campaign, item, scales))).at.values()))
         for item in (one, other)
     )
     assert second.evidence == pytest.approx(first.evidence, abs=0.5)
@@ -253,7 +252,6 @@ def test_a_patch_and_the_same_in_the_file_of_a_model_miss_the_same_force() -> No
 def seen_force(problem: Problem, effect: Effect | None = None, place: str = "") -> MissingForce | None:
     """Return the missing force of a problem, an effect drawn through it if one is given."""
     search = ForceSearch(problem)
-    search.locate()
     found = None
     if effect is not None:
         term = Term(effect, place)
@@ -297,7 +295,6 @@ def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path: 
     write_drive(tmp_path)
     problem = read(tmp_path)
     search = ForceSearch(problem)
-    search.locate()
     found = [search.followed(search.whole, Candidate((term,)), start)
              for _, term, start in search.screened(search.whole, available(problem))[:12]]  # fmt: skip
     best, *_ = sorted((item for item in found if item is not None), key=lambda item: -item.evidence)
@@ -339,7 +336,7 @@ def test_the_missing_force_does_not_depend_on_where_it_is_linear_about() -> None
     problem = chain("ringdown", "coulomb_friction", "joint", friction_ratio=0.004)
     candidate = Candidate((Term(FRICTION, "joint"),))
     there = fit(problem, candidate, problem.start(candidate)).point
-    one, other = (ForceSearch(problem).locate(about)["joint"] for about in (None, there))
+    one, other = (ForceSearch(problem, about).at["joint"] for about in (None, there))
     assert one.evidence == pytest.approx(other.evidence, abs=40.0)  # of 15,000 readings
 
 
