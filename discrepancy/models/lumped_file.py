@@ -247,7 +247,7 @@ class LumpedDescription(ModelDescription):
             named.append((f"{is_} the reaction of the prescribed motion", output.reaction, driven))
             named.append((f"{is_} what a controller gives,", output.controller, names["controller"]))
         for item in self.parameter:
-            named += [(f"parameter {item.name!r} scales", term, scaled) for term in item.scaled]
+            named += [(f"parameter {item.name!r} scales", term, scaled) for term in item.terms]
         for what, name, known in named:
             if name is not None and name not in known:
                 raise ValueError(f"{what} {name!r}, but there are {', '.join(known) or 'none'}")

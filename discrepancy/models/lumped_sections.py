@@ -206,13 +206,8 @@ class RootSection(Section):
 class ScaledParameter(ParameterSection):
     """`[[parameter]]`: a factor of the terms named."""
 
-    terms: Name | tuple[Name, ...]
+    terms: Annotated[tuple[Name, ...], BeforeValidator(_listed)]
     mean: Number = 1.0
-
-    @property
-    def scaled(self) -> tuple[str, ...]:
-        """Names of the terms."""
-        return (self.terms,) if isinstance(self.terms, str) else self.terms
 
     @model_validator(mode="after")
     def _in_range(self) -> Self:
