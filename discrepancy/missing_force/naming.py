@@ -170,8 +170,7 @@ class ForceSearch:
                 view = self._along(bare, bare.smoothed(self.at[name].processes)[2]) if turn else bare
                 begins = [scaled(self.about((port,)), 1.0, time) for time in BEGIN_TIMES]
                 begins += [self.at[name].processes] if turn else []
-                found = [seen(view, self.about(one), one, SHARES[:1]) for one in begins]
-                self.at[name] = max(found, key=lambda item: item.evidence)
+                self.at[name] = seen(view, self.about((port,)), begins, SHARES[:1])
             if not turn and about is None:
                 self.point = self._point(self.best())
         self.whole = self._together()
@@ -188,8 +187,8 @@ class ForceSearch:
         for item in ranked[1:]:
             begin |= scaled(item.processes, BESIDE, 1.0)
         view = best.view
-        for _ in range(2):
-            found = seen(view, self.about(begin), begin, SHARES[:1])
+        for shares in (SHARES[:1], ()):
+            found = seen(view, self.about(begin), [begin], shares)
             view = self._along(view, found.motions)
             begin = dict(found.processes)
         return found
@@ -227,7 +226,7 @@ class ForceSearch:
             for _ in range(2):
                 view = self._along(view, view.smoothed(found.processes)[2])
             begin = {at: replace(one, rough=True) for at, one in found.processes.items()}
-            found = seen(view, self.about(begin), begin)
+            found = seen(view, self.about(begin), [begin])
         return found
 
     def whole_point(self, found: Explained) -> Point:
@@ -357,8 +356,8 @@ class ForceSearch:
             if view is None:
                 break
             if turn == 0 or settled or turn == ROUNDS - 1:
-                some = SHARES[: 1 if turn else None]
-                found = seen(view, self.about(processes), processes, some, candidate, effect)
+                some = () if turn else SHARES
+                found = seen(view, self.about(processes), [processes], some, candidate, effect)
                 processes = dict(found.processes)
             else:
                 evidence = view.evidence(self.about(processes), processes)
@@ -406,11 +405,11 @@ class ForceSearch:
 def seen(
     view: View,
     about: Processes,
-    begin: Processes,
+    begins: Sequence[Processes],
     shares: Sequence[float] = SHARES,
     candidate: Candidate = NOTHING,
     effect: FloatArray = NO_VALUES,
 ) -> Explained:
     """Return a hypothesis beside the most probable missing forces, about some and begun at others."""
-    processes, evidence = view.most_probable(about, begin, shares)
+    processes, evidence = view.most_probable(about, begins, shares)
     return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))

@@ -122,7 +122,7 @@ def _most_telling(port: int, at: Explained) -> tuple[int, Explained]:
         ]
         about = max(processes, key=lambda item: on_reading.solve(item).evidence)
         if on_reading.solve(about).evidence > best[1].evidence:
-            best = 0, seen(on_reading, about, about)
+            best = 0, seen(on_reading, about, [about])
     return best
 
 
@@ -155,7 +155,7 @@ def of_series(
     )  # fmt: skip
     size = max(float(np.sqrt(np.mean(trial.residual**2))), 1.0)
     about = {0: Process(size, 0.1 * float(np.ptp(time)), rough=True)}
-    found = seen(View([trial], np.zeros(0)), about, about)
+    found = seen(View([trial], np.zeros(0)), about, [about])
     return found, pattern[0]
 
 
