@@ -12,7 +12,7 @@ import typer
 
 from reporting import terminal
 from uav_twin.options import FmiVersion, Kind, Replace
-from uav_twin.verify import Check, end_with, print_checks
+from uav_twin.wing import Check, end_with, print_checks
 
 if TYPE_CHECKING:
     from fe.reduction.structure_errors import MeasuredErrors

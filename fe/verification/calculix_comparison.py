@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fe.elements.cells import gradients, strain_matrix
+from fe.elements.kinds import gauss_points
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
@@ -21,8 +21,7 @@ from .calculix_job import read_frequencies, read_tables, run_calculix
 
 TEST_FORCE = 10.0
 """Upward force of the static test and before the ring-down [N]."""
-_LINE = 0.5 + 0.5 * np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0])
-INTEGRATION_POINTS = np.array([(x, y, z) for z in _LINE for y in _LINE for x in _LINE])
+INTEGRATION_POINTS = gauss_points(3)[0][:, ::-1]
 """Local places (27, 3) in 0..1 of the integration points of a C3D20 element, in the order of its output."""
 # Places of our strains in the order in which CalculiX prints a strain tensor: xx, yy, zz, xy, xz, yz.
 _PRINTED = [0, 1, 2, 5, 4, 3]
@@ -156,10 +155,8 @@ def wing_agreement(
 
 def _strain_tensors(operators: AffineOperators, free: FloatArray) -> FloatArray:
     """Strain tensors (27 cells, 6) in CalculiX's order at the integration points of the gauges' cells."""
-    mesh, cells = operators.wing_mesh, gauge_cells(operators)
-    slopes, _ = gradients(mesh.kind, mesh.nodes[cells], INTEGRATION_POINTS)
-    displacement = operators.full_displacement(free).ravel()[mesh.unknowns_of(cells)]
-    voigt = np.einsum("nqij,nj->nqi", strain_matrix(slopes), displacement).reshape(-1, 6)
+    displacement, cells = operators.full_displacement(free), gauge_cells(operators)
+    voigt = operators.wing_mesh.strains(displacement, cells, INTEGRATION_POINTS).reshape(-1, 6)
     voigt[:, 3:] *= 0.5  # engineering to tensor shear
     return np.asarray(voigt[:, _PRINTED])
 
