@@ -302,11 +302,8 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
 
     The root is a rigid set about the straight chord line, which moves in heave, flap and yaw on its springs.
     """
-    mesh, plan, lift = (
-        operators.wing_mesh,
-        operators.wing_mesh.design.planform,
-        operators.wing_mesh.design.lift,
-    )
+    mesh, design = operators.wing_mesh, operators.wing_mesh.design
+    plan, lift = design.planform, design.lift
     masses = (
         PointBlock(
             state.servo_mass if place.kind == "servo" else state.pitot_mass,
