@@ -16,10 +16,9 @@ from discrepancy.models.acting import Acting, Shown, shown_rows
 from discrepancy.models.interface import NO_PATCH, Outputs, Place
 from discrepancy.models.linear_system import Resting, springs
 from discrepancy.models.memory import Memory
-from discrepancy.models.reduced_structure import StructuralModel
 from discrepancy.models.scales import PortScale
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.system_model import Case, State
+from discrepancy.models.system_model import Case, State, SystemModel
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import PLANFORM, STATION_PORTS
@@ -54,7 +53,7 @@ paper, its masses, and the damping of the joint posterior, whose spread holds th
 ROTATING_PORT = "root"
 
 
-class WingModel(StructuralModel):
+class WingModel(SystemModel):
     """The wing in the states and under the structural patches that are asked for, each made once.
 
     Parameters
