@@ -23,10 +23,10 @@ _SOLVE = """
 import json, resource, sys, time
 import numpy as np
 from scipy.sparse.linalg import splu
-from fe.full import cholesky
+from fe.full import factorisation
 from fe.wing.design import load_design
 from fe.wing.operators import assemble
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation
 
 def least(function, repeats):
     times = []
@@ -40,7 +40,7 @@ def solved():
     return Factorisation(stiffness).solve(load)
 
 def first():
-    cholesky._analysed.cache_clear()
+    factorisation._analysed.cache_clear()
     return solved()
 
 def superlu():
@@ -73,7 +73,7 @@ import sys
 from pathlib import Path
 from fe.runtime.state import DigitalState
 from fe.verification.calculix_deck import Step
-from fe.verification.calculix_models import wing_deck
+from fe.verification.calculix_deck import wing_deck
 from fe.wing.design import load_design
 from fe.wing.operators import assemble
 operators = assemble(load_design().changed(mesh={"refinement": float(sys.argv[1])}))

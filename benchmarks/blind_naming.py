@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
 from discrepancy.errors import DiscrepancyError
-from discrepancy.files.patch import primitive_intervals
+from discrepancy.files.verdict import primitive_intervals
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.wing import WingModel

@@ -23,15 +23,9 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.models.acting import Acting, Course, Shown
-from discrepancy.models.interface import (
-    Conditions,
-    Model,
-    Outputs,
-    PortScale,
-    Response,
-    Scales,
-)
+from discrepancy.models.interface import Conditions, Model, Outputs, Response
 from discrepancy.models.questions import release_of
+from discrepancy.models.scales import PortScale, Scales
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.sensing import observe
 from fe.runtime.motion import laws_of

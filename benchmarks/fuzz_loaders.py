@@ -36,9 +36,8 @@ from calibration.static.experiments import read_measurements
 from calibration.wing.lab_data import read_weighed_mass
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import load_catalogue
-from discrepancy.files.patch import read_patch
 from discrepancy.files.residuals import read_residuals
-from discrepancy.files.verdict import read_verdict_file
+from discrepancy.files.verdict import read_patch, read_verdict_file
 from discrepancy.models.fmu_file import load_fmu_model
 from discrepancy.models.lumped import LumpedModel
 from fe.runtime.patch_arrays import PatchArrays

@@ -23,7 +23,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.models.wing import WingModel
 from discrepancy.report.figures import missing_force_figure
-from discrepancy.sources.real_wing import SIGNAL, wing_campaign
+from discrepancy.sources.measured_rigs import SIGNAL, wing_campaign
 from discrepancy.workflow import Investigation, investigate
 
 BEGINS = (0.8, 1.0, 1.25)
@@ -164,7 +164,7 @@ def main() -> int:
             [effect.identifier for effect in row.effects], f"{row.probability:.3f}", f"{row.chi_square:.1f}"
         )
     if first.location is not None:
-        for item in first.location.explanations:
+        for item in first.location.disagreements:
             console.print(item)
     for experiment in first.verdict.next_experiments:
         console.print(experiment.description, f"{float(experiment.information):.3f}")

@@ -10,18 +10,20 @@ from typing import Any
 from calibration.result.file import load_calibration
 from calibration.result.plain import tailoring
 from discrepancy.errors import DiscrepancyError, ModelError
-from discrepancy.files.patch import (
+from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
+from discrepancy.files.verdict import (
     APPLIED,
     PATCH_NAME,
     PATCHED,
+    VERDICT_NAME,
     StoredPatch,
+    StoredVerdict,
     fmu_outputs,
     patch_effects,
     read_patch,
+    read_verdict_file,
     write_patch,
 )
-from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
-from discrepancy.files.verdict import VERDICT_NAME, StoredVerdict, read_verdict_file
 from discrepancy.model_choice import ModelChoice, ModelKind, model_of
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
 from discrepancy.sentences import SENTENCES, said

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from discrepancy.errors import ModelError, VerdictFileError
 from discrepancy.files.document import Origin
-from discrepancy.files.patch import StoredPatch, read_patch
+from discrepancy.files.verdict import StoredPatch, read_patch
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.fmu_runs import binding_file
 from discrepancy.models.interface import Model

@@ -6,9 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from discrepancy.files.patch import PATCH_NAME, PATCHED, StoredPatch, fmu_outputs, patch_effects, write_patch
 from discrepancy.files.residuals import RESIDUALS_NAME, write_residuals
-from discrepancy.files.verdict import VERDICT_NAME, write_verdict
+from discrepancy.files.verdict import (
+    PATCH_NAME,
+    PATCHED,
+    VERDICT_NAME,
+    StoredPatch,
+    fmu_outputs,
+    patch_effects,
+    write_patch,
+    write_verdict,
+)
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import render_report

@@ -1,10 +1,22 @@
-"""Good inputs as files beside the tests, and tables of what is refused in them."""
+"""Good inputs as files beside the tests, tables of what is refused in them, and refusals in one sentence."""
 
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import pytest
+
+
+@contextmanager
+def refused(error: type[Exception] | tuple[type[Exception], ...], sentence: str) -> Iterator[None]:
+    """Expect an error of which the message holds a regular expression, on one line."""
+    with pytest.raises(error, match=sentence) as caught:
+        yield
+    assert "\n" not in str(caught.value)
 
 
 class Inputs:

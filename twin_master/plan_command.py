@@ -246,7 +246,7 @@ def _draw_design(
 ) -> None:  # fmt: skip
     import numpy as np
 
-    from fe.structure.field import write_vtu
+    from fe.structure.operators import write_vtu
     from twin_master.report.plan import design_figure
 
     places, outlines = where

@@ -10,8 +10,8 @@ from discrepancy.model_choice import load_model as load_model
 from discrepancy.workflow import investigate as investigate
 from fe.reduction.model_cache import reduced_model as reduced_model
 from fe.reduction.model_cache import reduced_structure as reduced_structure
-from fe.structure.field import natural_frequencies as natural_frequencies
-from fe.structure.field import static_responses as static_responses
+from fe.structure.affine import natural_frequencies as natural_frequencies
+from fe.structure.affine import static_responses as static_responses
 from fe.structure.operators import assemble_structure as assemble_structure
 from fe.wing.design import load_design as load_design
 from fe.wing.operators import assemble as assemble

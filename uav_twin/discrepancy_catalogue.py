@@ -173,8 +173,7 @@ def convert(
 ) -> None:
     """Write published measurements as a campaign; of other rigs than the wing with `model.toml` beside it."""
     from discrepancy.campaign.reading import read_campaign
-    from discrepancy.sources.measured_rigs import THE_WING, write_rig_campaign
-    from discrepancy.sources.real_wing import write_wing_campaign
+    from discrepancy.sources.measured_rigs import THE_WING, write_rig_campaign, write_wing_campaign
 
     if rig != THE_WING:
         made = read_campaign(write_rig_campaign(rig, data, out))

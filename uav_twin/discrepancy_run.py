@@ -236,7 +236,7 @@ def _packing(choice: "ModelChoice", progress: "Progress") -> "Pack":
 
     def pack(patch_file: Path, target: Path) -> str:
         from discrepancy.application import pack_patched
-        from discrepancy.files.patch import read_patch
+        from discrepancy.files.verdict import read_patch
         from fmu_asset.errors import PatchFileError
 
         patch = read_patch(patch_file).upon(choice.built_in)
@@ -253,7 +253,7 @@ def _packing(choice: "ModelChoice", progress: "Progress") -> "Pack":
 
 
 def _show(found: "Investigation", folder: Path) -> None:
-    from discrepancy.files.patch import PATCH_NAME, read_patch
+    from discrepancy.files.verdict import PATCH_NAME, read_patch
     from discrepancy.judgement.conclusion import probability_text
     from discrepancy.judgement.when import when_sentence
     from discrepancy.report.text import (

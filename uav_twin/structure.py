@@ -91,7 +91,7 @@ def structure_record(structure: "DesignedStructure", modes: int) -> dict[str, An
 
     Lengths carry the unit of the mesh where `length_unit` stands beside them; everything else is in SI units.
     """
-    from fe.structure.field import natural_frequencies, static_responses
+    from fe.structure.affine import natural_frequencies, static_responses
     from fe.structure.operators import Structure
 
     design, heavy = structure.design, structure.mass().diagonal().any()
@@ -121,8 +121,8 @@ def structure_record(structure: "DesignedStructure", modes: int) -> dict[str, An
 
 
 def _of_mesh(structure: "Structure") -> dict[str, Any]:
-    from fe.structure.field import weighed
     from fe.structure.mesh_file import memory_estimate
+    from fe.structure.operators import weighed
 
     mesh = structure.mesh
     mass, centre = weighed(structure)
@@ -185,15 +185,11 @@ def verify(
     json: terminal.Json = False,
 ) -> None:
     """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
-    from fe.runtime.errors import CalculixError
     from fe.verification.calculix_comparison import structure_agreement
-    from fe.verification.calculix_job import calculix_program
+    from fe.verification.calculix_job import required_calculix
     from reporting.files import refuse_filled
 
-    if calculix_program() is None:
-        raise CalculixError(
-            "CalculiX ('ccx') is not installed; on Debian and Ubuntu: apt-get install calculix-ccx."
-        )
+    required_calculix()
     refuse_filled(out)
     structure = assembled(file, memory_limit, mass_as_stiffness=True)
     with (

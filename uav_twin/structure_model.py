@@ -87,7 +87,7 @@ def field(
     memory_limit: MemoryLimit = None,
 ) -> None:
     """Solve the full structure under all its loads, and write its field as VTU for ParaView."""
-    from fe.structure.field import write_structure_vtu
+    from fe.structure.operators import write_structure_vtu
     from reporting.files import refuse_existing
 
     refuse_existing(out, replace=replace)

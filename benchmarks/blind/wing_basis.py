@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
-from fe.full.modes import lowest_eigenpairs
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.wing.design import SHIPPED_DESIGN, WingDesign, load_design
 from fe.wing.operators import (
     ROOT_UNKNOWNS,

@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from discrepancy.campaign.noise_records import pre_trigger_record, with_noise
+from discrepancy.campaign.noise import pre_trigger_record, with_noise
 from discrepancy.campaign.records import (
     USUAL_REGIONS,
     BoolArray,

@@ -17,7 +17,7 @@ from scipy.special import beta
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.errors import CatalogueError
-from discrepancy.models.interface import PortScale
+from discrepancy.models.scales import PortScale
 from fe.runtime.patch import EVERY_CHANNEL
 
 from .entry import Setting

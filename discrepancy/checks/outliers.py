@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from discrepancy.campaign.noise_records import repeated
+from discrepancy.campaign.noise import repeated
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
 
 LARGEST_SHARE = 0.03

@@ -13,8 +13,7 @@ from itertools import combinations
 import numpy as np
 from scipy.stats import f as fisher
 
-from discrepancy.campaign.noise import MAINS, line_near, without_lines
-from discrepancy.campaign.noise_records import repeat_record
+from discrepancy.campaign.noise import MAINS, line_near, repeat_record, without_lines
 from discrepancy.campaign.noise_tests import lag_products
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, NoiseRecord, Trial
 from discrepancy.campaign.sampling import IntArray

@@ -1,19 +1,28 @@
 """`verdict.json`: what was concluded, what it rests on, and the proof."""
 
+import re
 from collections import ChainMap
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
+from math import nan
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import numpy as np
+from pydantic import AfterValidator, Field, WithJsonSchema
+
+from discrepancy.campaign.records import Channel, Quantity
+from discrepancy.document_types import PRIMITIVE_UNITS, Number
+from discrepancy.errors import VerdictFileError
+from discrepancy.files.document import Origin, read_document, write_document
+from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.verdict import Proof, Verdict
+from discrepancy.verdict import CalibratedParameter, NamedEffect, Proof, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch
+from fmu_asset.packing.patch_file import FIRST_SCHEMA
+from fmu_asset.packing.patch_file import SCHEMA as PATCH_SCHEMA
 from reporting.folders import restore_folder
-
-from .document import Origin, read_document, write_document
-from .patch import PATCH_NAME, read_patch
-from .residuals import RESIDUALS_NAME, read_residuals
 
 VERDICT_SCHEMA = "uav-twin verdict 4"
 """Value of the key `schema`; files of earlier numbers are read too."""
@@ -111,3 +120,203 @@ def read_verdict(folder: Path | str) -> VerdictFolder:
         patch=read_patch(patch).patch if patch.is_file() else None,
         residuals=read_residuals(residuals) if residuals.is_file() else None,
     )
+
+
+PATCHED = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART, VerdictKind.FAMILY, VerdictKind.GROUP)
+"""Verdicts that leave a patch."""
+APPLIED = (*PATCHED, VerdictKind.UNEXPLAINED)
+"""What a patch may rest on; on an unexplained gap where its best hypothesis is applied."""
+PATCH_NAME = "patch.json"
+
+_INTERVAL = (0.05, 0.95)
+_STRAIN = re.compile(r"strain\[\d+\]")
+_DISPLACEMENTS = ("tip_displacement", "load_point_displacement")
+
+
+@dataclass(frozen=True)
+class PrimitiveInterval:
+    """90 % posterior interval of a parameter of the primitive `primitive` (index in the effect's patch).
+
+    `low`, `high` are nan where the posterior was not drawn from; `unit` is that of the parameter.
+    """
+
+    primitive: Annotated[int, Field(ge=0, description="Index in the effect's list `patch`.")]
+    parameter: str
+    value: Annotated[float, Field(allow_inf_nan=False)]
+    low: Number
+    high: Number
+    unit: str
+
+
+@dataclass(frozen=True)
+class PatchEffect(NamedEffect):
+    """An effect with the intervals of its primitives."""
+
+    intervals: tuple[PrimitiveInterval, ...]
+
+
+def _patched(kind: VerdictKind) -> VerdictKind:
+    if kind not in APPLIED:
+        raise ValueError(f"a patch rests on a name, a family, a group or a hypothesis, not on {kind.value!r}")
+    return kind
+
+
+@dataclass(frozen=True)
+class StoredPatch:
+    """Content of patch.json.
+
+    Attributes
+    ----------
+    verdict : VerdictKind
+        What the patch rests on; of a group it is one member, mostly the most probable, and of an unexplained
+        gap the best hypothesis: these are no names.
+    sentence : str
+        The verdict in words.
+    effects : tuple of PatchEffect
+        In order.
+    channels : mapping of str to str
+        Outputs of the wing FMU by the names of channels.
+    parameters : tuple of CalibratedParameter
+        Of the model, beside these effects.
+    origin : Origin
+        What it was reached from.
+    """
+
+    verdict: Annotated[
+        VerdictKind, AfterValidator(_patched), WithJsonSchema({"enum": [kind.value for kind in APPLIED]})
+    ]
+    sentence: str
+    effects: tuple[PatchEffect, ...]
+    channels: Mapping[str, str]
+    parameters: tuple[CalibratedParameter, ...]
+    origin: Origin
+
+    @property
+    def patch(self) -> ModelPatch:
+        """The whole patch: that of all effects, in order."""
+        return sum((effect.patch for effect in self.effects), ModelPatch())
+
+    def upon(self, earlier: "StoredPatch | None") -> "StoredPatch":
+        """Return this patch and the one that was built into its model, for the model that had neither."""
+        if earlier is None:
+            return self
+        beneath = replace(
+            self.origin, model_file=earlier.origin.model_file, model_hash=earlier.origin.model_hash
+        )
+        return replace(
+            self,
+            effects=earlier.effects + self.effects,
+            origin=beneath,
+            channels={**earlier.channels, **self.channels},
+        )
+
+
+def primitive_intervals(patch: ModelPatch, draws: Sequence[ModelPatch] = ()) -> tuple[PrimitiveInterval, ...]:
+    """Return the interval of each real parameter of a patch.
+
+    Parameters
+    ----------
+    patch : ModelPatch
+        At the posterior's centre.
+    draws : sequence of ModelPatch
+        Patches of the same effect at draws of its posterior; their quantiles 0.05 and 0.95 are taken.
+
+    Raises
+    ------
+    VerdictFileError
+        If a draw has other primitives than the patch.
+    """
+    kinds = [item.kind for item in patch]
+    for count, draw in enumerate(draws, start=1):
+        if [item.kind for item in draw] != kinds:
+            raise VerdictFileError(
+                f"Draw {count} of the posterior has the primitives "
+                f"{', '.join(item.kind for item in draw) or 'none'}, but the patch has "
+                f"{', '.join(kinds) or 'none'}."
+            )
+    found = []
+    for place, primitive in enumerate(patch):
+        for name, unit in PRIMITIVE_UNITS[primitive.kind].items():
+            values = [float(getattr(draw.primitives[place], name)) for draw in draws]
+            low, high = np.quantile(values, _INTERVAL).tolist() if values else (nan, nan)
+            found.append(PrimitiveInterval(place, name, float(getattr(primitive, name)), low, high, unit))
+    return tuple(found)
+
+
+def patch_effects(
+    effects: Sequence[NamedEffect], draws: Sequence[Sequence[ModelPatch]] = ()
+) -> tuple[PatchEffect, ...]:
+    """Return effects with the intervals of their primitives.
+
+    Parameters
+    ----------
+    effects : sequence of NamedEffect
+        In order.
+    draws : sequence of sequence of ModelPatch, optional
+        For each effect, in order: its patch at draws of the posterior. Without, intervals are null.
+
+    Raises
+    ------
+    VerdictFileError
+        As `primitive_intervals`, or if there are not draws of each effect.
+    """
+    if draws and len(draws) != len(effects):
+        raise VerdictFileError(
+            f"Draws are needed for each of {len(effects)} effects, or none, but came for {len(draws)}."
+        )
+    return tuple(
+        PatchEffect(
+            **{item.name: getattr(effect, item.name) for item in fields(NamedEffect)},
+            intervals=primitive_intervals(effect.patch, draws[place] if draws else ()),
+        )
+        for place, effect in enumerate(effects)
+    )
+
+
+def write_patch(path: Path, stored: StoredPatch) -> Path:
+    """Write patch.json, whole or not at all.
+
+    Raises
+    ------
+    VerdictFileError, reporting.errors.FileNotWrittenError
+        As `write_verdict`.
+    """
+    return write_document(path, PATCH_SCHEMA, stored)
+
+
+def fmu_outputs(channels: Mapping[str, Channel]) -> dict[str, str]:
+    """Return the outputs of the wing FMU by the names of the channels that measure them.
+
+    Gauges count from 1 in campaigns, in patches and in the FMU alike, so that `strain[k]` of a channel is
+    `strain[k]` of the FMU, whatever the channel is called. Channels that the FMU has no output for
+    (velocities, displacements of other places) are not in the table.
+
+    Parameters
+    ----------
+    channels : mapping of str to Channel
+        By name.
+
+    Returns
+    -------
+    dict of str to str
+        Output by channel, such as "strain[17]" for "g17".
+    """
+    outputs = {}
+    for name, channel in channels.items():
+        strain = channel.quantity is Quantity.STRAIN and _STRAIN.fullmatch(channel.output)
+        displacement = channel.quantity is Quantity.DISPLACEMENT and channel.output in _DISPLACEMENTS
+        if strain or displacement:
+            outputs[name] = channel.output
+    return outputs
+
+
+def read_patch(path: Path) -> StoredPatch:
+    """Read the patch.json that `write_patch` wrote; the patch is identical to the last bit.
+
+    Raises
+    ------
+    VerdictFileError
+        As `read_verdict_file`.
+    """
+    older = {FIRST_SCHEMA: lambda content: {**content, "model_file": None, "parameters": []}}
+    return read_document(path, PATCH_SCHEMA, StoredPatch, older)

@@ -14,7 +14,7 @@ from discrepancy.campaign.records import TrialKind
 from discrepancy.catalogue.entry import NINETY, EffectParameter, ShapeParameter
 from discrepancy.fits.candidate import FREE_SHAPE
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.posterior import with_draws
+from discrepancy.fits.predictive import with_draws
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.naming import Explained
 from discrepancy.search.strategy import Search

@@ -10,7 +10,7 @@ modes, has no end effects, and has error bars from the noise.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import log, nan, sqrt
+from math import sqrt
 
 import numpy as np
 
@@ -61,7 +61,6 @@ def backbones(
     noise_deviation: float | None = None,
     averaging_width: float = 0.0,
     periods: float = 4.0,
-    overlap: float = 0.5,
 ) -> tuple[Backbone, ...]:
     """Return the backbone of each mode.
 
@@ -79,15 +78,14 @@ def backbones(
     periods : float
         Length of a window in periods of the lowest frequency. Longer windows have smaller errors and smear
         what changes with amplitude: three periods of a quadratic damping with a ratio of 0.045 give 0.043.
-    overlap : float
-        Share of a window that the next one repeats, 0 <= overlap < 1; it correlates neighbouring points.
+        The next window repeats half of it.
 
     Raises
     ------
     FitError
-        If there is no frequency, one is above half the sampling rate, or the record is shorter than a window.
+        If the record is shorter than a window, or a window has too few samples.
     """
-    interval = _check(time, signal, frequencies, overlap)
+    interval = float(time[-1] - time[0]) / (time.size - 1)
     start = 2.0 * np.pi * np.sort(np.asarray(frequencies, dtype=float))
     width = round(periods * 2.0 * np.pi / (start[0] * interval)) + 1
     unknown = 4 * start.size + 2
@@ -95,12 +93,12 @@ def backbones(
         raise FitError(
             f"A window of {periods:g} periods has {width} samples, but at least "
             f"{_FEWEST_PER_UNKNOWN * unknown:.0f} and at most {time.size}, the record's length, are needed: "
-            "change `periods`, or give a longer or more finely sampled record."
+            "give a longer or more finely sampled record."
         )
     active = np.ones(start.size, dtype=bool)
     pole = (1j - 0.02) * start
     rows: list[list[tuple[float, ...]]] = [[] for _ in start]
-    for first in range(0, time.size - width + 1, max(1, round(width * (1.0 - overlap)))):
+    for first in range(0, time.size - width + 1, max(1, round(0.5 * width))):
         part = slice(first, first + width)
         window = DampedCosines(time[part], signal[part], averaging_width)
         while active.any():
@@ -123,25 +121,6 @@ def backbones(
         Backbone(number + 1, *np.array(points, dtype=float).reshape(-1, 7).T)
         for number, points in enumerate(rows)
     )
-
-
-def _check(time: FloatArray, signal: FloatArray, frequencies: Sequence[float], overlap: float) -> float:
-    if time.ndim != 1 or time.shape != signal.shape or time.size < 8:
-        raise FitError(
-            f"A backbone needs time and signal as vectors of one length, at least 8, but they are "
-            f"{time.shape} and {signal.shape}."
-        )
-    if not (np.all(np.isfinite(time)) and np.all(np.isfinite(signal))):
-        raise FitError("A backbone needs finite values; leave out or mend the samples that are lost.")
-    interval = float(time[-1] - time[0]) / (time.size - 1)
-    if not frequencies or not all(0.0 < f < 0.5 / interval for f in frequencies):
-        raise FitError(
-            f"A backbone needs start frequencies between 0 and half the sampling rate, "
-            f"{0.5 / interval:.4g} Hz, but they are {', '.join(f'{f:g}' for f in frequencies) or 'none'}."
-        )
-    if not 0.0 <= overlap < 1.0:
-        raise FitError(f"The overlap of windows must be at least 0 and below 1, but is {overlap:g}.")
-    return interval
 
 
 def _points(time: FloatArray, solution: Solution, noise_deviation: float | None) -> list[tuple[float, ...]]:
@@ -173,48 +152,3 @@ def _credible(point: tuple[float, ...], start: float) -> bool:
     _, amplitude, amplitude_error, frequency, _, ratio, _ = point
     near = abs(2.0 * np.pi * frequency / start - 1.0) < _GREATEST_CHANGE
     return amplitude > SMALLEST_SIGNAL * amplitude_error and near and abs(ratio) < 0.5
-
-
-@dataclass(frozen=True)
-class BackboneValue:
-    """Frequency [Hz] and damping ratio [1] of a mode at one amplitude, with standard errors."""
-
-    amplitude: float
-    frequency: float
-    frequency_error: float
-    damping_ratio: float
-    damping_ratio_error: float
-    trial_count: int
-
-
-def at_amplitude(curves: Sequence[Backbone], amplitude: float, factor: float = 2.0) -> BackboneValue:
-    """Return the mean over trials of a mode's frequency and damping ratio at an amplitude.
-
-    In each trial a straight line in ln A, weighted by the errors, is laid through the points within `factor`
-    of the amplitude; overlapping windows count as independent. The error is that of the mean over trials by
-    their scatter, or of the line if there is one trial; nan where no trial has two such points.
-    """
-    values = []
-    for curve in curves:
-        x = np.log(curve.amplitude / amplitude)
-        near = np.abs(x) <= log(factor)
-        if near.sum() < 2:
-            continue
-        row = []
-        for value, error in (
-            (curve.frequency, curve.frequency_error),
-            (curve.damping_ratio, curve.damping_ratio_error),
-        ):
-            weight = 1.0 / np.clip(error[near], 1e-300, None)
-            design = np.column_stack([np.ones(int(near.sum())), x[near]]) * weight[:, np.newaxis]
-            found = np.linalg.lstsq(design, value[near] * weight, rcond=None)[0]
-            row += [float(found[0]), sqrt(float(np.linalg.pinv(design.T @ design)[0, 0]))]
-        values.append(row)
-    if not values:
-        return BackboneValue(amplitude, nan, nan, nan, nan, 0)
-    table = np.array(values)
-    found = table.mean(axis=0)
-    if len(table) > 1:
-        found[1::2] = table[:, ::2].std(axis=0, ddof=1) / sqrt(len(table))
-    frequency, frequency_error, ratio, ratio_error = found.tolist()
-    return BackboneValue(amplitude, frequency, frequency_error, ratio, ratio_error, len(table))

@@ -145,9 +145,7 @@ def _hats(values: FloatArray, low: float, high: float, knots: int = _HATS) -> Fl
     return np.asarray(np.clip(1.0 - distance, 0.0, None))
 
 
-def explanations(
-    residuals: ResidualSet, frequencies: Sequence[float] | None = None
-) -> tuple[Explanation, ...]:
+def explanations(residuals: ResidualSet) -> tuple[Explanation, ...]:
     """Return what single dependences explain of the excess variance, by kind of trial, largest share first.
 
     Every dependence is fitted to each channel by itself with one set of coefficients for all trials of the
@@ -163,7 +161,7 @@ def explanations(
         if freedom <= 0.0 or whole <= 2.0 * np.sqrt(2.0 * freedom):
             continue  # no excess to explain
         parts: dict[tuple[str, str], list[Part]] = {}
-        modes = _modes(items, frequencies)
+        modes = _modes(items)
         line = dominant_line(items) if items[0].trial.is_dynamic else None
         for column in range(len(items[0].trial.channels)):
             used = [item for item in items if item.used[:, column].any()]
@@ -238,13 +236,11 @@ def _line_basis(items: Sequence[FittedTrial], column: int, line: SpectralLine) -
     return np.asarray(block_diag(*waves))
 
 
-def _modes(
-    items: Sequence[FittedTrial], frequencies: Sequence[float] | None
-) -> dict[int, MotionByMode] | None:
+def _modes(items: Sequence[FittedTrial]) -> dict[int, MotionByMode] | None:
     """Return the modal motion of each trial by its identity, None where it cannot be had."""
     if not items[0].trial.is_dynamic:
         return None
-    at = predicted_frequencies(items) if frequencies is None else tuple(frequencies)
+    at = predicted_frequencies(items)
     found = {id(item): modal_motion(item.prediction, item.trial.interval, at) for item in items}
     whole = {key: motion for key, motion in found.items() if motion is not None}
     return whole if len(whole) == len(items) else None

@@ -4,7 +4,7 @@ Patterns are singular vectors over the channels: one channel means a sensor, the
 load, all channels alike hum or temperature.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,48 +22,50 @@ from .residuals import FittedTrial, ResidualSet, at_own_scale
 ALIKE = 0.9
 """Squared cosine from which two patterns over the channels count as the same."""
 
+PATTERN_LEVEL = 0.01
+"""Largest p-value of a pattern that is told."""
+
 _SIMULATIONS = 999
 
 
 @dataclass(frozen=True)
-class SingularPattern:
-    """A singular vector of the residual matrix (samples x channels, in units of the noise).
+class Disagreement:
+    """One finding.
 
     Attributes
     ----------
     trials : str
-        "ring-down", "forced", "static" or "flight" trials.
-    channels : tuple of str
-        Columns of the matrix.
-    weights : (C,) ndarray
-        Right singular vector, unit length.
+        Kind of the trials where it shows.
+    subject : str
+        "mode 1", "channel g17", "all channels", ...; of a pattern over channels what it means.
+    dependence : str
+        What it goes with: "amplitude", "time", "load (not proportional)", "channels", ...
     share : float
         Of the excess variance of these trials.
     p_value : float
-        Share of simulated noise matrices of this size whose largest singular value is larger.
-    meaning : str
-        "sensor", "dynamics or load", "common" or "mixed".
+        Of the finding.
     sentence : str
         In words.
+    channel : str
+        Where a pattern over channels is strongest.
     """
 
     trials: str
-    channels: tuple[str, ...]
-    weights: FloatArray
+    subject: str
+    dependence: str
     share: float
     p_value: float
-    meaning: str
     sentence: str
+    channel: str = ""
 
 
 def singular_patterns(
-    residuals: ResidualSet,
-    white: Sequence[FloatArray],
-    shapes: Mapping[str, Mapping[str, float]],
-    generator: np.random.Generator,
-    level: float = 0.01,
-) -> tuple[SingularPattern, ...]:
+    residuals: ResidualSet, white: Sequence[FloatArray], generator: np.random.Generator
+) -> tuple[Disagreement, ...]:
     """Return the significant singular patterns of each kind of trial, largest first.
+
+    Vectors of the residual matrix (samples x channels, in units of the noise). Their p-value is the share of
+    simulated noise matrices of this size whose largest singular value is larger.
 
     Parameters
     ----------
@@ -71,15 +73,10 @@ def singular_patterns(
         Fitted trials.
     white : sequence of (N, C) ndarray
         What its `white` returned.
-    shapes : mapping of str to mapping of str to float
-        Patterns to compare with, such as mode shapes: name -> channel -> value [channel's unit]. The pattern
-        of the prediction itself is always compared.
     generator : numpy.random.Generator
         For the null distribution of singular values.
-    level : float
-        Largest p-value of a pattern that is returned.
     """
-    found: list[SingularPattern] = []
+    found: list[Disagreement] = []
     for name, members in kinds(residuals).items():
         items = [residuals.trials[number] for number in members]
         channels = items[0].trial.channels
@@ -94,13 +91,14 @@ def singular_patterns(
         for number, (value, weights) in enumerate(zip(singular**2, right, strict=True)):
             # After k patterns the rest is compared with whole noise matrices: a little too strict, never lax.
             p = (1.0 + float(np.sum(null >= value))) / (null.size + 1.0)
-            if p > level:
+            if p > PATTERN_LEVEL:
                 break
             share = float(np.clip((value - expected) / surplus, 0.0, 1.0))
-            meaning, words = _meaning(residuals, items, channels, weights, shapes)
+            meaning, words = _meaning(residuals, items, weights)
             told = f"p {'<=' if p <= 1.0 / _SIMULATIONS else '='} {p:.1g}"
             sentence = said("location.explains", what=words, trials=name, percent=100.0 * share, p=told)
-            found.append(SingularPattern(name, channels, weights, share, p, meaning, sentence))
+            channel = channels[int(np.argmax(np.abs(weights)))]
+            found.append(Disagreement(name, meaning, "channels", share, p, sentence, channel))
             if number >= 2:
                 break
     return tuple(found)
@@ -118,14 +116,9 @@ def _largest_singular_squares(rows: int, columns: int, generator: np.random.Gene
     return np.asarray(np.linalg.norm(factor, ord=2, axis=(1, 2)) ** 2)
 
 
-def _meaning(
-    residuals: ResidualSet,
-    items: Sequence[FittedTrial],
-    channels: tuple[str, ...],
-    weights: FloatArray,
-    shapes: Mapping[str, Mapping[str, float]],
-) -> tuple[str, str]:
-    """Return the meaning of a pattern over the channels, and it in words."""
+def _meaning(residuals: ResidualSet, items: Sequence[FittedTrial], weights: FloatArray) -> tuple[str, str]:
+    """Return "sensor", "dynamics or load", "common" or "mixed" of a pattern, and it in words."""
+    channels = items[0].trial.channels
     largest = int(np.argmax(np.abs(weights)))
     noise, alone = items[0].noise_deviation, np.eye(len(weights))[largest]
     compared = [(alone, "sensor", said("location.sensor", name=channels[largest]))]
@@ -134,9 +127,6 @@ def _meaning(
     prediction = np.vstack([(i.prediction - i.prediction.mean(axis=0)) / noise for i in items])
     own = np.linalg.svd(prediction, full_matrices=False)[2][0]
     compared.append((own if np.any(prediction) else 0.0 * own, "dynamics or load", said("location.response")))
-    for name, shape in shapes.items():
-        values = np.array([shape.get(channel, 0.0) for channel in channels]) / noise
-        compared.append((values, "dynamics or load", said("location.shape", name=name)))
     candidates = [
         (float((weights @ v) ** 2 / ((weights @ weights) * (v @ v))), kind, words)
         for v, kind, words in compared
@@ -166,34 +156,6 @@ _CLOSE = 0.02  # shares this close are not told apart
 
 
 @dataclass(frozen=True)
-class Disagreement:
-    """One finding.
-
-    Attributes
-    ----------
-    trials : str
-        Kind of the trials where it shows.
-    subject : str
-        "mode 1", "channel g17", "all channels", ...
-    dependence : str
-        What it goes with: "amplitude", "time", "load (not proportional)", ...
-    share : float
-        Of the excess variance of these trials.
-    p_value : float
-        Of the finding.
-    sentence : str
-        In words.
-    """
-
-    trials: str
-    subject: str
-    dependence: str
-    share: float
-    p_value: float
-    sentence: str
-
-
-@dataclass(frozen=True)
 class Location:
     """Where a fitted hypothesis disagrees with the data.
 
@@ -205,10 +167,6 @@ class Location:
         Variance, Ljung-Box, cumulative periodogram, Fisher g.
     cells : tuple of Cell
         The map; significant at the false discovery rate `MAP_RATE`.
-    patterns : tuple of SingularPattern
-        Over the channels.
-    explanations : tuple of Explanation
-        What single dependences explain, largest first.
     disagreements : tuple of Disagreement
         Findings in words, largest first; empty if nothing disagrees.
     remarks : tuple of str
@@ -219,19 +177,11 @@ class Location:
     disagrees: bool
     tests: tuple[OmnibusTest, ...]
     cells: tuple[Cell, ...]
-    patterns: tuple[SingularPattern, ...]
-    explanations: tuple[Explanation, ...]
     disagreements: tuple[Disagreement, ...]
     remarks: tuple[str, ...]
 
 
-def locate(
-    residuals: ResidualSet,
-    *,
-    seed: int = 0,
-    frequencies: Sequence[float] | None = None,
-    shapes: Mapping[str, Mapping[str, float]] | None = None,
-) -> Location:
+def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     """Locate disagreement in the fitted trials of a set.
 
     Parameters
@@ -240,10 +190,6 @@ def locate(
         Residuals of one hypothesis; held-out trials are not looked at.
     seed : int
         Of the draw that restores what the fit absorbed, and of the null distribution of singular values.
-    frequencies : sequence of float, optional
-        Natural frequencies [Hz] that modes are counted by; default: peaks of the predictions' spectra.
-    shapes : mapping, optional
-        Mode shapes and other patterns: name -> channel -> value [channel's unit].
 
     Returns
     -------
@@ -264,8 +210,7 @@ def locate(
     tests = (variance_test(fitted), *serial_tests(fitted, white, tuple(coloured)))
     rejected = holm([test.p_value for test in tests], GLOBAL_LEVEL)
     tests = tuple(replace(test, rejected=flag) for test, flag in zip(tests, rejected, strict=True))
-    patterns = singular_patterns(fitted, white, shapes or {}, generator)
-    explained = explanations(fitted, frequencies)
+    patterns = singular_patterns(fitted, white, generator)
     disagrees = any(rejected)
     own: tuple[str, ...] = ()
     cells = residual_map(fitted, white, MAP_RATE)
@@ -277,9 +222,7 @@ def locate(
         disagrees=disagrees,
         tests=tests,
         cells=cells,
-        patterns=patterns,
-        explanations=explained,
-        disagreements=_disagreements(fitted, white, explained, patterns, frequencies) if disagrees else (),
+        disagreements=_disagreements(fitted, white, patterns) if disagrees else (),
         remarks=(*coloured.values(), *_noise_remarks(fitted), *own),
     )
 
@@ -327,13 +270,10 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
 
 
 def _disagreements(
-    residuals: ResidualSet,
-    white: Sequence[FloatArray],
-    explained: Sequence[Explanation],
-    patterns: Sequence[SingularPattern],
-    frequencies: Sequence[float] | None,
+    residuals: ResidualSet, white: Sequence[FloatArray], patterns: Sequence[Disagreement]
 ) -> tuple[Disagreement, ...]:
     found: list[Disagreement] = []
+    explained = explanations(residuals)
     gap: dict[str, float] = {}
     for name, members in kinds(residuals).items():
         items = [residuals.trials[number] for number in members]
@@ -342,7 +282,7 @@ def _disagreements(
         told = _smallest_sufficient(rows)
         if told is None:
             continue
-        subject = told.subject or _subject(name, items, [white[n] for n in members], patterns, frequencies)
+        subject = told.subject or _subject(name, items, [white[n] for n in members], patterns)
         line = told.dependence.startswith("a ")
         if line and subject.startswith("mode"):
             subject = "all channels"  # a line of its own frequency is no matter of a mode that the model has
@@ -351,30 +291,25 @@ def _disagreements(
         p = "p < 1e-6" if told.p_value < 1e-6 else f"p = {told.p_value:.1g}"
         sentence = said("location.explains", what=whose, trials=name, percent=100.0 * told.share, p=p)
         found.append(Disagreement(name, subject, told.dependence, told.share, told.p_value, sentence))
-    found += [
-        Disagreement(item.trials, item.meaning, "channels", item.share, item.p_value, item.sentence)
-        for item in patterns
-    ]
     # Shares are of one kind of trial; what explains most of the whole gap is told first.
-    return tuple(sorted(found, key=lambda item: -item.share * gap[item.trials]))
+    return tuple(sorted((*found, *patterns), key=lambda item: -item.share * gap[item.trials]))
 
 
 def _subject(
     name: str,
     items: Sequence[FittedTrial],
     white: Sequence[FloatArray],
-    patterns: Sequence[SingularPattern],
-    frequencies: Sequence[float] | None,
+    patterns: Sequence[Disagreement],
 ) -> str:
     """Return what disagrees: a channel alone, the mode with most of the excess, or all channels."""
     channels = items[0].trial.channels
     if len(channels) == 1:
         return f"channel {channels[0]}"
     for pattern in patterns:
-        if pattern.trials == name and pattern.meaning == "sensor" and pattern.share > 0.5:
-            return f"channel {channels[int(np.argmax(np.abs(pattern.weights)))]}"
+        if pattern.trials == name and pattern.subject == "sensor" and pattern.share > 0.5:
+            return f"channel {pattern.channel}"
     if items[0].trial.is_dynamic:
-        at = tuple(frequencies) if frequencies else predicted_frequencies(items)
+        at = predicted_frequencies(items)
         shares = mode_shares(items, white, at) if at else np.zeros(1)
         if shares.max() > 0.5:
             return f"mode {int(np.argmax(shares)) + 1}"

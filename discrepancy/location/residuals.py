@@ -16,28 +16,6 @@ from discrepancy.campaign.records import BoolArray, Channel, FloatArray, NoiseRe
 from discrepancy.errors import FitError
 
 
-def sensitivity(jacobian: FloatArray, covariance: FloatArray, noise_deviation: FloatArray) -> FloatArray:
-    """Return S = J L / s0 with L L^T the posterior covariance, so that S S^T holds the leverages.
-
-    Parameters
-    ----------
-    jacobian : (N, C, P) ndarray
-        Derivatives of the predictions of one trial by all fitted parameters [channel's unit].
-    covariance : (P, P) ndarray
-        Posterior covariance of the parameters at the scale of the noise records.
-    noise_deviation : (C,) ndarray
-        s0 [channel's unit].
-
-    Returns
-    -------
-    (N, C, P) ndarray
-        Dimensionless.
-    """
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    root = vectors * np.sqrt(np.clip(values, 0.0, None))
-    return np.asarray((jacobian @ root) / noise_deviation[:, np.newaxis])
-
-
 @dataclass(frozen=True, eq=False)
 class FittedTrial:
     """One trial beside its prediction.

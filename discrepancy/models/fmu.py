@@ -3,40 +3,25 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from math import ceil
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
+from discrepancy.models.acting import Course
 from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
 from discrepancy.models.fmu_laws import FmuLaws
-from discrepancy.models.fmu_motion import FmuMotion
-from discrepancy.models.fmu_ports import FmuPorts
-from discrepancy.models.fmu_runs import FmuRuns, State
-from discrepancy.models.fmu_trials import Asked, FmuPatch, FmuTrials, sampled
-from discrepancy.models.interface import (
-    Conditions,
-    Outputs,
-    PortedSystem,
-    PortScale,
-    Response,
-    Scales,
-    campaign_sizes,
-)
+from discrepancy.models.fmu_motion import FmuMotion, sampled
+from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State
+from discrepancy.models.interface import Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.questions import (
-    LoadChange,
-    check_carried,
-    check_outputs,
-    check_parameters,
-    check_plain,
-    laws_at,
-    prior_mean,
-)
-from fe.runtime.motion import NO_LAWS
+from discrepancy.models.questions import LoadChange, laws_at, place_among, release_of
+from discrepancy.models.scales import PortScale, Scales, campaign_sizes
+from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.patch import (
     INTERNAL_FORCES,
     SENSORS,
@@ -52,6 +37,32 @@ FINER = 2
 """Steps under a recorded force are so many times smaller where laws act on the motion, too."""
 KEPT_SHOWN = 16
 """Responses without laws that are kept while laws are tried."""
+
+
+class FmuPatch(NamedTuple):
+    """A patch by what is done with it.
+
+    Attributes
+    ----------
+    laws : Laws
+        Internal forces at ports.
+    settings : tuple of (str, float)
+        Parameters that the FMU itself has for primitives, sorted by name.
+    load : LoadChange
+        Of the recorded force.
+    """
+
+    laws: Laws = NO_LAWS
+    settings: tuple[tuple[str, float], ...] = ()
+    load: LoadChange = LoadChange()
+
+
+class Asked(NamedTuple):
+    """What is asked of the FMU: a trial, in conditions and under a patch."""
+
+    trial: Trial
+    conditions: Conditions
+    patch: FmuPatch = FmuPatch()
 
 
 class FmuModel(DescribedModel):
@@ -79,15 +90,19 @@ class FmuModel(DescribedModel):
         self.description: FmuModelDescription = description
         self.runs = FmuRuns(description, Path(folder))
         super().__init__(description, self.runs.quantities)
-        self.length = description.scales.length
-        self._trials = FmuTrials(self.runs)
+        self.length, self.regions = description.scales.length, tuple(description.inputs.regions)
+        flies = description.inputs.load_factor is not None
+        self.kinds = frozenset(TrialKind) - {TrialKind.DRIVEN, *(() if flies else (TrialKind.FLIGHT,))}
+        self._keys = [self.runs.parameter(item.variable or item.name) for item in description.parameter]
+        self._forces = {place: self.runs.variable(name) for place, name in description.inputs.forces.items()}
+        self._inputs = {
+            item.name: self.runs.variable(item.variable or item.name) for item in description.input
+        }
         self._check_ranges()
-        means = Conditions(np.array([item.mean for item in self.parameters]))
-        nominal = self._trials.state(Asked(_any_trial(TrialKind.RINGDOWN, 1.0), means))
+        nominal = self._state(Asked(_any_trial(TrialKind.RINGDOWN, 1.0), Conditions(self.prior_mean())))
         self._shown = Memory(KEPT_SHOWN)
-        self.motion = FmuMotion(self.runs)
-        self.fmu_ports = FmuPorts(self.motion, nominal)
-        self._laws = FmuLaws(self.fmu_ports)
+        self.motion = FmuMotion(self.runs, nominal)
+        self._laws = FmuLaws(self.motion)
 
     @classmethod
     def load(cls, path: Path | str) -> "FmuModel":
@@ -101,8 +116,7 @@ class FmuModel(DescribedModel):
     def _check_ranges(self) -> None:
         """Refuse ranges of parameters that are wider than those of the FMU."""
         asset = self.runs.asset
-        for item in self.description.parameter:
-            key = self.runs.parameter(item.variable or item.name)
+        for key, item in zip(self._keys, self.description.parameter, strict=True):
             for end in (item.low, item.high):  # beyond its own range it refuses, and a posterior is cut there
                 try:
                     asset.check_parameters({key: end})
@@ -114,6 +128,7 @@ class FmuModel(DescribedModel):
 
     # ------------------------------------------------------------ what it is
 
+    holds_inputs: ClassVar[bool] = True
     shows_ports: ClassVar[bool] = True
 
     def supports(self, primitive: type[Primitive]) -> bool:
@@ -129,17 +144,17 @@ class FmuModel(DescribedModel):
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign: those of the file, else what the FMU shows."""
-        given, conditions = self.description.scales, Conditions(prior_mean(campaign, self.declared))
+        given, conditions = self.description.scales, Conditions(self.prior_mean(campaign))
         largest = np.zeros(len(self.ports()))
         for trial in campaign.trials:
             if trial.is_dynamic:
-                moved = self.motion.free(self._trials.run(Asked(trial, conditions), self.fmu_ports, 1))
+                moved = self.motion.free(self._run(Asked(trial, conditions), 1))
             else:
                 moved = self._at_rest(Asked(trial, replace(conditions, health=trial.health)))
-            largest = np.maximum(largest, np.max(np.abs(moved[:, self.fmu_ports.x]), axis=0))
+            largest = np.maximum(largest, np.max(np.abs(moved[:, self.motion.x]), axis=0))
         stiffness, frequency = self._stiffness(campaign, conditions)
-        forces = zip(self.fmu_ports.forces, stiffness, strict=True)
-        pushed = [pair for force, pair in forces if force in self._trials.forces.values()]
+        forces = zip(self.motion.forces, stiffness, strict=True)
+        pushed = [pair for force, pair in forces if force in self._forces.values()]
         modal, tip = (pushed or stiffness or [(1.0, 1.0)])[0]
         frequency = given.angular_frequency or frequency or 1.0
         return Scales(
@@ -161,18 +176,18 @@ class FmuModel(DescribedModel):
         given, ports = self.description.scales.angular_frequency, range(len(self.ports()))
         for trial in campaign.trials:
             if trial.is_dynamic:
-                state = self._trials.state(Asked(trial, conditions))
-                step = self.fmu_ports.step(trial, 1)
-                found = [self.fmu_ports.stiffness(number, state, step) for number in ports]
-                return found, given or self.fmu_ports.measured_frequency(trial, state)
+                state = self._state(Asked(trial, conditions))
+                step = self.motion.step(trial, 1)
+                found = [self.motion.stiffness(number, state, step) for number in ports]
+                return found, given or self.motion.measured_frequency(trial, state)
         still = campaign.trials[0] if campaign.trials else _any_trial(TrialKind.STATIC, 1.0)
-        state = self._trials.state(Asked(still, replace(conditions, health=still.health)))
-        flexible = self.fmu_ports.flexibility(state)
+        state = self._state(Asked(still, replace(conditions, health=still.health)))
+        flexible = self.motion.flexibility(state)
         frequency, interval = given, 0.01
         for _ in range(0 if campaign.trials or given else 3):  # until the interval suits the frequency
             trial = _any_trial(TrialKind.RINGDOWN, interval)
-            state = self._trials.state(Asked(trial, conditions))
-            frequency = self.fmu_ports.measured_frequency(trial, state)
+            state = self._state(Asked(trial, conditions))
+            frequency = self.motion.measured_frequency(trial, state)
             interval = 0.3 / frequency
         return [(1.0 / float(flexible[port, port]),) * 2 for port in ports], frequency
 
@@ -183,8 +198,6 @@ class FmuModel(DescribedModel):
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
         """
-        check_plain(trial, f"the FMU model {self.name!r}")
-        check_parameters(f"The FMU model {self.name!r}", self.parameters, conditions.parameters)
         columns = self._columns(outputs)
         asked = Asked(trial, conditions, self._parts(patch))
         if not trial.is_dynamic:
@@ -198,7 +211,7 @@ class FmuModel(DescribedModel):
     def _moving(self, asked: Asked, columns: Sequence[int], orders: Sequence[int]) -> Response:
         """Return columns of the FMU's outputs at the samples of a dynamic trial, derived so many times."""
         trial, conditions, patch = asked
-        excite = partial(self._trials.run, asked, self.fmu_ports)
+        excite = partial(self._run, asked)
         laws, (rate, zero) = patch.laws, conditions.clock
         finer = FINER if len(laws) and trial.kind is TrialKind.FORCED else 1
         run = excite(conditions.refinement * finer)
@@ -229,27 +242,26 @@ class FmuModel(DescribedModel):
         ModelError
             If the FMU is not linear, or its answers to forces at the ports do not tell its system.
         """
-        means = np.array([item.mean for item in self.declared])
-        parts, step = self._parts(self.patch), self.fmu_ports.step(trial)
+        parts, step = self._parts(self.patch), self.motion.step(trial)
         states = (
-            self._trials.state(Asked(trial, Conditions(values, health=trial.health[:1]), parts))
-            for values in (means, parameters)
+            self._state(Asked(trial, Conditions(values, health=trial.health[:1]), parts))
+            for values in (self.prior_mean(), parameters)
         )
-        base, found = (self.fmu_ports.system(state, step, len(trial.time)) for state in states)
+        base, found = (self.motion.system(state, step, len(trial.time)) for state in states)
         if base is None or found is None or len(base.push) != len(found.push):
             raise ModelError(
                 f"The FMU model {self.name!r} does not tell by its answers to single forces how its ports "
                 "move; it is not linear, or they are too few or too rough."
             )
         found = found.in_state_of(base)
-        position, speed = np.split(found.of_ports(self.fmu_ports.x, self.fmu_ports.v).outputs, 2)
+        position, speed = np.split(found.of_ports(self.motion.x, self.motion.v).outputs, 2)
         rows, at_once = found.rows(list(zip(self._columns(outputs), self._orders(outputs), strict=True)))
         return PortedSystem(found.generator, self.ports(), found.push.T, position, speed, rows, at_once.T)
 
     def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         asked = Asked(trial, conditions, self._parts(self.patch)._replace(laws=NO_LAWS))
-        found = self._moving(asked, self.fmu_ports.x, [0] * len(self.ports()))
+        found = self._moving(asked, self.motion.x, [0] * len(self.ports()))
         assert found.rates is not None  # of a motion there are
         return found.values, found.rates
 
@@ -258,27 +270,23 @@ class FmuModel(DescribedModel):
     def _at_rest(self, asked: Asked) -> FloatArray:
         """Return all outputs (N, C) of a static trial or a flight."""
         trial, _, patch = asked
-        loads = self._trials.loads_at_rest(asked)
-        states = [self._trials.state(asked, row) for row in range(len(loads))]
-        if not len(patch.laws):
-            return np.stack(
-                [self._rest(trial, row, *held) for row, held in enumerate(zip(states, loads, strict=True))]
-            )
-        return self._laws.at_rest(trial.name, states, loads, patch.laws)
-
-    def _rest(self, trial: Trial, row: int, state: State, loads: dict[str, float]) -> FloatArray:
-        """Return all outputs (C,) of a row; what the FMU refuses is said with its place."""
-        try:
-            return self.motion.rest(state, loads)
-        except ModelError as cause:
-            raise ModelError(f"The trial {trial.name!r}, row {row + 1} of its table: {cause}") from cause
+        loads = self._loads_at_rest(asked)
+        states = [self._state(asked, row) for row in range(len(loads))]
+        if len(patch.laws):
+            return self._laws.at_rest(trial.name, states, loads, patch.laws)
+        found = list[FloatArray]()
+        for row, held in enumerate(zip(states, loads, strict=True), start=1):
+            try:
+                found.append(self.motion.rest(*held))
+            except ModelError as cause:
+                raise ModelError(f"The trial {trial.name!r}, row {row} of its table: {cause}") from cause
+        return np.array(found)
 
     # ------------------------------------------------------------ parts
 
     def _parts(self, patch: ModelPatch) -> FmuPatch:
-        """Return a patch by what is done with it; raises `ModelError` if the model cannot carry it."""
+        """Return a patch by what is done with it; raises `ModelError` if the file lacks what it needs."""
         effects, what = self.description.effects, f"The FMU model {self.name!r}"
-        check_carried(patch, self, what)
         rest = ModelPatch(tuple(item for item in patch if item.kind not in effects))
         load = LoadChange.of(rest)
         if load.along_chord and self.description.inputs.torque is None:
@@ -299,12 +307,111 @@ class FmuModel(DescribedModel):
         return FmuPatch(laws, tuple(sorted(settings.items())), load)
 
     def _columns(self, outputs: Outputs) -> list[int]:
-        check_outputs(f"The FMU model {self.name!r}", self, outputs, self.quantities)
         return [self.runs.columns[output] for output, _ in outputs]
 
     def _orders(self, outputs: Outputs) -> list[int]:
         """Return how often each output is derived."""
         return [quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs]
+
+    # ------------------------------------------------------------ trials in its names and units
+
+    def _run(self, asked: Asked, refinement: int) -> Run:
+        """Return the run by which the FMU follows a dynamic trial."""
+        trial, conditions, _ = asked
+        step = self.motion.step(trial, refinement)
+        rate, zero = conditions.clock
+        end = max((1.0 + rate) * float(trial.time[-1]) + zero, float(trial.time[-1]))
+        # a little longer, so that a clock that is being fitted does not ask for another run
+        steps = ceil(end / step * (1.0 + 2e-9) - 1e-6) + (0 if (rate, zero) == (0.0, 0.0) else 1)
+        if trial.kind is TrialKind.RINGDOWN:
+            loads = self._release(trial, conditions)
+        else:
+            loads = self._forced(asked, step, steps)
+        return Run(self._state(asked), step, steps, loads)
+
+    def _release(self, trial: Trial, conditions: Conditions) -> Loads:
+        release, way = release_of(trial), self.description.release
+        if way is None:
+            raise ModelError(
+                f"The FMU model {self.name!r} cannot ring down: state in [release] the FMU's parameter of "
+                f"the release displacement, or the force that holds it."
+            )
+        first = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
+        if release.at_rest:
+            size = release.displacement * (1.0 + float(first[0]))
+            kind = "hold" if way.displacement is None else "displacement"
+            return [(Excitation(kind), size)]
+        if way.displacement is None or way.velocity is None:
+            raise ModelError(
+                f"The ring-down {trial.name!r} does not begin at rest, which the FMU model {self.name!r} "
+                f"can follow only if [release] names parameters of displacement and velocity."
+            )
+        unit = release.displacement
+        speed = self.motion.angular_frequency(trial)
+        return [
+            (Excitation("displacement"), unit * float(first[0])),
+            (Excitation("velocity"), unit * speed * float(first[1])),
+        ]
+
+    def _forced(self, asked: Asked, step: float, steps: int) -> Loads:
+        trial, _, patch = asked
+        course = Course.of(trial.time, trial.force, trial.hold)
+        begins, ends = course.ends(np.linspace(0.0, steps * step, steps + 1))
+        held, first = 0.5 * (begins + ends), float(trial.force[0])
+        on = ((begins != 0.0) | (ends != 0.0)).astype(float)
+        (gain, tare, *_), loads = patch.load, list[tuple[Excitation, float]]()
+        for variable, lever in self._pushed(trial, patch):
+            loads.append((Excitation("input", variable, held, first), (1.0 + gain) * lever))
+            if tare:
+                loads.append((Excitation("input", variable, on, float(first != 0.0)), tare * lever))
+        return loads
+
+    def _pushed(self, trial: Trial, patch: FmuPatch) -> list[tuple[str, float]]:
+        """Return the inputs that a force at a place of a patch pushes, each with its lever."""
+        inputs = self.description.inputs
+        moments = ((inputs.bending_moment, patch.load.along_span), (inputs.torque, patch.load.along_chord))
+        place = place_among([*self._forces], trial.load_place, self.what, f"the trial {trial.name!r}")
+        return [
+            (self._forces[place], 1.0),
+            *((self.runs.variable(name), lever) for name, lever in moments if name is not None and lever),
+        ]
+
+    def _loads_at_rest(self, asked: Asked) -> list[dict[str, float]]:
+        """Return the inputs of each row of a static trial or a flight."""
+        trial, conditions, patch = asked
+        offsets, given = conditions.offset or (0.0,) * len(trial.inputs), dict[str, FloatArray]()
+        for item, offset in zip(trial.inputs, offsets, strict=True):
+            if item.name not in self._inputs:
+                raise ModelError(
+                    f"The trial {trial.name!r} holds the input {item.name!r}, which the FMU model "
+                    f"{self.name!r} does not have; it has {', '.join(self._inputs) or 'none'}: name it in "
+                    "[[input]]."
+                )
+            variable = self._inputs[item.name]
+            given[variable] = self.runs.input_factors[variable] * (item.values + offset)
+        if trial.kind is TrialKind.FLIGHT:
+            given = {self.runs.variable(str(self.description.inputs.load_factor)): trial.load_factor}
+        elif not given or np.any(trial.force):
+            acting = patch.load.changed(trial.force, trial.force)
+            given |= {name: acting * lever for name, lever in self._pushed(trial, patch)}
+        return [dict(zip(given, row, strict=True)) for row in np.array([*given.values()]).T.tolist()]
+
+    def _state(self, asked: Asked, row: int = 0) -> State:
+        """Return parameters and constant inputs of a row of a trial."""
+        (trial, conditions, patch), wanted = asked, self.description.inputs
+        losses = self.losses(trial, conditions.health)
+        health = zip(wanted.regions.values(), losses[min(row, len(losses) - 1)], strict=True)
+        inputs = {self.runs.variable(name): value for name, value in health}
+        if wanted.temperature is not None:
+            base = wanted.temperature_reference or 0.0
+            at = 0 if trial.is_dynamic else row
+            inputs[self.runs.variable(wanted.temperature)] = base + float(trial.temperature[at])
+        table = self.description.motion if trial.is_dynamic else self.description.static
+        parameters = {self.runs.parameter(name): value for name, value in table.parameters.items()}
+        for key, value in zip(self._keys, conditions.parameters, strict=True):
+            parameters[key] = float(value)
+        parameters |= dict(patch.settings)
+        return State(tuple(sorted(parameters.items())), tuple(sorted(inputs.items())))
 
 
 def _any_trial(kind: TrialKind, interval: float) -> Trial:

@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.fmu_ports import FmuPorts
+from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_runs import Run, State
 from discrepancy.models.linear_system import solved
 from discrepancy.models.memory import Memory
@@ -30,13 +30,12 @@ class FmuLaws:
 
     Parameters
     ----------
-    ports : FmuPorts
-        Its ports.
+    motion : FmuMotion
+        The FMU without them.
     """
 
-    def __init__(self, ports: FmuPorts) -> None:
-        self._ports, self._motion, self._runs = ports, ports.motion, ports.motion.runs
-        self._description = self._runs.description
+    def __init__(self, motion: FmuMotion) -> None:
+        self._motion, self._runs, self._description = motion, motion.runs, motion.runs.description
         self._names = [port.name for port in self._description.port]
         self._refinements: dict[Hashable, tuple[int, float]] = {}
         self._starts = Memory()
@@ -57,10 +56,10 @@ class FmuLaws:
             If the law has no solution, or the FMU does not confirm it.
         """
         index = self._port_of(laws)
-        columns, inputs = np.array(self._ports.x)[index], [self._ports.forces[number] for number in index]
+        columns, inputs = np.array(self._motion.x)[index], [self._motion.forces[number] for number in index]
         memory, before, found = None, np.zeros(len(laws)), list[FloatArray]()
         for row, (state, load) in enumerate(zip(states, loads, strict=True)):
-            compliance = self._ports.flexibility(state)[np.ix_(index, index)]
+            compliance = self._motion.flexibility(state)[np.ix_(index, index)]
             linear = self._motion.rest(state, load)[columns]
             for _ in range(STATIC_ITERATIONS):
                 solution = solved(laws, linear[None], compliance, memory, before)
@@ -92,10 +91,10 @@ class FmuLaws:
 
         None if the FMU is not linear.
         """
-        system = self._ports.system(run.state, self._ports.step(trial), len(trial.time))
+        system = self._motion.system(run.state, self._motion.step(trial), len(trial.time))
         if system is None:
             return None
-        watched, at_ports = [*seen, *self._ports.x], system.of_ports(self._ports.x, self._ports.v)
+        watched, at_ports = [*seen, *self._motion.x], system.of_ports(self._motion.x, self._motion.v)
 
         def moved(parts: int) -> FloatArray:
             beside = self._runs.remembered(
@@ -120,7 +119,7 @@ class FmuLaws:
         Those of their system, from the state that the FMU shows; what is left of what the FMU shows at its
         own steps is small and a spline between them.
         """
-        x, count, ports = self._ports.x, len(self._names), self._ports.forces
+        x, count, ports = self._motion.x, len(self._names), self._motion.forces
         forces, first = np.zeros((run.steps, count)), np.zeros(count)
         for part, value in run.loads:
             if part.name in ports:
@@ -141,7 +140,7 @@ class FmuLaws:
 
         grid, coarse, found = run.step * np.arange(run.steps + 1), moved(1), moved(parts)
         fine = np.linspace(0.0, grid[-1], len(found))
-        for number, (slow, fast) in enumerate(zip(x, self._ports.v, strict=True)):
+        for number, (slow, fast) in enumerate(zip(x, self._motion.v, strict=True)):
             left = CubicSpline(grid, free[:, slow] - coarse[:, number])
             found[:, number] += left(fine)
             if fast >= 0:
@@ -159,10 +158,10 @@ class FmuLaws:
         ModelError
             If a port has no velocity, or the steps do not converge.
         """
-        watched, parts = [*seen, *self._ports.x], 1
+        watched, parts = [*seen, *self._motion.x], 1
         if self._description.motion.step is None:
             parts = self._parts(
-                laws, trial, watched, self._ports.step(trial),
+                laws, trial, watched, self._motion.step(trial),
                 lambda parts: self._stepped(laws, excite(parts))[::parts, watched],
             )  # fmt: skip
         run = excite(parts * refinement)
@@ -215,7 +214,7 @@ class FmuLaws:
 
     def _stepped(self, laws: Laws, run: Run) -> FloatArray:
         """Return the outputs (K, C) of the FMU stepped with the laws beside it."""
-        x, v, port_of = self._ports.x, self._ports.v, self._port_of(laws)
+        x, v, port_of = self._motion.x, self._motion.v, self._port_of(laws)
         without = [self._names[port] for port in port_of if v[port] < 0]
         if without:
             raise ModelError(
@@ -223,7 +222,7 @@ class FmuLaws:
                 f"velocity output; name it in [[port]]."
             )
         gain = self._runs.remembered(
-            ("gain", *run[:2]), lambda: self._ports.records(run.state, run.step, 1)[0]
+            ("gain", *run[:2]), lambda: self._motion.records(run.state, run.step, 1)[0]
         )[v]
         at_ports = [*x, *v]
         forces = stepper(laws, port_of, gain, run.step, self._motion.free(run)[:2, at_ports])
@@ -232,7 +231,7 @@ class FmuLaws:
         values[0] = first
         names = list(histories)
         rows = np.column_stack([histories[name] for name in names])
-        at = [names.index(name) for name in self._ports.forces]
+        at = [names.index(name) for name in self._motion.forces]
         for k in range(run.steps):
             now = rows[k].copy()
             np.add.at(now, at, forces(values[k, at_ports]))

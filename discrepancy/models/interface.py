@@ -10,112 +10,17 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 
 from calibration.result.record import ParameterPrior
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.memory import Memory
-from fe.runtime.patch import SENSORS, ModelPatch, PortForce, Primitive
-from reporting.words import brief
+from discrepancy.models.scales import Scales
+from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
+from fe.runtime.state import Losses
+from reporting.words import brief, capital, counted
 
 Place = str | tuple[float, float]
 KEPT = 400
 """Responses that a model keeps; the oldest goes first."""
-
-
-@dataclass(frozen=True)
-class PortScale:
-    """Natural scales of a port for the campaign at hand: they make dimensionless effects physical.
-
-    Attributes
-    ----------
-    displacement : float
-        A, the largest motion of the port by the unpatched model in the dynamic trials that are fitted; in the
-        other trials if there are none [m or rad].
-    stiffness : float
-        k, the stiffness of the first bending mode seen at the port, w1^2 / phi1(port)^2 [N/m or N m/rad].
-    angular_frequency : float
-        w1 [rad/s].
-    static_stiffness : float or None
-        1 / (p . K^-1 p), the stiffness at rest seen at the port [N/m or N m/rad]. At a stiff joint it is a
-        small part of `stiffness`, and no effect can take away more. None: not known, taken as `stiffness`.
-    largest_displacement : float or None
-        The largest motion of the port in all trials, flights too [m or rad]. None: taken as `displacement`.
-    spread : tuple of (float, float)
-        Where a force at the port acts: its share, and the motion there over that of the port, by place. A
-        force that is spread over the wing acts on the motion of each place, and A is the mean's.
-    free : bool
-        Whether nothing holds the port (a body that falls or rolls), so that no place is its zero.
-    turns : bool
-        Whether its motion turns in a trial, or may: one that goes one way shows no memory.
-    of_state : bool
-        Whether it is a port of a state (a level, a temperature), at which laws are flows: `displacement`
-        times `angular_frequency` is then its largest value, `displacement` times `stiffness` the flow scale.
-    driven : bool
-        Whether drives alone move it, so that no force holds it still.
-    """
-
-    displacement: float
-    stiffness: float
-    angular_frequency: float
-    static_stiffness: float | None = None
-    largest_displacement: float | None = None
-    spread: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
-    free: bool = False
-    turns: bool = True
-    of_state: bool = False
-    driven: bool = False
-
-    def mean_power(self, exponent: float) -> float:
-        """Return the mean of |motion / A|^exponent over the places where a force at the port acts."""
-        return sum((share * float(abs(motion) ** exponent) for share, motion in self.spread), 0.0)
-
-
-@dataclass(frozen=True)
-class Scales:
-    """Natural scales of a model under a campaign.
-
-    Attributes
-    ----------
-    length : float
-        Semi-span or characteristic length L [m].
-    tip_stiffness : float
-        Static stiffness at the load point [N/m].
-    modal_mass : float
-        Mass of the first mode referred to the load point [kg].
-    angular_frequency : float
-        w1 [rad/s].
-    force, load_factor : float
-        Largest applied force [N] and load factor [1] of the campaign.
-    duration : float
-        Longest dynamic record [s]; 1 without one.
-    campaign_time : float
-        Time from the first to the last sample of the campaign [s]; 1 if unknown.
-    ports : mapping of str to PortScale
-        By port name; besides those of `Model.ports` the places of forces that are spread over the structure.
-    """
-
-    length: float
-    tip_stiffness: float
-    modal_mass: float
-    angular_frequency: float
-    force: float
-    load_factor: float
-    duration: float
-    campaign_time: float
-    ports: Mapping[str, PortScale]
-
-
-def campaign_sizes(campaign: Campaign) -> dict[str, float]:
-    """Return what `Scales` has of the campaign alone: force, load factor, duration and campaign time."""
-    trials = campaign.trials
-    moments = [trial.start + trial.time if trial.is_dynamic else trial.time for trial in trials]
-    span = float(max(map(np.max, moments)) - min(map(np.min, moments))) if moments else 0.0
-    lengths = (float(trial.time[-1] - trial.time[0]) for trial in trials if trial.is_dynamic)
-    return {
-        "force": max((float(np.max(np.abs(trial.force))) for trial in trials), default=0.0),
-        "load_factor": max((float(np.max(np.abs(trial.load_factor))) for trial in trials), default=0.0),
-        "duration": max(lengths, default=1.0),
-        "campaign_time": span or 1.0,
-    }
 
 
 @dataclass(frozen=True)
@@ -234,6 +139,12 @@ class Model(ABC):
         Largest station or characteristic length [m], if it has any.
     patch : ModelPatch
         What is added to every question: a known addition, or an effect that was found.
+    regions : tuple of str
+        Damage regions.
+    kinds : frozenset of TrialKind
+        Trials that it can follow.
+    holds_inputs : bool
+        Whether static trials can hold other inputs than a force.
     follows_windows : bool
         Whether it can follow laws that act in windows only.
     shows_ports : bool
@@ -246,6 +157,9 @@ class Model(ABC):
     port_names: tuple[str, ...] = ()
     length: float | None = None
     patch: ModelPatch = NO_PATCH
+    regions: tuple[str, ...] = ()
+    kinds: frozenset[TrialKind] = frozenset(TrialKind)
+    holds_inputs: ClassVar[bool] = False
     follows_windows: ClassVar[bool] = False
     shows_ports: ClassVar[bool] = False
     _declared: tuple[ParameterPrior, ...] | None = None
@@ -254,6 +168,11 @@ class Model(ABC):
     def __repr__(self) -> str:
         parameters = [parameter.name for parameter in self.parameters]
         return brief(self, name=self.name, parameters=parameters, effects=len(self.patch))
+
+    @property
+    def what(self) -> str:
+        """What it is called in a sentence."""
+        return f"the model {self.name!r}"
 
     # ------------------------------------------------------------ what each model says
 
@@ -265,13 +184,21 @@ class Model(ABC):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive; sensors are not asked for: they need no model."""
 
+    @property
+    def shown_outputs(self) -> tuple[str, ...]:
+        """Its outputs, for a sentence."""
+        return tuple(f"{name} ({quantity.value})" for name, quantity in self.quantities.items())
+
     @abstractmethod
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign, without what is added."""
 
     @abstractmethod
     def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
-        """Return the response of a trial under a patch that holds what is added, see `respond`."""
+        """Return the response of a trial under a patch that holds what is added, see `respond`.
+
+        All of it was checked: the model has the outputs and carries the patch.
+        """
 
     def ports(self) -> tuple[str, ...]:
         """Names of the ports where internal forces can act on one motion; user effects act at these."""
@@ -305,6 +232,69 @@ class Model(ABC):
         """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""
         return ""
 
+    # ------------------------------------------------------------ what is asked of it
+
+    def check(self, trial: Trial) -> None:
+        """Refuse a trial that it cannot follow."""
+        name = f"The trial {trial.name!r}"
+        if trial.kind is TrialKind.FLIGHT and trial.kind not in self.kinds:
+            raise ModelError(
+                f"{name} is a flight, but {self.what} has no input load_factor: give it one, or leave it out."
+            )
+        driven = trial.kind is TrialKind.DRIVEN
+        if TrialKind.DRIVEN not in self.kinds and (driven or trial.begins is not Start.SETTLED):
+            raise ModelError(
+                f"{name} {'is driven' if driven else f'begins {trial.begins.value}'}, which {self.what} "
+                "cannot follow: describe the rig as a lumped model, or record it forced from rest."
+            )
+        if trial.kind is TrialKind.STATIC and trial.inputs and not self.holds_inputs:
+            raise ModelError(
+                f"{name} is static under the inputs {', '.join(map(repr, trial.input_names))}, which "
+                f"{self.what} does not have at rest: describe the asset as an FMU model with [[input]], or "
+                'record the trial as "driven".'
+            )
+
+    def check_outputs(self, outputs: Outputs) -> None:
+        """Refuse outputs that it does not have, or that no channel can measure so."""
+        for output, quantity in outputs:
+            own = self.output_quantity(output)
+            if own is None:
+                raise ModelError(
+                    f"{capital(self.what)} has no output {output!r}; it has {', '.join(self.shown_outputs)}."
+                )
+            if not quantity.shows(own):
+                raise ModelError(
+                    f"The output {output!r} of {self.what} is a {own.value}, but a channel measures "
+                    f"{quantity.value}."
+                )
+
+    def check_carried(self, patch: ModelPatch) -> None:
+        """Refuse a primitive that it cannot carry; those of sensors are not asked for."""
+        for item in patch:
+            at_port = isinstance(item, PortForce) and item.port in self.ports()
+            if not (isinstance(item, SENSORS) or self.supports(type(item)) or at_port):
+                port = " (it has no port)" if isinstance(item, INTERNAL_FORCES) and not self.ports() else ""
+                raise ModelError(f"{capital(self.what)} cannot carry the primitive {item.kind!r}{port}.")
+
+    def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
+        """Return the losses of its regions in each row from those (N, K) that a trial names.
+
+        Raises
+        ------
+        ModelError
+            If one is of a region that it does not have.
+        """
+        losses = np.zeros((len(health), len(self.regions)))
+        for name, column in zip(trial.regions, health.T, strict=False):
+            if name in self.regions:
+                losses[:, self.regions.index(name)] = column
+            elif np.any(column):
+                raise ModelError(
+                    f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but {self.what} "
+                    f"has {', '.join(self.regions) or 'none'}."
+                )
+        return [tuple(row) for row in losses.tolist()]
+
     # ------------------------------------------------------------ what all models do alike
 
     @property
@@ -325,6 +315,11 @@ class Model(ABC):
     def has_law(self) -> bool:
         """Whether it has a law of a port of its own, such as one that was found."""
         return len(self.patch.of(PortForce)) > 0
+
+    def prior_mean(self, campaign: Campaign | None = None) -> FloatArray:
+        """Return the means (P,) of what is `declared`, those of a campaign where it says them."""
+        known = {} if campaign is None else campaign.parameters
+        return np.array([known.get(item.name, (item.mean, 0.0))[0] for item in self.declared])
 
     @property
     def declared(self) -> tuple[ParameterPrior, ...]:
@@ -356,11 +351,20 @@ class Model(ABC):
         ModelError
             If the model lacks an output or cannot carry a primitive.
         """
-        if self._kept is None:
-            return self._respond(trial, outputs, self.patch + patch, conditions)
 
         def answer() -> tuple[Trial, Response]:  # the trial lives as long, so that its id stays its own
-            return trial, self._respond(trial, outputs, self.patch + patch, conditions)
+            count = len(self.parameters)
+            if conditions.parameters.shape != (count,):
+                came, has = conditions.parameters.size, counted(count, "parameter")
+                raise ModelError(f"{capital(self.what)} has {has}, but {came} came.")
+            whole = (self.patch + patch).in_trial(trial.name)
+            self.check(trial)
+            self.check_outputs(outputs)
+            self.check_carried(whole)
+            return trial, self._respond(trial, outputs, whole, conditions)
+
+        if self._kept is None:
+            return answer()[1]
 
         key = (id(trial), outputs, patch.primitives, conditions.key)
         return self._kept.get(key, answer)[1]
@@ -373,6 +377,7 @@ class Model(ABC):
         ModelError
             If sensors are built in: what they make of a missing force is not known here.
         """
+        self.check_outputs(outputs)
         if len(self.sensors):
             raise ModelError(
                 f"{self.name} has sensors built in, through which no missing force is seen; leave them out."

@@ -10,19 +10,13 @@ from discrepancy.campaign.records import Campaign, FloatArray, Hold, Quantity, R
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, Shown, order_of
-from discrepancy.models.interface import Conditions, Outputs, Place
+from discrepancy.models.interface import Outputs, Place
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped
 from discrepancy.models.lumped_rig import Loop, LumpedRig
 from discrepancy.models.lumped_sections import InputSection
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.questions import (
-    LoadChange,
-    check_no_inputs,
-    check_outputs,
-    place_among,
-    release_of,
-)
+from discrepancy.models.questions import LoadChange, place_among, release_of
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.runtime.laws import LAWS
@@ -99,26 +93,13 @@ class LumpedModel(DescribedModel, SystemModel):
         return primitive in SENSORS or (primitive in INTERNAL_FORCES and bool(self.port_rows))
 
     follows_windows: ClassVar[bool] = True
+    kinds = frozenset(TrialKind) - {TrialKind.FLIGHT}
 
     def stations(self) -> tuple[float, float] | None:
         """Return the least and largest station [m] of the places, None without places."""
         return (self._stations[0], self._stations[-1]) if self._stations else None
 
     # ------------------------------------------------------------ in a trial
-
-    @property
-    def what(self) -> str:
-        """What it is called where a sentence begins."""
-        return f"The lumped model {self.name!r}"
-
-    def check(self, trial: Trial) -> None:
-        """Refuse a flight, and a static trial under other inputs than a force."""
-        if trial.kind is TrialKind.FLIGHT:
-            raise ModelError(
-                f"The trial {trial.name!r} is a flight, but the lumped model {self.name!r} has no lift; "
-                "leave it out."
-            )
-        check_no_inputs(trial, f"the lumped model {self.name!r}")
 
     def own_laws(self, parameters: FloatArray) -> ModelPatch:
         """Return the laws of ports that it has as it is, each times its factor."""
@@ -210,7 +191,7 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the input of a load place; raises `ModelError` if there is none."""
         forces = [name for name, item in self._inputs.items() if not item.quantity.moving]
         known = [*self._inputs] if place in self._inputs else forces
-        return self._inputs[place_among(known, place, f"the lumped model {self.name!r}")]
+        return self._inputs[place_among(known, place, self.what)]
 
     def _moved_row(self, rig: LumpedRig, item: InputSection, change: LoadChange = UNCHANGED) -> FloatArray:
         """Return the row (N,) along which an input acts, where its place has been moved to."""
@@ -230,12 +211,12 @@ class LumpedModel(DescribedModel, SystemModel):
         section = self._inputs.get(item.name)
         if section is None:
             raise ModelError(
-                f"The trial {trial.name!r} records the input {item.name!r}, which the lumped model "
-                f"{self.name!r} does not have; it has {', '.join(self._inputs) or 'none'}."
+                f"The trial {trial.name!r} records the input {item.name!r}, which {self.what} does "
+                f"not have; it has {', '.join(self._inputs) or 'none'}."
             )
         if item.quantity is not section.quantity and item.quantity not in section.quantity.moving:
             raise ModelError(
-                f"The input {item.name!r} of the lumped model {self.name!r} is {section.quantity.value}, but "
+                f"The input {item.name!r} of {self.what} is {section.quantity.value}, but "
                 f"the trial {trial.name!r} records {item.quantity.value}."
             )
         return section
@@ -244,7 +225,7 @@ class LumpedModel(DescribedModel, SystemModel):
         """Refuse a ring-down that the model cannot begin."""
         why = "which no force with a course in time can act on" if at_ports else ""
         if not self.description.is_plain:
-            why = f"which the lumped model {self.name!r} cannot begin: it is free, driven or has states"
+            why = f"which {self.what} cannot begin: it is free, driven or has states"
         if why:
             raise ModelError(
                 f'The trial {trial.name!r} is a ring-down, {why}; say kind = "driven" and begins = "unknown".'
@@ -263,7 +244,6 @@ class LumpedModel(DescribedModel, SystemModel):
 
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
         """Return what each output shows under what acts; None: at rest."""
-        check_outputs(self.what, self, outputs, self.quantities)
         drives = {} if acting is None else acting.drives
         found, description = [], self.description
         for name, quantity in outputs:
@@ -287,13 +267,14 @@ class LumpedModel(DescribedModel, SystemModel):
                 found.append(seen._replace(constant=item.constant * (not further)))
         return found
 
-    def _losses(self, trial: Trial, conditions: Conditions) -> list[Losses]:
+    def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
+        """Return none: health has no meaning here."""
         return [()]
 
     @property
     def oscillates(self) -> bool:
         """Whether it has a mode that vibrates."""
-        return bool(np.any(self.system(State(self._mean)).angular_frequency > 0.0))
+        return bool(np.any(self.system(State(self.prior_mean())).angular_frequency > 0.0))
 
     # ------------------------------------------------------------ ports
 
@@ -307,7 +288,7 @@ class LumpedModel(DescribedModel, SystemModel):
         linear, laws = super().apart()
         description = self.description.model_copy(update={"law": []})
         linear = linear._changed(description=description, _rigs=Memory(KEPT_RIGS))
-        return linear, self.own_laws(self._mean) + laws
+        return linear, self.own_laws(self.prior_mean()) + laws
 
     def unit_of_state(self, port: str) -> str:
         """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.models.interface import PortScale
 from discrepancy.models.linear_system import LinearSystem
+from discrepancy.models.scales import PortScale
 from discrepancy.models.second_order import Motion
 
 FORCES = 5.0

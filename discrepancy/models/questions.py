@@ -1,27 +1,16 @@
-"""What is asked of a model, checked, and a patch sorted by what its primitives change."""
+"""What a patch makes of loads and laws, and where and how a trial begins."""
 
 from collections.abc import Collection, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from calibration.result.record import ParameterPrior
-from discrepancy.campaign.records import Campaign, FloatArray, Release, Start, Trial, TrialKind
+from discrepancy.campaign.records import FloatArray, Release, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Model, Outputs, Place
+from discrepancy.models.interface import Place
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
-from fe.runtime.patch import (
-    INTERNAL_FORCES,
-    SENSORS,
-    LoadGain,
-    LoadPlace,
-    ModelPatch,
-    PortForce,
-    Primitive,
-)
-from fe.runtime.state import Losses
-from reporting.words import counted
+from fe.runtime.patch import LoadGain, LoadPlace, ModelPatch, Primitive
 
 DEFAULT_PLACE = "tip_load"
 """What a campaign says when it does not say where the force acts; a model with one input takes that one."""
@@ -61,15 +50,6 @@ class LoadChange(NamedTuple):
         return np.asarray((1.0 + self.gain) * values + self.tare * (recorded != 0.0))
 
 
-def check_carried(patch: ModelPatch, model: Model, what: str) -> None:
-    """Refuse a primitive that a model, `what`, cannot carry; those of sensors are not asked for."""
-    for item in patch:
-        at_port = isinstance(item, PortForce) and item.port in model.ports()
-        if not (isinstance(item, SENSORS) or model.supports(type(item)) or at_port):
-            port = " (it has no port)" if isinstance(item, INTERNAL_FORCES) and not model.ports() else ""
-            raise ModelError(f"{what} cannot carry the primitive {item.kind!r}{port}.")
-
-
 def laws_at(forces: ModelPatch, ports: Collection[str], *, in_windows: bool = True) -> Laws:
     """Return the laws of internal forces at ports; raises `ModelError` where one cannot be."""
     if not len(forces):
@@ -78,29 +58,6 @@ def laws_at(forces: ModelPatch, ports: Collection[str], *, in_windows: bool = Tr
         return laws_of(forces, ports, in_windows=in_windows)
     except InvalidPatchError as cause:
         raise ModelError(str(cause)) from cause
-
-
-def prior_mean(campaign: Campaign, parameters: Sequence[ParameterPrior]) -> FloatArray:
-    """Return the means (P,) of parameters, those of the campaign where it says them."""
-    return np.array([campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in parameters])
-
-
-def check_parameters(what: str, parameters: Sequence[ParameterPrior], values: FloatArray) -> None:
-    """Refuse values of another number than a model, `what`, has parameters."""
-    if values.shape != (len(parameters),):
-        raise ModelError(f"{what} has {counted(len(parameters), 'parameter')}, but {values.size} came.")
-
-
-def check_outputs(what: str, model: Model, outputs: Outputs, known: Iterable[str]) -> None:
-    """Refuse outputs that a model, `what`, does not have beside those `known`, or no channel can measure."""
-    for output, quantity in outputs:
-        own = model.output_quantity(output)
-        if own is None:
-            raise ModelError(f"{what} has no output {output!r}; it has {', '.join(known)}.")
-        if not quantity.shows(own):
-            raise ModelError(
-                f"{what}: the output {output!r} is a {own.value}, but a channel measures {quantity.value}."
-            )
 
 
 def place_among(places: Sequence[str], place: Place, what: str, where: str = "a trial") -> str:
@@ -125,43 +82,3 @@ def release_of(trial: Trial) -> Release:
     if trial.release is None:
         raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
     return trial.release
-
-
-def check_no_inputs(trial: Trial, what: str) -> None:
-    """Refuse a static trial under other inputs than a force, for a model that has none."""
-    if trial.kind is TrialKind.STATIC and trial.inputs:
-        names = ", ".join(repr(item.name) for item in trial.inputs)
-        raise ModelError(
-            f"The trial {trial.name!r} is static under the inputs {names}, which {what} does not have at "
-            'rest: describe the asset as an FMU model with [[input]], or record the trial as "driven".'
-        )
-
-
-def losses_of(trial: Trial, health: FloatArray, regions: Sequence[str], what: str) -> list[Losses]:
-    """Return the losses of a model's regions in each row from those (N, K) that a trial names.
-
-    Raises
-    ------
-    ModelError
-        If one is of a region that the model, `what`, does not have.
-    """
-    losses = np.zeros((len(health), len(regions)))
-    for name, column in zip(trial.regions, health.T, strict=False):
-        if name in regions:
-            losses[:, regions.index(name)] = column
-        elif np.any(column):
-            raise ModelError(
-                f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but {what} has "
-                f"{', '.join(regions) or 'none'}."
-            )
-    return [tuple(row) for row in losses.tolist()]
-
-
-def check_plain(trial: Trial, what: str) -> None:
-    """Refuse a driven trial, and a forced one that is not settled, for a model that cannot follow them."""
-    if trial.kind is TrialKind.DRIVEN or trial.begins is not Start.SETTLED:
-        came = "is driven" if trial.kind is TrialKind.DRIVEN else f"begins {trial.begins.value}"
-        raise ModelError(
-            f"The trial {trial.name!r} {came}, which {what} cannot follow: describe the rig as a lumped "
-            "model, or record it forced from rest."
-        )

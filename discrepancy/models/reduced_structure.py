@@ -13,14 +13,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Shown, shown_rows
 from discrepancy.models.interface import NO_PATCH, Outputs, Place
 from discrepancy.models.memory import Memory
-from discrepancy.models.questions import (
-    LoadChange,
-    check_no_inputs,
-    check_outputs,
-    check_plain,
-    place_among,
-    release_of,
-)
+from discrepancy.models.questions import LoadChange, place_among, release_of
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.runtime.patch import INTERNAL_FORCES, LOADS, SENSORS, LoadGain, ModelPatch, PointMass, Primitive
@@ -45,6 +38,7 @@ class StructuralModel(SystemModel):
     """
 
     reference: str
+    kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
 
     @abstractmethod
     def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
@@ -53,11 +47,6 @@ class StructuralModel(SystemModel):
     @abstractmethod
     def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
         """Return the loads (2, n) of a load factor and of its square in a flight, as load primitives do."""
-
-    def check(self, trial: Trial) -> None:
-        """Refuse a trial that is driven, begins otherwise than settled, or holds other inputs at rest."""
-        check_plain(trial, self.name)
-        check_no_inputs(trial, self.name)
 
     def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
         """Return the load (n,) at whose place stiffness and modal mass are the natural ones."""
@@ -116,6 +105,8 @@ class StructureModel(StructuralModel):
                 'load that is recorded: give a [[control]] with unit = "N" and a [[load]] of 1 N tied to it, '
                 "or a [[control]] load_factor."
             )
+        if LOAD_FACTOR not in model.controls:
+            self.kinds -= {TrialKind.FLIGHT}
         self.reference = (*self.forces, LOAD_FACTOR)[0]
         _, outputs, accelerations = model.rows
         strains, displacements = np.split(outputs, [len(model.gauges)])
@@ -127,8 +118,7 @@ class StructureModel(StructuralModel):
         self.quantities = {name: quantity for names, quantity, _ in named for name in names}
         self._rows = {name: row for names, _, rows in named for name, row in zip(names, rows, strict=True)}
         self._systems = Memory()
-        means = np.array([item.mean for item in self.parameters])
-        along = [self._load(means, force) for force in self.forces]
+        along = [self._load(self.prior_mean(), force) for force in self.forces]
         self.port_rows = {
             name: row
             for push in along
@@ -156,14 +146,7 @@ class StructureModel(StructuralModel):
         """Return what outputs show.
 
         Loads that always act shift what a motion shows.
-
-        Raises
-        ------
-        ModelError
-            If there is no such output, or it is of another quantity.
         """
-        known = (f"{name} ({quantity.value})" for name, quantity in self.quantities.items())
-        check_outputs(self.name, self, outputs, known)
         found = shown_rows((self._rows[output] for output, _ in outputs), outputs)
         always = self._always(case.state.parameters)
         if acting is None or not always.any():
@@ -184,14 +167,10 @@ class StructureModel(StructuralModel):
         ModelError
             If there is no such force, or none is named of several.
         """
-        return self._load(parameters, place_among(self.forces or (self.reference,), place, self.name))
+        return self._load(parameters, place_among(self.forces or (self.reference,), place, self.what))
 
     def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
         """Return the loads (2, n) of the load factor and of its square, which is zero."""
-        if LOAD_FACTOR not in self.model.controls:
-            raise ModelError(
-                f"The trial {trial.name!r} is a flight, but {self.name} has no control {LOAD_FACTOR}."
-            )
         row = self._load(parameters, LOAD_FACTOR)
         return np.stack((row, np.zeros_like(row)))
 

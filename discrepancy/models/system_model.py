@@ -11,21 +11,11 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown
-from discrepancy.models.interface import (
-    NO_PATCH,
-    Conditions,
-    Model,
-    Outputs,
-    Place,
-    PortedSystem,
-    PortScale,
-    Response,
-    Scales,
-    campaign_sizes,
-)
+from discrepancy.models.interface import NO_PATCH, Conditions, Model, Outputs, Place, PortedSystem, Response
 from discrepancy.models.linear_system import Resting, at_rest
 from discrepancy.models.natural_scales import PortSizes
-from discrepancy.models.questions import check_carried, check_parameters, laws_at, losses_of, prior_mean
+from discrepancy.models.questions import laws_at
+from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws
@@ -78,8 +68,6 @@ class SystemModel(Model):
 
     Attributes
     ----------
-    regions : tuple of str
-        Damage regions.
     port_rows : mapping of str to (N,) ndarray
         Rows of all ports where laws act.
     missing : tuple of str
@@ -90,7 +78,6 @@ class SystemModel(Model):
         3 if it tells transverse and shear strain, too; else 1.
     """
 
-    regions: tuple[str, ...] = ()
     port_rows: Mapping[str, FloatArray]
     missing: tuple[str, ...] = ()
     displacements: int | None = None
@@ -98,15 +85,6 @@ class SystemModel(Model):
     shows_ports: ClassVar[bool] = True
 
     # ------------------------------------------------------------ what each says
-
-    @property
-    def what(self) -> str:
-        """What it is called where a sentence begins."""
-        return self.name
-
-    @abstractmethod
-    def check(self, trial: Trial) -> None:
-        """Refuse a trial of a kind that it cannot follow."""
 
     @abstractmethod
     def system(self, state: State) -> SecondOrderSystem:
@@ -148,7 +126,7 @@ class SystemModel(Model):
 
     def case(self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH) -> Case:
         """Return a trial as it is at its begin."""
-        losses, warmer = self._losses(trial, conditions)[0], float(trial.temperature[0])
+        losses, warmer = self.losses(trial, conditions.health)[0], float(trial.temperature[0])
         return Case(
             trial, conditions, patch, State(conditions.parameters, losses, patch.of(*STRUCTURE), warmer)
         )
@@ -184,10 +162,6 @@ class SystemModel(Model):
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero. In a
         dynamic trial the structure is that at its first temperature.
         """
-        self.check(trial)
-        check_parameters(self.what, self.parameters, conditions.parameters)
-        patch = patch.in_trial(trial.name)
-        check_carried(patch, self, self.what)
         components = range(self.components if conditions.components else 1)
         try:
             laws, case = self.laws(conditions.parameters, patch), self.case(trial, conditions, patch)
@@ -207,7 +181,7 @@ class SystemModel(Model):
             raise ModelError(
                 f"The trial {trial.name!r} has no time, which a law or a force in time asks for."
             )
-        count, losses = len(trial.force), self._losses(trial, conditions)
+        count, losses = len(trial.force), self.losses(trial, conditions.health)
         losses = losses * count if len(losses) == 1 else losses
         warmer = trial.temperature.tolist() if len(patch.of(ModulusTemperature)) else [0.0] * count
         values = np.empty((count, len(components) * len(outputs)))
@@ -237,21 +211,14 @@ class SystemModel(Model):
         along, *further = np.split(values, len(components), axis=1)
         return Response(along, None, *further)
 
-    def _losses(self, trial: Trial, conditions: Conditions) -> list[Losses]:
-        return losses_of(trial, conditions.health, self.regions, self.name)
-
     # ------------------------------------------------------------ ports
-
-    @property
-    def _mean(self) -> FloatArray:
-        return np.array([item.mean for item in self.declared])
 
     def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, in the modes of the prior means."""
         patch = self.patch.in_trial(trial.name)
         at_mean, case = (
             self.case(trial, Conditions(values, health=trial.health[:1]), patch)
-            for values in (self._mean, parameters)
+            for values in (self.prior_mean(), parameters)
         )
         (base, _), (system, acting) = (self.begun(item, self.missing) for item in (at_mean, case))
         shapes = base.shapes
@@ -269,7 +236,7 @@ class SystemModel(Model):
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of a state at the begin of a trial: of motion from rest, and of data."""
-        parameters = prior_mean(campaign, self.declared)
+        parameters = self.prior_mean(campaign)
         case = self.case(trial, Conditions(parameters))
         moved = self.moved(case, self.laws(parameters), still=True)
         rig = moved.system
@@ -278,6 +245,7 @@ class SystemModel(Model):
         pace = np.maximum(rig.angular_frequency[:moving], 1.0 / float(trial.time[-1] - trial.time[0]))
         channels = [campaign.channels[name] for name in trial.channels]
         outputs = tuple((channel.output, channel.quantity) for channel in channels)
+        self.check_outputs(outputs)
         shown = self.shown(case, outputs, moved.acting)
         for column, item in enumerate(shown):
             kept = trial.values[trial.used[:, column], column] - item.constant
@@ -299,7 +267,7 @@ class SystemModel(Model):
         A structure that springs hold, which only forces move from rest, has scales of its own; for others
         what acts and moves is the measure.
         """
-        trials, parameters = campaign.trials, prior_mean(campaign, self.declared)
+        trials, parameters = campaign.trials, self.prior_mean(campaign)
         state, names = State(parameters, (0.0,) * len(self.regions)), self.ports()
         system, rest, laws = self.system(state), self.rest(state), self.laws(parameters)
         held = system.mode_count is not None and all(

@@ -13,11 +13,11 @@ from calibration.result.record import STATE
 from discrepancy.campaign.records import FloatArray, Quantity, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown, shown_rows
-from discrepancy.models.interface import Outputs, Place, PortScale
+from discrepancy.models.interface import Outputs, Place
 from discrepancy.models.linear_system import Resting, springs
 from discrepancy.models.memory import Memory
-from discrepancy.models.questions import check_outputs
 from discrepancy.models.reduced_structure import StructuralModel
+from discrepancy.models.scales import PortScale
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State
 from fe.reduction.model_cache import patch_arrays
@@ -136,32 +136,28 @@ class WingModel(StructuralModel):
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is, or None if there is no such output."""
-        if self.wing.output_row(output) is None:
+        if self._row(output) is None:
             return None
         return Quantity.STRAIN if output.startswith("strain") else Quantity.DISPLACEMENT
 
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
-        """Return what outputs show; `component` 1 and 2: transverse and shear strain.
-
-        Raises
-        ------
-        ModelError
-            If there is no such output, or it is of another quantity.
-        """
-        rows = self._rows.get((outputs, component), lambda: self._made_rows(outputs, component))
+        """Return what outputs show; `component` 1 and 2: transverse and shear strain."""
+        rows = np.array([self._row(output, component) for output, _ in outputs]).reshape(-1, self.wing.size)
         factors = self.wing.strain_factors(case.patch.of(LocalStiffnessLoss))
         if factors is not None:
             gauges = np.array([strain_gauge(output) for output, _ in outputs])
             rows = rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
         return shown_rows(rows if acting is None or acting.basis is None else rows @ acting.basis, outputs)
 
-    def _made_rows(self, outputs: Outputs, component: int) -> FloatArray:
+    def _row(self, output: str, component: int = 0) -> FloatArray | None:
+        return self._rows.get((output, component), lambda: self.wing.output_row(output, component))
+
+    @property
+    def shown_outputs(self) -> tuple[str, ...]:
+        """Its outputs, for a sentence."""
         places = f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction"
-        named = ("tip_displacement", "load_point_displacement", places)
         gauges = f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}]"
-        check_outputs("The wing", self, outputs, (gauges, *named))
-        rows = [self.wing.output_row(output, component) for output, _ in outputs]
-        return np.array(rows, dtype=np.float64).reshape(len(rows), self.wing.size)
+        return gauges, "tip_displacement", "load_point_displacement", places
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the wing can carry a primitive; it can carry all but forces by a formula in time."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.files.document import Origin
-from discrepancy.files.patch import PrimitiveInterval
+from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.shares import MissingForce

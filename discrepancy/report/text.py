@@ -8,7 +8,7 @@ from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.catalogue.entry import Effect
 from discrepancy.document_types import PRIMITIVE_UNITS
-from discrepancy.files.patch import PrimitiveInterval
+from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.judgement.conclusion import effects_text, probability_text
 from discrepancy.models.interface import Model
 from discrepancy.verdict import (

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from discrepancy.campaign.noise_records import pre_trigger_record
+from discrepancy.campaign.noise import pre_trigger_record
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.campaign.writing import write_campaign

@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.result.file import load_calibration
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import (
+    Campaign,
+    Channel,
+    FloatArray,
+    NoiseRecord,
+    Quantity,
+    Trial,
+    TrialKind,
+)
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
 from discrepancy.models.wing import WingModel
 from fmu_asset.door.binding import load_binding
@@ -25,8 +33,6 @@ from reporting.json_file import read_json
 from reporting.netcdf import read_groups
 from reporting.provenance import hash_file
 from reporting.words import counted
-
-FloatArray = NDArray[np.float64]
 
 RUN_FILE, CONFIG_FILE = "run.nc", "config.json"
 DESIGN_FILE, CALIBRATION_FILE = "asset/design.toml", "asset/calibration.nc"

@@ -4,21 +4,40 @@ The data are not part of the package; `docs/measured_rigs.md` says where they ar
 """
 
 from collections.abc import Callable, Sequence
+from math import inf
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg import helmert
 from scipy.signal import savgol_filter
 
-from discrepancy.campaign.records import FloatArray
-from discrepancy.errors import CampaignFileError
+from calibration.dynamics.records import RingDownRecord, read_records
+from calibration.errors import CalibrationError
+from calibration.static.experiments import LoadDisplacementData, read_measurements
+from discrepancy.campaign.noise import pre_trigger_record
+from discrepancy.campaign.reading import read_campaign
+from discrepancy.campaign.records import (
+    Campaign,
+    Channel,
+    FloatArray,
+    NoiseRecord,
+    Quantity,
+    Release,
+    Trial,
+    TrialKind,
+)
+from discrepancy.campaign.writing import write_campaign
+from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.files import atomic_write_text
+from reporting.provenance import hash_record
 from reporting.table_file import table_text
+from reporting.words import be, counted
 
 FALLING = 3.0
 """While the reading of the sensor's z is below this share of a rest's, it falls [m/s^2]."""
 CUT = 0.04
 """Left out at both ends of a fall: hands let go, and the ground comes [s]."""
-HELD_OUT = ("fall_14", "fall_5")
+HELD_OUT_FALLS = ("fall_14", "fall_5")
 LARGEST_LEVEL = 10.0
 """Where the tank's level sensor ends: readings there are left out [V]."""
 SMOOTHED = 0.12
@@ -56,7 +75,7 @@ def write_rig_campaign(rig: str, data: Path, folder: Path) -> Path:
     )
     for name in (name for name in tables if name.startswith("fall_")):  # as many as were published
         trial = name.removesuffix(".csv")
-        campaign += TRIAL.format(name=trial) + ("held_out = true\n" if trial in HELD_OUT else "")
+        campaign += TRIAL.format(name=trial) + ("held_out = true\n" if trial in HELD_OUT_FALLS else "")
     for name, text in {"model.toml": model, **tables, "campaign.toml": campaign}.items():
         atomic_write_text(folder / name, text)
     return folder
@@ -135,3 +154,203 @@ RIGS: dict[str, Callable[[Path], dict[str, str]]] = {
     "pendulum": _pendulum,
 }
 """What makes the tables of a campaign from a published folder, by the name of the rig."""
+
+
+# ---------------------------------------------------------------- the wing of Kapteyn et al. 2021
+
+
+SIGNAL, TIP = "spanwise", "tip"
+"""Names of the channels: the strain signal of the ring-downs, the displacement of the loading runs."""
+ROOT_GAUGE = "strain[17]"
+"""Where the model's strain is read for the signal: the gauge of the largest strain, 0.35 m from the root."""
+READING_ERROR = 33e-6 / 3.0**0.5
+"""Deviation of a value read off the plot [V]: evenly within +-33 microvolt (a pixel is 66).
+
+The plots show the same motion on the same grid, so that its error is common to the trials, and no average
+makes it less.
+"""
+TREND = 67
+"""Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""
+PARAMETERS = {
+    "young_modulus_factor": (1.0080, 0.0103),
+    "servo_mass": (0.1680, 0.0140),
+    "pitot_mass": (0.1360, 0.0280),
+    "damping_alpha": (1.03, 0.37),
+    "damping_beta": (7.56e-4, 1.84e-4),
+}
+"""Mean and deviation of the calibrated parameters: the joint posterior (docs/calibration.md), which allows
+for what the amplitude does to the frequency and the damping ratio that were calibrated to."""
+
+
+BEGIN = 0.8
+"""Begin of the window since the release [s]; before it higher modes ring that the model does not meet."""
+COLUMNS = 4
+"""Columns of the plot that are averaged into one sample. Four (32 ms) have a zero of their frequency response
+at 30.8 Hz, where the second bending mode rings."""
+RELEASE, MODE_COUNT = 0.05, 2
+"""Nominal displacement of the tip at the window's begin [m], where the unknown scale of the signal makes any
+value as good; modes whose state there is free."""
+HELD_OUT = (3, 5)
+"""Trials kept for proof, counted from 1."""
+
+
+def wing_campaign(
+    data: Path | str, *, begin: float = BEGIN, columns: int = COLUMNS, detrended: bool = True
+) -> Campaign:
+    """Return the published measurements of the real wing as a campaign.
+
+    Parameters
+    ----------
+    data : path
+        The authors' calibration folder, with `step2` and `step3`.
+    begin, columns
+        In place of `BEGIN` and `COLUMNS`.
+    detrended : bool
+        Whether the slow zero that the trials share is taken off: the moving average over three periods (Hann
+        weights), averaged over the trials. It moves by a third of a millivolt and is no motion of the wing.
+        What moves slowly in one trial alone is noise and stays.
+
+    Returns
+    -------
+    Campaign
+        Two static trials of the channel `tip` [m] (if `step2` is there), and the ring-downs of the channel
+        `spanwise` [V], of unknown scale.
+
+    Raises
+    ------
+    CampaignFileError
+        If the folder holds no ring-down records.
+    CampaignDataError
+        If a record cannot be used.
+    """
+    data = Path(data)
+    try:
+        records = read_records(data)
+        pairs = read_measurements(data) if _has_pairs(data) else None
+    except CalibrationError as cause:
+        raise CampaignFileError(f"The measurements of the wing cannot be read: {cause}") from cause
+    if any(len(record.time) != len(records[0].time) for record in records) or len(records) < 2:
+        raise CampaignDataError(
+            f"{data} must hold two or more ring-down records of one length; it holds {len(records)}."
+        )
+    zero = _shared_zero(records) if detrended else np.zeros(records[0].count)
+    windows = [_windowed(record, zero, begin, columns) for record in records]
+    scatter = trial_scatter(windows)
+    spread = float(np.std(scatter, ddof=1))
+    noise = pre_trigger_record(
+        scatter * np.hypot(1.0, READING_ERROR / spread), _interval(windows), SIGNAL, str(data)
+    )
+    channels = {SIGNAL: Channel(SIGNAL, Quantity.SIGNAL, ROOT_GAUGE, noise, inf, inf)}
+    trials: list[Trial] = []
+    if pairs is not None:
+        displacement_deviation = np.hypot(
+            pairs.displacement_standard_deviation,
+            pairs.load_standard_deviation * float(np.median(pairs.displacement / pairs.load)),
+        )
+        at_tip = NoiseRecord(float(displacement_deviation), inf)
+        channels[TIP] = Channel(TIP, Quantity.DISPLACEMENT, "load_point_displacement", at_tip)
+        trials += _loading_runs(pairs)
+    for number, (time, signal) in enumerate(windows, start=1):
+        trials.append(
+            Trial.plain(
+                f"release {number}", TrialKind.RINGDOWN, (SIGNAL,), time, values=signal[:, None],
+                release=Release(RELEASE, 1.0, at_rest=False, mode_count=MODE_COUNT),
+                held_out=number in HELD_OUT,
+            )
+        )  # fmt: skip
+    return Campaign(
+        "The real wing of Kapteyn et al. 2021",
+        channels,
+        tuple(trials),
+        None,
+        PARAMETERS,
+        hash_record([[*trial.values.ravel().tolist()] for trial in trials]),
+        (
+            f"Ring-downs: {records[0].source} to {records[-1].source}, from {begin:g} s after the "
+            f"release; {counted(columns, 'column')} of the plot averaged into a sample of "
+            f"{1e3 * _interval(windows):.3g} ms.",
+            f"Noise of the signal: scatter between the trials, {1e6 * spread:.3g} microvolt, and "
+            f"the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
+        ),
+    )
+
+
+def write_wing_campaign(data: Path | str, out: Path | str) -> Campaign:
+    """Write `wing_campaign` as a folder and return it as read from there; errors as there and of writing."""
+    return read_campaign(write_campaign(wing_campaign(data), out))
+
+
+def trial_scatter(windows: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
+    """Return noise of the signal ((R - 1) N,) [V] from what differs between R trials of N samples.
+
+    All trials are releases of one kind, so that what they share is the motion, whatever its law; what differs
+    beside amplitude, delay and zero is noise. Each trial is fitted by the mean of all, its rate, its second
+    derivative and a constant; the R - 1 orthonormal contrasts of what is left (Helmert) are independent of
+    each other and have the variance of a single trial. Four degrees of freedom of each contrast went into the
+    fit, and the variance allows for it.
+
+    Raises
+    ------
+    CampaignDataError
+        If the records are too short.
+    """
+    signals = np.array([signal for _, signal in windows])
+    count, size = signals.shape
+    mean = signals.mean(axis=0)
+    rate = np.gradient(mean)
+    known = np.stack((mean, rate, np.gradient(rate), np.ones(size)), axis=1)
+    known /= np.linalg.norm(known, axis=0)
+    left = signals.T - known @ np.linalg.lstsq(known, signals.T, rcond=None)[0]
+    noise = (left @ helmert(count).T).T
+    return np.asarray(noise.ravel() * np.sqrt(size / (size - known.shape[1])))
+
+
+def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
+    """Return the slow zero (N,) that all records share, NaN at the ends, where no average is known."""
+    weights = np.hanning(TREND + 2)[1:-1]
+    mean = np.mean([record.signal for record in records], axis=0)
+    zero = np.full(len(mean), np.nan)
+    zero[TREND // 2 : len(mean) - TREND // 2] = np.convolve(mean, weights / weights.sum(), "valid")
+    return zero
+
+
+def _windowed(
+    record: RingDownRecord, zero: FloatArray, begin: float, columns: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return times since the first and samples of a record from the window's begin on."""
+    known = np.isfinite(zero)
+    inside = np.flatnonzero(known & (record.time >= begin))
+    count = len(inside) // columns
+    if count < 60:
+        raise CampaignDataError(
+            f"{record.source}: {counted(count, 'sample')} {be(count)} left after {begin:g} s; 60 are needed."
+        )
+    kept = inside[: count * columns].reshape(count, columns)
+    time = record.time[kept].mean(axis=1)
+    interval = float(time[-1] - time[0]) / (count - 1)
+    return np.asarray(interval * np.arange(count), dtype=np.float64), np.asarray(
+        (record.signal - zero)[kept].mean(axis=1)
+    )
+
+
+def _interval(windows: list[tuple[FloatArray, FloatArray]]) -> float:
+    return float(windows[0][0][1])
+
+
+def _has_pairs(data: Path) -> bool:
+    return any(
+        (data / above / "step2").is_dir() for above in (Path(), Path("datafiles"), Path("src") / "datafiles")
+    )
+
+
+def _loading_runs(pairs: LoadDisplacementData) -> list[Trial]:
+    trials = []
+    for number in np.unique(pairs.run).tolist():
+        rows = pairs.run == number
+        trials.append(
+            Trial.plain(
+                f"loading run {number + 1}", TrialKind.STATIC, (TIP,), np.zeros(rows.sum()),
+                values=pairs.displacement[rows][:, None], force=pairs.load[rows], run=f"run {number + 1}",
+            )
+        )  # fmt: skip
+    return trials

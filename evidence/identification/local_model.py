@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.full.modes import lowest_eigenpairs, most_moved
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, lowest_eigenpairs, most_moved
 from fe.runtime.errors import FiniteElementError
 from fe.wing.design import WingDesign
 from fe.wing.operators import AffineOperators, assemble, point_masses

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.full.modes import lowest_eigenpairs, most_moved
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, lowest_eigenpairs, most_moved
 from fe.runtime.state import Losses
 from fe.wing.design import WingDesign
 from fe.wing.operators import AffineOperators, AffineWing, assemble, point_masses

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skfem import MeshQuad
 
-from fe.full.modes import lowest_eigenpairs
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, lowest_eigenpairs
 
 from .plate import FIELDS, A, B, Plate, Surface, U, V, W, plane_stress
 

@@ -9,7 +9,7 @@ from scipy.linalg import qr
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import SolutionError
 
-from .statics import Factorisation
+from .factorisation import Factorisation
 
 Norm = Factorisation
 """The energy norm of a stiffness is what its factorisation gives."""

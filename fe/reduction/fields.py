@@ -15,7 +15,7 @@ from fe.elements.kinds import HEXAHEDRA_20
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.reduced import ReducedModel
-from fe.structure.field import write_vtu
+from fe.structure.operators import write_vtu
 
 if TYPE_CHECKING:
     from fe.wing.operators import AffineOperators

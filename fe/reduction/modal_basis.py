@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.linalg import eigh
 
-from fe.full.affine import affine_sum
 from fe.full.subspace import Norm, ProjectedBasis
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
+from fe.structure.affine import affine_sum
 
 from .settings import TOGETHER, ModalSettings
 from .terms import ModalState, ReductionTerms

@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from fe.full.affine import affine_sum
-from fe.full.modes import most_moved
+from fe.full.factorisation import most_moved
 from fe.full.subspace import Norm
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE, WING
-from fe.structure.affine import AffineStructure
+from fe.structure.affine import AffineStructure, affine_sum
 from fe.wing.operators import AffineWing, point_masses
 from reporting.progress import Progress, SilentProgress
 from reporting.words import counted

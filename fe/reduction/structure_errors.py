@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fe.runtime.reduced import ReducedModel
-from fe.structure.affine import AffineStructure
-from fe.structure.field import natural_frequencies, static_response
+from fe.structure.affine import AffineStructure, natural_frequencies, static_response
 
 
 @dataclass(frozen=True)

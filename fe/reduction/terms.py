@@ -7,10 +7,9 @@ import numpy as np
 from scipy import sparse
 from scipy.stats import qmc
 
-from fe.full.affine import AffineSum
 from fe.full.subspace import Norm, conjugate_gradients
 from fe.runtime.arrays import FloatArray
-from fe.structure.affine import AffineStructure
+from fe.structure.affine import AffineStructure, AffineSum
 
 from .settings import MOST_GRID_REGIONS, default_anchors, remaining_levels
 

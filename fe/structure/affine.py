@@ -10,16 +10,55 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import sparse
 
-from fe.full.affine import affine_sum
+from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray
-from fe.runtime.errors import InvalidStateError
+from fe.runtime.errors import InvalidStateError, SolutionError
 from fe.runtime.state import losses_of
 
 from .tables import StructureDesign
 
 Values = Mapping[str, float]
+
+
+def affine_sum(coefficients: ArrayLike, terms: tuple[Any, ...]) -> Any:
+    """Return the sparse matrix sum of `coefficients` times `terms`."""
+    first, *others = (factor * term for factor, term in zip(np.asarray(coefficients), terms, strict=True))
+    return sum(others, first).tocsr()
+
+
+class AffineSum:
+    """The sums of coefficients times the same sparse terms, the places of their entries found once.
+
+    Five times faster than `affine_sum`; the entries of a row may stand in another order.
+
+    Parameters
+    ----------
+    terms : tuple of csr (n, n)
+        The terms.
+    """
+
+    def __init__(self, terms: tuple[Any, ...]) -> None:
+        self._shape = terms[0].shape
+        rows, columns = self._shape
+        for term in terms:
+            term.sum_duplicates()  # and sorts it, once for whatever else is done with it
+        entries = [term.tocoo() for term in terms]
+        keys = np.concatenate([part.row.astype(np.int64) * columns + part.col for part in entries])
+        found, place = np.unique(keys, return_inverse=True)
+        self._indptr = np.searchsorted(found, columns * np.arange(rows + 1, dtype=np.int64)).astype(np.int32)
+        self._indices = (found % columns).astype(np.int32)
+        # Each entry of the sum is a row, which holds the entry of each term.
+        term_of = np.repeat(np.arange(len(terms)), [part.nnz for part in entries])
+        values = np.concatenate([part.data for part in entries])
+        self._entries = sparse.coo_array((values, (place, term_of)), (len(found), len(terms))).tocsr()
+
+    def matrix(self, coefficients: ArrayLike) -> sparse.csr_array:
+        """Return the sum; its arrays of places are shared with all others."""
+        data = self._entries @ np.asarray(coefficients, dtype=np.float64)
+        return sparse.csr_array((data, self._indices, self._indptr), shape=self._shape)
 
 
 class StiffnessTerm(NamedTuple):
@@ -250,3 +289,84 @@ def _updated(nominal: dict[str, float], changed: Values | None, what: str) -> di
     factors: dict[str | None, float] = {None: 1.0}
     factors.update(nominal | dict(changed or {}))
     return factors
+
+
+@dataclass(frozen=True)
+class StaticResponse:
+    """Static response of a structure.
+
+    Attributes
+    ----------
+    displacement : (n,) m
+        Free unknowns.
+    largest : float
+        Largest displacement of a node [m].
+    strain : (gauges,)
+        Strain at the gauges, positive in tension.
+    output : (displacements,) m
+        Displacement outputs.
+    """
+
+    displacement: FloatArray
+    largest: float
+    strain: FloatArray
+    output: FloatArray
+
+
+def static_responses(structure: AffineStructure) -> dict[str, StaticResponse]:
+    """Solve for each load alone, its control at the nominal value, the structure undamaged.
+
+    Raises
+    ------
+    SolutionError
+        If the stiffness cannot be factorised, or a solution is not accurate.
+    """
+    if not structure.loads:
+        return {}
+    factors = Factorisation(structure.stiffness())
+    fields = factors.solve(np.column_stack([structure.load(name) for name in structure.loads]))
+    return {name: _response(structure, field) for name, field in zip(structure.loads, fields.T, strict=True)}
+
+
+def static_response(structure: AffineStructure, values: Mapping[str, float]) -> StaticResponse:
+    """Solve for all loads together at values by name; what is left out is nominal, and healthy.
+
+    Raises
+    ------
+    SolutionError
+        As of `static_responses`.
+    """
+    stiffness, _, load = structure.at(values)
+    return _response(structure, Factorisation(stiffness).solve(load))
+
+
+def _response(structure: AffineStructure, displacement: FloatArray) -> StaticResponse:
+    return StaticResponse(
+        displacement=displacement,
+        largest=float(np.linalg.norm(structure.full_displacement(displacement), axis=1).max()),
+        strain=np.asarray(structure.gauge_output @ displacement),
+        output=np.asarray(structure.displacement_output @ displacement),
+    )
+
+
+def natural_frequencies(
+    structure: AffineStructure, count: int, values: Mapping[str, float] | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Lowest frequencies (m,) [Hz], rising, and mass-normalised shapes (n, m), undamped; see `at` for values.
+
+    Raises
+    ------
+    SolutionError
+        If there is no mass, there are not so many modes, or the iteration did not converge.
+    """
+    if count >= structure.unknowns:
+        raise SolutionError(
+            f"{count} modes were asked for, but a structure of {structure.unknowns} free unknowns gives at "
+            f"most {structure.unknowns - 1}."
+        )
+    stiffness, mass, _ = structure.at(values or {})
+    if not mass.diagonal().any():
+        raise SolutionError("The structure has no mass, hence no modes; give its materials a density.")
+    squares, shapes = lowest_eigenpairs(stiffness, mass, count)
+    shapes = shapes / np.sqrt(np.einsum("im,im->m", shapes, mass @ shapes))
+    return np.sqrt(squares) / (2.0 * np.pi), shapes

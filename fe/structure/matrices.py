@@ -13,15 +13,12 @@ from pathlib import Path
 import numpy as np
 from scipy import sparse
 
-from fe.full.cholesky import Cholesky
-from fe.full.modes import lowest_eigenpairs
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError, SolutionError
 
 from .affine import DesignedStructure, StiffnessTerm, designed
-from .design import unit_vector
-from .matrix_design import Extension, MatrixDesign, MatrixLoad, MatrixMass, NodeOutput
+from .design import Extension, MatrixDesign, MatrixLoad, MatrixMass, NodeOutput, unit_vector
 from .matrix_files import Place, read_matrix, read_unknowns, read_vector
 from .tables import MOTIONS, Vector
 
@@ -298,7 +295,7 @@ def _part_of(
 
 def _check_definite(matrix: sparse.csr_array, sentence: str) -> None:
     try:
-        Cholesky(sparse.csr_array(matrix))
+        Factorisation(sparse.csr_array(matrix))
     except SolutionError:
         raise MeshError(f"{sentence}.") from None
 

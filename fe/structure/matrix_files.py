@@ -21,7 +21,7 @@ from fe.runtime.errors import MeshError
 from reporting.text_file import read_text
 
 from .deck import fail
-from .matrix_design import file_of
+from .design import file_of
 from .nastran_file import cards
 
 Place = tuple[int, int]

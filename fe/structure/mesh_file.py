@@ -16,7 +16,7 @@ from scipy.sparse import csgraph
 
 from fe.elements.cells import BATCH, jacobians
 from fe.elements.kinds import KINDS, meshio_with_wedges
-from fe.full.cholesky import analyse
+from fe.full.factorisation import analyse
 from fe.runtime.arrays import IntArray
 from fe.runtime.errors import MeshError
 

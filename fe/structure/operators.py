@@ -1,21 +1,24 @@
-"""From a structure file and its mesh to affine operators."""
+"""From a structure file and its mesh to affine operators, and their fields as VTU files for ParaView."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
+from fe.elements.cells import centre_strains
+from fe.elements.kinds import meshio_with_wedges
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError, MeshError
+from reporting.files import atomic_file
 
-from .affine import DesignedStructure, StiffnessTerm, designed
-from .design import Damage, Material, MeshDesign, load_structure, structure_hash
-from .gauges import gauge_rows
-from .location import nodal_load, point_shares
+from .affine import DesignedStructure, StiffnessTerm, designed, static_response
+from .design import Damage, Material, MatrixDesign, MeshDesign, load_structure, structure_hash
+from .location import gauge_rows, nodal_load, point_shares
 from .matrices import assemble_matrices
-from .matrix_design import MatrixDesign
 from .mesh import StructureMesh
 from .mesh_file import check_memory, read_mesh
 from .supports import SupportedUnknowns, supported
@@ -225,3 +228,67 @@ def _point_rows(design: MeshDesign, mesh: StructureMesh, key: str) -> sparse.csr
         direction = np.asarray(part.direction) / np.linalg.norm(part.direction)
         rows.append(sparse.csr_array(np.outer(shares, direction).reshape(1, -1)))
     return sparse.vstack(rows).tocsr()
+
+
+def weighed(structure: Structure) -> tuple[float, FloatArray]:
+    """Mass [kg] with the nominal point masses, and the centre of gravity (3,) [m]."""
+    shares, points = structure.nodal_mass, structure.mesh.points
+    mass = float(shares.sum())
+    return mass, shares @ points / mass if mass > 0.0 else points.mean(axis=0)
+
+
+def write_structure_vtu(
+    path: Path | str, structure: Structure, values: Mapping[str, float] | None = None
+) -> None:
+    """Solve the full model and write its field, whole or not at all.
+
+    Point data: `displacement` [m]. Cell data: `strain` at the centres, `material` and `region` (their numbers
+    in the file from 1, 0 for no region), `stiffness_loss`.
+
+    Parameters
+    ----------
+    path : Path or str
+        Where to write.
+    structure : Structure
+        The structure.
+    values : mapping of str to float, optional
+        Parameters, losses, free masses and controls by name; what is left out is nominal, and healthy.
+
+    Raises
+    ------
+    SolutionError
+        If the structure cannot be solved.
+    FileNotWrittenError
+        If the file cannot be written.
+    """
+    given = dict(values or {})
+    displacement = structure.full_displacement(static_response(structure, given).displacement)
+    mesh, loss = structure.mesh, np.zeros(len(structure.mesh.cells))
+    for number, name in enumerate(structure.regions):
+        loss[structure.region_of == number] = given.get(name, 0.0)
+    write_vtu(
+        path,
+        mesh.points,
+        (mesh.kind.file_type, mesh.cells),
+        {"displacement": displacement},
+        {
+            "strain": centre_strains(mesh, displacement),
+            "material": structure.material_of + 1,
+            "region": structure.region_of + 1,
+            "stiffness_loss": loss,
+        },
+    )
+
+
+def write_vtu(
+    path: Path | str,
+    points: FloatArray,
+    cells: tuple[str, IntArray],
+    point_data: dict[str, FloatArray],
+    cell_data: dict[str, NDArray[Any]],
+) -> None:
+    """Write a VTU file, whole or not at all; `cells` are their kind in meshio and their nodes."""
+    meshio, values = meshio_with_wedges(), {name: [value] for name, value in cell_data.items()}
+    mesh = meshio.Mesh(points, [cells], point_data=point_data, cell_data=values)
+    with atomic_file(path) as temporary:
+        meshio.write(temporary, mesh, file_format="vtu")

@@ -8,17 +8,16 @@ from pathlib import Path
 import numpy as np
 
 from fe.elements.cells import gradients, strain_matrix
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import TIP_FORCE, DigitalState
-from fe.structure.field import natural_frequencies
+from fe.structure.affine import natural_frequencies
 from fe.structure.operators import Structure
 from fe.wing.operators import AffineOperators
 
-from .calculix_deck import CalculixDeck, Step, number_line
+from .calculix_deck import CalculixDeck, Step, gauge_cells, load_step, number_line, structure_deck, wing_deck
 from .calculix_job import read_frequencies, read_tables, run_calculix
-from .calculix_models import gauge_cells, load_step, structure_deck, wing_deck
 
 TEST_FORCE = 10.0
 """Upward force of the static test and before the ring-down [N]."""
@@ -165,44 +164,13 @@ def _strain_tensors(operators: AffineOperators, free: FloatArray) -> FloatArray:
     return np.asarray(voigt[:, _PRINTED])
 
 
-@dataclass(frozen=True)
-class RingDownAgreement:
-    """Upward displacement [m] of the tip after its release, at equal steps of time, of both codes.
-
-    Attributes
-    ----------
-    ours, calculix : (t,)
-        Modal integration, exact in time, and direct integration by CalculiX.
-    same_rule : (t,)
-        Modal integration by the trapezoidal rule with the increment of CalculiX, which leaves out the error
-        of that rule.
-    initial : float
-        Displacement before the release [m].
-    """
-
-    ours: FloatArray
-    calculix: FloatArray
-    same_rule: FloatArray
-    initial: float
-
-    @property
-    def relative(self) -> float:
-        """Largest difference over the initial displacement."""
-        return float(np.abs(self.calculix - self.ours).max() / abs(self.initial))
-
-    @property
-    def relative_same_rule(self) -> float:
-        """Largest difference over the initial displacement when both use the trapezoidal rule."""
-        return float(np.abs(self.calculix - self.same_rule).max() / abs(self.initial))
-
-
 def ring_down_agreement(
     operators: AffineOperators,
     folder: Path,
     state: DigitalState,
     periods: float = 5.0,
     steps_per_period: int = 80,
-) -> RingDownAgreement:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Release the tip from a static force: our modal integration against direct integration.
 
     Ours is the reduced model with its few modes, exact in time; CalculiX integrates all unknowns by the
@@ -220,6 +188,13 @@ def ring_down_agreement(
         Length in periods of the first mode.
     steps_per_period : int
         Increments of the direct integration.
+
+    Returns
+    -------
+    ours, calculix, same_rule : (t,)
+        Upward displacement of the tip at equal steps of time after its release over that before it: modal
+        integration, exact in time; direct integration by CalculiX; modal integration by the trapezoidal rule
+        with the increment of CalculiX, which leaves out the error of that rule.
 
     Raises
     ------
@@ -257,7 +232,7 @@ def ring_down_agreement(
     theirs = np.array([rows[:, 1:].ravel()[tip] for rows in tables.get("NPROBES", ())])
     if len(theirs) != steps:
         raise CalculixError(f"CalculiX printed {len(theirs)} increments of the ring-down instead of {steps}.")
-    return RingDownAgreement(ours, theirs, same_rule, initial)
+    return ours / initial, theirs / initial, same_rule / initial
 
 
 def _trapezoidal(omega: FloatArray, damping_ratio: FloatArray, increment: float, steps: int) -> FloatArray:

@@ -20,6 +20,15 @@ def calculix_program() -> str | None:
     return shutil.which(PROGRAM)
 
 
+def required_calculix() -> str:
+    """Return the path of CalculiX; raises `CalculixError` where it is not installed."""
+    if program := calculix_program():
+        return program
+    raise CalculixError(
+        f"CalculiX ('{PROGRAM}') is not installed; on Debian and Ubuntu: apt-get install calculix-ccx."
+    )
+
+
 _HEADER = re.compile(r"^ *(\w[\w ]*?) \(.*\) for set (\w+) and time +\S+$", re.MULTILINE)
 
 
@@ -77,11 +86,7 @@ def run_calculix(text: str, folder: Path, name: str) -> str:
     CalculixError
         If CalculiX is not installed, ends with an error or takes more than an hour.
     """
-    program = calculix_program()
-    if program is None:
-        raise CalculixError(
-            f"CalculiX ('{PROGRAM}') is not installed; on Debian and Ubuntu: apt-get install calculix-ccx."
-        )
+    program = required_calculix()
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.inp").write_text(text, encoding="ascii")
     try:

@@ -13,15 +13,15 @@ from scipy import sparse
 
 from fe.elements.cells import CellMesh, centre_strains, gradients, hexahedra_20, isotropic_compliance
 from fe.elements.kinds import HEXAHEDRA_20, gauss_points
-from fe.full.modes import most_moved
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
-from fe.structure.field import natural_frequencies, static_response
+from fe.structure.affine import static_response
 from fe.structure.location import face_areas
 from fe.structure.mesh import Surface
 from fe.structure.supports import rigid_motions
 from fe.wing.design import WingDesign
-from fe.wing.operators import AffineOperators, assemble, cell_density, point_masses, root_support
+from fe.wing.operators import AffineOperators, assemble, cell_density, root_support
+from fe.wing.responses import eigenmodes
 
 _PATCH_GRADIENT = np.array([[1.0, -0.4, 0.3], [0.2, -0.7, 0.5], [-0.6, 0.1, 0.8]]) * 1e-3
 
@@ -210,9 +210,8 @@ def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> dict[s
         operators = assemble(design.changed(mesh={"refinement": refinement}))
         loads = np.column_stack((operators.turn(design.lift.load_factor), operators.load_tip))
         turn, bent = Factorisation(operators.stiffness()).solve(loads).T
-        masses = point_masses(design.masses.servo, design.masses.pitot)
-        frequency, shapes = natural_frequencies(operators, 4, masses)
-        first, second = frequency[most_moved(operators.load_tip, frequency**2, shapes)].tolist()
+        modes = eigenmodes(operators, 1.0, (), design.masses.servo, design.masses.pitot, 4)
+        first, second = modes.frequency[modes.flapwise_bending].tolist()
         for name, value in (
             ("unknowns", operators.unknowns),
             ("tip stiffness", 1.0 / float(operators.load_tip @ bent)),

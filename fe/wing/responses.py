@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fe.full.modes import most_moved
+from fe.full.factorisation import most_moved
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.state import Losses, losses_of
-from fe.structure.field import StaticResponse, natural_frequencies, static_response
+from fe.structure.affine import StaticResponse, natural_frequencies, static_response
 
 from .operators import AffineWing
 

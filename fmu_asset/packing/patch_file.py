@@ -1,7 +1,7 @@
 """Patch files as an FMU takes them: effects with an id and primitives, channels named as outputs.
 
-The file may hold more (posterior, data hash); what is read here, in the names of `discrepancy.files.patch` or
-in shorter ones, is
+The file may hold more (posterior, data hash); what is read here, in the names of
+`discrepancy.files.verdict` or in shorter ones, is
 
 ```json
 {"schema": "uav-twin patch 2",

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from fe.structure.design import Load, MeshDesign, PointOutput
-from fe.structure.matrix_design import MatrixDesign, MatrixLoad, NodeOutput
+from fe.structure.design import Load, MatrixDesign, MatrixLoad, MeshDesign, NodeOutput, PointOutput
 from fmu_asset.description import rendered
 from fmu_asset.errors import FmuBuildError
 

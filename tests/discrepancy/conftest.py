@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
-from discrepancy.location.residuals import FittedTrial, ResidualSet, sensitivity
+from discrepancy.location.residuals import FittedTrial, ResidualSet
+from tests.discrepancy.rigs import sensitivity
 
 FloatArray = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Simulated campaigns of the single-mass rig."""
+"""Simulated campaigns of the single-mass rig, and sensitivities of fits."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from discrepancy.campaign.records import Campaign
+import numpy as np
+
+from discrepancy.campaign.records import Campaign, FloatArray
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.files.document import Origin
@@ -19,6 +21,29 @@ from fe.runtime.patch import (
 )
 from reporting.provenance import collect_provenance
 from tests.refusals import Inputs
+
+
+def sensitivity(jacobian: FloatArray, covariance: FloatArray, noise_deviation: FloatArray) -> FloatArray:
+    """Return S = J L / s0 with L L^T the posterior covariance, so that S S^T holds the leverages.
+
+    Parameters
+    ----------
+    jacobian : (N, C, P) ndarray
+        Derivatives of the predictions of one trial by all fitted parameters [channel's unit].
+    covariance : (P, P) ndarray
+        Posterior covariance of the parameters at the scale of the noise records.
+    noise_deviation : (C,) ndarray
+        s0 [channel's unit].
+
+    Returns
+    -------
+    (N, C, P) ndarray
+        Dimensionless.
+    """
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    root = vectors * np.sqrt(np.clip(values, 0.0, None))
+    return np.asarray((jacobian @ root) / noise_deviation[:, np.newaxis])
+
 
 MODEL = "single_mass_rig"
 INPUTS = Inputs(Path(__file__).with_name("models"))

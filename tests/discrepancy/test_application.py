@@ -20,7 +20,7 @@ from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
 from discrepancy.errors import ModelError, VerdictFileError
 from discrepancy.files.document import Origin
-from discrepancy.files.patch import read_patch
+from discrepancy.files.verdict import read_patch
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem

@@ -1,6 +1,7 @@
 import pytest
 from threadpoolctl import threadpool_limits
 
+from fe.reduction.fields import WingFields, field_basis
 from fe.reduction.reduced_basis import Reduction, reduce_model
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
@@ -36,6 +37,12 @@ def shipped_operators(shipped_design: WingDesign) -> AffineOperators:
 def coarse_reduction(coarse_design: WingDesign, coarse_operators: AffineOperators) -> Reduction:
     with threadpool_limits(1):
         return kept("coarse-reduction", lambda: reduce_model(coarse_operators), FE, coarse_design.hash)
+
+
+@pytest.fixture(scope="session")
+def coarse_fields(coarse_operators: AffineOperators, coarse_reduction: Reduction) -> WingFields:
+    with threadpool_limits(1):
+        return field_basis(coarse_operators, coarse_reduction)
 
 
 @pytest.fixture(scope="session")

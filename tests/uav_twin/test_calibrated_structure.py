@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 from calibration.result.file import load_calibration
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation
 from fe.structure.operators import load_and_assemble
 from fmu_asset.archive.fmu_file import packed_design_hash
 from reporting.progress import SilentProgress

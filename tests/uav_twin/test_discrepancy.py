@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from discrepancy.files.patch import read_patch
-from discrepancy.files.verdict import read_verdict_file
+from discrepancy.files.verdict import read_patch, read_verdict_file
 from tests.command_line import command, refused, said
 
 RIG = ("--model", "single_mass_rig")

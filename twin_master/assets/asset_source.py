@@ -7,9 +7,7 @@ names end in `_source`: each holds the tables of its kinds and what is made of t
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 import numpy as np
@@ -29,13 +27,6 @@ if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
 
 Float = NDArray[np.float64]
-
-
-def load_sources() -> None:
-    """Import every source, so that its kinds are known."""
-    for module in iter_modules([str(Path(__file__).parent)]):
-        if module.name.endswith("_source"):
-            import_module(f"{__package__}.{module.name}")
 
 
 @dataclass(frozen=True)

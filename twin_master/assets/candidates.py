@@ -5,7 +5,7 @@ from pathlib import Path
 
 from fe.runtime.errors import InvalidDesignError
 from fe.structure.design import Gauge, Gauged, MeshDesign, load_structure, parse_structure
-from fe.structure.gauges import gauge_rows, spread_rosettes
+from fe.structure.location import gauge_rows, spread_rosettes
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 from reporting.section import checked

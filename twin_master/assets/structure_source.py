@@ -262,10 +262,8 @@ def _write_field(path: Path, file: Path, values: Mapping[str, float]) -> bool:
     FileNotWrittenError
         The disk is full or the folder cannot be written.
     """
-    from fe.structure.design import load_structure
-    from fe.structure.field import write_structure_vtu
-    from fe.structure.matrix_design import MatrixDesign
-    from fe.structure.operators import load_and_assemble
+    from fe.structure.design import MatrixDesign, load_structure
+    from fe.structure.operators import load_and_assemble, write_structure_vtu
 
     if isinstance(load_structure(file), MatrixDesign):
         return False

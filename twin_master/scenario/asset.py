@@ -9,6 +9,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any, ClassVar, Self
 
 from pydantic import ModelWrapValidatorHandler, model_validator
@@ -17,6 +18,9 @@ from reporting.section import shown
 from scenarios import asset_scripts, binding_files, structure_files
 from twin_master.scenario.section import Section, short
 
+KIND_FOLDER = Path(__file__).parents[1] / "assets"
+KIND_PACKAGE = f"{__package__.rpartition('.')[0]}.{KIND_FOLDER.name}"
+"""Where the kinds are found by the names of their files: the tables know none of them."""
 CALIBRATED_DESIGN_NAME = "calibration"
 """The tailored design inside the calibration file: with a file it takes the place of the scenario's."""
 
@@ -79,7 +83,9 @@ class KindSection(FileSection):
     @classmethod
     def kinds(cls) -> dict[str, type[Self]]:
         """Return the kinds of this union and their classes."""
-        import_module("twin_master.assets.asset_source").load_sources()
+        for module in iter_modules([str(KIND_FOLDER)]):
+            if module.name.endswith("_source"):
+                import_module(f"{KIND_PACKAGE}.{module.name}")
         return {kind: found for found in _subclasses(cls) if (kind := found.own_kind()) is not None}
 
     @classmethod

@@ -19,15 +19,9 @@ from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
-from discrepancy.models.interface import (
-    Conditions,
-    Model,
-    Outputs,
-    PortScale,
-    Response,
-    Scales,
-)
+from discrepancy.models.interface import Conditions, Model, Outputs, Response
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.scales import PortScale, Scales
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch, Primitive, RunOffset, SensorDrift
 

@@ -11,7 +11,7 @@ import pytest
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.posterior import ensemble, with_draws
+from discrepancy.fits.predictive import ensemble, with_draws
 from discrepancy.fits.screening import Screen
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.workflow import patch_draws

@@ -10,14 +10,8 @@ import pytest
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import (
-    Conditions,
-    Model,
-    Outputs,
-    PortScale,
-    Response,
-    Scales,
-)
+from discrepancy.models.interface import Conditions, Model, Outputs, Response
+from discrepancy.models.scales import PortScale, Scales
 from fe.runtime.patch import ModelPatch, Primitive
 
 # Gauges of a square patch of skin in plane stress: strain along, across, shear per metre of displacement.

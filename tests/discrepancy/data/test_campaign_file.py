@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from discrepancy.campaign.noise_records import pre_trigger_record
+from discrepancy.campaign.noise import pre_trigger_record
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import (
     Campaign,

@@ -17,16 +17,18 @@ from discrepancy.campaign.records import NoiseRecord
 from discrepancy.document_types import PRIMITIVE_UNITS
 from discrepancy.errors import VerdictFileError
 from discrepancy.files.document import Origin, json_schema, shipped_schema
-from discrepancy.files.patch import (
+from discrepancy.files.residuals import read_residuals, write_residuals
+from discrepancy.files.verdict import (
     PATCH_SCHEMA,
+    VERDICT_SCHEMA,
     StoredPatch,
+    StoredVerdict,
     patch_effects,
     primitive_intervals,
     read_patch,
     write_patch,
+    write_verdict,
 )
-from discrepancy.files.residuals import read_residuals, write_residuals
-from discrepancy.files.verdict import VERDICT_SCHEMA, StoredVerdict, write_verdict
 from discrepancy.files.verdict import read_verdict_file as read_verdict
 from discrepancy.judgement.proof import prove
 from discrepancy.verdict import (

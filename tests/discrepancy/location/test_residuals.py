@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from discrepancy.errors import FitError
-from discrepancy.location.residuals import ResidualSet, quadratic_moments, sensitivity
+from discrepancy.location.residuals import ResidualSet, quadratic_moments
+from tests.discrepancy.rigs import sensitivity
 
 
 def test_sensitivity_holds_the_leverages_of_least_squares() -> None:

@@ -1,4 +1,4 @@
-"""The contract of a model, a lumped one, a wing and an FMU: what it says of itself, and what it refuses."""
+"""The contract of a model, lumped, a wing, a structure, an FMU: what it says, reads and refuses."""
 
 from __future__ import annotations
 
@@ -8,16 +8,26 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
-from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Hold, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.models.reduced_structure import StructureModel
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
 from fe.runtime import patch
 from fe.runtime.laws import LAWS
-from fe.runtime.patch import PRIMITIVES, FreePlay, LoadGain, LoadPlace, PointMass, PowerStiffness
+from fe.runtime.patch import (
+    PRIMITIVES,
+    FreePlay,
+    LoadGain,
+    LoadPlace,
+    PointMass,
+    PowerDamping,
+    PowerStiffness,
+)
 from tests.discrepancy.asking import seen
 from tests.discrepancy.asking import trial as asked
 from tests.discrepancy.rigs import fmu_rig
@@ -25,13 +35,14 @@ from tests.discrepancy.rigs import fmu_rig
 
 @dataclass
 class Kind:
-    """A kind of model: an instance, a place of its loads, an output, and what it is to say of itself."""
+    """A kind of model: an instance, a place of its loads, an output, a pace, what it is to say of itself."""
 
     model: Model
     place: str
     output: str
+    pace: float
     ports: tuple[str, ...]
-    stations: tuple[float, ...]
+    stations: tuple[float, ...] | None
     parameters: tuple[str, ...]
     quantities: dict[str, Quantity | None]
     carried: set[str] = field(default_factory=set)
@@ -52,25 +63,24 @@ SENSED = {
     "clock", "logger_clock", "line", "decaying_line", "run_offset",
 }  # fmt: skip
 FMU = SENSED | {law.kind for law in LAWS} | {"load_gain"}
-STRUCTURE = {
-    "port_load",
-    "point_mass",
-    "root_compliance",
-    "modulus_temperature",
-    "stiffness_drift",
-    "load_place",
-}
+LUMPED = FMU | {
+    "port_load", "point_mass", "root_compliance", "modulus_temperature", "stiffness_drift", "load_place",
+}  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=["lumped", "wing", "FMU"])
-def kind(request, coarse_patch_arrays, foreign_fmu, tmp_path_factory) -> Iterator[Kind]:
+@pytest.fixture(scope="module", params=["lumped", "wing", "structure", "FMU"])
+def kind(request, coarse_patch_arrays, pushed_beam, foreign_fmu, tmp_path_factory) -> Iterator[Kind]:
     if request.param == "lumped":
-        chain, quantities = (
-            LumpedModel.load("three_mass_chain"),
-            {"base_strain": Quantity.STRAIN, "nothing": None},
-        )
+        quantities: dict[str, Quantity | None] = {"base_strain": Quantity.STRAIN, "nothing": None}
+        chain = LumpedModel.load("three_mass_chain")
         names = tuple(item.name for item in chain.parameters)
-        yield Kind(chain, "end", "x1", ("joint", "end"), (0.2, 0.6), names, quantities, FMU | STRUCTURE)
+        yield Kind(chain, "end", "x1", 28.0, ("joint", "end"), (0.2, 0.6), names, quantities, LUMPED)
+    elif request.param == "structure":
+        quantities = {"g1": Quantity.STRAIN, "shake": Quantity.ACCELERATION, "z1": None}
+        yield Kind(
+            StructureModel(pushed_beam[1]), "push", "tip", 2e3, ("tip",), None, ("e", "pump"), quantities,
+            FMU | {"stiffness_drift"},
+        )  # fmt: skip
     elif request.param == "wing":
         quantities = {
             "strain[3]": Quantity.STRAIN,
@@ -78,20 +88,21 @@ def kind(request, coarse_patch_arrays, foreign_fmu, tmp_path_factory) -> Iterato
             "displacement[0.5, 0.3]": Quantity.DISPLACEMENT,
         }
         yield Kind(
-            WingModel(coarse_patch_arrays), "tip_load", "tip_displacement", ("root", "tip", "span"),
-            (0.0, 1.828), tuple(SHIPPED_PRIOR), quantities, set(PRIMITIVES) - {"port_load"},
+            WingModel(coarse_patch_arrays), "tip_load", "tip_displacement", 18.0 * np.pi,
+            ("root", "tip", "span"), (0.0, 1.828), tuple(SHIPPED_PRIOR), quantities,
+            set(PRIMITIVES) - {"port_load"},
         )  # fmt: skip
     else:
         model = FmuModel.load(fmu_rig(tmp_path_factory.mktemp("rig"), foreign_fmu("rig2")))
         quantities = {"leaf_strain": Quantity.STRAIN, "slide.position": None}
         names = ("stiffness_factor", "damping_factor")
-        yield Kind(model, "mass", "displacement", ("slide",), (0.0, 0.4), names, quantities, FMU)
+        yield Kind(model, "mass", "displacement", 28.0, ("slide",), (0.0, 0.4), names, quantities, FMU)
         model.close()
 
 
 def test_it_says_what_it_is_and_what_it_carries(kind: Kind) -> None:
     model = kind.model
-    assert (model.ports(), model.stations()) == (kind.ports, pytest.approx(kind.stations))
+    assert (model.ports(), model.stations()) == (kind.ports, kind.stations and pytest.approx(kind.stations))
     assert tuple(item.name for item in model.parameters) == kind.parameters
     assert all(item.low < item.mean < item.high for item in model.parameters)
     assert {name: model.output_quantity(name) for name in kind.quantities} == kind.quantities
@@ -104,14 +115,36 @@ def test_what_changes_nothing_changes_no_bit(kind: Kind, how: TrialKind) -> None
     once = kind.seen(what)
     for items in ((), (patch.SensorGain("*", 0.5),), (LoadGain(0.0, 0.0),)):
         assert np.array_equal(kind.seen(what, *items), once)
-    if PointMass.kind in kind.carried:
+    if isinstance(kind.model, LumpedModel | WingModel):
         assert np.array_equal(kind.seen(what, PointMass(0.0, 0.3)), once)
-        fresh = (
-            WingModel(kind.model.wing.arrays)
-            if hasattr(kind.model, "wing")
-            else LumpedModel.load("three_mass_chain")
-        )
+        wing = isinstance(kind.model, WingModel)
+        fresh = WingModel(kind.model.wing.arrays) if wing else LumpedModel.load("three_mass_chain")
         assert np.array_equal(replace(kind, model=fresh).seen(what), once)
+
+
+@pytest.mark.parametrize("hold", list(Hold))
+@pytest.mark.parametrize("rubs", [False, True])
+def test_a_coarse_force_does_between_its_samples_what_is_said(kind: Kind, hold: Hold, rubs: bool) -> None:
+    """At nine samples a period, against the same force recorded a hundred times as fast."""
+    time, fine = (
+        2.0 * np.pi / 9.0 / kind.pace * samples for samples in (np.arange(120), np.arange(11901) / 100)
+    )
+    force, laws = (
+        3.0 * np.sin(kind.pace * time),
+        [PowerDamping(kind.ports[-1], 0.3, 0.0, 0.0, 1.0, 1.0)] * rubs,
+    )
+    coarse = replace(kind.trial(TrialKind.FORCED, force=force), time=time)
+    between = {
+        Hold.LINEAR: np.interp(fine, time, force),
+        Hold.SMOOTH: CubicSpline(time, force)(fine),
+        Hold.ZERO_ORDER: force[np.maximum(np.arange(len(fine)) - 1, 0) // 100],
+    }[hold]
+    wanted = kind.seen(replace(kind.trial(TrialKind.FORCED, force=between), time=fine), *laws)[::100]
+    found, straight = (kind.seen(replace(coarse, hold=own), *laws, refinement=4) for own in (hold, None))
+    largest = np.abs(wanted).max()
+    # the fine record of what is held goes up within its first interval
+    assert np.abs(found - wanted).max() < (5e-3 if hold is Hold.ZERO_ORDER else 1e-4) * largest
+    assert (np.abs(straight - wanted).max() > 2e-2 * largest) == (hold is not Hold.LINEAR)
 
 
 @pytest.mark.parametrize(
@@ -141,7 +174,7 @@ def test_what_cannot_be_answered_is_refused_in_a_sentence(
 @pytest.mark.parametrize(
     ("kind", "how", "said", "items", "sentence"),
     [
-        ("lumped", TrialKind.FLIGHT, {}, (), "is a flight, but the lumped model"),
+        ("lumped", TrialKind.FLIGHT, {}, (), "is a flight, but the model .* no input load_factor"),
         ("lumped", TrialKind.STATIC, {"load_place": (0.1, 0.2)}, (), "takes forces at"),
         ("lumped", TrialKind.STATIC, {}, (patch.Washout(0.1, 1.0),), "cannot carry the primitive 'washout'"),
         ("lumped", TrialKind.STATIC, {"load_place": "middle"}, (LoadPlace(0.1, 0.0),), "no station_deriv"),
@@ -151,7 +184,7 @@ def test_what_cannot_be_answered_is_refused_in_a_sentence(
         ("wing", TrialKind.STATIC, {}, (patch.LocalStiffnessLoss(1.2, 0.2, 0.5),), "leave some stiffness"),
         ("FMU", TrialKind.STATIC, {}, (PointMass(0.1, 0.2),), "cannot carry the primitive 'point_mass'"),
         ("FMU", TrialKind.RINGDOWN, {}, (FreePlay("tip", 1.0, 1.0),), "port 'tip', which this model does"),
-        ("FMU", TrialKind.FLIGHT, {"load_factor": np.ones(3)}, (), "names no load_factor"),
+        ("FMU", TrialKind.FLIGHT, {"load_factor": np.ones(3)}, (), "no input load_factor"),
         ("FMU", TrialKind.STATIC, {"load_place": "wing tip"}, (), "In the trial 'a trial' the load place is"),
         ("FMU", TrialKind.RINGDOWN, {}, (PowerStiffness("slide", 1e9 * 1974.0 * 0.02, 1.0, 0, 0.02),),
          "does not converge"),

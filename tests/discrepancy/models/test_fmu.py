@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from discrepancy.campaign.records import Campaign, Hold, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity, Release, Trial, TrialKind
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.errors import ModelError
 from discrepancy.model_choice import choose_model
@@ -173,17 +173,6 @@ def test_motion_converges_to_the_lumped_model(
     coarse, fine = (error(what, *items, refinement=n) for n in (1, 4))
     assert coarse < largest
     assert np.log(coarse / fine) / np.log(4.0) > least
-
-
-@pytest.mark.parametrize("hold", list(Hold))
-@pytest.mark.parametrize("items", [(), (LAWS["coulomb"],)])
-def test_a_coarse_force_does_between_its_samples_what_is_said(error, rig, lumped, hold: Hold, items) -> None:
-    time = 0.04 * np.arange(75)
-    coarse = trial(TrialKind.FORCED, time, force=8.0 * np.sin(28.0 * time), hold=hold)
-    assert error(coarse, *items, refinement=4) < 1e-3
-    wanted, straight = seen(lumped, coarse, *items), seen(rig, replace(coarse, hold=None), *items)
-    differ = np.abs(straight - wanted).max() > 0.02 * np.abs(wanted).max()
-    assert differ == (hold is not Hold.LINEAR)
 
 
 @pytest.mark.parametrize("name", ["coulomb", "quadratic", "bouc-wen"])

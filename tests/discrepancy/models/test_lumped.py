@@ -8,19 +8,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import eigh, expm
+from scipy.linalg import eigh
 
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Shown
-from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
 from discrepancy.models.second_order import SecondOrderSystem
 from fe.runtime import patch as patches
-from fe.runtime.laws.micro_slip import slip_displacements
-from fe.runtime.motion import NO_LAWS, laws_of
+from fe.runtime.motion import NO_LAWS
 from fe.runtime.patch import (
     BoucWen,
     FreePlay,
@@ -33,7 +31,7 @@ from fe.runtime.patch import (
 from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
 from tests.discrepancy.asking import trial as asked
 from tests.discrepancy.rigs import model_of
-from tests.fe.runtime.stepping import simulate
+from tests.fe.runtime.stepping import exact, second_order
 from tests.refusals import Inputs
 
 pytestmark = pytest.mark.xdist_group("compiling")
@@ -136,7 +134,9 @@ def test_static_rows_with_a_joint_are_in_equilibrium(chain, law, force_of, toler
 # ---------------------------------------------------------------- motion
 
 
-def exact(start: FloatArray, internal: Any, times: FloatArray, force: Any = lambda t: 0.0) -> FloatArray:
+def by_its_equation(
+    start: FloatArray, internal: Any, times: FloatArray, force: Any = lambda t: 0.0
+) -> FloatArray:
     """Displacement and velocity (N, 6) of the full equations, by a general integrator."""
 
     def slope(t: float, y: FloatArray) -> FloatArray:
@@ -150,7 +150,7 @@ def exact(start: FloatArray, internal: Any, times: FloatArray, force: Any = lamb
 def test_a_linear_ringdown_starts_from_the_static_shape(chain: LumpedModel) -> None:
     what = ringdown()
     response = chain.respond(what, tuple(DISPLACEMENTS.items()), patches.ModelPatch(), Conditions(np.ones(3)))
-    wanted = exact(0.02 * END / END[2], lambda x, v: 0.0, what.time)
+    wanted = by_its_equation(0.02 * END / END[2], lambda x, v: 0.0, what.time)
     np.testing.assert_allclose(response.values, wanted[:, :3], atol=1e-9)
     np.testing.assert_allclose(response.rates, wanted[:, 3:], atol=1e-7)
 
@@ -173,7 +173,7 @@ def test_a_ringdown_with_a_law_is_its_equation(chain: LumpedModel, law: Primitiv
     # released from equilibrium under a force at the end only
     np.testing.assert_allclose((STIFFNESS @ start + JOINT * force(JOINT @ start, 0.0))[:2], 0.0, atol=1e-8)
     assert start[2] == pytest.approx(0.02)
-    wanted = exact(start, force, what.time)
+    wanted = by_its_equation(start, force, what.time)
     u, v = wanted[:, :3], wanted[:, 3:]
     np.testing.assert_allclose(values[:, :3], u, atol=0.02 * 5e-4)
     np.testing.assert_allclose(values[:, 3], v[:, 2], atol=0.5 * 1e-3)
@@ -182,45 +182,12 @@ def test_a_ringdown_with_a_law_is_its_equation(chain: LumpedModel, law: Primitiv
     np.testing.assert_allclose(values[:, 4], acceleration, atol=2e-3 * np.max(np.abs(acceleration)))
 
 
-def test_a_ringdown_with_a_slipping_joint_begins_loaded_and_is_its_equation(chain: LumpedModel) -> None:
-    law = MicroSlip("joint", 0.5, 300.0, -0.3, element_count=4)
-    values, limits = shown(chain, ringdown(100), law), slip_displacements(law)
-    elements = np.clip(JOINT @ values[0], -limits, limits)  # loaded from zero without turning back
-    u, v, x = values[0].copy(), np.zeros(3), JOINT @ values[0]
-    held = STIFFNESS @ u + JOINT * 300.0 * (elements.mean() - x)
-    np.testing.assert_allclose(held[:2], 0.0, atol=1e-9)
-    assert u[2] == pytest.approx(0.02)
-    path, h = [u.copy()], 2e-5
-    for step in range(1, 99 * 500 + 1):  # leap-frog with steps far smaller than the model's
-        pull = -STIFFNESS @ u - VISCOUS @ v - JOINT * (300.0 * (elements.mean() - x))
-        v = v + h * (0.5 if step == 1 else 1.0) * pull / np.diag(MASS)
-        u = u + h * v
-        elements = np.clip(elements + JOINT @ u - x, -limits, limits)
-        x = JOINT @ u
-        if step % 500 == 0:
-            path.append(u.copy())
-    np.testing.assert_allclose(values, path, atol=0.02 * 4e-4)
-
-
-@pytest.mark.parametrize(
-    "law",
-    [
-        PowerDamping("joint", 0.1, 0, 0, 1, 1),
-        MicroSlip("joint", 0.5, 200.0, -0.3),
-        patches.StiffnessDrift(0.01),
-    ],
-)
-def test_finer_steps_change_less_than_the_noise(chain: LumpedModel, law: Primitive) -> None:
-    coarse, fine = (shown(chain, ringdown(), law, refinement=n) for n in (1, 8))
-    assert np.max(np.abs(coarse - fine)) < 3e-4 * 0.02
-
-
 def test_a_forced_motion_is_its_equation(chain: LumpedModel) -> None:
     time = np.arange(300) * 0.01
     force = 3.0 * np.sin(25.0 * time) + np.where(time > 1.0, 2.0, 0.0)
     values = shown(chain, trial(TrialKind.FORCED, time, force=force), CUBIC)
     at = lambda t: float(np.interp(t, time, force))  # noqa: E731
-    wanted = exact(np.zeros(3), lambda x, v: 2.0 * (x / 2e-3) ** 3, time, at)[:, :3]
+    wanted = by_its_equation(np.zeros(3), lambda x, v: 2.0 * (x / 2e-3) ** 3, time, at)[:, :3]
     np.testing.assert_allclose(values, wanted, atol=5e-4 * np.max(np.abs(wanted)))
 
 
@@ -310,35 +277,14 @@ COULOMB = PowerDamping("joint", 0.4, 0.0, 0.0, 1.0, 1.0)
 TOGETHER = PowerDamping("joint", 2.0, 2.0, 0.0, 0.2, 1.0), PowerStiffness("joint", 4.0, 3.0, 0, 0.01)
 
 
-@pytest.mark.parametrize("laws", [(), (COULOMB,), TOGETHER])
-def test_even_stamps_are_those_of_the_even_stepper(laws: tuple[Primitive, ...]) -> None:
-    ports = {"joint": np.array([0.7, -1.1])}
-    system = SecondOrderSystem(np.eye(2), np.diag([0.1, 0.4]), np.diag([81.0, 961.0]), ports)
-    internal = laws_of(patches.ModelPatch(laws), system.ports) if laws else NO_LAWS
-    time, shape = 0.01 * np.arange(300), np.array([0.4, 0.9])
-    force = np.append(0.0, np.random.default_rng(0).normal(size=299))
-    given = {"q": np.zeros(2), "v": np.zeros(2), "shape": shape @ system.shapes, "kernel": compiled_kernel()}
-    even = simulate(system.modal, internal, force=force, interval=0.01, **given)
-    found = system.motion(Acting(time, np.zeros(2), [(shape, Course.of(time, force))]), internal)
-    for one, other in ((found.q, even.q), (found.velocity, even.v), (found.port_forces, even.port_forces)):
-        size = max(1e-9, float(np.abs(other).max(initial=0.0)))
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * size)
-
-
 def test_a_forced_motion_at_uneven_stamps_is_exact(chain: LumpedModel) -> None:
     time = 0.02 * (np.arange(200) + 0.9 * np.random.default_rng(1).uniform(-0.5, 0.5, 200))
     time = np.delete(time - time[0], slice(66, 73))  # and a gap
     force = np.append(0.0, np.random.default_rng(2).normal(size=len(time) - 1))
-    matrix = np.zeros((8, 8))
-    matrix[:3, 3:6] = np.eye(3)
-    matrix[3:6] = np.linalg.solve(MASS, np.hstack((-STIFFNESS, -VISCOUS, np.eye(3)[:, 2:], np.zeros((3, 1)))))
-    matrix[6, 7] = 1.0
-    states = [np.zeros(6)]
-    for k, h in enumerate(np.diff(time)):
-        slope = (force[k + 1] - force[k]) / h
-        states.append((expm(h * matrix) @ np.concatenate((states[-1], [force[k], slope])))[:6])
-    found = np.array(states)
-    acceleration = found @ matrix[5, :6] + force * matrix[5, 6]
+    into = np.append(np.zeros(5), 1.0 / MASS[2, 2])[:, None]
+    matrix = second_order(*(np.linalg.solve(MASS, part) for part in (STIFFNESS, VISCOUS)))
+    found = exact(matrix, into, time, force[:, None])
+    acceleration = found @ matrix[5] + force * into[5]
     expected = np.stack([found[:, 0], found[:, 5], acceleration], axis=1)
     measured = shown(chain, trial(TrialKind.FORCED, time, force=force), outputs=SEEN)
     np.testing.assert_allclose(measured, expected, atol=1e-9 * np.abs(expected).max())

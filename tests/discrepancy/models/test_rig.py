@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
-from scipy.linalg import expm
 
 from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import (
@@ -30,6 +29,7 @@ from fe.runtime.patch import ModulusTemperature, Overflow, PowerDamping, PowerSt
 from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
 from tests.discrepancy.asking import trial as asked
 from tests.discrepancy.rigs import model_of
+from tests.fe.runtime.stepping import exact
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
@@ -56,19 +56,6 @@ def actuator(values: FloatArray) -> RecordedInput:
 def uneven(count: int, interval: float) -> FloatArray:
     steps = interval * np.random.default_rng(0).uniform(0.6, 1.4, count - 1)
     return np.concatenate(([0.0], np.cumsum(steps)))
-
-
-def exact(matrix: Any, into: Any, time: FloatArray, inputs: FloatArray, held: bool = False) -> FloatArray:
-    """States (N, n) of y' = A y + B u from zero, u (N, I) linear or held between the samples."""
-    n, wide = np.shape(into)
-    block = np.zeros((n + 2 * wide, n + 2 * wide))
-    block[:n, :n], block[:n, n : n + wide] = matrix, into
-    block[n : n + wide, n + wide :] = np.eye(wide)
-    states = [np.zeros(n)]
-    for k, h in enumerate(np.diff(time)):
-        slope = 0.0 * inputs[k] if held else (inputs[k + 1] - inputs[k]) / h
-        states.append((expm(h * block) @ np.concatenate((states[-1], inputs[k], slope)))[:n])
-    return np.array(states)
 
 
 # ---------------------------------------------------------------- bodies, tanks, motors
@@ -102,20 +89,6 @@ def test_tanks_begin_settled_and_stay_so(offset: float) -> None:
     what = trial(uneven(20, 4.0), pump(np.full(20, 2.0)), begins=Start.SETTLED)
     found = seen(rig("tanks"), what, LOWER, offset=(offset,) if offset else ())
     np.testing.assert_allclose(found[:, 0], (2.0 + offset) * 0.5 / 0.08, rtol=1e-10)
-
-
-def test_an_outlet_by_a_root_of_the_level() -> None:
-    time = 4.0 * np.arange(100.0)
-    voltage = 2.0 + np.sin(0.05 * time)
-    law = PowerDamping("outlet", 0.3, 0.5, 0.0, 1.0, 1.0)
-    found = seen(rig("tanks"), trial(time, pump(voltage)), LOWER, law, refinement=8)
-
-    def slope(t: float, x: FloatArray) -> list[float]:
-        first = (0.5 * np.interp(t, time, voltage) - 0.1 * x[0]) / 2.0
-        return [first, (0.1 * x[0] - 0.08 * x[1] - 0.3 * np.sqrt(max(x[1], 0.0))) / 3.0]
-
-    wanted = integrated(slope, time, np.zeros(2), rtol=1e-9, atol=1e-11, max_step=1.0)[:, 1]
-    np.testing.assert_allclose(found[:, 0], wanted, atol=5e-4 * wanted.max())
 
 
 def test_a_motor_couples_displacements_and_states() -> None:
@@ -245,18 +218,6 @@ def test_a_shaken_base_and_a_hand_on_the_mass() -> None:
     np.testing.assert_allclose(found[:, 0], solution[0], atol=2e-5)
     x, v = solution[0] - w0(time), solution[1] - w1(time)
     np.testing.assert_allclose(found[:, 1], shake - 400.0 * x - 1.5 * v - 4.0 * np.abs(v) * v, atol=5e-3)
-
-
-def test_a_smooth_force_at_nine_samples_a_period_is_read_as_a_curve() -> None:
-    model = rig("tanks", ("[2.0, 3.0]", "[0.02, 3.0]"))  # so quick that the first state is the force itself
-    time = np.arange(200.0) * (2.0 * np.pi / 0.9 / 9.0)
-    fine = np.linspace(0.0, time[-1], 199 * 64 + 1)
-    truth = seen(model, trial(fine, pump(np.sin(0.9 * fine), None)), LOWER)[::64, 0]
-    linear, smooth = (
-        np.abs(seen(model, trial(time, pump(np.sin(0.9 * time), hold)), LOWER)[:, 0] - truth)[20:].max()
-        for hold in (Hold.LINEAR, Hold.SMOOTH)
-    )
-    assert smooth < 0.1 * linear
 
 
 def test_plain_models_take_driven_trials_and_other_begins() -> None:

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 
 from calibration.result.file import save_calibration
-from discrepancy.campaign.records import Hold, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.wing import WingModel
@@ -105,13 +104,6 @@ def test_at_rest_it_is_the_solution_of_the_matrices(wing: Wing) -> None:
     items = patch.Washout(0.1, 2.0), PointMass(0.1, 1.0)
     u = wing.static(np.transpose([wing.lift(n, *items) for n in FLIGHT.load_factor]))
     assert wing.seen(FLIGHT, *items) == pytest.approx((wing.rows() @ u).T, rel=1e-9)
-
-
-def test_load_gain_and_tare_act_while_a_force_is_applied(wing: Wing) -> None:
-    values, plain = wing.seen(STATIC, patch.LoadGain(0.05, 0.4)), wing.seen(STATIC)
-    wanted = np.outer(1.05 * STATIC.force + 0.4 * (STATIC.force != 0.0), plain[0] / STATIC.force[0])
-    assert values == pytest.approx(wanted, rel=1e-12)
-    assert not values[-1].any()
 
 
 def test_each_row_has_its_own_health_and_temperature(wing: Wing) -> None:
@@ -226,25 +218,6 @@ def test_a_harmonic_force_reaches_the_frequency_response(wing: Wing) -> None:
     amplitude = wing.rows() @ np.linalg.solve(dynamic, 3.0 * wing.tip)
     wanted = (amplitude[:, None] * np.exp(1j * omega * time[-1000:])).imag.T
     assert np.abs((values - wanted) / np.abs(amplitude)).max() < 2e-3
-
-
-@pytest.mark.parametrize("hold", list(Hold))
-def test_a_coarse_force_does_between_its_samples_what_is_said(wing: Wing, hold: Hold) -> None:
-    """At nine samples a period, against the same force recorded a hundred times as fast."""
-    time, fine = np.arange(120) / 81.0, np.arange(119 * 100 + 1) / 8100.0
-    force = 3.0 * np.sin(2.0 * np.pi * 9.0 * time)
-    coarse = trial(TrialKind.FORCED, time, force=force, hold=hold)
-    between = {
-        Hold.LINEAR: np.interp(fine, time, force),
-        Hold.SMOOTH: CubicSpline(time, force)(fine),
-        Hold.ZERO_ORDER: force[np.maximum(np.arange(len(fine)) - 1, 0) // 100],
-    }[hold]
-    wanted = wing.seen(trial(TrialKind.FORCED, fine, force=between))[::100]
-    found, straight = wing.seen(coarse), wing.seen(replace(coarse, hold=None))
-    largest = np.abs(wanted).max()
-    # the fine record of what is held goes up within its first interval
-    assert np.abs(found - wanted).max() < (2e-2 if hold is Hold.ZERO_ORDER else 1e-4) * largest
-    assert (np.abs(straight - wanted).max() > 2e-2 * largest) == (hold is not Hold.LINEAR)
 
 
 def test_a_small_mass_lowers_the_frequency_as_rayleigh_says(wing: Wing) -> None:

@@ -18,14 +18,8 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Quantity, Trial
 from discrepancy.errors import CampaignDataError, ModelError
 from discrepancy.model_choice import ModelChoice, ModelKind, choose_model
-from discrepancy.models.interface import (
-    Conditions,
-    Model,
-    Outputs,
-    PortScale,
-    Response,
-    Scales,
-)
+from discrepancy.models.interface import Conditions, Model, Outputs, Response
+from discrepancy.models.scales import PortScale, Scales
 from discrepancy.parameters.calibration import calibrate_parameters
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.patch import ModelPatch, Primitive

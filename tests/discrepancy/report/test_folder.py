@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from discrepancy.catalogue.library import library
-from discrepancy.files.patch import read_patch
 from discrepancy.files.residuals import read_residuals
+from discrepancy.files.verdict import read_patch
 from discrepancy.files.verdict import read_verdict_file as read_verdict
 from discrepancy.judgement.separability import Separability
 from discrepancy.report.figures import ReportInput, report_figures

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from discrepancy.files.patch import primitive_intervals
+from discrepancy.files.verdict import primitive_intervals
 from discrepancy.judgement.conclusion import named_effects, probability_text
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.lumped import LumpedModel

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.errors import CampaignDataError, CampaignFileError
-from discrepancy.sources.real_wing import (
+from discrepancy.sources.measured_rigs import (
     READING_ERROR,
     SIGNAL,
     TIP,

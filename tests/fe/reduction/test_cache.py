@@ -1,7 +1,7 @@
-import logging
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +11,10 @@ from threadpoolctl import threadpool_limits
 
 from fe.reduction import model_cache
 from fe.reduction.built_once import cache_folder
-from fe.reduction.fields import WingFields, field_basis
-from fe.reduction.model_cache import MODELLING_ROOMS, entry, reduced_model, wing_fields
-from fe.reduction.settings import ReductionSettings
+from fe.reduction.fields import WingFields
+from fe.reduction.model_cache import MODELLING_ROOMS, entry, patch_arrays, reduced_model, wing_fields
+from fe.reduction.settings import PatchSettings, ReductionSettings
+from fe.runtime.kept_arrays import KeptArrays
 from fe.wing.design import WingDesign
 
 ROOT = Path(__file__).parents[3]
@@ -25,23 +26,21 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache" / "uav-twin"
 
 
-@pytest.fixture(scope="module")
-def coarse_wing(coarse_operators, coarse_reduction) -> WingFields:
-    with threadpool_limits(1):
-        return field_basis(coarse_operators, coarse_reduction)
-
-
 @pytest.fixture
-def builds(monkeypatch: pytest.MonkeyPatch, coarse_wing: WingFields) -> list[str]:
-    """Names of the designs that were built; the build itself is replaced by a finished one."""
+def builds(monkeypatch: pytest.MonkeyPatch, coarse_fields, coarse_patch_arrays) -> list[str]:
+    """Names of the designs that were built; the builds themselves are replaced by finished ones."""
     built: list[str] = []
 
-    def build(design: WingDesign, *_: object) -> WingFields:
-        built.append(design.name)
-        time.sleep(0.05)
-        return replace(coarse_wing, design_hash=design.hash)
+    def building(made: KeptArrays) -> Callable[..., KeptArrays]:
+        def build(design: WingDesign, *_: object) -> KeptArrays:
+            built.append(design.name)
+            time.sleep(0.05)
+            return replace(made, design_hash=design.hash)
 
-    monkeypatch.setattr(model_cache, "build", build)
+        return build
+
+    monkeypatch.setattr(model_cache, "build", building(coarse_fields))
+    monkeypatch.setattr(model_cache, "build_patch_arrays", building(coarse_patch_arrays))
     return built
 
 
@@ -72,29 +71,30 @@ def test_what_is_changed_is_built_anew(builds, coarse_design: WingDesign, monkey
         reduced_model(design)
     assert len(builds) == 2
     reduced_model(coarse_design, settings=ReductionSettings(bound_tolerance=1e-3))
-    assert len(builds) == 3
+    for settings in (None, PatchSettings(vectors=30), None):
+        patch_arrays(coarse_design, settings=settings)
+    assert len(builds) == 5
     monkeypatch.setattr(model_cache, "modelling_hash", lambda: "another")
     reduced_model(coarse_design)
-    assert len(builds) == 4
+    assert len(builds) == 6
 
 
-@pytest.mark.parametrize("victim", ["wing", "fields"])
+@pytest.mark.parametrize(
+    ("kind", "make"), [("wing", reduced_model), ("fields", wing_fields), ("patches", patch_arrays)]
+)
 @pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "missing"])
-def test_damaged_entry_is_built_anew(builds, coarse_design, caplog, victim: str, damage: str) -> None:
-    good = reduced_model(coarse_design).to_bytes()
-    path, other = (entry(kind, coarse_design.hash, None) for kind in (victim, "fields"))
+def test_damaged_entry_is_built_anew(builds, coarse_design, caplog, kind, make, damage: str) -> None:
+    good, path = make(coarse_design).to_bytes(), entry(kind, coarse_design.hash, None)
     content = bytearray(path.read_bytes())
     if damage == "flipped":
         content[len(content) // 3] ^= 0x55
     path.write_bytes({"cut": content[: len(content) // 2], "flipped": content}.get(damage, b""))
     if damage == "missing":
         path.unlink()
-    with caplog.at_level(logging.WARNING):
-        assert reduced_model(coarse_design).to_bytes() == wing_fields(coarse_design).model.to_bytes() == good
+    for _ in range(2):
+        assert make(coarse_design).to_bytes() == good
     assert damage == "missing" or "built anew" in caplog.text
-    assert len(builds) == 1 + (path == other)  # the model alone is among the fields
-    wing_fields(coarse_design)
-    assert len(builds) == 1 + (path == other)
+    assert len(builds) == 1 + (kind != "wing")  # the model alone is among the fields
 
 
 def test_entry_of_another_design_is_not_taken(builds, coarse_design: WingDesign, caplog) -> None:
@@ -145,9 +145,11 @@ def test_every_file_that_shapes_the_model_counts_for_the_key() -> None:
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_a_real_build_is_reproducible_in_any_number_of_threads(coarse_design, coarse_wing, own_cache) -> None:
+def test_a_real_build_is_reproducible_in_any_number_of_threads(
+    coarse_design, coarse_fields, own_cache
+) -> None:
     with threadpool_limits(2):
         wing = wing_fields(coarse_design)
-    assert wing.to_bytes() == coarse_wing.to_bytes()
+    assert wing.to_bytes() == coarse_fields.to_bytes()
     assert wing.model.to_bytes() == reduced_model(coarse_design).to_bytes()
     assert len(list(own_cache.glob("*.npz"))) == 2

@@ -1,5 +1,4 @@
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import meshio
@@ -7,8 +6,8 @@ import numpy as np
 import pytest
 
 from fe.elements.cells import gradients, strain_matrix
-from fe.reduction.fields import WingFields, field_basis, write_modes_vtu, write_wing_vtu
-from fe.runtime.errors import OutsideModelError, ReducedModelFileError
+from fe.reduction.fields import WingFields, write_modes_vtu, write_wing_vtu
+from fe.runtime.errors import OutsideModelError
 from fe.wing.responses import eigenmodes, solve_static
 from reporting.errors import FileNotWrittenError
 
@@ -16,16 +15,11 @@ STATE = {"young_modulus_factor": 0.95, "stiffness_loss": (0.3, 0.6), "load_facto
 
 
 @pytest.fixture(scope="module")
-def wing(coarse_operators, coarse_reduction) -> WingFields:
-    return field_basis(coarse_operators, coarse_reduction)
-
-
-@pytest.fixture(scope="module")
-def written(wing: WingFields, tmp_path_factory) -> meshio.Mesh:
+def written(coarse_fields: WingFields, tmp_path_factory) -> meshio.Mesh:
     """What two files of the same state hold, which are the same bytes."""
     folder = tmp_path_factory.mktemp("vtu")
     for name in ("wing.vtu", "again.vtu"):
-        write_wing_vtu(folder / name, wing, wing.vector(**STATE))
+        write_wing_vtu(folder / name, coarse_fields, coarse_fields.vector(**STATE))
     assert sorted(p.name for p in folder.iterdir()) == ["again.vtu", "wing.vtu"]
     assert (folder / "wing.vtu").read_bytes() == (folder / "again.vtu").read_bytes()
     return meshio.read(folder / "wing.vtu")
@@ -70,11 +64,11 @@ def test_displacement_strain_and_damage_are_those_of_the_full_model(
     np.testing.assert_array_equal(data["stiffness_loss"], lost)
 
 
-def test_modes_are_those_of_the_full_model(wing: WingFields, coarse_operators, tmp_path: Path) -> None:
-    write_modes_vtu(tmp_path / "modes.vtu", wing, wing.nominal)
+def test_modes_are_those_of_the_full_model(coarse_fields, coarse_operators, tmp_path: Path) -> None:
+    write_modes_vtu(tmp_path / "modes.vtu", coarse_fields, coarse_fields.nominal)
     written = meshio.read(tmp_path / "modes.vtu").point_data
     full = eigenmodes(coarse_operators, 1.0, (0.0, 0.0), 0.169, 0.134)
-    assert len(written) == wing.mode_count
+    assert len(written) == coarse_fields.mode_count
     for number, name in enumerate(list(written)[:3]):
         label, frequency = name.rsplit("_", 1)
         assert label == f"mode_{number + 1}"
@@ -83,27 +77,13 @@ def test_modes_are_those_of_the_full_model(wing: WingFields, coarse_operators, t
         np.testing.assert_allclose(np.abs(written[name]), wanted, atol=1e-2 * wanted.max())
 
 
-def test_bad_states_and_places_leave_no_file(wing: WingFields, tmp_path: Path) -> None:
+def test_bad_states_and_places_leave_no_file(coarse_fields: WingFields, tmp_path: Path) -> None:
     (tmp_path / "folder.vtu").mkdir()
-    state = wing.vector(**STATE)
+    state = coarse_fields.vector(**STATE)
     for name, vector, error, sentence in (
-        ("wing.vtu", wing.vector(load_factor=np.nan), OutsideModelError, "load_factor must"),
+        ("wing.vtu", coarse_fields.vector(load_factor=np.nan), OutsideModelError, "load_factor must"),
         ("folder.vtu", state, FileNotWrittenError, re.escape(f"{tmp_path / 'folder.vtu'}")),
     ):
         with pytest.raises(error, match=sentence):
-            write_wing_vtu(tmp_path / name, wing, vector)
+            write_wing_vtu(tmp_path / name, coarse_fields, vector)
     assert [path.name for path in tmp_path.iterdir()] == ["folder.vtu"]
-
-
-def test_basis_comes_back_to_the_last_bit(wing: WingFields) -> None:
-    content = wing.to_bytes()
-    assert WingFields.from_bytes(content, "the basis").to_bytes() == content
-    for wrong, sentence in ((content[:1000], "the basis"), (wing.model.to_bytes(), "lacks")):
-        with pytest.raises(ReducedModelFileError, match=sentence):
-            WingFields.from_bytes(wrong, "the basis")
-    for name in ("points", "cells", "region", "static_displacement", "modal_displacement"):
-        for value in (np.array(1.0), np.array("a"), getattr(wing, name)[:-1, ...]):
-            with pytest.raises(ReducedModelFileError, match="field basis"):
-                replace(wing, **{name: value})
-    with pytest.raises(ReducedModelFileError, match="nodes that are not there"):
-        replace(wing, cells=wing.cells + 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,16 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation
 from fe.reduction.certified_basis import compressed
 from fe.reduction.reduced_basis import reduce_structure
 from fe.reduction.structure_errors import measured_errors
-from fe.runtime import kept_arrays
-from fe.runtime.errors import OutsideModelError, ReducedModelFileError
-from fe.runtime.kept_arrays import arrays_from_bytes, arrays_to_bytes
+from fe.runtime.errors import OutsideModelError
 from fe.runtime.reduced import ReducedModel
-from fe.structure.affine import AffineStructure
-from fe.structure.field import natural_frequencies, static_response
+from fe.structure.affine import AffineStructure, natural_frequencies, static_response
 from fe.structure.operators import load_and_assemble
 from fe.wing.responses import eigenmodes
 from tests.fe.springs import SETTINGS, reduced_springs, springs
@@ -177,6 +174,7 @@ def test_the_bound_allows_for_rounding(pair: Pair) -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e9, -1e9])
 def test_values_outside_validity_are_refused_by_name(pair: Pair, bad: float) -> None:
     model = pair.model
+    assert tuple(model.validity) == model.chosen
     for name in model.chosen:
         vector = model.vector({name: bad})
         asked = [(ask, vector) for ask in (model.static_response, model.modes)]
@@ -185,72 +183,6 @@ def test_values_outside_validity_are_refused_by_name(pair: Pair, bad: float) -> 
                 ask(values)
     with pytest.raises(OutsideModelError, match="nothing named 'z9'"):
         model.static_response({"z9": 0.1})
-
-
-def test_all_corners_of_the_box_are_inside(pair: Pair) -> None:
-    assert tuple(pair.model.validity) == pair.model.chosen
-    for corner in pair.model.validity_box.T:
-        pair.model.static_response(corner)
-        pair.model.modes(corner)
-
-
-def test_a_saved_model_comes_back_to_the_last_bit(pair: Pair, tmp_path: Path) -> None:
-    path, model = tmp_path / "model.npz", pair.model
-    model.save(path)
-    again = ReducedModel.load(path)
-    for item in fields(model):
-        if item.init:
-            np.testing.assert_array_equal(getattr(again, item.name), getattr(model, item.name))
-    assert again.to_bytes() == model.to_bytes() == path.read_bytes()
-    assert [p.name for p in tmp_path.iterdir()] == ["model.npz"]
-
-
-def test_incomplete_damaged_or_foreign_files_are_refused(model: ReducedModel, tmp_path: Path) -> None:
-    path = tmp_path / "wing.npz"
-    with pytest.raises(FileNotFoundError):
-        ReducedModel.load(path)
-    path.write_bytes(model.to_bytes()[:1000])
-    with pytest.raises(ReducedModelFileError, match=r"wing\.npz is not a sound archive"):
-        ReducedModel.load(path)
-    arrays = arrays_from_bytes(model.to_bytes(), "the model")
-    for changes, sentence in (
-        ({"cross_mass": None}, "lacks cross_mass"),
-        ({"format": np.array(99)}, "has the format 99"),
-        ({"static_load": np.zeros((2, 1))}, "static_load"),
-        ({"static_load": arrays["static_load"] * np.nan}, "finite"),
-        ({"mode_count": np.array(0)}, "modes"),
-        ({"rounding_allowance": np.array(-1.0)}, "rounding_allowance"),
-    ):
-        wrong = {name: array for name, array in {**arrays, **changes}.items() if array is not None}
-        with pytest.raises(ReducedModelFileError, match=sentence):
-            ReducedModel.from_bytes(arrays_to_bytes(wrong))
-
-
-@pytest.mark.parametrize(
-    "value", [np.array(1.0), np.array("a"), np.zeros(5), np.zeros(0), np.zeros((0, 0, 0)), np.array(1j)]
-)
-def test_arrays_of_a_wrong_kind_are_refused(model: ReducedModel, value: np.ndarray) -> None:
-    arrays = arrays_from_bytes(model.to_bytes(), "the model")
-    numbers = {"format", "mode_count", "residual_allowance", "rounding_allowance"}
-    for name in set(arrays) - {item.name for item in fields(model) if item.type is str}:
-        if name in numbers and value.shape == () and value.dtype.kind == "f":
-            continue
-        with pytest.raises(ReducedModelFileError):
-            ReducedModel.from_bytes(arrays_to_bytes({**arrays, name: value}))
-
-
-def test_failed_write_leaves_the_old_file(model: ReducedModel, tmp_path: Path, monkeypatch) -> None:
-    path = tmp_path / "wing.npz"
-    path.write_bytes(b"old")
-
-    def full_disk(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(kept_arrays.os, "fsync", full_disk)
-    with pytest.raises(OSError, match="No space left"):
-        model.save(path)
-    assert path.read_bytes() == b"old"
-    assert [p.name for p in tmp_path.iterdir()] == ["wing.npz"]
 
 
 # ---------------------------------------------------------------- what one kind alone shows
@@ -285,12 +217,6 @@ def test_the_wing_bends_in_the_modes_of_the_full_one(coarse_operators, model: Re
         )
         strain = coarse_operators.gauge_output @ shape
         np.testing.assert_allclose(output[:-1], strain, rtol=0, atol=1e-2 * np.abs(strain).max())
-
-
-def test_modal_compliance_adds_up_to_the_static_one(model: ReducedModel) -> None:
-    modes = model.modes(stiffness_loss=(0.2, 0.2), servo_mass=0.169, pitot_mass=0.134)
-    terms = modes.participation[1] ** 2 / (2 * np.pi * modes.frequency) ** 2
-    assert 0.97 < terms.sum() * model.tip_stiffness(1.0, (0.2, 0.2)) < 1.0
 
 
 def test_a_beam_in_all_its_parts(beam, beam_reduction) -> None:

@@ -17,8 +17,6 @@ from pymor.parameters.functionals import MinThetaParameterFunctional, Projection
 from pymor.reductors.coercive import CoerciveRBReductor
 
 from benchmarks.study_regions import bracket, plate, tube
-from fe.full.affine import affine_sum
-from fe.full.subspace import Norm, ProjectedBasis, conjugate_gradients
 from fe.reduction.certified_basis import compressed
 from fe.reduction.model_cache import reduced_structure
 from fe.reduction.reduced_basis import Reduction, reduce_model, reduce_structure
@@ -26,8 +24,8 @@ from fe.reduction.settings import ModalSettings, StructureSettings, loss_splits,
 from fe.reduction.structure_errors import measured_errors
 from fe.reduction.terms import ReductionTerms
 from fe.runtime.errors import FiniteElementError, ReductionError, SolutionError
+from fe.structure.affine import affine_sum, static_response
 from fe.structure.design import load_structure, structure_hash
-from fe.structure.field import static_response
 from fe.structure.operators import load_and_assemble
 from tests.fe.springs import SETTINGS, reduced_springs, springs
 
@@ -151,28 +149,6 @@ def test_progress_is_told() -> None:
 
     reduce_model(SYSTEM, SETTINGS, Listener())
     assert {"Reducing the modes", "full solution 1"} <= set(told)
-
-
-def test_conjugate_gradients_solve_and_give_up() -> None:
-    norm = Norm(affine_sum((1, 0.45, 0.45, 1), STIFFNESS))
-    matrix = affine_sum((0.9, 1.0, 0.2, 1), STIFFNESS)
-    right = np.stack((SYSTEM.load_lift, SYSTEM.load_tip, np.zeros(60)), axis=1)
-    found = conjugate_gradients([matrix], norm, right, np.zeros_like(right), tolerance=1e-12)
-    np.testing.assert_allclose(found, np.linalg.solve(matrix.toarray(), right), rtol=1e-9, atol=1e-15)
-    with pytest.raises(SolutionError, match="Conjugate gradients reached"):
-        conjugate_gradients([matrix], norm, right, np.zeros_like(right), tolerance=1e-12, most_iterations=2)
-
-
-def test_basis_stays_orthonormal_with_nearly_dependent_vectors() -> None:
-    whole, random = affine_sum((1, 1, 1, 1), STIFFNESS), np.random.default_rng(5)
-    basis = ProjectedBasis(Norm(whole), [(whole,)], drop=1e-9)
-    first = random.normal(size=(60, 5))
-    basis.extend(first)
-    assert basis.vectors.shape[1] == 5
-    near = first + 1e-6 * random.normal(size=first.shape)
-    basis.extend(np.concatenate((near, first @ random.normal(size=(5, 3)), np.zeros((60, 1))), axis=1))
-    np.testing.assert_allclose(basis.vectors.T @ whole @ basis.vectors, np.eye(10), atol=1e-9)
-    np.testing.assert_allclose(basis.inner[0][0], np.eye(10), atol=1e-9)
 
 
 def test_anchors_part_the_losses_in_equal_ratios() -> None:

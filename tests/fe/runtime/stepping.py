@@ -1,7 +1,10 @@
-"""Motion under a force that is linear between evenly spaced samples, by the loops of the product."""
+"""Motion under forces that are linear between samples: by the loops of the product, and exactly."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, PLAIN, Kernel, Laws
@@ -35,3 +38,24 @@ def simulate(
     steps = steps_under(system, boundaries, modal[:-1], modal[1:], feed)
     begin = Begin(q, v, memory)
     return advance(system, laws, steps._replace(time=start + steps.time), begin, kernel or PLAIN)
+
+
+def exact(
+    matrix: Any, into: Any, time: FloatArray, inputs: FloatArray, held: bool = False, first: Any = None
+) -> FloatArray:
+    """States (N, n) of y' = A y + B u, zero at first, u (N, I) linear or held between the samples."""
+    n, wide = np.shape(into)
+    block = np.zeros((n + 2 * wide, n + 2 * wide))
+    block[:n, :n], block[:n, n : n + wide] = matrix, into
+    block[n : n + wide, n + wide :] = np.eye(wide)
+    states = [np.zeros(n) if first is None else np.asarray(first)]
+    for k, h in enumerate(np.diff(time)):
+        slope = 0.0 * inputs[k] if held else (inputs[k + 1] - inputs[k]) / h
+        states.append((expm(h * block) @ np.concatenate((states[-1], inputs[k], slope)))[:n])
+    return np.array(states)
+
+
+def second_order(stiffness: Any, damping: Any) -> FloatArray:
+    """The matrix of (x, v)' where v' = -K x - D v."""
+    n = len(stiffness)
+    return np.block([[np.zeros((n, n)), np.eye(n)], [-np.asarray(stiffness), -np.asarray(damping)]])

@@ -1,6 +1,5 @@
 """Motion with internal forces against closed forms, general integrators and energy."""
 
-import itertools
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad, solve_ivp
-from scipy.linalg import expm
 from scipy.optimize import brentq
 from scipy.special import ellipk
 
@@ -19,7 +17,7 @@ from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
 from fe.runtime.stepwise import ModalMotion
-from tests.fe.runtime.stepping import simulate
+from tests.fe.runtime.stepping import exact, second_order, simulate
 
 W = 2.0 * np.pi  # one second for a period
 ONE = ModalSystem(np.array([W]), np.zeros((1, 1)), {"mass": np.array([1.0])})
@@ -45,34 +43,20 @@ def coulomb(strength: float) -> PowerDamping:
 # ---------------------------------------------------------------- linear
 
 
-def test_a_random_linear_system_is_the_matrix_exponential() -> None:
-    random = np.random.default_rng(3)
-    w = np.array([3.0, 11.0, 40.0, 150.0])
-    root = random.normal(size=(4, 4))
-    damping = root @ root.T * 0.3
-    q, v = random.normal(size=4), random.normal(size=4)
-    matrix = np.block([[np.zeros((4, 4)), np.eye(4)], [-np.diag(w**2), -damping]])
-    moved = simulate(ModalSystem(w, damping), NO_LAWS, q=q, v=v, force=np.zeros(50), interval=0.02)
-    for sample in (1, 17, 49):
-        expected = expm(matrix * 0.02 * sample) @ np.concatenate((q, v))
-        np.testing.assert_allclose(moved.q[sample], expected[:4], atol=1e-11)
-        np.testing.assert_allclose(moved.v[sample], expected[4:], atol=1e-9)
-
-
-def test_a_force_that_is_linear_between_samples_is_exact() -> None:
-    w, zeta, dt = 7.0, 0.05, 0.11
-    system = ModalSystem(np.array([w]), np.array([[2 * zeta * w]]))
-    force, time = np.random.default_rng(5).normal(size=40), dt * np.arange(40)
-    shape = {"shape": np.array([0.7]), "constant": np.array([0.3]), "kernel": compiled_kernel()}
-    moved = simulate(system, NO_LAWS, q=np.zeros(1), v=np.zeros(1), force=force, interval=dt, **shape)
-    wd = w * np.sqrt(1 - zeta**2)
-
-    def integrand(tau: float) -> float:
-        load = 0.7 * np.interp(tau, time, force) + 0.3
-        return float(load * np.exp(-zeta * w * (time[-1] - tau)) * np.sin(wd * (time[-1] - tau)) / wd)
-
-    duhamel = sum(quad(integrand, a, b, epsabs=1e-13)[0] for a, b in itertools.pairwise(time))
-    assert moved.q[-1, 0] == pytest.approx(duhamel, abs=1e-12)
+def test_a_coupled_linear_system_under_a_force_is_the_matrix_exponential() -> None:
+    random, w, time = np.random.default_rng(3), np.array([3.0, 11.0, 40.0, 150.0]), 0.02 * np.arange(50)
+    root, shape, constant = random.normal(size=(4, 4)), random.normal(size=4), random.normal(size=4)
+    damping, first, force = 0.3 * root @ root.T, random.normal(size=8), random.normal(size=50)
+    into = np.concatenate((np.zeros((4, 2)), np.stack((shape, constant), axis=1)))
+    inputs = np.stack((force, np.ones(50)), axis=1)
+    wanted = exact(second_order(np.diag(w**2), damping), into, time, inputs, first=first)
+    for kernel in (None, compiled_kernel()):
+        moved = simulate(
+            ModalSystem(w, damping), NO_LAWS, q=first[:4], v=first[4:], force=force, interval=0.02,
+            shape=shape, constant=constant, kernel=kernel,
+        )  # fmt: skip
+        np.testing.assert_allclose(moved.q, wanted[:, :4], atol=1e-11)
+        np.testing.assert_allclose(moved.v, wanted[:, 4:], atol=1e-9)
 
 
 # ---------------------------------------------------------------- damping

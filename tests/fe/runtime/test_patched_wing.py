@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,13 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from fe.full.statics import Factorisation
-from fe.reduction import model_cache
-from fe.reduction.patch_basis import PatchSettings
+from fe.full.factorisation import Factorisation
 from fe.runtime import patch
-from fe.runtime.errors import InvalidPatchError, ReducedModelFileError
+from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
-from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.wing.operators import (
     AffineOperators,
@@ -350,14 +345,6 @@ def test_outputs_and_places_by_name(both: Compared) -> None:
     assert np.abs(by_place - both.row).max() < 1e-9 * np.abs(by_place).max()
 
 
-def test_the_span_port_weighs_by_area(both: Compared) -> None:
-    arrays = both.arrays
-    assert arrays.station_weights.sum() == pytest.approx(1.0)
-    root, tip, span = arrays.root_chord, arrays.tip_chord, arrays.semi_span
-    mean = (root / 2.0 + (tip - root) / 3.0) * span / (0.5 * (root + tip))  # of y over the trapezium
-    assert arrays.station_weights @ arrays.stations == pytest.approx(mean, rel=1e-12)
-
-
 # ---------------------------------------------------------------- no change, softer, impossible
 
 
@@ -410,33 +397,6 @@ def test_what_cannot_be_is_refused(both: Compared, ask: Any, message: str) -> No
         _ = ask(both) if callable(ask) else both.structure(ask, temperature=10.0).mass
 
 
-# ---------------------------------------------------------------- its arrays
-
-
-def test_a_file_gives_the_arrays_back(coarse_patch_arrays: PatchArrays, tmp_path: Path) -> None:
-    coarse_patch_arrays.save(tmp_path / "wing.npz")
-    again = PatchArrays.load(tmp_path / "wing.npz")
-    for item in fields(PatchArrays):
-        assert np.array_equal(*(getattr(one, item.name) for one in (coarse_patch_arrays, again))), item.name
-    assert again.to_bytes() == coarse_patch_arrays.to_bytes()
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
-        ("load_tip", lambda _: np.full(3, np.nan), "array"),
-        ("flap_spring", lambda _: 0.0, "flap_spring"),
-        ("straight_chord_line", lambda _: 2.0, "straight_chord_line"),
-        ("weight", lambda _: np.zeros(2), "weight"),
-        ("strip_of", lambda strips: np.array([99, *strips[1:]]), "strips"),
-        ("stations", lambda stations: stations[::-1].copy(), "must rise"),
-    ],
-)
-def test_wrong_arrays_are_refused(coarse_patch_arrays, name: str, change, message: str) -> None:
-    with pytest.raises(ReducedModelFileError, match=message):
-        replace(coarse_patch_arrays, **{name: change(getattr(coarse_patch_arrays, name))})
-
-
 def test_strips_end_at_mesh_lines_and_shares_of_the_area_integrate_a_parabola_on_each_cell() -> None:
     lines = np.array([0.0, 0.003, 0.1, 0.25, 0.5, 0.52, 0.8, 1.0])
     assert strip_edges(lines, 4).tolist() == [0.0, 0.25, 0.5, 0.8, 1.0]
@@ -445,25 +405,3 @@ def test_strips_end_at_mesh_lines_and_shares_of_the_area_integrate_a_parabola_on
     # mean of y^2 with chord 2 - y: (2/3 - 1/4) / 1.5
     mean = area_shares(stations, 2.0, 1.0) @ stations**2
     assert mean == pytest.approx((2.0 / 3.0 - 0.25) / 1.5, rel=1e-12)
-
-
-def test_the_cache_builds_once(coarse_design, coarse_patch_arrays, tmp_path, monkeypatch, caplog) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    built: list[str] = []
-    monkeypatch.setattr(
-        model_cache,
-        "build_patch_arrays",
-        lambda design, *_: (built.append(design.hash), coarse_patch_arrays)[1],
-    )
-    first = model_cache.patch_arrays(coarse_design)
-    assert model_cache.patch_arrays(coarse_design).to_bytes() == first.to_bytes()
-    assert built == [coarse_design.hash]
-    entries = {
-        model_cache.entry("patches", coarse_design.hash, own) for own in (None, PatchSettings(vectors=30))
-    }
-    assert len(entries) == 2
-    (file,) = (tmp_path / "uav-twin").glob("patches-*.npz")
-    file.write_bytes(b"rubbish")
-    model_cache.patch_arrays(coarse_design)
-    assert len(built) == 2
-    assert "not usable" in caplog.text

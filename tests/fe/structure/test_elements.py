@@ -22,8 +22,7 @@ from fe.elements.cells import (
 )
 from fe.elements.kinds import KINDS
 from fe.structure.design import Gauge
-from fe.structure.gauges import gauge_rows
-from fe.structure.location import attach, face_areas
+from fe.structure.location import attach, face_areas, gauge_rows
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 

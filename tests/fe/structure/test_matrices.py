@@ -10,11 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import io, sparse
 
-from fe.full.modes import lowest_eigenpairs
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.errors import FiniteElementError
+from fe.structure.affine import natural_frequencies, static_responses
 from fe.structure.design import load_structure
-from fe.structure.field import natural_frequencies, static_responses
 from fe.structure.operators import assemble_structure, load_and_assemble
 from tests import calculix_decks as decks
 from tests.calculix_decks import Point, needs_calculix

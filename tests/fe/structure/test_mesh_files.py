@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from fe.elements.cells import jacobians
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.runtime.errors import MeshError
+from fe.structure.affine import static_responses
 from fe.structure.deck import words_of
-from fe.structure.field import static_responses
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_by_meshio, read_mesh
 from fe.structure.operators import load_and_assemble

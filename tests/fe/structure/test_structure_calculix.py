@@ -10,7 +10,7 @@ import pytest
 from fe.runtime.errors import CalculixError
 from fe.structure.operators import load_and_assemble
 from fe.verification.calculix_comparison import structure_agreement
-from fe.verification.calculix_models import structure_deck
+from fe.verification.calculix_deck import structure_deck
 from tests.calculix_decks import needs_calculix
 from tests.refusals import Inputs
 

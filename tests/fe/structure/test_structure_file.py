@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fe.runtime.errors import FiniteElementError, SolutionError
-from fe.structure.field import static_responses
+from fe.structure.affine import static_responses
 from fe.structure.operators import load_and_assemble
 from tests.refusals import Inputs
 

@@ -10,9 +10,9 @@ import pytest
 
 from fe.elements.kinds import KINDS
 from fe.runtime.errors import FiniteElementError, InvalidDesignError, InvalidStateError, MeshError
-from fe.structure.field import natural_frequencies, static_responses, weighed, write_structure_vtu
+from fe.structure.affine import natural_frequencies, static_responses
 from fe.structure.mesh_file import check_memory, memory_estimate, read_mesh
-from fe.structure.operators import Structure, load_and_assemble
+from fe.structure.operators import Structure, load_and_assemble, weighed, write_structure_vtu
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from discrepancy.campaign.records import Campaign, Channel, Quantity, TrialKind
 from discrepancy.files.document import Origin
-from discrepancy.files.patch import StoredPatch, fmu_outputs, patch_effects, read_patch, write_patch
+from discrepancy.files.verdict import StoredPatch, fmu_outputs, patch_effects, read_patch, write_patch
 from discrepancy.models.high_pass import filtered_record
 from discrepancy.models.wing import WingModel
 from discrepancy.verdict import NamedEffect, VerdictKind

@@ -12,8 +12,7 @@ import meshio
 import numpy as np
 import pytest
 
-from fe.full.modes import lowest_eigenpairs
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.errors import FiniteElementError
 from fe.structure.operators import load_and_assemble
 from scenarios import scenario_files, structure_files

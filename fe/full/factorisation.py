@@ -1,4 +1,4 @@
-"""Sparse Cholesky factors by the multifrontal method, with dense LAPACK kernels.
+"""Sparse Cholesky factors by the multifrontal method with dense LAPACK kernels; solutions and modes by them.
 
 The unknowns are eliminated front by front: a front is a small dense matrix of the unknowns that a leaf or
 separator of a nested dissection holds (its pivots) and of those that they are coupled to later (its
@@ -17,6 +17,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 from scipy import sparse
 from scipy.linalg import blas, lapack
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, norm
 from threadpoolctl import ThreadpoolController
 
 from fe.runtime.arrays import FloatArray, IntArray
@@ -24,8 +25,17 @@ from fe.runtime.errors import SolutionError
 
 from .dissection import elimination_blocks
 
+MODE_RESIDUAL_LIMIT = 1e-12
+"""Largest max|K phi - omega^2 M phi| / (|K| max|phi|), in maximum norms, of an accepted mode."""
 LEAF_UNKNOWNS = 120
 """Parts of the mesh with up to so many unknowns are eliminated as one dense front."""
+BACKWARD_ERROR_LIMIT = 1e-12
+"""Largest backward error max|b - K u| / (|K| max|u| + max|b|) of an accepted solution, in maximum norms."""
+CORRECTION_LIMIT = 1e-4
+"""Largest change |du| / |u| that one step of iterative refinement may still make.
+
+Thin cells make the condition number about 1e10, so that about 1e-6 is what double precision reaches.
+"""
 _STRIP = 96  # rows that are added at once; only their part right of the diagonal is touched
 
 
@@ -136,16 +146,21 @@ def _threads() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-class Cholesky:
-    """Cholesky factors of a sparse symmetric positive definite matrix.
+class Factorisation:
+    """Cholesky factors of a sparse symmetric positive definite matrix X, its energy norm, and the dual norm.
 
     They are computed, and applied, in one thread: sums over several threads depend on their number, and the
     fronts are too small to gain from them.
 
     Parameters
     ----------
-    matrix : csr (n, n)
-        The matrix; only one half of it is read.
+    stiffness : sparse (n, n)
+        X; only one half of it is factorised, the whole is kept for the residual.
+
+    Attributes
+    ----------
+    stiffness : csr (n, n)
+        X.
 
     Raises
     ------
@@ -153,7 +168,8 @@ class Cholesky:
         If it is not positive definite.
     """
 
-    def __init__(self, matrix: sparse.csr_array) -> None:
+    def __init__(self, stiffness: sparse.sparray) -> None:
+        self.stiffness = matrix = stiffness.tocsr()
         if not np.all(matrix.diagonal() > 0.0):
             self._refuse(matrix, "it has a diagonal entry that is not positive")
         places = (part.astype(np.int32).tobytes() for part in (matrix.indptr, matrix.indices))
@@ -227,6 +243,39 @@ class Cholesky:
                     values[front.boundary] -= below @ own
         return found
 
+    def product(self, vectors: FloatArray) -> FloatArray:
+        """Return X times vectors (n, k)."""
+        return np.asarray(self.stiffness @ vectors)
+
+    def solve(self, right_hand_side: FloatArray) -> FloatArray:
+        """Solution (n,) or (n, k), refined once, its backward error and its accuracy checked.
+
+        Raises
+        ------
+        SolutionError
+            If the backward error exceeds `BACKWARD_ERROR_LIMIT` or refinement still changes the solution by
+            more than `CORRECTION_LIMIT`.
+        """
+        solution = self.riesz(right_hand_side)
+        correction = self.riesz(right_hand_side - self.stiffness @ solution)
+        solution = solution + correction
+        error = self.backward_error(solution, right_hand_side)
+        change = float(np.linalg.norm(correction)) / max(float(np.linalg.norm(solution)), 1e-300)
+        if not (error <= BACKWARD_ERROR_LIMIT and change <= CORRECTION_LIMIT):
+            raise SolutionError(
+                f"The static solution has a backward error of {error:.2g} (at most {BACKWARD_ERROR_LIMIT:g}) "
+                f"and is accurate to {change:.2g} (at most {CORRECTION_LIMIT:g}); the stiffness matrix is "
+                "nearly singular, some part of the structure is hardly held."
+            )
+        return solution
+
+    def backward_error(self, solution: FloatArray, right_hand_side: FloatArray) -> float:
+        """Backward error max|b - K u| / (|K| max|u| + max|b|), in maximum norms (0 for a zero load)."""
+        size = float(norm(self.stiffness, np.inf))
+        scale = size * float(np.abs(solution).max()) + float(np.abs(right_hand_side).max())
+        residual = float(np.abs(right_hand_side - self.stiffness @ solution).max())
+        return residual / scale if scale > 0.0 else residual
+
 
 def _substitute(lower: FloatArray, values: FloatArray, *, transposed: bool) -> FloatArray:
     """Solve L x = v or L' x = v in place, values (m, k) contiguous."""
@@ -251,3 +300,46 @@ def _extend_add(
             high = min(low + _STRIP, end)
             column = index[low:] - first
             flat[column[: high - low, None] * width + column] += complement[low:high, low:]
+
+
+def most_moved(load: FloatArray, values: FloatArray, shapes: FloatArray) -> IntArray:
+    """Find the two modes (2,), ascending, that contribute most to the compliance under a load.
+
+    Parameters
+    ----------
+    load : (n,)
+        The load, on what the shapes are of.
+    values, shapes : (m,), (n, m)
+        Squared angular frequencies and mass-normalised shapes.
+    """
+    return np.asarray(np.sort(np.argsort((load @ shapes) ** 2 / values)[-2:]))
+
+
+def lowest_eigenpairs(
+    stiffness: sparse.sparray, mass: sparse.sparray, count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Lowest eigenvalues (count,) [rad^2/s^2] and vectors (n, count) by shift-inverted Lanczos.
+
+    Raises
+    ------
+    SolutionError
+        If the iteration did not converge to `MODE_RESIDUAL_LIMIT`.
+    """
+    factors = Factorisation(stiffness)
+    size = stiffness.shape[0]
+    inverse = LinearOperator((size, size), matvec=factors.riesz, dtype=float)
+    start = np.random.default_rng(16).standard_normal(size)  # fixed: the same model gives the same bytes
+    try:
+        values, shapes = eigsh(stiffness, k=count, M=mass, sigma=0.0, OPinv=inverse, v0=start)
+    except ArpackNoConvergence as error:
+        raise SolutionError(f"Only {len(error.eigenvalues)} of {count} eigenmodes converged.") from None
+    order = np.argsort(values)
+    values, shapes = values[order], shapes[:, order]
+    scale = float(norm(stiffness, np.inf)) * np.abs(shapes).max(axis=0)
+    residual = np.abs(stiffness @ shapes - (mass @ shapes) * values).max(axis=0) / scale
+    if not residual.max() <= MODE_RESIDUAL_LIMIT:
+        raise SolutionError(
+            f"Eigenmode {int(residual.argmax())} has a residual of {residual.max():.2g}, more than "
+            f"{MODE_RESIDUAL_LIMIT:g}; the stiffness matrix is nearly singular."
+        )
+    return values, shapes

@@ -1,3 +1,5 @@
+"""What solves for stiffness: factorisation, iteration, modes and bases, against general and dense solvers."""
+
 import itertools
 
 import numpy as np
@@ -5,14 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
+from scipy.linalg import eigh
 from scipy.sparse.linalg import spsolve
 from threadpoolctl import threadpool_limits
 
-from fe.full import cholesky
-from fe.full.cholesky import Cholesky, analyse
+from fe.full import factorisation
 from fe.full.dissection import best_cut, elimination_blocks
-from fe.full.statics import Factorisation
+from fe.full.factorisation import Factorisation, analyse, lowest_eigenpairs
+from fe.full.subspace import FunctionalBasis, Norm, ProjectedBasis, conjugate_gradients
 from fe.runtime.errors import SolutionError
+from fe.structure.affine import AffineSum, affine_sum
 
 seeds = st.integers(0, 999)
 
@@ -69,7 +73,7 @@ def test_a_slender_body_is_cut_across():
 def test_fronts_hold_the_fill_of_the_elimination(seed, size, share, copies):
     matrix = random_matrix(seed, size, share, copies)
     with pytest.MonkeyPatch.context() as small:
-        small.setattr(cholesky, "LEAF_UNKNOWNS", 12)
+        small.setattr(factorisation, "LEAF_UNKNOWNS", 12)
         found = analyse(matrix)
     n = matrix.shape[0]
     assert sorted(found.order) == list(range(n))
@@ -105,7 +109,7 @@ def test_solutions_are_those_of_a_general_solver(seed, size, share, copies, colu
     shape = (matrix.shape[0], columns) if columns else (matrix.shape[0],)
     right = np.random.default_rng(seed).standard_normal(shape)
     given_side = right.copy()
-    found = Cholesky(matrix).riesz(right)
+    found = Factorisation(matrix).riesz(right)
     assert np.array_equal(right, given_side)
     assert found.shape == shape
     expected = spsolve(matrix.tocsc(), right).reshape(shape)
@@ -115,15 +119,14 @@ def test_solutions_are_those_of_a_general_solver(seed, size, share, copies, colu
 def test_a_body_of_many_fronts():
     matrix = grid(40, 12, 9)
     right = np.random.default_rng(5).standard_normal((matrix.shape[0], 3))
-    found = Cholesky(matrix).riesz(right)
-    assert found == pytest.approx(spsolve(matrix.tocsc(), right), rel=1e-11, abs=1e-11)
-    single = Cholesky(matrix).riesz(right[:, 0])
-    assert single == pytest.approx(found[:, 0], rel=1e-12, abs=1e-12)
+    factors, expected = Factorisation(matrix), spsolve(matrix.tocsc(), right)
+    assert factors.riesz(right) == pytest.approx(expected, rel=1e-11, abs=1e-11)
+    assert factors.riesz(right[:, 0]) == pytest.approx(expected[:, 0], rel=1e-11, abs=1e-11)
+    assert factors.solve(np.zeros(len(right))) == pytest.approx(0.0)
 
 
 def test_the_wing_is_solved_as_by_a_general_solver(coarse_operators):
-    stiffness = coarse_operators.stiffness(None, (0.3, 0.7))
-    load = coarse_operators.turn(3.0, 5.0)
+    stiffness, load = coarse_operators.stiffness(None, (0.3, 0.7)), coarse_operators.turn(3.0, 5.0)
     factors = Factorisation(stiffness)
     found, expected = factors.solve(load), spsolve(stiffness.tocsc(), load)
     assert factors.backward_error(factors.riesz(load), load) < 2e-15
@@ -136,13 +139,14 @@ def test_factors_are_the_same_bytes_whatever_the_number_of_threads(coarse_operat
     found = []
     for threads in (1, 2, 2):
         with threadpool_limits(threads):
-            factors = Cholesky(stiffness)
+            factors = Factorisation(stiffness)
             found.append((factors.riesz(load).tobytes(), factors.riesz(np.eye(len(load), 3)).tobytes()))
     assert found[0] == found[1] == found[2]
 
 
 BODY = grid(20, 5)
 LOOSE = grid(12, 4) - sparse.diags_array(np.asarray(grid(12, 4).sum(axis=1)))
+DENSE = np.random.default_rng(2).standard_normal((30, 30))
 
 
 @pytest.mark.parametrize(
@@ -152,7 +156,9 @@ LOOSE = grid(12, 4) - sparse.diags_array(np.asarray(grid(12, 4).sum(axis=1)))
         *((BODY + sparse.csr_array(([x], ([33], [33])), (100, 100)), "diagonal entry that is not positive")
           for x in (-BODY[33, 33], -BODY[33, 33] - 1.0, np.nan)),
         (BODY - 1.5 * sparse.eye_array(100), r"unknown \d+ is left without a positive pivot"),
-        (LOOSE, r"nearly singular|not held"),  # a constant calls forth no force
+        (np.diag([1.0, 0.0, 2.0]), "cannot be factorised"),
+        (DENSE[:, :10] @ DENSE[:, :10].T + 1e-14 * np.eye(30), "nearly singular|not positive definite"),
+        (LOOSE, "nearly singular|not held"),  # a constant calls forth no force
     ],
 )  # fmt: skip
 def test_what_is_not_positive_definite_is_refused(matrix, sentence):
@@ -162,17 +168,100 @@ def test_what_is_not_positive_definite_is_refused(matrix, sentence):
 
 def test_a_pattern_met_before_is_not_analysed_again(monkeypatch):
     calls = []
-    monkeypatch.setattr(cholesky, "analyse", lambda matrix: calls.append(1) or analyse(matrix))
+    monkeypatch.setattr(factorisation, "analyse", lambda matrix: calls.append(1) or analyse(matrix))
     first = grid(9, 7, 3)
     second = first.copy()
     second.data = second.data * np.where(second.data < 0.0, 0.5, 2.0)
     third = grid(7, 9, 3)
     right = np.arange(189.0)
     for matrix in (first, second, third, first):
-        assert matrix @ Cholesky(matrix).riesz(right) == pytest.approx(right, abs=1e-10)
+        assert matrix @ Factorisation(matrix).riesz(right) == pytest.approx(right, abs=1e-10)
     assert len(calls) == 2
     second.indices[:] = third.indices  # what is kept does not follow a matrix that is changed in place
     second.indptr[:] = third.indptr
     second.data[:] = third.data
-    assert second @ Cholesky(second).riesz(right) == pytest.approx(right, abs=1e-10)
+    assert second @ Factorisation(second).riesz(right) == pytest.approx(right, abs=1e-10)
     assert len(calls) == 2
+
+
+# ---------------------------------------------------------------- several at once
+
+SIZE = 60
+
+
+def _terms() -> tuple[sparse.csr_array, ...]:
+    """Positive semi-definite terms of different patterns, one of them with entries that stand twice."""
+    rng, places = np.random.default_rng(3), np.repeat(np.arange(SIZE), 2)
+    springs = [
+        sparse.csr_array(rng.normal(size=(20, SIZE)) * (rng.random((20, SIZE)) < 0.2)) for _ in range(2)
+    ]
+    starts = np.arange(0, 2 * SIZE + 1, 2)
+    doubled = sparse.csr_array((np.full(2 * SIZE, 0.5), places, starts), shape=(SIZE, SIZE))
+    return (*(sparse.csr_array(part.T @ part) for part in springs), doubled)
+
+
+TERMS = _terms()
+WHOLE = affine_sum((1.0, 1.0, 1.0), TERMS)
+
+
+@pytest.mark.parametrize("coefficients", [(1.0, 2.0, 3.0), (0.0, -1.0, 0.5)])
+def test_a_sum_is_the_sum(coefficients) -> None:
+    wanted = sum(c * term.toarray() for c, term in zip(coefficients, TERMS, strict=True))
+    for found in (AffineSum(TERMS).matrix(coefficients), affine_sum(coefficients, TERMS)):
+        np.testing.assert_allclose(found.toarray(), wanted, rtol=0.0, atol=1e-13)
+
+
+def test_conjugate_gradients_solve_with_several_matrices_at_once_and_give_up() -> None:
+    matrices, norm = [WHOLE, affine_sum((0.3, 2.0, 1.0), TERMS)], Norm(WHOLE)
+    right = np.random.default_rng(4).normal(size=(SIZE, 4)) * [1.0, 1.0, 1.0, 0.0]
+    found = conjugate_gradients(matrices, norm, right, np.zeros_like(right), tolerance=1e-12)
+    wanted = [np.linalg.solve(m.toarray(), right[:, 2 * k : 2 * k + 2]) for k, m in enumerate(matrices)]
+    np.testing.assert_allclose(found, np.concatenate(wanted, axis=1), rtol=1e-9, atol=1e-15)
+    with pytest.raises(SolutionError, match="Conjugate gradients reached"):
+        conjugate_gradients(matrices, norm, right, np.zeros_like(right), tolerance=1e-12, most_iterations=2)
+
+
+def test_eigenpairs_equal_the_dense_ones_and_a_structure_that_is_not_held_has_none() -> None:
+    stiffness, mass = DENSE @ DENSE.T + np.eye(30), np.diag(np.linspace(1.0, 2.0, 30))
+    values, shapes = lowest_eigenpairs(sparse.csr_array(stiffness), sparse.csr_array(mass), 4)
+    assert values == pytest.approx(eigh(stiffness, mass, eigvals_only=True)[:4], rel=1e-9)
+    np.testing.assert_allclose(shapes.T @ mass @ shapes, np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(stiffness @ shapes, mass @ shapes * values, atol=1e-9)
+    loose = sparse.csr_array(np.diag([0.0, *np.arange(1.0, 20.0)]))
+    with pytest.raises(SolutionError, match="not held"):
+        lowest_eigenpairs(loose, sparse.eye_array(20).tocsr(), 3)
+
+
+def test_a_basis_of_functionals_holds_what_it_was_given_and_says_what_it_dropped() -> None:
+    """Blocks with copies, zeros and directions of all sizes: orthonormal, and the rest is below the bound."""
+    rng, norm = np.random.default_rng(5), Norm(WHOLE)
+    basis, own = FunctionalBasis(SIZE, norm, drop=1e-8), rng.normal(size=(SIZE, 12))
+    blocks = [
+        own[:, :4],
+        np.column_stack((own[:, :4] @ rng.normal(size=(4, 3)), own[:, 4:8], np.zeros(SIZE))),
+        own[:, :8] @ rng.normal(size=(8, 5)) + 10.0 ** -np.arange(1.0, 14.0, 2.6) * own[:, 7:12],
+    ]
+    coordinates = [basis.extend(block) for block in blocks]
+    vectors, given = basis.vectors, np.concatenate(blocks, axis=1)
+    np.testing.assert_allclose(vectors.T @ vectors, np.eye(vectors.shape[1]), atol=1e-7)
+    lengths = np.linalg.norm(norm.whitened(given), axis=0)
+    np.testing.assert_allclose(lengths**2, np.einsum("ik,ik->k", given, norm.riesz(given)), rtol=1e-11)
+    left = [norm.whitened(b) - vectors[:, : len(c)] @ c for b, c in zip(blocks, coordinates, strict=True)]
+    missing = np.linalg.norm(np.concatenate(left, axis=1), axis=0)
+    assert 8 < vectors.shape[1] < 12
+    assert 0.0 < missing.max() <= np.sqrt(basis.dropped_square) * (1.0 + 1e-6) + 1e-12
+    assert np.sqrt(basis.dropped_square) < 1e-6
+    nothing = FunctionalBasis(SIZE, norm, drop=1e-8)
+    assert nothing.extend(np.zeros((SIZE, 3))).shape == (0, 3)
+    assert (nothing.vectors.shape, nothing.dropped_square) == ((SIZE, 0), 0.0)
+
+
+def test_a_basis_stays_orthonormal_with_nearly_dependent_vectors() -> None:
+    random = np.random.default_rng(5)
+    basis, first = ProjectedBasis(Norm(WHOLE), [(WHOLE,)], drop=1e-9), random.normal(size=(SIZE, 5))
+    basis.extend(first)
+    assert basis.vectors.shape[1] == 5
+    near = first + 1e-6 * random.normal(size=first.shape)
+    basis.extend(np.concatenate((near, first @ random.normal(size=(5, 3)), np.zeros((SIZE, 1))), axis=1))
+    np.testing.assert_allclose(basis.vectors.T @ WHOLE @ basis.vectors, np.eye(10), atol=1e-9)
+    np.testing.assert_allclose(basis.inner[0][0], np.eye(10), atol=1e-9)
