@@ -170,7 +170,7 @@ def reduce(
 def _ranges(model: "ReducedModel") -> Iterator[tuple[str, ...]]:
     kinds = dict.fromkeys(model.parameters, "parameter") | dict.fromkeys(model.regions, "stiffness loss")
     kinds |= dict.fromkeys(model.masses, "mass [kg]")
-    units = model.control_units.split()
+    units = model.control_units
     kinds |= {name: f"control [{unit}]" for name, unit in zip(model.controls, units, strict=True)}
     for (name, (low, high)), nominal in zip(model.validity.items(), model.nominal, strict=True):
         yield kinds[name], name, f"{low:g}", f"{nominal:g}", f"{high:g}"

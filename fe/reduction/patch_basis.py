@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 from scipy.linalg import eigh
+from scipy.stats import qmc
 
 from fe.full.subspace import Norm
 from fe.runtime.arrays import FloatArray
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedState, PatchedWing
-from fe.structure.field import natural_frequencies
+from fe.structure.affine import natural_frequencies
 from fe.wing.operators import AffineOperators
 from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
 from reporting.progress import Progress, SilentProgress
@@ -126,7 +127,7 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
     shapes = eigh(whole, nominal, subset_by_index=[0, START_SHAPES - 1])[1]
     return PatchArrays(
         design_hash=operators.design_hash,
-        region_names=" ".join(operators.regions),
+        regions=operators.regions,
         validity_box=np.array(list(settings.ranges.named_ranges(operators.regions).values())),
         largest_loss=settings.largest_loss,
         largest_compliance=settings.compliance_share
@@ -151,13 +152,15 @@ OUTBOARD = (0.75, 1.0)
 TURNED_WEIGHT = 0.4
 """How much representatives of strain across a gauge and of shear count."""
 MODE_WEIGHTS = np.array([3.0, 3.0, 6.0, 3.0, 1.5, 1.0, 0.5, 0.3])
+CHANGED = 6
+"""Numbers of the changes: start, length, amount of a local loss, root compliance, point mass, its station."""
 PLAIN_WEIGHT = 3.0
 """How much more the wing as it was counts than one of the patched states."""
 
 
 def _directions(arrays: PatchArrays, settings: PatchSettings) -> FloatArray:
     """Return the kept directions (N, n) of the working basis."""
-    generator, wing = np.random.default_rng(settings.seed), PatchedWing(arrays)
+    wing = PatchedWing(arrays)
     eta, upwards = arrays.stations / wing.span, arrays.line_rows[2:]
     washed = np.power.outer(eta, WASHOUTS).T @ arrays.lift_rows
     forces = upwards[:, np.searchsorted(eta, OUTBOARD)].reshape(-1, wing.size)
@@ -170,8 +173,9 @@ def _directions(arrays: PatchArrays, settings: PatchSettings) -> FloatArray:
     columns = np.concatenate(groups).T
     weights = np.repeat((LOAD_WEIGHT, 1.0, TURNED_WEIGHT), [len(rows) for rows in groups])
     all_snapshots = np.zeros((wing.size, wing.size))
-    for number in range(settings.states):
-        structure = _patched_state(wing, generator, number)
+    places = qmc.Halton(len(arrays.validity_box) - 2 + CHANGED, scramble=False).random(settings.states)
+    for number, shares in enumerate(places):
+        structure = _patched_state(wing, shares, number)
         solutions, modes = _unit(structure.static(columns)), _unit(structure.lowest(MODES).shapes)
         shapes = np.concatenate((solutions * weights, modes * MODE_WEIGHTS), axis=1)
         all_snapshots += shapes @ shapes.T * (1.0 if number else PLAIN_WEIGHT**2)
@@ -183,18 +187,17 @@ def _unit(vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=0))
 
 
-def _patched_state(wing: PatchedWing, generator: np.random.Generator, number: int) -> PatchedState:
-    """Return a random state whose number says what is changed; the first is the wing as it was."""
+def _patched_state(wing: PatchedWing, shares: FloatArray, number: int) -> PatchedState:
+    """Return a state at shares of all ranges; its number says what is changed, 0 is the wing as it was."""
     arrays, span = wing.arrays, wing.span
-    box = arrays.validity_box[:-2].T  # all but the loads
-    e, *losses, servo, pitot = (generator.uniform(*box) if number else box.mean(axis=0)).tolist()
-    loss, compliance, mass, station = generator.uniform((0.1, 0.0, 0.0, 0.1), 1.0).tolist()
-    start, length = generator.uniform((-0.05, 0.02), (0.9, 0.3)).tolist()
+    start, length, loss, compliance, mass, station = shares[:CHANGED].tolist()
+    low, high = arrays.validity_box[:-2].T  # all but the loads
+    e, *losses, servo, pitot = (low + (high - low) * (shares[CHANGED:] if number else 0.5)).tolist()
     changes = (
-        LocalStiffnessLoss(loss * arrays.largest_loss, start * span, length * span),
+        LocalStiffnessLoss(loss**0.5 * arrays.largest_loss, start * span, (0.02 + 0.28 * length) * span),
         RootCompliance(compliance * arrays.largest_compliance),
-        PointMass(mass * arrays.largest_mass, station * span),
+        PointMass(mass * arrays.largest_mass, (0.1 + 0.9 * station) * span),
     )
-    taken = zip(changes, (number % 3, number & 2, number & 4), strict=True)
+    taken = zip(changes, (number, number & 2, number & 4), strict=True)
     patch = ModelPatch(tuple(change for change, wanted in taken if wanted))
     return wing.structure(e, tuple(losses) if number & 1 else (), servo, pitot, patch)

@@ -9,7 +9,7 @@ import io
 import os
 import tempfile
 import zipfile
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
 from math import isfinite
 from pathlib import Path
@@ -20,6 +20,11 @@ import numpy.typing as npt
 
 from .errors import ReducedModelFileError
 
+KINDS: Mapping[type, Callable[[Any], Any]] = {
+    **{kind: kind for kind in (str, int, float)},
+    tuple: lambda names: tuple(map(str, names)),
+}
+"""What makes the value of a field that is no array, by its type, of the array that a file has of it."""
 _TIMESTAMP = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip archive can hold
 
 
@@ -135,7 +140,8 @@ class KeptArrays:
 
     An array is declared with its axes, `Annotated[FloatArray, "loads", 2]`: a number is the length, and a
     name means one length in all arrays, which `_lengths` or else the first array with that axis tells. A
-    number may be declared with its least and largest value, `Annotated[float, 0.0, 1.0]`.
+    number may be declared with its least and largest value, `Annotated[float, 0.0, 1.0]`. A tuple holds
+    names.
 
     Class attributes
     ----------------
@@ -214,7 +220,7 @@ class KeptArrays:
         require_arrays(arrays, where, (item.name for item in fields(cls)))
         try:
             values: dict[str, Any] = {
-                item.name: kind(arrays[item.name]) if kind in (str, int, float) else arrays[item.name]
+                item.name: KINDS[kind](arrays[item.name]) if kind in KINDS else arrays[item.name]
                 for item in fields(cls)
                 for kind in (getattr(item.type, "__origin__", item.type),)
             }

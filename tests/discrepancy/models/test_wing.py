@@ -126,7 +126,7 @@ def test_a_cubic_spring_at_the_tip_solves_its_scalar_equation(wing: Wing) -> Non
 
 def test_a_cubic_spring_over_the_planform_solves_the_equations_of_all_unknowns(wing: Wing) -> None:
     stiffness, *_ = wing.matrices()
-    rows, share = np.stack([wing.wing.port_rows[port] for port in STATION_PORTS]), wing.wing.planform.share
+    rows, share = np.stack([wing.wing.port_rows[port] for port in STATION_PORTS]), wing.wing.planform[1]
     values = wing.seen(STATIC, PowerStiffness("planform", 60.0, 3.0, 0, 0.02))
     for level, force in enumerate(STATIC.force):
         u = np.linalg.solve(stiffness, force * wing.tip)
