@@ -100,7 +100,7 @@ found = {"unknowns": structure.unknowns, "assembly": assembly, "solution": solut
 deck = structure_deck(structure)
 text = deck.text(*(load_step(structure, load) for load in structure.design.load))
 (folder / "static.inp").write_text(text, encoding="ascii")
-found["reduction"], reduction = timed(lambda: reduce_structure(structure, "beam"))
+found["reduction"], reduction = timed(lambda: reduce_structure(structure))
 found["bound"] = reduction.bound_history[-1]
 found["memory"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
 if with_superlu:

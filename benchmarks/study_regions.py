@@ -204,7 +204,7 @@ def measured(name: str, regions: int, states: int, folder: Path) -> dict[str, fl
         build_fmu(reduction.model, folder / "wing.fmu")
     else:
         full = load_and_assemble({"plate": plate, "tube": tube, "bracket": bracket}[name](folder, regions))
-        reduction = reduce_structure(full, name)
+        reduction = reduce_structure(full)
         build_fmu(reduction.model, folder / f"{name}.fmu")
     found = {
         "regions": regions,

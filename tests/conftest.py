@@ -391,7 +391,7 @@ def beam_reduction(beam: Structure) -> Reduction:
     """Its reduction."""
     from fe.reduction.reduced_basis import reduce_structure
 
-    return reduce_structure(beam, "beam")
+    return reduce_structure(beam)
 
 
 @pytest.fixture(scope="session")
@@ -417,9 +417,8 @@ def coarse_plate(plate_file: Path) -> Structure:
 def plate_model(coarse_plate: Structure) -> ReducedModel:
     """Its reduced model."""
     from fe.reduction.reduced_basis import reduce_structure
-    from fe.reduction.settings import StructureSettings
 
     def reduced() -> ReducedModel:
-        return reduce_structure(coarse_plate, "plate", StructureSettings.of(coarse_plate.design)).model
+        return reduce_structure(coarse_plate).model
 
     return kept("coarse-plate", reduced, FE, coarse_plate.design_hash)

@@ -87,11 +87,11 @@ def packed(path: Path, pack: Callable[[], object], places: tuple[Path, ...], inp
     return path
 
 
-def compiled_wing(model: ReducedModel, folder: Path, **options: Any) -> Path:
-    """Return the compiled FMU of a wing, packed with further options of `build_fmu`."""
-    path = folder / "wing.fmu"
+def compiled_wing(model: ReducedModel, path: Path, **options: Any) -> Path:
+    """Return the compiled FMU of a wing or structure, packed with further options of `build_fmu`."""
+    options = {"kind": "compiled", **options}
     inputs = (hashlib.sha256(model.to_bytes()).hexdigest(), options)
-    return packed(path, lambda: build_fmu(model, path, kind="compiled", **options), FMU, inputs)
+    return packed(path, lambda: build_fmu(model, path, **options), FMU, inputs)
 
 
 @cache

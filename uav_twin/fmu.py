@@ -10,8 +10,8 @@ from reporting import terminal
 from reporting.words import counted
 from uav_twin.options import FmiVersion, Kind, Replace, StepTimeout
 from uav_twin.simulated import simulate
-from uav_twin.structure_model import fmu as build_structure
-from uav_twin.structure_model import names_structure
+from uav_twin.structure import fmu as build_structure
+from uav_twin.structure import names_structure
 
 if TYPE_CHECKING:
     from fmu_asset.compiled.compiler import Platform

@@ -2,17 +2,22 @@
 
 import tempfile
 from collections.abc import Iterator
+from dataclasses import asdict
+from math import inf, nan
+from os.path import relpath
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from reporting import terminal
-from uav_twin.structure_model import File, MemoryLimit, assembled, assembled_of_any, field, fmu, reduce
-from uav_twin.verify import Check, end_with, print_checks
+from uav_twin.options import FmiVersion, Kind, Replace
+from uav_twin.wing import Check, end_with, print_checks
 
 if TYPE_CHECKING:
-    from fe.structure.affine import DesignedStructure
+    from fe.reduction.structure_errors import MeasuredErrors
+    from fe.runtime.reduced import ReducedModel
+    from fe.structure.affine import AffineStructure
     from fe.structure.operators import Structure
     from fe.verification.calculix_comparison import Agreement
 
@@ -25,6 +30,62 @@ structure_app = typer.Typer(
 )
 
 Modes = Annotated[int, typer.Option(min=1, max=50, help="Number of modes.")]
+
+
+File = Annotated[
+    Path,
+    typer.Argument(
+        help="A structure file (TOML) beside its mesh or matrices, or a shipped one.", show_default=False
+    ),
+]
+MemoryLimit = Annotated[
+    float | None,
+    typer.Option(
+        min=0.1,
+        help="GiB that it may take; what the machine has left by default.",
+        callback=lambda gibibytes: None if gibibytes is None else 2.0**30 * gibibytes,
+    ),
+]
+"""As it is typed, in GiB; as commands get it, in bytes."""
+
+
+def located(file: Path) -> Path:
+    """Return a structure file, or the shipped one of that name where there is no such file."""
+    from scenarios import structure_files
+
+    return file if file.exists() else structure_files().get(str(file), file)
+
+
+def names_structure(design: Path) -> bool:
+    """Return whether a design is that of a structure, and not of a wing."""
+    from fe.runtime.errors import DesignFileError
+    from fe.structure.design import is_structure
+    from reporting.toml_file import read_toml
+
+    return is_structure(read_toml(located(design), DesignFileError, what="wing design"))
+
+
+def assembled(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool = False) -> "Structure":
+    """Return the full model of a mesh."""
+    from fe.structure.operators import load_and_assemble
+
+    with terminal.progress().stage("Reading the mesh and assembling"):
+        return load_and_assemble(located(file), memory_limit, mass_as_stiffness=mass_as_stiffness)
+
+
+def assembled_of_any(file: Path, memory_limit: float | None) -> "AffineStructure":
+    """Return the full model of a mesh or of matrices."""
+    from fe.structure.operators import assemble_structure
+
+    with terminal.progress().stage("Reading and assembling"):
+        return assemble_structure(located(file), memory_limit)
+
+
+def reduced(file: Path, memory_limit: float | None) -> "ReducedModel":
+    """Return the reduced model, from the cache where it is there."""
+    from fe.reduction.model_cache import reduced_structure
+
+    return reduced_structure(located(file), progress=terminal.progress(), memory_limit=memory_limit)
 
 
 @structure_app.command("info")
@@ -86,7 +147,7 @@ def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         yield title, ", ".join(f"{value:.6g}" for value in record[key]), unit
 
 
-def structure_record(structure: "DesignedStructure", modes: int) -> dict[str, Any]:
+def structure_record(structure: "AffineStructure", modes: int) -> dict[str, Any]:
     """Return what is known of a structure without damage, at nominal values, by name.
 
     Lengths carry the unit of the mesh where `length_unit` stands beside them; everything else is in SI units.
@@ -224,6 +285,164 @@ def _differences(agreement: "Agreement") -> Iterator[Check]:
     yield Check(f"{len(agreement.ours)} modes", "frequencies", agreement.modal, FREQUENCY_LIMIT)
 
 
-structure_app.command("reduce")(reduce)
-structure_app.command("fmu")(fmu)
-structure_app.command("field")(field)
+@structure_app.command("field")
+def field(
+    file: File,
+    out: Annotated[Path, typer.Option(help="The VTU file to write.", show_default=False)],
+    at: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="A parameter, loss, mass or control that is not nominal; may come again.",
+        ),
+    ] = None,
+    replace: Replace = False,
+    memory_limit: MemoryLimit = None,
+) -> None:
+    """Solve the full structure under all its loads, and write its field as VTU for ParaView."""
+    from fe.structure.operators import write_structure_vtu
+    from reporting.files import refuse_existing
+
+    refuse_existing(out, replace=replace)
+    structure = assembled(file, memory_limit)
+    values: dict[str, float] = {}
+    for text in at or ():
+        name, _, number = text.partition("=")
+        low, high = structure.ranges.get(name, (inf, -inf))
+        try:
+            value = float(number)
+        except ValueError:
+            value = nan
+        if name in values or not low <= value <= high:
+            known = ", ".join(
+                f"{own} from {low:g} to {high:g}" for own, (low, high) in structure.ranges.items()
+            )
+            raise typer.BadParameter(
+                f"NAME=VALUE is expected, each name once, but {text!r} came; there are {known}. Give a value "
+                "inside, or widen its range in the structure file.",
+                param_hint="--at",
+            )
+        values[name] = value
+    with terminal.progress().stage("Solving and writing the field"):
+        write_structure_vtu(out, structure, values)
+    terminal.say(f"{out}: {len(structure.mesh.cells):,} cells, displacement, strain, material, region, loss")
+
+
+@structure_app.command("reduce")
+def reduce(
+    file: File,
+    states: Annotated[
+        int, typer.Option(min=0, max=1000, help="Random states at which it is compared with the full model.")
+    ] = 4,
+    memory_limit: MemoryLimit = None,
+    json: terminal.Json = False,
+) -> None:
+    """Make the reduced model of a structure, keep it in the cache, and measure its errors."""
+    from fe.reduction.structure_errors import measured_errors
+
+    model, errors = reduced(file, memory_limit), None
+    if states:
+        structure = assembled_of_any(file, memory_limit)
+        with terminal.progress().stage("Comparing it with the full model"):
+            errors = measured_errors(structure, model, states)
+    if json:
+        terminal.print_json(
+            {
+                "name": model.name,
+                "design_hash": model.design_hash,
+                "static_basis": len(model.static_load.T),
+                "modal_basis": len(model.modal_load.T),
+                "ranges": {name: list(ends) for name, ends in model.validity.items()},
+                "errors": None if errors is None else asdict(errors),
+            }
+        )
+        return
+    headings = ("what", "name", "least", "nominal", "largest")
+    terminal.print_table(headings, list(_ranges(model)))
+    terminal.say(
+        f"{model.name}: {len(model.static_load.T)} static and {len(model.modal_load.T)} modal basis vectors; "
+        f"gauges {len(model.gauges)}, displacements {len(model.displacements)}, "
+        f"accelerations {len(model.accelerations)}, modes {model.mode_count}."
+    )
+    if errors is not None:
+        heading = f"largest error at {errors.states} random states"
+        terminal.print_table(("of", heading), list(_errors(errors)))
+
+
+def _ranges(model: "ReducedModel") -> Iterator[tuple[str, ...]]:
+    kinds = dict.fromkeys(model.parameters, "parameter") | dict.fromkeys(model.regions, "stiffness loss")
+    kinds |= dict.fromkeys(model.masses, "mass [kg]")
+    units = model.control_units
+    kinds |= {name: f"control [{unit}]" for name, unit in zip(model.controls, units, strict=True)}
+    for (name, (low, high)), nominal in zip(model.validity.items(), model.nominal, strict=True):
+        yield kinds[name], name, f"{low:g}", f"{nominal:g}", f"{high:g}"
+
+
+def _errors(errors: "MeasuredErrors") -> Iterator[tuple[str, str]]:
+    for what, value in (
+        ("strains, of the largest", errors.strain),
+        ("displacements, of the largest", errors.displacement),
+        ("certified bound of both", errors.bound),
+        ("frequencies", errors.frequency),
+    ):
+        if value == value:  # not where there are no such outputs
+            yield what, f"{value:.2g}"
+    yield "states in which an error exceeds its bound", f"{errors.broken}"
+
+
+@structure_app.command("fmu")
+def fmu(
+    file: File,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="The FMU to write; by default beside the structure file, with its name."),
+    ] = None,
+    kind: Kind = "python",
+    fmi: FmiVersion = 2,
+    binding: Annotated[
+        Path | None, typer.Option(help="Write the binding of the FMU to this file, too.")
+    ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the file by which `calibrate campaign` and `discrepancy` take the FMU as a model."
+        ),
+    ] = None,
+    replace: Replace = False,
+    memory_limit: MemoryLimit = None,
+) -> None:
+    """Pack the reduced model of a structure as an FMU; equal input gives equal bytes."""
+    from fe.structure.design import load_structure
+    from fmu_asset.packing.contents import checked_target
+    from fmu_asset.packing.structure_fmu import build_fmu, check_form
+    from fmu_asset.structures.binding import structure_binding_text
+    from fmu_asset.structures.rig import rig_text
+    from reporting.errors import FileNotWrittenError
+    from reporting.files import atomic_write_text, refuse_existing
+
+    version: Literal[2, 3] = 3 if fmi == 3 else 2
+    check_form(kind, version)
+    if version == 3 and (binding is not None or rig is not None):
+        raise typer.BadParameter("--binding and --rig are for FMI 2.0; `uav-twin fmu bind` drafts a binding.")
+    source = located(file)
+    target = checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
+    taken = {source.resolve(): "the structure file", target.resolve(): "the FMU"}
+    design, others = load_structure(source), list[tuple[Path, str, str]]()
+    for option, path in (("--binding", binding), ("--rig", rig)):
+        if path is None:
+            continue
+        if path.resolve() in taken:
+            raise FileNotWrittenError(f"{path} is {taken[path.resolve()]}: choose another {option}.")
+        taken[path.resolve()] = f"the file of {option}"
+        refuse_existing(path, replace=replace, option=option)
+        if option == "--rig":
+            use = f"the model of `uav-twin calibrate campaign` and `discrepancy run CAMPAIGN --model {path}`"
+            others.append((path, rig_text(design, relpath(target, path.parent)), use))
+        else:
+            others.append((path, structure_binding_text(design), "its binding"))
+    model = reduced(file, memory_limit)
+    info = build_fmu(model, target, kind=kind, fmi=version, replace=replace)
+    terminal.say(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
+    for path, text, what in others:
+        atomic_write_text(path, text)
+        terminal.say(f"{path}: {what}")

@@ -11,7 +11,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Course
+from discrepancy.models.acting import Course, LoadChange, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
 from discrepancy.models.fmu_laws import FmuLaws
 from discrepancy.models.fmu_motion import FmuMotion, sampled
@@ -19,7 +19,6 @@ from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State
 from discrepancy.models.interface import Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.questions import LoadChange, laws_at, place_among, release_of
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.patch import (
@@ -98,6 +97,9 @@ class FmuModel(DescribedModel):
         self._inputs = {
             item.name: self.runs.variable(item.variable or item.name) for item in description.input
         }
+        self.load_places = tuple(self._forces)
+        limits = (self.runs.asset.input_range("load", name)[1] for name in self._forces.values())
+        self.largest_force = 0.5 * min(limits, default=np.inf)
         self._check_ranges()
         nominal = self._state(Asked(_any_trial(TrialKind.RINGDOWN, 1.0), Conditions(self.prior_mean())))
         self._shown = Memory(KEPT_SHOWN)
@@ -303,7 +305,7 @@ class FmuModel(DescribedModel):
                 )
             values = {key: value for key, value in item.to_mapping().items() if key != "kind"}
             settings |= {f"{effect}.{key}": float(value) for key, value in {"active": 1.0, **values}.items()}
-        laws = laws_at(rest.of(*INTERNAL_FORCES), self.ports(), in_windows=False)
+        laws = self.laws_at(rest.of(*INTERNAL_FORCES), self.ports())
         return FmuPatch(laws, tuple(sorted(settings.items())), load)
 
     def _columns(self, outputs: Outputs) -> list[int]:
@@ -323,13 +325,12 @@ class FmuModel(DescribedModel):
         end = max((1.0 + rate) * float(trial.time[-1]) + zero, float(trial.time[-1]))
         # a little longer, so that a clock that is being fitted does not ask for another run
         steps = ceil(end / step * (1.0 + 2e-9) - 1e-6) + (0 if (rate, zero) == (0.0, 0.0) else 1)
-        if trial.kind is TrialKind.RINGDOWN:
-            loads = self._release(trial, conditions)
-        else:
-            loads = self._forced(asked, step, steps)
-        return Run(self._state(asked), step, steps, loads)
+        run = Run(self._state(asked), step, steps, [])
+        loads = self._release if trial.kind is TrialKind.RINGDOWN else self._forced
+        return run._replace(loads=loads(asked, run))
 
-    def _release(self, trial: Trial, conditions: Conditions) -> Loads:
+    def _release(self, asked: Asked, run: Run) -> Loads:
+        (trial, conditions, _), (state, step, *_) = asked, run
         release, way = release_of(trial), self.description.release
         if way is None:
             raise ModelError(
@@ -338,23 +339,18 @@ class FmuModel(DescribedModel):
             )
         first = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
         if release.at_rest:
-            size = release.displacement * (1.0 + float(first[0]))
-            kind = "hold" if way.displacement is None else "displacement"
-            return [(Excitation(kind), size)]
+            return [self.motion.let_go(state, step, release.displacement * (1.0 + float(first[0])))]
         if way.displacement is None or way.velocity is None:
             raise ModelError(
                 f"The ring-down {trial.name!r} does not begin at rest, which the FMU model {self.name!r} "
                 f"can follow only if [release] names parameters of displacement and velocity."
             )
-        unit = release.displacement
-        speed = self.motion.angular_frequency(trial)
-        return [
-            (Excitation("displacement"), unit * float(first[0])),
-            (Excitation("velocity"), unit * speed * float(first[1])),
-        ]
+        at, speed = release.displacement * first * (1.0, self.motion.angular_frequency(trial))
+        moving = Excitation("parameter", self.runs.parameter(way.velocity))
+        return [self.motion.let_go(state, step, float(at)), (moving, float(speed))]
 
-    def _forced(self, asked: Asked, step: float, steps: int) -> Loads:
-        trial, _, patch = asked
+    def _forced(self, asked: Asked, run: Run) -> Loads:
+        (trial, _, patch), (_, step, steps, _) = asked, run
         course = Course.of(trial.time, trial.force, trial.hold)
         begins, ends = course.ends(np.linspace(0.0, steps * step, steps + 1))
         held, first = 0.5 * (begins + ends), float(trial.force[0])

@@ -153,8 +153,8 @@ class LumpedDescription(ModelDescription):
                 if not count:
                     raise ValueError(f"{place} is there, but {reference} is missing")
                 _check_matrix(place, matrix, count, reference, symmetric=kind != "conductance")
-            whole, loose = self.whole(kind), _LOOSE if kind == "stiffness" else ""
-            least, most = np.linalg.eigvalsh(whole)[[0, -1]] if count else (1.0, 1.0)
+            loose, own = _LOOSE if kind == "stiffness" else "", self.unknowns(kind)
+            least, most = np.linalg.eigvalsh(self.whole(kind)[own, own])[[0, -1]] if count else (1.0, 1.0)
             singular = kind == "stiffness" and self.free and least >= -1e-9 * max(abs(most), 1e-300)
             if kind in ("mass", "capacity", "stiffness") and least <= 0.0 and not singular:
                 raise ValueError(f"{kind} (with its parts) must be positive definite{loose}")
@@ -173,15 +173,21 @@ class LumpedDescription(ModelDescription):
         return found
 
     def whole(self, kind: str, factors: Mapping[str, float] = MappingProxyType({})) -> FloatArray:
-        """Return the matrix of a kind with its parts, each times its factor.
+        """Return the matrix (N, N) of a kind with its parts, each times its factor.
 
         The factor of the matrix itself is that of the whole. Damping by modes is left out.
         """
-        count = self.states if kind in OF_STATES else self.size
-        whole = np.array(self._base(kind) or np.zeros((count, count)))
+        whole = self.placed(self._base(kind), kind)
         for part in self.parts(kind):
-            whole = whole + factors.get(part.name, 1.0) * np.array(part.matrix)
-        return np.asarray(whole * factors.get(kind, 1.0))
+            whole += factors.get(part.name, 1.0) * self.placed(part.matrix, kind)
+        return whole * factors.get(kind, 1.0)
+
+    def placed(self, matrix: Matrix, kind: str) -> FloatArray:
+        """Return a matrix of a kind, zero where there is none, among all unknowns (N, N)."""
+        found, own = np.zeros((self.width, self.width)), self.unknowns(kind)
+        if matrix:
+            found[own, own] = matrix
+        return found
 
     def _check_vectors(self, kind: str, item: NamedVector | OutputSection | ControllerSection) -> None:
         """Refuse vectors of another length and zero ones, and what sees both displacements and states."""
@@ -199,7 +205,10 @@ class LumpedDescription(ModelDescription):
         if isinstance(item, PortSection) and item.acts is not None:
             push = np.array(item.acts)
             of_states = not any(row[:n]) and not any(push[:n])
-            if not of_states or row[n:] @ np.linalg.solve(self.whole("capacity"), push[n:]) <= 0.0:
+            if (
+                not of_states
+                or row[n:] @ np.linalg.solve(self.whole("capacity")[n : n + m, n : n + m], push[n:]) <= 0.0
+            ):
                 raise ValueError(
                     f"`acts` of the port {item.name!r} is for states, and must take from what its vector sees"
                 )

@@ -295,25 +295,18 @@ class SecondOrderSystem(LinearSystem):
         if len(stamps) == 1:  # a step that nobody looks at
             found = self._advanced(acting, laws, stamps[0] + np.array([0.0, INSTANT]), begin, refinement)
             return ModalMotion(*(part if part is found.memory else part[:1] for part in found))
+        pushed = acting.loads or acting.drives or acting.constant.any() or not laws.linear
+        free = None if pushed else self.modal.free(begin.q, begin.v, stamps - stamps[0])
+        if free is not None:
+            none = np.zeros((len(stamps), 0))
+            return ModalMotion(*free, none, NO_LAWS.memory(), none)
         smooth = bool(acting.drives) or any(course.is_smooth for _, course in acting.loads)
         edges = (*laws.edges, *(moment for _, course in acting.loads for moment in course.edges))
         boundaries = substeps(self.modal, laws, stamps, refinement, SMOOTH_PARTS if smooth else 1, edges)
-        pushed = acting.loads or acting.drives or acting.constant.any() or not laws.linear
-        if not pushed and len(boundaries.alike[0]) == 1:
-            return self._free(begin, boundaries)
         feed = np.zeros((len(boundaries.time), len(laws)))
         if self.truncated and len(laws) and acting.loads:
             feed = acting.load_at(boundaries.time, self.residual(self.port_rows(laws).T))
         return advance(self.modal, laws, self._steps(acting, boundaries, feed), begin, compiled_kernel())
-
-    def _free(self, begin: Begin, boundaries: Boundaries) -> ModalMotion:
-        """Return the motion that nothing pushes in steps of one length: powers of one step by doubling."""
-        power = self.modal.exact_steps(boundaries.alike[0])[0][0].T
-        states, none = np.concatenate((begin.q, begin.v))[None], np.zeros((len(boundaries.sample), 0))
-        while len(states) < len(boundaries.time):
-            states, power = np.concatenate((states, states @ power)), power @ power
-        q, v = np.split(states[boundaries.sample], 2, axis=1)
-        return ModalMotion(q, v, none, NO_LAWS.memory(), none)
 
     def _steps(self, acting: Acting, boundaries: Boundaries, feed: FloatArray) -> Steps:
         """Return the steps of all coordinates; the drives follow from nothing but what is prescribed."""

@@ -35,13 +35,13 @@ class PlateOperators(AffineWing):
         Place among the five fields of all nodes of each free unknown before the three of the root.
     plate : Plate
         Nodes and cells.
-    design : WingDesign
-        The design.
+    wing_design : WingDesign
+        The design of the wing.
     """
 
     kept: NDArray[np.int64]
     plate: Plate
-    design: WingDesign
+    wing_design: WingDesign
 
     def fields(self, free: FloatArray) -> FloatArray:
         """Fields u, v, a, b, w (5, N) of all nodes from free unknowns (n,)."""
@@ -72,32 +72,27 @@ def assemble_plate(design: WingDesign, *, straight_section: bool = False) -> Pla
     expansion, kept = _expansion(layout)
     restriction = expansion.T.tocsr()
 
-    def reduced(matrix: sparse.csr_array) -> sparse.csr_array:
-        return (restriction @ (matrix @ expansion)).tocsr()
-
     springs = np.zeros(expansion.shape[1])
     root = design.root
     springs[-ROOT_UNKNOWNS:] = root.transverse_spring, root.flap_spring, root.yaw_spring
-    *skins, base = (reduced(term) for term in _stiffness_terms(layout))
+    *skins, base = ((restriction @ (term @ expansion)).tocsr() for term in _stiffness_terms(layout))
     plan = design.planform
     load_place = plan.semi_span - design.tip_load.distance_from_tip
     load_tip, tip = (
-        restriction @ _deflection(layout, distance, design.tip_load.chord)
-        for distance in (load_place, plan.semi_span)
+        _deflection(layout, distance, design.tip_load.chord) for distance in (load_place, plan.semi_span)
     )
     return PlateOperators.of(
-        regions=design.regions,
-        stiffness=(*skins, (base + sparse.diags_array(springs)).tocsr()),
-        mass_terms=tuple(reduced(term) for term in _mass_terms(layout)),
-        load_lift=np.asarray(restriction @ _lift(layout)),
-        load_tip=np.asarray(load_tip),
-        gauge_output=(_gauge_output(layout) @ expansion).tocsr(),
-        tip=np.asarray(tip),
-        expansion=expansion,
+        design.regions,
+        (*skins, (base + sparse.diags_array(springs)).tocsr()),
+        _mass_terms(layout),
+        (_lift(layout), load_tip),
+        _gauge_output(layout),
+        tip,
+        expansion,
         design_hash=design.hash,
         kept=kept,
         plate=plate,
-        design=design,
+        wing_design=design,
     )
 
 

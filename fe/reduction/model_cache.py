@@ -23,7 +23,7 @@ from reporting.provenance import hash_bytes, hash_tree
 
 from .built_once import built_once, cache_folder
 from .fields import WingFields, field_basis
-from .settings import PatchSettings, ReductionSettings, StructureSettings
+from .settings import PatchSettings, StructureSettings
 
 MODELLING_ROOMS = ("runtime", "elements", "full", "structure", "wing", "reduction")
 """The rooms that decide what a reduced model holds; a change in any of their files makes a new entry."""
@@ -33,7 +33,9 @@ _Kept = TypeVar("_Kept", bound=KeptArrays)
 
 def modelling_hash() -> str:
     """Return the SHA-256 of the modelling code, hexadecimal."""
-    rooms = (hash_tree(Path(__file__).parents[1] / room, suffixes=[".py"]) for room in MODELLING_ROOMS)
+    rooms = (
+        hash_tree(Path(__file__).parents[1] / room, suffixes=[".py", ".toml"]) for room in MODELLING_ROOMS
+    )
     return hash_bytes("".join(rooms).encode())
 
 
@@ -65,7 +67,7 @@ def _once(
 def reduced_model(
     design: WingDesign | None = None,
     progress: Progress | None = None,
-    settings: ReductionSettings | None = None,
+    settings: StructureSettings | None = None,
 ) -> ReducedModel:
     """Return the reduced model of a wing, from the cache if it is there.
 
@@ -75,8 +77,8 @@ def reduced_model(
         The wing; the shipped one if left out.
     progress : Progress, optional
         Where a build reports.
-    settings : ReductionSettings, optional
-        Where and how well the model is to hold.
+    settings : StructureSettings, optional
+        How well the model is to hold.
 
     Raises
     ------
@@ -92,7 +94,7 @@ def reduced_model(
 def wing_fields(
     design: WingDesign | None = None,
     progress: Progress | None = None,
-    settings: ReductionSettings | None = None,
+    settings: StructureSettings | None = None,
 ) -> WingFields:
     """Return the reduced model of a wing with its bases on the mesh, from the cache if it is there.
 
@@ -103,7 +105,7 @@ def wing_fields(
 
 
 def build(
-    design: WingDesign, progress: Progress | None = None, settings: ReductionSettings | None = None
+    design: WingDesign, progress: Progress | None = None, settings: StructureSettings | None = None
 ) -> WingFields:
     """Build the reduced model and the bases of a wing, without the cache; see `reduced_model`."""
     from .reduced_basis import reduce_model
@@ -174,7 +176,7 @@ def reduced_structure(
 
         with (progress or SilentProgress()).stage("Reading the mesh and assembling"):
             structure = assemble_structure(file, memory_limit)
-        return reduce_structure(structure, structure.design.name, chosen, progress).model
+        return reduce_structure(structure, chosen, progress).model
 
     return _once(ReducedModel, "structure", design_hash, chosen, build_structure)
 

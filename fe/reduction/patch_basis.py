@@ -123,12 +123,12 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
         for terms in ([term.matrix for term in operators.stiffness_terms], operators.mass_terms)
     )
     whole, tip = stiffness.sum(axis=0), rows["load_tip"]
-    nominal = np.tensordot((1.0, *settings.ranges.nominal_masses), mass, 1)
+    nominal = np.tensordot((1.0, *operators.masses.values()), mass, 1)
     shapes = eigh(whole, nominal, subset_by_index=[0, START_SHAPES - 1])[1]
     return PatchArrays(
         design_hash=operators.design_hash,
         regions=operators.regions,
-        validity_box=np.array(list(settings.ranges.named_ranges(operators.regions).values())),
+        validity_box=np.array(list(operators.ranges.values())),
         largest_loss=settings.largest_loss,
         largest_compliance=settings.compliance_share
         * float(tip @ np.linalg.solve(whole, tip))

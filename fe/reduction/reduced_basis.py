@@ -14,15 +14,15 @@ from fe.full.subspace import Norm
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import TIP_FORCE, WING
+from fe.runtime.state import TIP_FORCE
 from fe.structure.affine import AffineStructure, affine_sum
-from fe.wing.operators import AffineWing, point_masses
+from fe.wing.operators import AffineWing
 from reporting.progress import Progress, SilentProgress
 from reporting.words import counted
 
 from .certified_basis import StaticReduction, compressed, fewest_directions, greedy
 from .modal_basis import eigenmodes, modal_basis
-from .settings import ModalSettings, ReductionSettings, StructureSettings, loss_splits
+from .settings import ModalSettings, StructureSettings, loss_splits
 from .terms import ReductionTerms, State
 
 
@@ -53,7 +53,6 @@ class Reduction:
 
 def reduce_structure(
     structure: AffineStructure,
-    name: str,
     settings: StructureSettings | None = None,
     progress: Progress | None = None,
     followed_load: int | None = None,
@@ -64,10 +63,8 @@ def reduce_structure(
     ----------
     structure : AffineStructure
         The full model.
-    name : str
-        What the structure is called.
     settings : StructureSettings, optional
-        How well it is to hold.
+        How well it is to hold; by default as its design says.
     progress : Progress, optional
         Where to report.
     followed_load : int, optional
@@ -80,8 +77,9 @@ def reduce_structure(
     SolutionError
         If the full model cannot be solved.
     """
-    settings, progress = settings or StructureSettings(), progress or SilentProgress()
-    terms = ReductionTerms(structure)
+    settings, progress = settings or StructureSettings.of(structure.design), progress or SilentProgress()
+    structure = replace(structure, ranges=structure.ranges | settings.ranges)
+    terms, name = ReductionTerms(structure), structure.design.name
     _check(terms, name)
     with progress.stage("Factorising the structure"):
         norm = Norm(affine_sum(terms.reference, terms.stiffness_terms))
@@ -182,10 +180,7 @@ def _named(terms: ReductionTerms, name: str) -> dict[str, Any]:
 
 
 def reduce_model(
-    wing: AffineWing, settings: ReductionSettings | None = None, progress: Progress | None = None
+    wing: AffineWing, settings: StructureSettings | None = None, progress: Progress | None = None
 ) -> Reduction:
     """Make the reduced model of a wing, its flapwise bendings followed; see `reduce_structure`."""
-    settings = settings or ReductionSettings()
-    ranges = settings.named_ranges(wing.regions)
-    structure = replace(wing, ranges=ranges, masses=point_masses(*settings.nominal_masses))
-    return reduce_structure(structure, WING, settings, progress, TIP_FORCE)
+    return reduce_structure(wing, settings, progress, TIP_FORCE)

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fe.runtime.arrays import FloatArray
-from fe.runtime.state import wing_names
 from fe.structure.tables import ReductionLimits, StructureDesign
 
 Range = tuple[float, float]
@@ -38,7 +37,7 @@ class ModalSettings:
 
 @dataclass(frozen=True)
 class StructureSettings:
-    """How well the reduced model of a structure is to hold; where, and both limits, the structure file says.
+    """How well the reduced model of a structure is to hold; where, and both limits, its design says.
 
     Attributes
     ----------
@@ -49,11 +48,14 @@ class StructureSettings:
         Limit of the greedy search.
     modal : ModalSettings
         Accuracy and number of modes.
+    ranges : dict of str to (float, float)
+        Least and largest value where it is to hold elsewhere than the design says, by name.
     """
 
     bound_tolerance: float = ReductionLimits().tolerance
     most_snapshots: int = ReductionLimits().most_solutions
     modal: ModalSettings = field(default_factory=ModalSettings)
+    ranges: dict[str, Range] = field(default_factory=dict)
 
     @classmethod
     def of(cls, design: StructureDesign) -> "StructureSettings":
@@ -62,46 +64,11 @@ class StructureSettings:
 
 
 @dataclass(frozen=True)
-class ReductionSettings(StructureSettings):
-    """Where the reduced model of a wing is to hold, and how well.
-
-    Attributes
-    ----------
-    young_modulus_factor, stiffness_loss : tuple of float
-        Ranges of e and of the loss of every damage region [1].
-    load_factor, tip_force : tuple of float
-        Ranges of the loads [1], [N]; the model is linear in them.
-    servo_mass, pitot_mass : tuple of float
-        Ranges of the masses [kg].
-    nominal_masses : tuple of float
-        Servo and pitot mass at which the flapwise modes are named [kg].
-    """
-
-    bound_tolerance: float = 6e-4
-    most_snapshots: int = 401
-    young_modulus_factor: Range = (0.9, 1.1)
-    stiffness_loss: Range = (0.0, 0.8)
-    load_factor: Range = (-4.0, 6.0)
-    tip_force: Range = (-100.0, 100.0)
-    servo_mass: Range = (0.05, 0.30)
-    pitot_mass: Range = (0.0, 0.30)
-    nominal_masses: tuple[float, float] = (0.169, 0.134)
-
-    def named_ranges(self, regions: tuple[str, ...]) -> dict[str, Range]:
-        """Return the ranges of all that can be chosen of a wing, by name."""
-        return {
-            name: getattr(self, "stiffness_loss" if name in regions else name) for name in wing_names(regions)
-        }
-
-
-@dataclass(frozen=True)
 class PatchSettings:
     """How far changes may go and how many vectors hold them.
 
     Attributes
     ----------
-    ranges : ReductionSettings
-        Ranges of e, the losses and the masses, those of the reduced model.
     strip_count : int
         Largest number of strips of the skin; by default each row of cells along the span is one.
     vectors : int
@@ -116,7 +83,6 @@ class PatchSettings:
         Point mass [kg].
     """
 
-    ranges: ReductionSettings = field(default_factory=ReductionSettings)
     strip_count: int = 64
     vectors: int = 240
     states: int = 240

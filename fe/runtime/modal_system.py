@@ -137,6 +137,37 @@ class ModalSystem:
         found = np.abs(np.linalg.eigvals(matrix))
         return np.asarray(found[found > 1e-7 * np.max(found, initial=0.0)])
 
+    @cached_property
+    def _waves(self) -> tuple[Any, Any, Any] | None:
+        """Rates (R,) [1/s] of free motion, one of each conjugate pair, shapes (2M, R) and amounts (R, 2M).
+
+        None where shapes are hardly apart, as under critical damping.
+        """
+        none, unit = np.zeros_like(self.damping), np.where(self.stiffness > 0.0, self.angular_frequency, 1.0)
+        matrix = np.block([[none, np.diag(unit)], [-self.whole / unit[:, None], -self.damping]])
+        rates, shapes = np.linalg.eig(matrix)
+        if not np.linalg.cond(shapes) < APART:
+            return None
+        scale, kept = np.concatenate((np.ones_like(unit), unit)), rates.imag >= 0.0
+        amounts = np.linalg.inv(shapes) / scale * np.where(rates.imag > 0.0, 2.0, 1.0)[:, None]
+        return rates[kept], scale[:, None] * shapes[:, kept], amounts[kept]
+
+    def free(self, q: FloatArray, v: FloatArray, time: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Return free motion q and v (N, M) at times (N,) from that at zero; None: steps must tell it."""
+        if self._waves is None:
+            return None
+        rates, shapes, amounts = self._waves
+        even, first = np.linspace(time[0], time[-1], len(time)), np.zeros(1)
+        if np.abs(time - even).max() <= 1e-9 * (even[-1] - even[0]) / len(time):
+            block = math.isqrt(len(time))
+            time, first = even[::block], even[:block] - even[0]
+        moved = shapes * (amounts @ np.concatenate((q, v)))
+        moved = (np.exp(np.outer(first, rates))[:, None] * moved).reshape(-1, len(rates)).T
+        waves = np.exp(np.outer(time, rates))
+        found = np.hstack((waves.real, -waves.imag)) @ np.vstack((moved.real, moved.imag))
+        found = found.reshape(-1, 2 * len(q))[: len(even)]
+        return found[:, : len(q)], found[:, len(q) :]
+
     def exact_steps(self, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return its `exact_step` for lengths (S,): transitions, and the parts of the forces."""
         matrix = self.whole if self.coupled else self.stiffness
@@ -154,6 +185,8 @@ def _kept_steps(
 
 
 _TAYLOR = 14
+APART = 1e4
+"""Condition up to which the shapes of free motion are apart."""
 
 
 def exact_step(

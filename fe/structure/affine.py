@@ -83,6 +83,8 @@ class AffineStructure:
 
     Attributes
     ----------
+    design : StructureDesign
+        What was asked for.
     parameters, masses, controls : dict of str to float
         Nominal values of the parameters [1], free masses [kg] and controls [each in its unit].
     control_units : dict of str to str
@@ -113,6 +115,7 @@ class AffineStructure:
         Hash of the design with its mesh.
     """
 
+    design: StructureDesign
     parameters: dict[str, float]
     masses: dict[str, float]
     controls: dict[str, float]
@@ -204,19 +207,6 @@ class AffineStructure:
         return np.asarray(self.expansion @ free).reshape(-1, 3)
 
 
-@dataclass(frozen=True)
-class DesignedStructure(AffineStructure):
-    """Affine model of a structure file.
-
-    Attributes
-    ----------
-    design : StructureDesign
-        What was asked for.
-    """
-
-    design: StructureDesign
-
-
 def designed(
     design: StructureDesign,
     expansion: sparse.csr_array,
@@ -256,17 +246,15 @@ def designed(
             terms.append(LoadTerm(load.name, restriction @ vector))
         else:
             terms += [LoadTerm(load.name, restriction @ (own @ vector), name) for name, own in masses.items()]
-    free = tuple(part for part in design.mass if part.free)
     return {
         "design": design,
         "parameters": {part.name: part.nominal for part in design.parameter},
-        "masses": {part.name: part.mass for part in free},
+        "masses": {part.name: part.mass for part in design.mass if part.free},
         "controls": {part.name: part.nominal for part in design.control},
         "control_units": {part.name: part.unit for part in design.control},
-        "ranges": {part.name: part.range for part in (*design.parameter, *free, *design.control)}
-        | {part.name: (0.0, part.largest_loss) for part in design.damage},
+        "ranges": design.ranges,
         "regions": tuple(part.name for part in design.damage),
-        "mass_terms": tuple((restriction @ own @ expansion).tocsr() for own in masses.values()),
+        "mass_terms": tuple((restriction @ (own @ expansion)).tocsr() for own in masses.values()),
         "loads": {part.name: part.control for part in design.load},
         "load_terms": tuple(terms),
         "gauges": tuple(part.name for part in design.gauge),

@@ -205,22 +205,17 @@ def nodal_load(mesh: StructureMesh, load: Load, where: str) -> FloatArray:
     if load.acceleration is not None:
         return np.tile(load.acceleration, (len(mesh.points), 1))
     if load.pressure is not None:
-        assert load.set is not None
-        return -load.pressure * face_areas(mesh, mesh.faces_of(load.set, where))[0]
-    assert load.force is not None
+        return -load.pressure * face_areas(mesh, mesh.faces_of(str(load.set), where))[0]
     force = np.asarray(load.force)
     if load.point is not None:
         return np.outer(point_shares(mesh, load.point, where), force)
-    assert load.set is not None
-    nodes = mesh.nodes_of(load.set, where)
-    surface = mesh.faces_between(load.set, nodes)
+    nodes = mesh.nodes_of(str(load.set), where)
+    surface = mesh.faces_between(str(load.set), nodes)
     shares = np.zeros(len(mesh.points))
+    shares[nodes] = 1.0
     if len(surface):
         _, shares = face_areas(mesh, surface)
-        shares /= shares.sum()
-    else:
-        shares[nodes] = 1.0 / len(nodes)
-    return np.outer(shares, force)
+    return np.outer(shares / shares.sum(), force)
 
 
 def point_shares(mesh: StructureMesh, point: tuple[float, float, float], where: str) -> FloatArray:

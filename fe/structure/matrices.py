@@ -17,7 +17,7 @@ from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError, SolutionError
 
-from .affine import DesignedStructure, StiffnessTerm, designed
+from .affine import AffineStructure, StiffnessTerm, designed
 from .design import Extension, MatrixDesign, MatrixLoad, MatrixMass, NodeOutput, unit_vector
 from .matrix_files import Place, read_matrix, read_unknowns, read_vector
 from .tables import MOTIONS, Vector
@@ -153,7 +153,7 @@ class Matrices:
         return sparse.csr_array(0.5 * (matrix + matrix.T))
 
 
-def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> DesignedStructure:
+def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> AffineStructure:
     """Make the affine operators of a structure from matrices.
 
     Raises
@@ -187,7 +187,7 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> D
             for key in ("gauge", "displacement", "acceleration")
         },
     )
-    return DesignedStructure(
+    return AffineStructure(
         **fields | {"expansion": design.unit * _expansion(files)[:, free]},
         stiffness_terms=tuple(_stiffness_terms(design, files, stiffness, free)),
         design_hash=design_hash,

@@ -15,7 +15,7 @@ from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError, MeshError
 from reporting.files import atomic_file
 
-from .affine import DesignedStructure, StiffnessTerm, designed, static_response
+from .affine import AffineStructure, StiffnessTerm, designed, static_response
 from .design import Damage, Material, MatrixDesign, MeshDesign, load_structure, structure_hash
 from .location import gauge_rows, nodal_load, point_shares
 from .matrices import assemble_matrices
@@ -25,7 +25,7 @@ from .supports import SupportedUnknowns, supported
 
 
 @dataclass(frozen=True)
-class Structure(DesignedStructure):
+class Structure(AffineStructure):
     """Finite element model of a structure.
 
     Attributes
@@ -143,7 +143,7 @@ def load_and_assemble(
     return assemble(design, mesh, digest, mass_as_stiffness=mass_as_stiffness)
 
 
-def assemble_structure(file: Path | str, memory_limit: float | None = None) -> DesignedStructure:
+def assemble_structure(file: Path | str, memory_limit: float | None = None) -> AffineStructure:
     """Read a structure file with its mesh or matrices; parameters and errors as of `load_and_assemble`."""
     design, folder = load_structure(file), Path(file).parent
     if isinstance(design, MatrixDesign):

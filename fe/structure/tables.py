@@ -136,6 +136,11 @@ class Region(Named):
 
     largest_loss: float = Field(default=0.8, gt=0.0, le=0.95)
 
+    @property
+    def range(self) -> tuple[float, float]:
+        """Least and largest loss."""
+        return (0.0, self.largest_loss)
+
 
 class ChosenMass(Ranged):
     """Mass [kg]; `free` where it is to be calibrated or chosen later."""
@@ -186,7 +191,7 @@ class StructureDesign(Part):
 
     what: ClassVar[str]
     """What its files hold."""
-    scaled_table: ClassVar[str]
+    scaled_table: ClassVar[str] = ""
     """Name of the tables that a parameter may scale."""
     own_names: ClassVar[tuple[str, ...]] = ()
     """Further tables whose names must differ from one another."""
@@ -219,8 +224,8 @@ class StructureDesign(Part):
                 if first.setdefault(part.name, place) != place:
                     both = f"{first[part.name]} and {place} are both named {part.name!r}"
                     raise ValueError(f"{both}; give each a name of its own")
-        table = self.scaled_table
-        self._check_ties(table, "scaled_by", "parameter", "is scaled by", f"scales no {table}")
+        if table := self.scaled_table:
+            self._check_ties(table, "scaled_by", "parameter", "is scaled by", f"scales no {table}")
         self._check_ties("load", "control", "control", "is tied to the control", "commands no load")
         return self
 
@@ -239,3 +244,10 @@ class StructureDesign(Part):
     def unit(self) -> float:
         """Metres in the unit of length."""
         return UNITS[self.length_unit]
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Least and largest value for which a reduced model is to hold of all that can be chosen, by name."""
+        free = (part for part in self.mass if part.free)
+        chosen: tuple[Ranged | Region, ...] = (*self.parameter, *self.damage, *free, *self.control)
+        return {part.name: part.range for part in chosen}

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fe.elements.cells import gradients, strain_matrix
+from fe.elements.kinds import gauss_points
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
@@ -21,8 +22,7 @@ from .calculix_job import read_frequencies, read_tables, run_calculix
 
 TEST_FORCE = 10.0
 """Upward force of the static test and before the ring-down [N]."""
-_LINE = 0.5 + 0.5 * np.sqrt(0.6) * np.array([-1.0, 0.0, 1.0])
-INTEGRATION_POINTS = np.array([(x, y, z) for z in _LINE for y in _LINE for x in _LINE])
+INTEGRATION_POINTS = gauss_points(3)[0][:, ::-1]
 """Local places (27, 3) in 0..1 of the integration points of a C3D20 element, in the order of its output."""
 # Places of our strains in the order in which CalculiX prints a strain tensor: xx, yy, zz, xy, xz, yz.
 _PRINTED = [0, 1, 2, 5, 4, 3]

@@ -24,11 +24,10 @@ from fe.elements.cells import (
 )
 from fe.elements.kinds import gauss_points
 from fe.runtime.arrays import FloatArray, IntArray
-from fe.runtime.state import DigitalState
-from fe.structure.affine import AffineStructure, LoadTerm, StiffnessTerm
+from fe.structure.affine import AffineStructure, StiffnessTerm, designed
 from fe.structure.supports import RigidSet, SupportedUnknowns, rigid_motions
 
-from .design import WingDesign
+from .design import WingDesign, wing_structure
 from .mesh import WingMesh, build_mesh
 from .parts import PointMassPlace
 from .turn_load import STANDARD_GRAVITY, lift_load
@@ -103,54 +102,48 @@ class AffineWing(AffineStructure):
     def of(
         cls,
         regions: tuple[str, ...],
-        stiffness: tuple[sparse.csr_array, ...],
-        load_lift: FloatArray,
-        load_tip: FloatArray,
+        stiffness: Iterable[sparse.csr_array],
+        masses: Iterable[sparse.csr_array],
+        loads: Iterable[FloatArray],
         gauge_output: sparse.csr_array,
         tip: FloatArray,
+        expansion: sparse.csr_array,
         **own: Any,
     ) -> Self:
-        """Name what a wing is made of.
+        """Name what a wing is made of; all but its stiffness is given on all unknowns.
 
         Parameters
         ----------
         regions : tuple of str
             Names of the K damage regions.
-        stiffness : tuple of csr (n, n)
+        stiffness : iterable of csr (n, n)
             Skin without the damage regions, each of these, and the rest with the root springs [N/m].
-        load_lift : (n,) N
-            Load of a turn at load factor 1.
-        load_tip : (n,) 1
-            Upward load of 1 N at the place of the static test; as a row, the displacement there.
-        gauge_output : csr (gauges, n) 1/m
+        masses : iterable of csr (full, full)
+            Structure [kg], and 1 kg in each servo and in the pitot [1].
+        loads : iterable of (full,)
+            A turn at load factor 1 [N], and 1 N upwards at the place of the static test [1].
+        gauge_output : csr (gauges, full) 1/m
             Strain of each gauge, positive in compression (upper skin under positive lift), dimensionless.
-        tip : (n,) 1
+        tip : (full,) 1
             Upward displacement at the tip, on the chord line of the static test.
+        expansion : csr (full, n)
+            Free unknowns to all unknowns.
         **own
-            Mass terms [kg] of the structure and of 1 kg in each servo and in the pitot, expansion, hash.
+            Hash, and what a subclass holds.
         """
-        state = DigitalState()
         pairs = (("young_modulus_factor", None), *((None, name) for name in regions), (None, None))
+        outputs = {
+            "gauge": gauge_output,
+            "displacement": sparse.csr_array(tip[np.newaxis]),
+            "acceleration": sparse.csr_array((0, len(tip))),
+        }
+        structure, *point_masses = masses
+        design = wing_structure(regions, gauge_output.shape[0])
         return cls(
-            parameters={"young_modulus_factor": state.young_modulus_factor},
-            masses=point_masses(state.servo_mass, state.pitot_mass),
-            controls={"load_factor": 1.0, "tip_force": 0.0},
-            control_units={"load_factor": "1", "tip_force": "N"},
-            ranges={},
-            regions=regions,
+            **designed(design, expansion, structure, point_masses, loads, outputs),
             stiffness_terms=tuple(
                 StiffnessTerm(term, *pair) for term, pair in zip(stiffness, pairs, strict=True)
             ),
-            loads={"lift": "load_factor", "tip": "tip_force"},
-            load_terms=(LoadTerm("lift", load_lift), LoadTerm("tip", load_tip)),
-            gauges=tuple(f"gauge_{number}" for number in range(1, gauge_output.shape[0] + 1)),
-            displacements=("tip",),
-            accelerations=(),
-            gauge_output=gauge_output,
-            displacement_output=sparse.csr_array(tip[np.newaxis]),
-            acceleration_output=sparse.csr_array((0, len(tip))),
-            damping_alpha=state.damping_alpha,
-            damping_beta=state.damping_beta,
             **own,
         )
 
@@ -354,32 +347,26 @@ def assemble(design: WingDesign) -> AffineOperators:
     """
     mesh = build_mesh(design)
     held = root_support(mesh)
-    expansion = held.expansion
-    restriction = expansion.T.tocsr()
-
-    def reduced(matrix: sparse.csr_array) -> sparse.csr_array:
-        return (restriction @ (matrix @ expansion)).tocsr()
-
+    restriction, expansion = held.expansion.T.tocsr(), held.expansion
     parts = [np.flatnonzero(mesh.stiffness_term == term) for term in range(len(design.regions) + 2)]
-    *skin, rest = (reduced(matrix) for matrix in stiffness_parts(mesh, parts))
+    *skin, rest = ((restriction @ (part @ expansion)).tocsr() for part in stiffness_parts(mesh, parts))
     masses = [mesh.mass(np.arange(len(mesh.cells)), cell_density(mesh))]
     for places in all_point_mass_weights(mesh):
         columns = sparse.csr_array(np.array(places).reshape(-1, len(mesh.points)).T)
         masses.append(columns @ columns.T)
     span, load = design.planform.semi_span, design.tip_load
     at_load, at_tip = (
-        np.asarray(restriction @ upward(section_displacement(mesh, place, load.chord)))
+        upward(section_displacement(mesh, place, load.chord))
         for place in (span - load.distance_from_tip, span)
     )
     return AffineOperators.of(
-        regions=design.regions,
-        stiffness=(*skin, (rest + held.stiffness).tocsr()),
-        mass_terms=tuple(reduced(sparse.kron(mass, sparse.eye_array(3), format="csr")) for mass in masses),
-        load_lift=np.asarray(restriction @ turn_load(mesh)),
-        load_tip=at_load,
-        gauge_output=(gauge_output(mesh) @ expansion).tocsr(),
-        tip=at_tip,
-        expansion=expansion,
+        design.regions,
+        (*skin, (rest + held.stiffness).tocsr()),
+        (sparse.kron(mass, sparse.eye_array(3), format="csr") for mass in masses),
+        (turn_load(mesh), at_load),
+        gauge_output(mesh),
+        at_tip,
+        expansion,
         design_hash=design.hash,
         wing_mesh=mesh,
     )

@@ -211,22 +211,25 @@ class FmuInstance(Instance):
 
     def _advance_many(self) -> None:
         first, size = self._begin.value, self._size.value
-        for number in range(self._plan.substeps):
-            self._begin.value = first + number * size
-            try:
+        number = 0
+        try:
+            for number in range(self._plan.substeps):
+                self._begin.value = first + number * size
                 if number and self._lines is not None:
                     self._follow(self._lines)
                 self._advance()
-            except FmuError as error:
-                if number == 0 or isinstance(error, FmuEndedError):
-                    raise
-                # Between two observations it cannot go back to the last one.
-                self.lost = True
-                raise type(error)(
-                    f"{error.sentence} It was step {number + 1} of the {self._plan.substeps} between two "
-                    "observations: reset the asset or restore a state to go on.",
-                    error.messages,
-                ) from error
+        except FmuError as error:
+            if number == 0 or isinstance(error, FmuEndedError):
+                raise
+            # Between two observations it cannot go back to the last one.
+            self.lost = True
+            raise type(error)(
+                f"{error.sentence} It was step {number + 1} of the {self._plan.substeps} between two "
+                "observations: reset the asset or restore a state to go on.",
+                error.messages,
+            ) from error
+        finally:
+            self._begin.value = first  # the request is the caller's, and what a later start is compared by
 
     def read(self) -> None:
         """Read the outputs of this moment into the reply block."""

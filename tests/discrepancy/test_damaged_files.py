@@ -12,22 +12,9 @@ from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.errors import DiscrepancyError
 from discrepancy.models.fmu_file import load_fmu_model
 from discrepancy.models.lumped_file import SHIPPED_MODELS, load_lumped
+from tests.refusals import Inputs
 
-CAMPAIGN = """\
-format = 1
-name = "release"
-[[channel]]
-name = "tip"
-quantity = "displacement"
-unit = "mm"
-output = "tip"
-noise = { standard_deviation = 0.1 }
-[[trial]]
-name = "release"
-kind = "ringdown"
-file = "release.csv"
-release = { displacement = 10.0, unit = "mm" }
-"""
+CAMPAIGN = Inputs(__file__).text("campaign.toml")
 TABLE = "time,tip\n" + "".join(f"{0.01 * n:.2f},{10.0 - 0.1 * n:.1f}\n" for n in range(60))
 
 

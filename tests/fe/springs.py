@@ -9,11 +9,11 @@ import numpy as np
 from scipy import sparse
 
 from fe.reduction.reduced_basis import Reduction, reduce_model
-from fe.reduction.settings import ModalSettings, ReductionSettings
+from fe.reduction.settings import ModalSettings, StructureSettings
 from fe.runtime.state import region_names
 from fe.wing.operators import AffineWing
 
-SETTINGS = ReductionSettings(modal=ModalSettings(mode_count=4, frequency_tolerance=1e-5))
+SETTINGS = StructureSettings(modal=ModalSettings(mode_count=4, frequency_tolerance=1e-5))
 PIECES = ((6, 20), (30, 48), (48, 56), (20, 24), (24, 28), (2, 6), (28, 30), (56, 60))
 """First and last spring, of sixty, of the damage regions of a chain; the first holds every other one."""
 
@@ -37,14 +37,13 @@ def springs(regions: int = 2, root: float = 1.0) -> AffineWing:
     # each gauge is a mean over a piece of the chain, so that no spring decides alone
     places = np.linspace(0, count - 9, 24).astype(int)
     return AffineWing.of(
-        regions=region_names(regions),
-        stiffness=tuple((stretch.T @ sparse.diags_array(1e3 * row) @ stretch).tocsr() for row in kind),
-        mass_terms=tuple(sparse.diags_array(row).tocsr() for row in masses),
-        load_lift=random.uniform(0.5, 1.5, count),
-        load_tip=tip,
-        gauge_output=sparse.csr_array((np.eye(count)[places + 8] - np.eye(count)[places]) / 8),
-        tip=tip,
-        expansion=sparse.eye_array(count).tocsr(),
+        region_names(regions),
+        ((stretch.T @ sparse.diags_array(1e3 * row) @ stretch).tocsr() for row in kind),
+        (sparse.diags_array(row).tocsr() for row in masses),
+        (random.uniform(0.5, 1.5, count), tip),
+        sparse.csr_array((np.eye(count)[places + 8] - np.eye(count)[places]) / 8),
+        tip,
+        sparse.eye_array(count).tocsr(),
         design_hash="a chain",
     )
 

@@ -1,16 +1,13 @@
 """Our FMUs and others', packed once; a small wing of springs and masses stands for the real one."""
 
-from __future__ import annotations
-
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
-from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.errors import FmuBuildError
@@ -18,7 +15,7 @@ from scenarios import binding_files
 from tests.conftest import BEAM
 from tests.fmu_asset.chain import chain_arrays, chain_model
 from tests.fmu_asset.making import with_dependencies
-from tests.fmu_asset.ours import OurFmus, three_regions
+from tests.fmu_asset.ours import OurFmus
 from tests.kept import FE, kept
 
 
@@ -48,11 +45,6 @@ def compiler() -> list[str]:
 
 
 @pytest.fixture(scope="session")
-def make_model() -> Callable[[float], ReducedModel]:
-    return chain_model
-
-
-@pytest.fixture(scope="session")
 def model() -> ReducedModel:
     return chain_model()
 
@@ -71,38 +63,19 @@ def beam_model(request: pytest.FixtureRequest) -> ReducedModel:
 @pytest.fixture(scope="session")
 def ours(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> OurFmus:
     """Pack our own FMUs: `ours("compiled")` is a path."""
-    models = {
-        "chain": chain_model,
-        "regions": three_regions,
-        "beam": lambda: request.getfixturevalue("beam_model"),
-    }
-    return OurFmus(tmp_path_factory.mktemp("ours"), models)
+    return OurFmus(tmp_path_factory.mktemp("ours"), lambda: request.getfixturevalue("beam_model"))
 
 
-@pytest.fixture(scope="session")
-def fmu(ours: OurFmus) -> Path:
-    return ours("python")
+def _packed(name: str) -> Any:
+    def made(ours: OurFmus) -> Path:
+        return ours(name)
+
+    return pytest.fixture(scope="session")(made)
 
 
-@pytest.fixture(scope="session")
-def compiled_fmu(ours: OurFmus) -> Path:
-    return ours("compiled")
-
-
-@pytest.fixture(scope="session")
-def compiled_beam(ours: OurFmus) -> Path:
-    return ours("compiled_beam")
-
-
-@pytest.fixture(scope="session")
-def spring_mass(ours: OurFmus) -> Path:
-    return ours("spring_mass")
-
-
-@pytest.fixture(scope="session")
-def companions(ours: OurFmus) -> dict[str, Path]:
-    """The companion FMUs."""
-    return {name: ours(name) for name in COMPANION_NAMES}
+fmu, compiled_fmu, spring_mass = map(_packed, ("python", "compiled", "spring_mass"))
+linear_fmu = _packed("linear")
+"""The linear system as pythonfmu exports it: it declares no dependencies, so all outputs have all."""
 
 
 @pytest.fixture(scope="session")
@@ -113,12 +86,6 @@ def binding() -> Binding:
 @pytest.fixture(scope="session")
 def spring_binding() -> Binding:
     return load_binding(Path(__file__).parent / "door" / "bindings" / "spring_mass.toml")
-
-
-@pytest.fixture(scope="session")
-def linear_fmu(ours: OurFmus) -> Path:
-    """The linear system as pythonfmu exports it: it declares no dependencies, so all outputs have all."""
-    return ours("linear")
 
 
 @pytest.fixture(scope="session")

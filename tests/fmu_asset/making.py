@@ -1,7 +1,5 @@
 """What these tests make things with: archives, changed FMUs, bindings, systems, other processes."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

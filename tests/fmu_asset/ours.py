@@ -1,12 +1,10 @@
 """Our own FMUs by name, each packed once and kept between runs where that takes a compiler."""
 
-from __future__ import annotations
-
-import hashlib
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,7 @@ from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import asset_scripts
 from tests.fmu_asset.chain import chain_arrays, chain_model
-from tests.kept import FMU, packed
+from tests.kept import compiled_wing, packed
 
 HERE = Path(__file__).parent
 REGIONS = ("z1", "z2", "tip_panel")
@@ -66,18 +64,19 @@ NAMES = (*STRUCTURES, *EXPORTED, *COMPANION_NAMES, *asset_scripts())
 
 
 class OurFmus:
-    """Packs each FMU once.
+    """Packs each FMU once; what took a compiler or another program is kept between runs.
 
     Parameters
     ----------
     folder : Path
         Where the FMUs are put.
-    models : mapping of str to callable
-        The reduced models by name.
+    beam : callable
+        Returns the reduced beam.
     """
 
-    def __init__(self, folder: Path, models: dict[str, Callable[[], ReducedModel]]) -> None:
-        self._folder, self._models = folder, models
+    def __init__(self, folder: Path, beam: Callable[[], ReducedModel]) -> None:
+        self._folder = folder
+        self._models = {"chain": chain_model, "regions": partial(chain_model, regions=REGIONS), "beam": beam}
 
     def __call__(self, name: str) -> Path:
         """Return the FMU of a name."""
@@ -85,18 +84,16 @@ class OurFmus:
         return path if path.exists() else self.write(name, path)
 
     def write(self, name: str, path: Path) -> Path:
-        """Pack it anew; what took a compiler or another program is kept between runs."""
+        """Pack it anew."""
         if name in STRUCTURES:
-            which, options = STRUCTURES[name]
-            model = self._models[which]()
+            options = STRUCTURES[name][1]
             if options.get("kind") != "compiled":
-                return build_fmu(model, path, **options).path
+                return build_fmu(self.model(name), path, **options).path
             try:
                 find_compiler()
             except FmuBuildError as error:
                 pytest.skip(f"no C compiler: {error}")
-            inputs = hashlib.sha256(model.to_bytes()).hexdigest(), options
-            return packed(path, lambda: build_fmu(model, path, **options), FMU, inputs)
+            return compiled_wing(self.model(name), path, **options)
         if name in EXPORTED:
             return packed(path, lambda: exported(path, *EXPORTED[name]), EXPORTED[name][:1], name)
         if name in COMPANION_NAMES:
@@ -116,8 +113,3 @@ def exported(path: Path, script: Path, class_name: str, options: tuple[str, ...]
     words = [sys.executable, "-m", "pythonfmu", "build", "-f", f"{class_name}.py", *options]
     subprocess.run(words, cwd=folder, check=True, capture_output=True)
     (folder / f"{class_name}.fmu").rename(path)
-
-
-def three_regions() -> ReducedModel:
-    """Return a wing with other damage regions than the shipped two."""
-    return chain_model(regions=REGIONS)

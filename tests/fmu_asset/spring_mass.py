@@ -5,6 +5,7 @@ Copied to a folder of its own and built there; it is never imported by the tests
 
 import builtins
 import ctypes
+import itertools
 import json
 import math
 import os
@@ -12,8 +13,48 @@ import time
 
 from pythonfmu import Boolean, Fmi2Causality, Fmi2Slave, Fmi2Variability, Integer, Real
 
-FINE, NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD, WANDER, TALK, LOOP = range(9)
-HOLD, SPOIL_JSON, SPOIL_BUILTINS, ESCAPES, READ = range(9, 14)
+
+def broken(_, text="the spring broke"):
+    raise ArithmeticError(text)
+
+
+def spoil_json(mass):
+    json.JSONEncoder.encode = json.dumps = lambda *_, **__: "spoilt"
+    broken(mass)
+
+
+def talk(mass):
+    print("chatter " * 100_000, flush=True)  # noqa: T201
+    mass.log("the spring creaks")
+
+
+def escape(mass):
+    mass.log("\x1b[2J\x1b]0;owned\x07 the spring \x9b31mcreaks")
+    broken(mass, "\x1b[31mthe spring broke")
+
+
+def read(_):
+    with open(os.environ["HOSTILE_TARGET"]) as file:  # noqa: PTH123
+        file.read()
+
+
+DEEDS = (
+    lambda _: None,
+    lambda mass: setattr(mass, "position", math.nan),
+    lambda _: time.sleep(60.0),
+    lambda _: os.abort(),
+    broken,
+    lambda _: False,
+    lambda _: os.chdir("/"),
+    talk,
+    lambda _: all(itertools.repeat(1)),
+    lambda _: ctypes.PyDLL(None).sleep(600),  # a PyDLL keeps the lock of the interpreter
+    spoil_json,
+    lambda _: setattr(builtins, "len", lambda _: 3),
+    escape,
+    read,
+)
+"""What it does by the number of its misbehaviour, before it moves; False refuses the step."""
 
 
 class SpringMass(Fmi2Slave):
@@ -21,62 +62,26 @@ class SpringMass(Fmi2Slave):
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
-        self.force = 0.0
-        self.stiffness = 4.0
-        self.locked = False
-        self.misbehaviour = FINE
-        self.position = 0.0
-        self.velocity = 0.0
-        self.steps = 0
-        for name in ("force", "stiffness"):
-            self.register_variable(Real(name, causality=Fmi2Causality.input))
-        self.register_variable(
-            Boolean("locked", causality=Fmi2Causality.input, variability=Fmi2Variability.discrete)
-        )
-        self.register_variable(
-            Integer("misbehaviour", causality=Fmi2Causality.input, variability=Fmi2Variability.discrete)
-        )
-        for name in ("position", "velocity"):
-            self.register_variable(Real(name, causality=Fmi2Causality.output))
-        self.register_variable(
-            Integer("steps", causality=Fmi2Causality.output, variability=Fmi2Variability.discrete)
-        )
+        self.force, self.stiffness, self.locked, self.misbehaviour = 0.0, 4.0, False, 0
+        self.position, self.velocity, self.steps = 0.0, 0.0, 0
+        given, shown = {"causality": Fmi2Causality.input}, {"causality": Fmi2Causality.output}
+        discrete = {"variability": Fmi2Variability.discrete}
+        for variable in (
+            Real("force", **given),
+            Real("stiffness", **given),
+            Boolean("locked", **given, **discrete),
+            Integer("misbehaviour", **given, **discrete),
+            Real("position", **shown),
+            Real("velocity", **shown),
+            Integer("steps", **shown, **discrete),
+        ):
+            self.register_variable(variable)
 
     def do_step(self, current_time, step_size):
-        if self.misbehaviour == NOT_A_NUMBER:
-            self.position = math.nan
-        elif self.misbehaviour == SLEEP:
-            time.sleep(60.0)
-        elif self.misbehaviour == LOOP:
-            while True:
-                pass
-        elif self.misbehaviour == HOLD:
-            ctypes.PyDLL(None).sleep(600)  # a PyDLL keeps the lock of the interpreter
-        elif self.misbehaviour == SPOIL_JSON:
-            json.JSONEncoder.encode = json.dumps = lambda *_, **__: "spoilt"
-            raise ArithmeticError("the spring broke")
-        elif self.misbehaviour == SPOIL_BUILTINS:
-            builtins.len = lambda _: 3
-        elif self.misbehaviour == ESCAPES:
-            self.log("\x1b[2J\x1b]0;owned\x07 the spring \x9b31mcreaks")
-            raise ArithmeticError("\x1b[31mthe spring broke")
-        elif self.misbehaviour == READ:
-            with open(os.environ["HOSTILE_TARGET"]) as file:  # noqa: PTH123
-                file.read()
-        elif self.misbehaviour == DIE:
-            os.abort()
-        elif self.misbehaviour == RAISE:
-            raise ArithmeticError("the spring broke")
-        elif self.misbehaviour == DISCARD:
+        if DEEDS[self.misbehaviour](self) is False:
             return False
-        elif self.misbehaviour == WANDER:
-            os.chdir("/")
-        elif self.misbehaviour == TALK:
-            print("chatter " * 100_000, flush=True)  # noqa: T201
-            self.log("the spring creaks")
-        if not self.locked and self.misbehaviour != NOT_A_NUMBER:
-            for _ in range(100):
-                self.velocity += (self.force - self.stiffness * self.position) * step_size / 100
-                self.position += self.velocity * step_size / 100
+        for _ in range(0 if self.locked or math.isnan(self.position) else 100):
+            self.velocity += (self.force - self.stiffness * self.position) * step_size / 100
+            self.position += self.velocity * step_size / 100
         self.steps += 1
         return True

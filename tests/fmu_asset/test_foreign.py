@@ -1,39 +1,28 @@
 """FMUs of FMI 1, 2 and 3 as others export them: what they end and refuse, and what is refused of them."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from fmu_asset import errors
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import (
-    BindingError,
-    FmuCallError,
-    FmuEndedError,
-    FmuFileError,
-    FmuInputError,
-    FmuUnsupportedError,
-    FmuWorkerError,
-)
-from tests.fmu_asset.door.kinds import BINDINGS, bounces
+from tests.fmu_asset.door.kinds import BINDINGS, INPUTS, bounces
 from tests.fmu_asset.making import archive_of, bound, changed, members
 
 LAG, FIXED, ARRAY, BALL = (BINDINGS[name] for name in ("lag1", "fixed2", "array3", "ball2"))
 
 
-def test_an_error_is_the_end_of_an_instance_and_a_state_goes_on(foreign_fmu: Any, isolated: bool) -> None:
+def test_an_error_is_the_end_of_an_instance_and_a_state_goes_on(foreign_fmu, isolated) -> None:
     """Of FMI 1, by replay; a refusal between two observations leaves nothing to go on from."""
     with FmiAsset(foreign_fmu("lag1"), LAG, isolated=isolated, parameters={"gain": 3.0}) as asset:
         held = asset.step({"speed": 2.0}).values
         saved = asset.save_state()
-        with pytest.raises(FmuInputError, match=r"parameter\.gain = 101\.0 lies outside .* 0 to 100"):
+        with pytest.raises(errors.FmuInputError, match=r"parameter\.gain = 101\.0 lies outside .* 0 to 100"):
             asset.reset({"gain": 101.0})
-        with pytest.raises(FmuCallError, match=r"(?s)fmiDoStep returned Error.*saturates"):
+        with pytest.raises(errors.FmuCallError, match=r"(?s)fmiDoStep returned Error.*saturates"):
             asset.step({"speed": 1500.0})
         asset.restore_state(saved)
         np.testing.assert_array_equal(asset.observe().values, held)
@@ -41,34 +30,34 @@ def test_an_error_is_the_end_of_an_instance_and_a_state_goes_on(foreign_fmu: Any
         asset.step({"u": 3.0})
         saved = asset.save_state()
         following = asset.step({"u": -1.0}).values
-        with pytest.raises(FmuCallError, match=r"It was step 5\d of the 100 between two observations"):
+        with pytest.raises(errors.FmuCallError, match=r"It was step 5\d of the 100 between two observations"):
             asset.step({"u": 2e6})
         asset.restore_state(saved)
         np.testing.assert_array_equal(asset.step({"u": -1.0}).values, following)
     wrong = changed(FIXED, header={"decimation": 1, "step_size": 1.0})
     with (
         FmiAsset(foreign_fmu("fixed2"), wrong, isolated=isolated) as asset,
-        pytest.raises(FmuCallError, match=r"(?s)fmi2DoStep returned Error.*the sample time is 0\.01 s"),
+        pytest.raises(
+            errors.FmuCallError, match=r"(?s)fmi2DoStep returned Error.*the sample time is 0\.01 s"
+        ),
     ):
         asset.step()
 
 
-def test_what_is_recorded_is_in_the_units_of_the_fmu(foreign_fmu: Any) -> None:
+def test_what_is_recorded_is_in_the_units_of_the_fmu(foreign_fmu) -> None:
     asset = FmiAsset(foreign_fmu("room2"), BINDINGS["room2"])
     assert asset.recorded_units == {"der(room.T)": "K/s", "room.T": "K"}
 
 
-def test_fmi_3_asks_to_end_or_returns_early(foreign_fmu: Any, isolated: bool) -> None:
+def test_fmi_3_asks_to_end_or_returns_early(foreign_fmu, isolated) -> None:
     with FmiAsset(foreign_fmu("array3"), ARRAY, isolated=isolated) as asset:
         for offset, words in ((99, "asked to end the simulation in the step"), (98, "returned early")):
             asset.reset()
-            with pytest.raises(FmuCallError, match=words):
+            with pytest.raises(errors.FmuCallError, match=words):
                 asset.step(load={"offset": offset})
 
 
-def test_a_nominal_of_zero_counts_as_one_and_an_identifier_may_have_a_hyphen(
-    foreign_fmu: Any, tmp_path: Path
-) -> None:
+def test_a_nominal_of_zero_counts_as_one_and_an_identifier_may_have_a_hyphen(foreign_fmu, tmp_path) -> None:
     contents = {
         name.replace("ball2", "ball-2"): text.replace(b'modelIdentifier="ball2"', b'modelIdentifier="ball-2"')
         for name, text in members(foreign_fmu("ball2", "NOMINAL=0.0")).items()
@@ -82,39 +71,31 @@ def test_a_nominal_of_zero_counts_as_one_and_an_identifier_may_have_a_hyphen(
 SECOND_BOUNCE = math.sqrt(2.0 / 9.81) * 2.4
 
 
-@pytest.mark.parametrize(
-    ("model", "observed", "size", "end", "value"),
-    [
-        ("hostile2", ("y", "m"), 1.0, 2.5, 2.5),
-        ("ball2", ("h", "m"), 0.1, SECOND_BOUNCE, 0.0),
-        ("decay1", ("x", "K"), 0.3, 1.0, math.exp(-1.0)),
-        ("swing3", ("a", "1"), 0.3, 1.0, 1.0),
-    ],
-)
-def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(
-    foreign_fmu: Any,
-    isolated: bool,
-    model: str,
-    observed: tuple[str, str],
-    size: float,
-    end: float,
-    value: float,
-) -> None:
+ENDS = {  # what is observed, the step, where it ends, and what is seen there
+    "hostile2": ("y", "m", 1.0, 2.5, 2.5),
+    "ball2": ("h", "m", 0.1, SECOND_BOUNCE, 0.0),
+    "decay1": ("x", "K", 0.3, 1.0, math.exp(-1.0)),
+    "swing3": ("a", "1", 0.3, 1.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("model", ENDS)
+def test_an_fmu_that_ends_its_simulation_leaves_what_was_simulated(foreign_fmu, isolated, model) -> None:
     """Discard and `fmi2Terminated`; events of model exchange in FMI 2, 1 and 3."""
+    name, unit, size, end, value = ENDS[model]
     sent = {"control": {"u": ("u", "m/s")}} if model == "hostile2" else {}
-    with FmiAsset(
-        foreign_fmu(model, "ENDS"), bound(size, {"y": observed}, **sent), isolated=isolated
-    ) as asset:
+    binding = bound(size, {"y": (name, unit)}, **sent)
+    with FmiAsset(foreign_fmu(model, "ENDS"), binding, isolated=isolated) as asset:
         history = asset.simulate(steps=50)
         assert f"ended at t = {end:g} s" in history.ended
         whole = int(end / size)
         np.testing.assert_allclose(history.time, [*(size * np.arange(1, whole + 1)), end], rtol=1e-6)
         assert history.values[-1, 0] == pytest.approx(value, abs=1e-5)
-        with pytest.raises(FmuEndedError, match="has ended its simulation at t = "):
+        with pytest.raises(errors.FmuEndedError, match="has ended its simulation at t = "):
             asset.step()
         asset.reset()
         assert [asset.step().values[0] for _ in range(whole)] == history.values[:whole, 0].tolist()
-        with pytest.raises(FmuEndedError, match="asked to end the simulation in the step") as caught:
+        with pytest.raises(errors.FmuEndedError, match="asked to end the simulation in the step") as caught:
             asset.step()
         assert caught.value.time == pytest.approx(end, rel=1e-6)
         assert asset.observe().values[0] == history.values[-1, 0]
@@ -126,58 +107,33 @@ def port(force: Any, force_unit: str, **motion: tuple[Any, str]) -> dict[str, An
     return {"port": {"p": {name: {"variables": v, "unit": unit} for name, (v, unit) in ends.items()}}}
 
 
-UNBOUND: list[tuple[dict[str, Any], str]] = [
-    *(
-        ({"load": {"it": (variable, "1")}}, rf"load\.it of the binding bound .*{sentence}")
-        for variable, sentence in (
-            ("ticked", "which changes with a clock; clocks are not supported"),
-            ("blob", "is of type Binary; only numbers can be bound"),
-            ("tick", "is of type Clock; only numbers can be bound"),
-            ("u[4]", "but 'u' has 3 elements, counted from 1"),
-            ("u[0]", "but 'u' has 3 elements, counted from 1"),
-            ("u[1,1]", "but 'u' has 3 elements, counted from 1"),
-            ("n", "must be of causality input, but 'n' is declared as structuralParameter"),
-            ("activ", "not a variable of .*did you mean 'active'"),
-        )
-    ),
-    (
-        {"load": {"all": ("u", "1"), "one": ("u[2]", "1")}},
-        r"load\.one and load\.all set the same value of 'u'; keep one",
-    ),
-    (
-        port(["u[2]", "u[2]"], "N", displacement=(["y[1]", "y[2]"], "mm")),
-        r"port\.p\.force and port\.p\.force set the same value of 'u'; keep one",
-    ),
-    (port("u", "1"), "needs a displacement or a velocity"),
-    (port("u", "N", velocity=("v", "m")), "velocity is in 'm', but must be in m/s or rad/s"),
-]
-
-
-@pytest.mark.parametrize(("roles", "sentence"), UNBOUND, ids=[sentence[-30:] for _, sentence in UNBOUND])
-def test_what_cannot_be_bound_is_named(foreign_fmu: Any, roles: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(BindingError, match=sentence):
+@pytest.mark.parametrize(("roles", "sentence"), INPUTS["unbound"])
+def test_what_cannot_be_bound_is_named(foreign_fmu, roles, sentence) -> None:
+    with pytest.raises(errors.BindingError, match=sentence):
         FmiAsset(foreign_fmu("array3"), bound(1.0, {"y": ("y", "mm")}, **roles))
 
 
-def test_other_kinds_are_refused_with_their_reason(foreign_fmu: Any) -> None:
-    with pytest.raises(BindingError, match=r"is for FMI 2\.0, but .* is of FMI 1\.0"):
+def test_other_kinds_are_refused_with_their_reason(foreign_fmu) -> None:
+    with pytest.raises(errors.BindingError, match=r"is for FMI 2\.0, but .* is of FMI 1\.0"):
         FmiAsset(foreign_fmu("lag1"), changed(LAG, header={"fmi_version": "2.0"}))
-    with pytest.raises(FmuUnsupportedError, match=r"offers model-exchange only, .* asks for co-simulation"):
+    with pytest.raises(
+        errors.FmuUnsupportedError, match=r"offers model-exchange only, .* asks for co-simulation"
+    ):
         FmiAsset(foreign_fmu("ball2"), changed(BALL, header={"interface": "co-simulation"}))
     scheduled = foreign_fmu.changed("swing3", "scheduled", ("<ModelExchange", "<ScheduledExecution"))
-    with pytest.raises(FmuUnsupportedError, match="scheduled execution is not supported"):
+    with pytest.raises(errors.FmuUnsupportedError, match="scheduled execution is not supported"):
         read_fmu(scheduled)
     change = ('<Real start="0.0"/>', '<Real start="0.0" unit="rad/s"/>')
     outside = bound(0.1, {"out": ("Out1", "1")}, control={"speed": ("In1 (rad/s)", "m")})
-    with pytest.raises(BindingError, match=r"control\.speed is in 'm', but the FMU has .* in 'rad/s'"):
+    with pytest.raises(errors.BindingError, match=r"control\.speed is in 'm', but the FMU has .* in 'rad/s'"):
         FmiAsset(foreign_fmu.changed("lag1", "unit", change), outside)
     huge = ('<Dimension start="2"/>', '<Dimension start="2000000000"/>')
     words = r"cannot be read \('y' is an array of 2000000000 elements; 10000000 are the most"
-    with pytest.raises(FmuFileError, match=words):
+    with pytest.raises(errors.FmuFileError, match=words):
         read_fmu(foreign_fmu.changed("array3", "huge", huge))
 
 
-def test_ports_are_sent_and_read(foreign_fmu: Any) -> None:
+def test_ports_are_sent_and_read(foreign_fmu) -> None:
     beam = foreign_fmu.changed(
         "room2", "beam", ('unit="W"', 'unit="kN"'), ('name="W"', 'name="kN"'),
         ('<BaseUnit kg="1" m="2" s="-3"/>', '<BaseUnit kg="1" m="1" s="-2" factor="1000"/>'),
@@ -193,7 +149,7 @@ def test_ports_are_sent_and_read(foreign_fmu: Any) -> None:
         assert shown.extra["p.displacement"] == pytest.approx(1e3 * expected)
         assert asset.recorded_units == {"p.displacement": "mm", "p.velocity": "m/s"}
     both = port(heater, "N", displacement=("ambient.T", "m"), velocity=rate)
-    with pytest.raises(BindingError, match=r"force and motion are both inputs of the FMU"):
+    with pytest.raises(errors.BindingError, match=r"force and motion are both inputs of the FMU"):
         FmiAsset(beam, bound(60.0, seen, **both))
     # Elements of an array go in, a whole array comes out.
     fmu = foreign_fmu.changed("array3", "forces", ('min="-10" max="10"', 'min="-10" max="10" unit="N"'))
@@ -203,13 +159,13 @@ def test_ports_are_sent_and_read(foreign_fmu: Any) -> None:
         expected = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]) @ [2.0, 0.0, -1.0]
         found = [shown.extra["p.displacement[1]"], shown.extra["p.displacement[2]"]]
         np.testing.assert_allclose(found, 1e-3 * expected, rtol=1e-12)
-        with pytest.raises(FmuInputError, match=r"port\.p\.force takes 2 values, but 1 came"):
+        with pytest.raises(errors.FmuInputError, match=r"port\.p\.force takes 2 values, but 1 came"):
             asset.step(port={"p.force": 1.0})
-    with pytest.raises(BindingError, match=r"port\.p\.displacement .* has 2 values and the force 3"):
+    with pytest.raises(errors.BindingError, match=r"port\.p\.displacement .* has 2 values and the force 3"):
         FmiAsset(fmu, bound(1.0, seen, **port("u", "N", displacement=("y", "m"))))
 
 
-def test_both_interfaces_in_one_fmu(foreign_fmu: Any) -> None:
+def test_both_interfaces_in_one_fmu(foreign_fmu) -> None:
     """Co-simulation is taken unless the binding says otherwise; a model without states is solved as well."""
     both = foreign_fmu.changed(
         "fixed2", "both", ("<CoSimulation", '<ModelExchange modelIdentifier="fixed2"/><CoSimulation')
@@ -222,10 +178,10 @@ def test_both_interfaces_in_one_fmu(foreign_fmu: Any) -> None:
             assert asset.step({"u": 3.0}).values[0] == pytest.approx(expected)
 
 
-def test_events_that_pile_up_are_one_sentence(foreign_fmu: Any) -> None:
+def test_events_that_pile_up_are_one_sentence(foreign_fmu) -> None:
     with FmiAsset(foreign_fmu("ball2"), bound(1.0, {"h": ("h", "mm")})) as asset:
         asset.step(), asset.step()
-        with pytest.raises(FmuCallError, match=r"10000 events in the step from t = 2 s .* pile up"):
+        with pytest.raises(errors.FmuCallError, match=r"10000 events in the step from t = 2 s .* pile up"):
             asset.step()
-        with pytest.raises(FmuWorkerError, match="reset the asset"):
+        with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
             asset.step()

@@ -295,14 +295,14 @@ class DesignSource(ReducedModelSource):
         MissingObservationModelError
             The scenario's states, controls, parameter or sensors are not those of the design's model.
         """
-        from fe.reduction.settings import ReductionSettings
+        from fe.wing.design import wing_structure
         from twin_master.assets.patches import check_model_patch
 
         calibration = self._scenario.calibration
         read_calibration(calibration)
         self.files()
         design = self._of.design()
-        ranges = {"young_modulus_factor": ReductionSettings().young_modulus_factor}
+        ranges = {part.name: part.range for part in wing_structure(design.regions, 0).parameter}
         check_calibration(
             calibration, ranges, f"the reduced model of the design {design.name}", ranges=ranges,
             design_hash=design.hash, advice=OWN_OF_WING,

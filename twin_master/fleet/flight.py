@@ -272,19 +272,20 @@ def _check_group(group: Group, scenario: Scenario) -> None:
 
 def _check_truth(group: Group, scenario: Scenario) -> None:
     """Check that the model holds where the true assets are."""
-    from fe.reduction.settings import ReductionSettings
+    from fe.wing.design import wing_structure
 
-    ranges, name = ReductionSettings(), "young_modulus_factor"
+    name, regions = "young_modulus_factor", tuple(factor.name for factor in scenario.state)
+    ranges = wing_structure(regions, 0).ranges
     own = scenario.asset.true_parameters.get(name, 1.0)
     e = np.array([member.parameters.get(name, own) for member in group.members])
     states = np.zeros((1, len(scenario.state)))
     if scenario.truth.kind == "scripted":
         truth = Truth(scenario, build_graphical_model(scenario), group.members[0].seed)
         states = np.array([truth.state(step, None, None) for step in range(scenario.mission.steps)])
-    found = [(name, e, ranges.young_modulus_factor, "assets")]
+    found = [(name, e, ranges[name], "assets")]
     found += [
-        (factor.name, states[:, place], ranges.stiffness_loss, f"{scenario.mission.step_name}s")
-        for place, factor in enumerate(scenario.state)
+        (region, states[:, place], ranges[region], f"{scenario.mission.step_name}s")
+        for place, region in enumerate(regions)
     ]
     for what, values, (low, high), of in found:
         outside = values[(values < low - 1e-12) | (values > high + 1e-12)]

@@ -36,44 +36,6 @@ void structure_add(double *restrict sum, size_t size, double factor, const doubl
     }
 }
 
-static inline void inline_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
-                        size_t count, const double *restrict coefficients) {
-    size_t c = 0;
-    for (; c + 4 <= count; c += 4) { /* four at a time, so that the sum is loaded and stored less often */
-        const double *a = columns + c * stride, *b = a + stride, *d = b + stride, *e = d + stride;
-        const double fa = coefficients[c], fb = coefficients[c + 1], fd = coefficients[c + 2],
-                     fe = coefficients[c + 3];
-        for (size_t i = 0; i < size; ++i) {
-            sum[i] += (fa * a[i] + fb * b[i]) + (fd * d[i] + fe * e[i]);
-        }
-    }
-    if (c + 2 <= count) {
-        const double *a = columns + c * stride, *b = a + stride;
-        const double fa = coefficients[c], fb = coefficients[c + 1];
-        for (size_t i = 0; i < size; ++i) {
-            sum[i] += fa * a[i] + fb * b[i];
-        }
-        c += 2;
-    }
-    if (c < count) {
-        const double *a = columns + c * stride, fa = coefficients[c];
-        for (size_t i = 0; i < size; ++i) {
-            sum[i] += fa * a[i];
-        }
-    }
-}
-
-STRUCTURE_WIDE
-static void add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
-                        size_t count, const double *restrict coefficients) {
-    inline_add_columns(sum, size, columns, stride, count, coefficients);
-}
-
-void structure_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
-                      size_t count, const double *restrict coefficients) {
-    add_columns(sum, size, columns, stride, count, coefficients); /* the clones themselves would be exported */
-}
-
 static inline double inline_dot(const double *first, const double *second, size_t size) {
     /* Four sums that do not wait for each other. */
     double a = 0.0, b = 0.0, c = 0.0, d = 0.0;
@@ -110,33 +72,53 @@ void structure_sum_terms(double *restrict result, size_t size, const double *res
     structure_add_columns(result, size * size, terms, size * size, count, theta);
 }
 
-STRUCTURE_WIDE
-static bool cholesky(double *matrix, size_t size) {
-    for (size_t k = 0; k < size; ++k) {
-        double *row = matrix + k * size;
-        /* Column k of the factor, negative, moves to the lower triangle, where it lies in one piece. */
-        for (size_t i = 0; i < k; ++i) {
-            row[i] = -matrix[i * size + k];
-        }
-        inline_add_columns(row + k, size - k, matrix + k, size, k, row);
-        if (!(row[k] > 0.0)) { /* also NaN */
-            return false;
-        }
-        const double scale = sqrt(row[k]) * (1.0 / row[k]); /* neither waits for the other */
-        row[k] = scale;
-        for (size_t j = k + 1; j < size; ++j) {
-            row[j] *= scale;
-        }
-    }
-    return true;
+/* Compiled for the registers that every processor has, and for wider ones where they are. */
+#define TARGET
+#define IN_LANES(name) name##_narrow
+#if defined(__GNUC__)
+#define WIDTH 2
+#else
+#define WIDTH 1
+#endif
+#include "structure_factor.h"
+#define CHOOSE(name) name##_narrow
+#if defined(__GNUC__) && defined(__x86_64__) && !defined(_WIN32)
+#undef TARGET
+#undef IN_LANES
+#undef WIDTH
+#undef CHOOSE
+#define TARGET __attribute__((target("avx2")))
+#define IN_LANES(name) name##_wide
+#define WIDTH 4
+#include "structure_factor.h"
+#define CHOOSE(name) (__builtin_cpu_supports("avx2") ? name##_wide : name##_narrow)
+#endif
+
+void structure_add_columns(double *restrict sum, size_t size, const double *restrict columns, size_t stride,
+                           size_t count, const double *restrict coefficients) {
+    CHOOSE(add_columns)(sum, size, columns, stride, count, coefficients);
 }
 
-bool structure_cholesky(double *matrix, size_t size) { return cholesky(matrix, size); }
+size_t structure_padded(size_t size) { return (size + 3) / 4 * 4; }
+
+bool structure_cholesky(double *factor, size_t size, size_t stride, const double *base, const double *terms,
+                        size_t count, const double *theta) {
+    return CHOOSE(factorise)(factor, size, stride, base, terms, count, theta);
+}
+
+void structure_pad(double *padded, const double *matrix, size_t size) {
+    const size_t stride = structure_padded(size);
+    for (size_t i = 0; i < stride; ++i) {
+        for (size_t j = 0; j < stride; ++j) {
+            padded[i * stride + j] = i < size && j < size ? matrix[i * size + j] : i == j ? 1.0 : 0.0;
+        }
+    }
+}
 
 STRUCTURE_WIDE
-static void solve_lower(const double *restrict factor, size_t size, double *restrict right) {
+static void solve_lower(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
     for (size_t k = 0; k < size; ++k) {
-        const double *row = factor + k * size, found = right[k] * row[k];
+        const double *row = factor + k * stride, found = right[k] * row[k];
         right[k] = found;
         for (size_t i = k + 1; i < size; ++i) {
             right[i] -= found * row[i];
@@ -144,29 +126,18 @@ static void solve_lower(const double *restrict factor, size_t size, double *rest
     }
 }
 
-void structure_solve_lower(const double *restrict factor, size_t size, double *restrict right) {
-    solve_lower(factor, size, right);
+void structure_solve_lower(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
+    solve_lower(factor, size, stride, right);
+}
+
+void structure_solve_upper(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
+    CHOOSE(solve_upper)(factor, size, stride, right);
 }
 
 STRUCTURE_WIDE
-static void solve_upper(const double *restrict factor, size_t size, double *restrict right) {
-    for (size_t k = size; k-- > 0;) {
-        const double *row = factor + k * size, found = right[k] * row[k];
-        right[k] = found;
-        for (size_t i = 0; i < k; ++i) { /* column k, negative */
-            right[i] += found * row[i];
-        }
-    }
-}
-
-void structure_solve_upper(const double *restrict factor, size_t size, double *restrict right) {
-    solve_upper(factor, size, right);
-}
-
-STRUCTURE_WIDE
-static void solve_lower_columns(const double *restrict factor, size_t size, double *restrict right) {
+static void solve_lower_columns(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
     for (size_t k = 0; k < size; ++k) {
-        const double *row = factor + k * size;
+        const double *row = factor + k * stride;
         const double scale = row[k];
         double *solved = right + k * size;
         for (size_t j = 0; j < size; ++j) {
@@ -181,8 +152,8 @@ static void solve_lower_columns(const double *restrict factor, size_t size, doub
     }
 }
 
-void structure_solve_lower_columns(const double *restrict factor, size_t size, double *restrict right) {
-    solve_lower_columns(factor, size, right);
+void structure_solve_lower_columns(const double *restrict factor, size_t size, size_t stride, double *restrict right) {
+    solve_lower_columns(factor, size, stride, right);
 }
 
 /* Bring a symmetric matrix to tridiagonal form by Householder reflections H = I - factor v v' (Golub & Van Loan,

@@ -24,6 +24,7 @@ void structure_modes_lay_out(structure_modes *modes, const structure_model *mode
     modes->mass = structure_take(arena, size * size);
     modes->cross_mass = structure_take(arena, size * model->static_size);
     modes->basis = structure_take(arena, size * size);
+    modes->factor = structure_take(arena, structure_padded(size) * structure_padded(size));
     modes->stiffness = structure_take(arena, (1 + damaged_terms(model)) * size * size);
     modes->present = structure_take(arena, size * size);
     modes->images = structure_take(arena, 2 * count * size);
@@ -58,26 +59,28 @@ static void project(double *result, const structure_modes *modes, const double *
 static bool make_basis(structure_modes *modes, const double *chosen, structure_problem *problem) {
     const structure_model *model = modes->model;
     const size_t size = model->modal_size, n = model->static_size, square = size * size;
-    double *factor = modes->stiffness;
+    const size_t stride = structure_padded(size);
+    double *factor = modes->factor;
     memcpy(modes->basis_key, chosen, model->key * sizeof *chosen);
     memset(modes->basis_key + model->parameters, 0, model->regions * sizeof *chosen);
     structure_stiffness_coefficients(model, modes->basis_key, modes->theta);
     structure_mass_coefficients(model, chosen, modes->mass_theta);
-    structure_sum_terms(factor, size, model->modal_stiffness, model->terms, modes->theta);
+    structure_sum_terms(modes->matrix, size, model->modal_stiffness, model->terms, modes->theta);
+    structure_pad(factor, modes->matrix, size);
     structure_sum_terms(modes->mass, size, model->modal_mass, model->masses + 1, modes->mass_theta);
     memset(modes->cross_mass, 0, size * n * sizeof *modes->cross_mass);
     structure_add_columns(modes->cross_mass, size * n, model->cross_mass, size * n, model->masses + 1,
                           modes->mass_theta);
-    if (!structure_cholesky(factor, size)) {
+    if (!structure_cholesky(factor, size, stride, factor, NULL, 0, NULL)) {
         return structure_fail(problem, "the modal stiffness under these parameters is not positive definite");
     }
     /* M x = K x / omega^2 with K = U' U: the eigenvalues of U'^-1 M U^-1 are 1 / omega^2. The stiffness is well
        conditioned in this basis, the mass is not, and the low modes are the largest eigenvalues, which keep all
        their digits. */
     memcpy(modes->matrix, modes->mass, square * sizeof *modes->matrix);
-    structure_solve_lower_columns(factor, size, modes->matrix);
+    structure_solve_lower_columns(factor, size, stride, modes->matrix);
     transpose_square(modes->matrix, size);
-    structure_solve_lower_columns(factor, size, modes->matrix);
+    structure_solve_lower_columns(factor, size, stride, modes->matrix);
     if (!structure_symmetric_eigen(modes->matrix, size, size, modes->values, modes->basis, modes->work)) {
         return structure_fail(problem, "the modes under these parameters and masses were not found");
     }
@@ -87,7 +90,7 @@ static bool make_basis(structure_modes *modes, const double *chosen, structure_p
     for (size_t i = 0; i < size; ++i) {
         double *shape = modes->basis + i * size;
         const double scale = 1.0 / sqrt(modes->values[i]);
-        structure_solve_upper(factor, size, shape);
+        structure_solve_upper(factor, size, stride, shape);
         for (size_t j = 0; j < size; ++j) {
             shape[j] *= scale;
         }

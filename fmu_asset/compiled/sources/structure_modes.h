@@ -21,6 +21,7 @@ typedef struct {
     double *participation;     /* (M, L) modal force per unit of load */
     double *mass;              /* (Nm, Nm) */
     double *cross_mass;        /* (Nm, N) between the modal and the static basis */
+    double *factor;            /* of the stiffness without a loss, padded */
     double *basis;             /* (Nm, Nm) all modes without a loss, by which the others are found */
     double *stiffness;         /* (1 + damaged terms, Nm, Nm) in it, first what no loss changes */
     double *present;           /* (Nm, Nm) their sum */

@@ -9,4 +9,4 @@ def pushed_beam(write_beam, tmp_path_factory):
     """The structure file of a beam that is pushed at a point, which is a port, and its reduced model."""
     place = {'set = "end", force': "point = [100, 10, 5], force"}
     file = write_beam(tmp_path_factory.mktemp("pushed"), place, cells=2)
-    return file, reduce_structure(load_and_assemble(file), "beam").model
+    return file, reduce_structure(load_and_assemble(file)).model

@@ -312,10 +312,3 @@ def test_plain_python_gives_the_same(name: str) -> None:
     plain, compiled = (simulate(modal, laws, kernel=kernel, **given) for kernel in (None, compiled_kernel()))
     assert plain.q == pytest.approx(compiled.q, abs=1e-12)
     assert plain.memory == pytest.approx(compiled.memory, abs=1e-9)
-    # and a motion goes on from its memory
-    one = simulate(modal, laws, kernel=compiled_kernel(), **{**given, "force": np.zeros(16)})
-    rest = simulate(
-        modal, laws, kernel=compiled_kernel(),
-        **{**given, "force": np.zeros(15), "q": one.q[-1], "v": one.v[-1], "memory": one.memory},
-    )  # fmt: skip
-    assert rest.q[-1] == pytest.approx(compiled.q[-1], abs=1e-10)

@@ -55,7 +55,7 @@ def at(*parameters: float, **given: Any) -> dict[str, Any]:
 def kinds(write_beam, tmp_path_factory) -> Iterator[Kinds]:
     folder = tmp_path_factory.mktemp("rig")
     file = write_beam(folder, {'set = "end", force': "point = [100, 10, 5], force"}, cells=2)
-    reduced = reduce_structure(load_and_assemble(file), "beam").model
+    reduced = reduce_structure(load_and_assemble(file)).model
     fmu = build_fmu(reduced, folder / "beam.fmu").path
     path = folder / "rig.toml"
     path.write_text(rig_text(load_structure(file), os.path.relpath(fmu, folder)), encoding="utf-8")

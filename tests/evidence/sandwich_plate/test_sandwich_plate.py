@@ -53,7 +53,7 @@ def shipped_layout(shipped_design):
 
 def test_the_free_unknowns_hold_every_rigid_motion_that_the_root_allows(plate):
     x, y = plate.plate.node_points.T
-    root = plate.design.root
+    root = plate.wing_design.root
     springs = (root.transverse_spring, root.flap_spring, root.yaw_spring)
     stiffness = plate.stiffness()
     for number, motion in enumerate(({W: 1.0 + 0 * x}, {W: y, B: -1.0 + 0 * x}, {U: -y, V: x})):

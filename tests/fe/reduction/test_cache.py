@@ -13,7 +13,7 @@ from fe.reduction import model_cache
 from fe.reduction.built_once import cache_folder
 from fe.reduction.fields import WingFields
 from fe.reduction.model_cache import MODELLING_ROOMS, entry, patch_arrays, reduced_model, wing_fields
-from fe.reduction.settings import PatchSettings, ReductionSettings
+from fe.reduction.settings import PatchSettings, StructureSettings
 from fe.runtime.kept_arrays import KeptArrays
 from fe.wing.design import WingDesign
 
@@ -70,7 +70,7 @@ def test_what_is_changed_is_built_anew(builds, coarse_design: WingDesign, monkey
     for design in (coarse_design, changed):
         reduced_model(design)
     assert len(builds) == 2
-    reduced_model(coarse_design, settings=ReductionSettings(bound_tolerance=1e-3))
+    reduced_model(coarse_design, settings=StructureSettings(bound_tolerance=1e-3))
     for settings in (None, PatchSettings(vectors=30), None):
         patch_arrays(coarse_design, settings=settings)
     assert len(builds) == 5

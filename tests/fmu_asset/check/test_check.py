@@ -1,15 +1,16 @@
 """What the checks say of sound FMUs and of FMUs with one fault each."""
 
-from __future__ import annotations
-
+import tomllib
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from fmu_asset.check import FmuCheck, check_fmu
+from tests.fmu_asset.foreign.workshop import MODELS
 from tests.fmu_asset.making import bound
 
-MODELS = ["lag1", "room2", "fixed2", "array3", "ball2", "decay1", "swing3", "hostile2"]
+FAULTS = tomllib.loads(Path(__file__).with_name("faults.toml").read_text("utf-8"))
 QUICK = ("array3", "ball2", "hostile2")
 
 
@@ -24,7 +25,7 @@ def texts(check: FmuCheck, name: str) -> str:
 @pytest.mark.parametrize(
     "model", [name if name in QUICK else pytest.param(name, marks=pytest.mark.long) for name in MODELS]
 )
-def test_sound_fmus_of_all_kinds_have_no_problem(foreign_fmu: Any, model: str) -> None:
+def test_sound_fmus_of_all_kinds_have_no_problem(foreign_fmu, model) -> None:
     check = check_fmu(foreign_fmu(model), step_size=0.01 if model == "fixed2" else 0.1)
     assert check.passed, check.problems
     found = verdicts(check)
@@ -34,22 +35,8 @@ def test_sound_fmus_of_all_kinds_have_no_problem(foreign_fmu: Any, model: str) -
     assert found["reset"] == ("warning" if model == "decay1" else "ok")
 
 
-@pytest.mark.parametrize(
-    ("what", "check", "sentence"),
-    [
-        ("STATE_HIDDEN", "state", "declares canGetAndSetFMUstate but keeps part of its state elsewhere"),
-        ("STATE_NOT_RESTORED", "state", "does not restore all of its state"),
-        ("STATE_ERROR", "state", "fmi2GetFMUstate is not implemented"),
-        ("NOT_DETERMINISTIC", "determinism", "Two flights with the same inputs differ"),
-        ("NOT_A_NUMBER", "first flight", "values that are not finite at t = 3 s"),
-        ("SEGFAULT", "first flight", "SIGSEGV"),
-        ("EXIT", "first flight", "exit status 3"),
-        ("HANG", "first flight", "longer than 1 s for the step"),
-        ("NO_INSTANCE", "first flight", "no licence"),
-        ("CRASH_AT_LOAD", "first flight", "SIGSEGV"),
-    ],
-)
-def test_one_fault_is_one_problem(foreign_fmu: Any, what: str, check: str, sentence: str) -> None:
+@pytest.mark.parametrize(("what", "check", "sentence"), FAULTS["fault"])
+def test_one_fault_is_one_problem(foreign_fmu, what, check, sentence) -> None:
     result = check_fmu(foreign_fmu("hostile2", what), step_timeout=1.0)
     assert not result.passed
     assert verdicts(result)[check] == "problem"
@@ -61,7 +48,7 @@ def test_one_fault_is_one_problem(foreign_fmu: Any, what: str, check: str, sente
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_eighty_instances_in_one_process(foreign_fmu: Any) -> None:
+def test_eighty_instances_in_one_process(foreign_fmu) -> None:
     """Create, run and free: the process does not grow, and one that leaks 256 KiB each is found out."""
     for what, cycles, verdict, sentence in (
         ((), 80, "ok", ""),
@@ -73,35 +60,15 @@ def test_eighty_instances_in_one_process(foreign_fmu: Any) -> None:
         assert sentence in texts(check, "instances")
 
 
-M = '<Unit name="m"><BaseUnit m="1"'
-TOLD: list[tuple[str, dict[str, Any], tuple[tuple[str, str], ...], str, str]] = [
-    ("fixed2", {"step_size": 1.0}, (), "first flight", "the sample time is 0.01 s"),
-    ("fixed2", {}, (), "step size", "It takes 0.01 s only"),
-    (
-        "fixed2", {},
-        (("<CoSimulation ", '<CoSimulation canHandleVariableCommunicationStepSize="true" '),),
-        "step size", "declares that it takes any step size, but not 0.005 s",
-    ),
-    (
-        "ball2", {}, ((f"{M}/>", f'{M} factor="0.001"/>'),), "units",
-        "'m' is defined with the factor 0.001 and the offset 0; usual are 1 and 0",
-    ),
-    (
-        "room2", {}, (('unit="K/s"', 'unit="bushel"'), ('"K/s"', '"bushel"')), "units",
-        "Nothing can be converted to bushel",
-    ),
-]  # fmt: skip
-
-
-def test_step_sizes_and_units_that_contradict(foreign_fmu: Any) -> None:
-    for number, (model, options, changes, check, sentence) in enumerate(TOLD):
+def test_step_sizes_and_units_that_contradict(foreign_fmu) -> None:
+    for number, (model, options, changes, check, sentence) in enumerate(FAULTS["told"]):
         path = foreign_fmu.changed(model, f"told{number}", *changes)
         assert sentence in texts(check_fmu(path, **options), check)
     broken = foreign_fmu.changed("fixed2", "schema", ('<Real start="0"/>', "<Real/>"))
     assert any("start value" in problem for problem in check_fmu(broken).problems)
 
 
-def test_a_binding_of_ones_own(foreign_fmu: Any) -> None:
+def test_a_binding_of_ones_own(foreign_fmu) -> None:
     def own(unit: str) -> Any:
         load = {
             "outside": ("ambient.T", "degC", -40.0, 50.0),
@@ -120,14 +87,14 @@ def test_a_binding_of_ones_own(foreign_fmu: Any) -> None:
     assert check_fmu(foreign_fmu("room2"), own("m")).problems == (sentence,)
 
 
-def test_a_range_that_the_fmu_does_not_keep(foreign_fmu: Any) -> None:
+def test_a_range_that_the_fmu_does_not_keep(foreign_fmu) -> None:
     check = check_fmu(foreign_fmu("hostile2", "REFUSE", "AFTER=0"))
     assert check.passed
     assert "1 of 4 ends of ranges fail, such as u = 10 m/s" in texts(check, "range edges")
     assert "u is too large" in texts(check, "range edges")
 
 
-def test_a_binding_with_other_sizes_is_checked_with_them(foreign_fmu: Any) -> None:
+def test_a_binding_with_other_sizes_is_checked_with_them(foreign_fmu) -> None:
     """Three inputs, for which the FMU has two start values."""
     sized = bound(
         1.0, {"y": ("y", "1")}, control={"u": ("u", "1")}, header={"structural_parameters": {"n": 3}}

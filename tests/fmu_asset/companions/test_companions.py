@@ -1,7 +1,5 @@
 """The companions of the wing: what they do by their own formulas, and what they refuse as FMUs."""
 
-from __future__ import annotations
-
 import math
 import random
 from collections.abc import Callable
@@ -55,7 +53,7 @@ def damage(parameters: Any) -> Callable[..., DamageGrowth]:
     return begun
 
 
-def test_growth_with_the_load_is_the_law_of_paris(damage: Any) -> None:
+def test_growth_with_the_load_is_the_law_of_paris(damage) -> None:
     rate, exponent = 2e-3, 3.5
     behaviour = damage(**{"rate.z1": rate, "exponent": exponent, "initial.z1": 0.1})
     time, expected = 0.0, 0.1
@@ -66,7 +64,7 @@ def test_growth_with_the_load_is_the_law_of_paris(damage: Any) -> None:
     assert behaviour.advance(time, 1e6, [3.0])[0] == 0.8  # the ceiling
 
 
-def test_a_script_gives_at_each_mark_what_it_says(damage: Any) -> None:
+def test_a_script_gives_at_each_mark_what_it_says(damage) -> None:
     script = {
         "script[1].first": 10.0, "script[1].last": 19.0, "script[1].z1": 0.02,
         "script[2].first": 20.0, "script[2].last": 20.0, "script[2].z1": 0.2, "script[2].z2": 0.1,
@@ -78,7 +76,7 @@ def test_a_script_gives_at_each_mark_what_it_says(damage: Any) -> None:
 
 @settings(max_examples=60)
 @given(st.integers(0, 2**31 - 1), st.lists(st.integers(1, 7), min_size=1, max_size=12))
-def test_chance_does_not_depend_on_the_steps(damage: Any, seed: int, parts: list[int]) -> None:
+def test_chance_does_not_depend_on_the_steps(damage, seed, parts) -> None:
     """A mark draws by its own number: steps of a tenth to seven tenths of a mark lead to the same damage."""
     changes = {"probability.z1": 0.3, "probability.z2": 0.5, "exponent": 1.7, "seed": float(seed)}
     whole, fine, time = damage(**changes), damage(**changes), 0.0
@@ -91,7 +89,7 @@ def test_chance_does_not_depend_on_the_steps(damage: Any, seed: int, parts: list
         assert coarse_end == fine_end
 
 
-def test_chance_has_the_probability_that_it_says(damage: Any) -> None:
+def test_chance_has_the_probability_that_it_says(damage) -> None:
     """One level more with p (n / n_ref)^m at each mark but the first, and with the load before the mark."""
     exponent, trials = math.log(2.0) / math.log(1.5), 4000
     for load, probability in ((2.0, 0.05), (3.0, 0.10)):
@@ -104,7 +102,7 @@ def test_chance_has_the_probability_that_it_says(damage: Any) -> None:
         assert abs(count - trials * probability) < 4.0 * deviation
 
 
-def test_regions_and_marks_are_independent(damage: Any) -> None:
+def test_regions_and_marks_are_independent(damage) -> None:
     seen = []
     for seed in range(3000):
         behaviour = damage(**{"probability.z1": 0.5, "probability.z2": 0.5, "seed": float(seed)})
@@ -114,7 +112,7 @@ def test_regions_and_marks_are_independent(damage: Any) -> None:
     assert np.abs(correlation - np.eye(3)).max() < 4.0 / math.sqrt(3000)
 
 
-def test_refusals_leave_the_state(ours: OurFmus) -> None:
+def test_refusals_leave_the_state(ours) -> None:
     """Values and steps that a master should not send: refused by the FMU itself, which goes on from there."""
     with closing(Slave(ours("damage_growth"))) as slave:
         fmu, rate = slave.fmu, slave.reference["rate.z1"]
@@ -153,7 +151,7 @@ def gauges(parameters: Any) -> Callable[..., Callable[[float], list[float]]]:
     return begun
 
 
-def test_a_gauge_reads_gain_offset_and_drift(gauges: Any) -> None:
+def test_a_gauge_reads_gain_offset_and_drift(gauges) -> None:
     changes = {"gain[1]": 1.02, "offset[2]": 5e-6, "drift_rate[3]": 2e-6, "drift_start[3]": 4.0}
     at = gauges([1e-3, -2e-3, 0.5e-3], **changes)
     assert at(-1) == [1.02e-3, -2e-3 + 5e-6, 0.5e-3, 1.0, 1.0, 1.0]
@@ -163,7 +161,7 @@ def test_a_gauge_reads_gain_offset_and_drift(gauges: Any) -> None:
         assert at(step)[:3] == pytest.approx([1.02e-3, -2e-3 + 5e-6, expected], rel=1e-14)
 
 
-def test_dropouts_and_blackouts(gauges: Any) -> None:
+def test_dropouts_and_blackouts(gauges) -> None:
     changes = {"dropout_start[2]": 3.0, "dropout_end[2]": 6.0, "blackout.start": 8.0, "blackout.end": 9.0}
     at = gauges([1e-3] * 3, **changes)
     rows = [at(step) for step in range(12)]
@@ -173,7 +171,7 @@ def test_dropouts_and_blackouts(gauges: Any) -> None:
         assert row[:3] == [0.0 if gauge in gone else 1e-3 for gauge in range(3)]
 
 
-def test_noise_is_gaussian_and_repeats(gauges: Any) -> None:
+def test_noise_is_gaussian_and_repeats(gauges) -> None:
     at = gauges([0.0] * 24, noise=150e-6, seed=3.0)
     noise = np.array([at(step)[:24] for step in range(500)])
     standard = noise.ravel() / 150e-6
@@ -189,13 +187,13 @@ def test_noise_is_gaussian_and_repeats(gauges: Any) -> None:
     assert normal(generator) == math.sqrt(-2.0 * math.log(1.0 - first)) * math.cos(2.0 * math.pi * second)
 
 
-def test_lost_by_chance(gauges: Any) -> None:
+def test_lost_by_chance(gauges) -> None:
     at = gauges([1e-3] * 24, dropout_probability=0.1, seed=3.0)
     received = [at(step)[24:] for step in range(400)]
     assert abs(np.mean(received) - 0.9) < 4.0 * math.sqrt(0.09 / (400 * 24))
 
 
-def test_the_gauges_take_their_parameters(ours: OurFmus) -> None:
+def test_the_gauges_take_their_parameters(ours) -> None:
     noise = {"noise": ("noise", "microstrain")}
     binding = bound(1.0, {"r": ("reading[{1..24}]", "microstrain")}, parameter=noise)
     with FmiAsset(ours("strain_gauges"), binding, isolated=False, parameters={"noise": 1.0}) as asset:

@@ -1,7 +1,5 @@
 """The C sources: clean under warnings and sanitizers, in other hosts; no damaged file is read."""
 
-from __future__ import annotations
-
 import csv
 import importlib.util
 import json
@@ -22,7 +20,6 @@ from fmu_asset.compiled.compiler import CROSS_COMPILER
 from fmu_asset.compiled.package import MAGIC, NAME_BYTES, data_file_bytes, pack_arrays
 from fmu_asset.packing.structure_fmu import build_fmu
 from tests.fmu_asset.making import DESCRIPTION, members, run_python
-from tests.fmu_asset.ours import OurFmus
 
 DRIVER, HOST = (Path(__file__).with_name(name) for name in ("driver.c", "host.c"))
 WARNINGS = (
@@ -67,7 +64,7 @@ def arrays_of(content: bytes) -> dict[str, np.ndarray]:
     return arrays
 
 
-def test_the_data_file_holds_the_arrays_of_the_model(model: ReducedModel) -> None:
+def test_the_data_file_holds_the_arrays_of_the_model(model) -> None:
     content = data_file_bytes(model)
     assert data_file_bytes(ReducedModel.from_bytes(model.to_bytes())) == content
     arrays = arrays_of(content)
@@ -127,16 +124,14 @@ def damaged(content: bytes) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", ["compiled", "fmi3", "exchange", "exchange3"])
-def test_the_sources_are_clean(compiler: list[str], ours: OurFmus, name: str, tmp_path: Path) -> None:
+def test_the_sources_are_clean(compiler, ours, name, tmp_path) -> None:
     shutil.unpack_archive(ours(name), tmp_path, "zip")
     sources = sorted((tmp_path / "sources").glob("*.c"))
     standard = ["-Wno-strict-prototypes"] if "3" in name else []  # which the headers of FMI 3.0 break
     subprocess.run([*compiler, "-std=c11", *WARNINGS, *standard, "-fsyntax-only", *sources], check=True)
 
 
-def test_driven_in_c_under_sanitizers(
-    compiler: list[str], extracted: Path, model: ReducedModel, tmp_path: Path
-) -> None:
+def test_driven_in_c_under_sanitizers(compiler, extracted, model, tmp_path) -> None:
     """Every FMI function, garbage as states, damaged files: no error of memory, no undefined behaviour."""
     driver = tmp_path / "driver"
     sanitized = "-fsanitize=address,undefined"
@@ -163,9 +158,7 @@ def run_well(words: list[Any], **options: Any) -> str:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["compiled", "compiled_beam"])
-def test_driven_in_c_without_a_lost_byte(
-    compiler: list[str], ours: OurFmus, name: str, tmp_path: Path
-) -> None:
+def test_driven_in_c_without_a_lost_byte(compiler, ours, name, tmp_path) -> None:
     """Optimised and warned of as much as the compiler can; valgrind watches, where it is installed."""
     shutil.unpack_archive(ours(name), tmp_path, "zip")
     driver = tmp_path / "driver"
@@ -176,7 +169,7 @@ def test_driven_in_c_without_a_lost_byte(
     run_well([*watched, driver, (tmp_path / "resources").as_uri()])
 
 
-def test_nothing_but_the_fmi_functions_is_exported(extracted: Path) -> None:
+def test_nothing_but_the_fmi_functions_is_exported(extracted) -> None:
     nm = shutil.which("nm")
     if nm is None:
         pytest.skip("nm is not installed")
@@ -214,9 +207,7 @@ print("SEEN" + json.dumps(seen))
 """
 
 
-def test_a_host_without_python_needs_nothing_else(
-    extracted: Path, compiled_fmu: Path, compiler: list[str], model: ReducedModel, tmp_path: Path
-) -> None:
+def test_a_host_without_python_needs_nothing_else(extracted, compiled_fmu, compiler, model, tmp_path) -> None:
     host = tmp_path / "host"
     words = [*compiler, "-Wall", "-Wextra", "-Werror", f"-I{extracted / 'sources'}", HOST, "-o", host, "-ldl"]
     subprocess.run(words, check=True)
@@ -229,9 +220,7 @@ def test_a_host_without_python_needs_nothing_else(
     np.testing.assert_allclose([float(line) for line in shown.split()], expected, rtol=1e-12)
 
 
-def test_the_windows_binary_gives_the_same_under_wine(
-    compiled_fmu: Path, compiler: list[str], model: ReducedModel, tmp_path: Path
-) -> None:
+def test_the_windows_binary_gives_the_same_under_wine(compiled_fmu, compiler, model, tmp_path) -> None:
     """To the last bit: statics, bound and modes."""
     if shutil.which(CROSS_COMPILER) is None:
         pytest.skip(f"{CROSS_COMPILER} is not installed")
@@ -262,7 +251,7 @@ def test_the_windows_binary_gives_the_same_under_wine(
     assert shown[0] == shown[1]
 
 
-def test_both_fmus_fly_in_libcosim(compiled_fmu: Path, fmu: Path, model: ReducedModel) -> None:
+def test_both_fmus_fly_in_libcosim(compiled_fmu, fmu, model) -> None:
     if importlib.util.find_spec("libcosimpy") is None:
         pytest.skip("libcosimpy is not installed")
     said = run_python(LIBCOSIM, compiled_fmu, fmu, json.dumps(COURSE))
@@ -274,9 +263,7 @@ def test_both_fmus_fly_in_libcosim(compiled_fmu: Path, fmu: Path, model: Reduced
         np.testing.assert_allclose(compiled, python, rtol=1e-9, atol=1e-15)
 
 
-def test_the_compiled_fmu_runs_in_omsimulator(
-    compiled_fmu: Path, model: ReducedModel, tmp_path: Path
-) -> None:
+def test_the_compiled_fmu_runs_in_omsimulator(compiled_fmu, model, tmp_path) -> None:
     simulator = shutil.which("OMSimulator")
     if simulator is None:
         pytest.skip("OMSimulator is not installed")

@@ -1,7 +1,5 @@
 """Coupled systems against closed forms; the contract of all assets has their recursion written by hand."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -10,23 +8,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fmu_asset.coupling.asset import Algorithm, CoupledAsset
+from fmu_asset import errors
+from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component, Setting, SystemStructure
-from fmu_asset.errors import (
-    AlgebraicLoopError,
-    BindingError,
-    CouplingError,
-    FmuInputError,
-    FmuOutputError,
-    FmuStateError,
-    FmuUnsupportedError,
-    FmuWorkerError,
-    IterationError,
+from tests.fmu_asset.door.kinds import (
+    A1,
+    A2,
+    B1,
+    B2,
+    C2,
+    D2,
+    OSCILLATOR,
+    SYSTEM_OF_THREE,
+    held,
+    oscillator,
+    three,
 )
-from tests.fmu_asset.coupling.systems import oscillator, three
-from tests.fmu_asset.door.kinds import A1, A2, B1, B2, C2, D2, OSCILLATOR, SYSTEM_OF_THREE, held
 from tests.fmu_asset.making import bound, changed, linear, system, watch
-from tests.fmu_asset.ours import OurFmus
 
 NAN, DIE = 1.0, 3.0
 
@@ -39,7 +37,7 @@ def flown(
         return np.array([asset.observe().values, *(asset.step().values for _ in range(steps))])
 
 
-def test_the_order_follows_from_the_dependencies(state_fmu: Path, linear_fmu: Path) -> None:
+def test_the_order_follows_from_the_dependencies(state_fmu, linear_fmu) -> None:
     asset = CoupledAsset(oscillator(state_fmu, linear_fmu), watch("first.y1"), isolated=False)
     assert asset.schedule.order == ("first", "second")
     assert asset.schedule.loops == ()
@@ -51,12 +49,12 @@ def test_the_order_follows_from_the_dependencies(state_fmu: Path, linear_fmu: Pa
     np.testing.assert_allclose(one, four, rtol=1e-12)
 
 
-def test_the_face_is_that_of_one_fmu(linear_fmu: Path) -> None:
+def test_the_face_is_that_of_one_fmu(linear_fmu) -> None:
     one = system([linear("one", linear_fmu, d=[[2.0, 0.0], [0.0, 1.0]])], [("push", "one.u1")])
     with CoupledAsset(one, watch("one.y1", inputs=["push"], step_size=0.1), isolated=False) as asset:
         assert asset.describe()["order"] == ["one"]
         for steps in (0, -1):
-            with pytest.raises(FmuInputError, match=f"steps must be at least 1, but is {steps}"):
+            with pytest.raises(errors.FmuInputError, match=f"steps must be at least 1, but is {steps}"):
                 asset.simulate(steps=steps)
         assert asset.simulate({"push": 3.0}, steps=1).values.tolist() == [[6.0]]
         with pytest.raises(TypeError, match="Inputs are control, health, load, port, and 'contrl' came"):
@@ -66,7 +64,7 @@ def test_the_face_is_that_of_one_fmu(linear_fmu: Path) -> None:
         assert asset.observe().values.tolist() == [2.0]
 
 
-def test_a_chain_gives_in_one_step_what_one_system_would(linear_fmu: Path) -> None:
+def test_a_chain_gives_in_one_step_what_one_system_would(linear_fmu) -> None:
     """Direct feedthrough through three FMUs, written backwards, arrives in the same step."""
     gains = {"third": 5.0, "second": 3.0, "first": 2.0}
     parts = [linear(name, linear_fmu, d=np.diag([gain, 1.0])) for name, gain in gains.items()]
@@ -88,10 +86,10 @@ def loop_of(linear_fmu: Path, gain: float) -> SystemStructure:
     return system([left, right], [("left.y1", "right.u1"), ("right.y1", "left.u1")])
 
 
-def test_an_algebraic_loop_is_reported_and_broken_by_a_delay_or_by_jacobi(linear_fmu: Path) -> None:
+def test_an_algebraic_loop_is_reported_and_broken_by_a_delay_or_by_jacobi(linear_fmu) -> None:
     """y = 0.5 u + 1, u of the last step; u = 2 - 0.3 y, y of this step, but of the last one by Jacobi."""
     loop = loop_of(linear_fmu, 0.5)
-    with pytest.raises(AlgebraicLoopError) as caught:
+    with pytest.raises(errors.AlgebraicLoopError) as caught:
         CoupledAsset(loop, watch("left.y1"))
     assert "left.y1 -> right.u1 -> right.y1 -> left.u1" in str(caught.value)
     words = "delay one of its connections, allow iterations, or take the algorithm jacobi"
@@ -100,13 +98,15 @@ def test_an_algebraic_loop_is_reported_and_broken_by_a_delay_or_by_jacobi(linear
         seen = flown(structure, "left.y1", "right.y1", steps=5, algorithm=algorithm)
         for (before_y, before_u), (y, u) in itertools.pairwise(seen):
             np.testing.assert_allclose([y, u], [1.0 + 0.5 * before_u, 2.0 - 0.3 * (before_y if lag else y)])
-    with pytest.raises(CouplingError, match=r"ends at left\.u2.*connections end at right\.u1, left\.u1"):
+    with pytest.raises(
+        errors.CouplingError, match=r"ends at left\.u2.*connections end at right\.u1, left\.u1"
+    ):
         loop.delayed(["left.u2"])
 
 
 @pytest.mark.parametrize("algorithm", ["gauss_seidel", "jacobi"])
 def test_iterations_solve_an_algebraic_loop_and_make_the_coupling_implicit(
-    state_fmu: Path, linear_fmu: Path, algorithm: Algorithm
+    state_fmu, linear_fmu, algorithm
 ) -> None:
     """Settled, each FMU has the other's values of the end of the step, whichever algorithm led there."""
     settled = {"algorithm": algorithm, "iterations": 80, "tolerance": 1e-13}
@@ -125,16 +125,18 @@ def test_iterations_solve_an_algebraic_loop_and_make_the_coupling_implicit(
         np.testing.assert_allclose(row, [*x, force], rtol=1e-9)
 
 
-def test_iterations_that_do_not_settle_or_cannot_be_made(spring_mass: Path, linear_fmu: Path) -> None:
-    with pytest.raises(IterationError, match=r"left, right did not settle in 8 iterations.*still changes by"):
+def test_iterations_that_do_not_settle_or_cannot_be_made(spring_mass, linear_fmu) -> None:
+    with pytest.raises(
+        errors.IterationError, match=r"left, right did not settle in 8 iterations.*still changes by"
+    ):
         flown(loop_of(linear_fmu, -7.0), "left.y1", iterations=8)
     parts = [Component("spring", spring_mass), linear("law", linear_fmu, d=np.eye(2))]
     joined = system(parts, [("spring.position", "law.u1"), ("law.y1", "spring.force")])
-    with pytest.raises(CouplingError, match="component 'spring' cannot save and restore its state"):
+    with pytest.raises(errors.CouplingError, match="component 'spring' cannot save and restore its state"):
         CoupledAsset(joined, watch("law.y1"), iterations=3)
 
 
-def test_components_in_a_circle_without_a_loop_of_variables(crossed_fmu: Path) -> None:
+def test_components_in_a_circle_without_a_loop_of_variables(crossed_fmu) -> None:
     """Two FMUs that feed each other through different variables: no loop, but one value is a step old."""
     parts = [linear("left", crossed_fmu, d=np.diag([2, 3])), linear("right", crossed_fmu, d=np.diag([5, 1]))]
     joined = system(parts, [("push", "left.u1"), ("left.y1", "right.u1"), ("right.y1", "left.u2")])
@@ -146,22 +148,20 @@ def test_components_in_a_circle_without_a_loop_of_variables(crossed_fmu: Path) -
         assert asset.step({"push": 1.0}).values[0] == 30.0
 
 
-def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(
-    state_fmu: Path, linear_fmu: Path
-) -> None:
+def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(state_fmu, linear_fmu) -> None:
     structure, push = oscillator(state_fmu, linear_fmu, pushed=True), {"push": ("push", "1", -1.0, 2.0)}
     ranged = bound(1.0, {"y": ("first.y1", "1")}, control=push)
     with CoupledAsset(structure, ranged, isolated=False) as asset:
         before = asset.step({"push": 2.0}).values
-        with pytest.raises(FmuInputError, match=r"push = 2\.5 lies outside .* 'push', -1 to 2"):
+        with pytest.raises(errors.FmuInputError, match=r"push = 2\.5 lies outside .* 'push', -1 to 2"):
             asset.step({"push": 2.5})
         assert asset.step_index == 1
         np.testing.assert_array_equal(asset.observe().values, before)
-    with pytest.raises(BindingError, match="bound of several FMUs has a decimation"):
+    with pytest.raises(errors.BindingError, match="bound of several FMUs has a decimation"):
         CoupledAsset(structure, changed(ranged, header={"decimation": 2}), isolated=False)
 
 
-def test_parameters_and_refusals_are_those_of_the_components(ours: OurFmus) -> None:
+def test_parameters_and_refusals_are_those_of_the_components(ours) -> None:
     structure, seen = three(ours), []
     for seed in (5.0, 6.0):
         options = {"isolated": False, "parameters": {"seed": seed}}
@@ -169,9 +169,9 @@ def test_parameters_and_refusals_are_those_of_the_components(ours: OurFmus) -> N
             assert asset.schedule.order == ("damage", "wing", "gauges")
             seen.append(asset.simulate({"load_factor": 2.0}, steps=3).values)
             state = asset.save_state()
-            with pytest.raises(FmuInputError, match=r"component (damage|wing): load.load_factor = 99"):
+            with pytest.raises(errors.FmuInputError, match=r"component (damage|wing): load.load_factor = 99"):
                 asset.step({"load_factor": 99.0})
-            with pytest.raises(FmuStateError, match="no longer stand at the same time"):
+            with pytest.raises(errors.FmuStateError, match="no longer stand at the same time"):
                 asset.step({"load_factor": 2.0})
             asset.reset()
             asset.step({"load_factor": 2.0})
@@ -179,18 +179,18 @@ def test_parameters_and_refusals_are_those_of_the_components(ours: OurFmus) -> N
     delayed = tuple(replace(c, delayed=bool(c.source.component)) for c in structure.connections)
     with (
         CoupledAsset(replace(structure, connections=delayed), SYSTEM_OF_THREE, isolated=False) as other,
-        pytest.raises(FmuStateError, match="another FMU than the system test"),
+        pytest.raises(errors.FmuStateError, match="another FMU than the system test"),
     ):
         other.restore_state(state)
 
 
-def test_what_an_fmu_does_wrong_names_its_component(spring_mass: Path, linear_fmu: Path) -> None:
+def test_what_an_fmu_does_wrong_names_its_component(spring_mass, linear_fmu) -> None:
     law = linear("law", linear_fmu, d=np.eye(2))
     joined = system([Component("spring", spring_mass), law], [("spring.position", "law.u1")])
     binding = bound(0.1, {"y": ("law.y1", "1")}, load={"misbehaviour": ("spring.misbehaviour", "1")})
     for behaviour, kind, words in (
-        (NAN, FmuOutputError, "component spring: .*not finite.*position"),
-        (DIE, FmuWorkerError, "component spring: .*ended by signal"),
+        (NAN, errors.FmuOutputError, "component spring: .*not finite.*position"),
+        (DIE, errors.FmuWorkerError, "component spring: .*ended by signal"),
     ):
         with CoupledAsset(joined, binding) as asset:
             asset.step()
@@ -198,7 +198,7 @@ def test_what_an_fmu_does_wrong_names_its_component(spring_mass: Path, linear_fm
                 asset.step(load={"misbehaviour": behaviour})
 
 
-def test_fmus_of_model_exchange_are_solved_by_us_and_coupled_as_any(foreign_fmu: Any) -> None:
+def test_fmus_of_model_exchange_are_solved_by_us_and_coupled_as_any(foreign_fmu) -> None:
     """x' = u - k x of FMI 1.0, the second fed by the first: exact between the moments of exchange."""
     fmu, step, slow = foreign_fmu("decay1"), 0.25, 0.5
     second = Component("second", fmu, {"k": Setting(slow)}, interface="model-exchange")
@@ -210,5 +210,7 @@ def test_fmus_of_model_exchange_are_solved_by_us_and_coupled_as_any(foreign_fmu:
             y = y * np.exp(-slow * step) + x * (1.0 - np.exp(-slow * step)) / slow
             np.testing.assert_allclose(asset.step().values, [x, y], rtol=1e-8)
     only = Component("ball", foreign_fmu("ball2"), interface="co-simulation")
-    with pytest.raises(FmuUnsupportedError, match=r"offers model-exchange only, but .* for co-simulation"):
+    with pytest.raises(
+        errors.FmuUnsupportedError, match=r"offers model-exchange only, but .* for co-simulation"
+    ):
         CoupledAsset(system([only], []), watch("ball.h"))

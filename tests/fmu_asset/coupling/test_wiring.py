@@ -1,7 +1,6 @@
 """What cannot be joined is said in one sentence; units and types of connections."""
 
-from __future__ import annotations
-
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,42 +28,23 @@ def link(source: str, target: str, **options: Any) -> Connection:
     return replace(expand(source, target, tuple(FILES))[0], **options)
 
 
-UNJOINED: list[tuple[list[tuple[str, str]], str]] = [
-    ([("damage.z3", "wing.health.z1")], r"'damage' \(damage_growth.fmu\) has no variable 'z3'\."),
-    ([("damage.z1", "wing.helth.z1")], r"no variable 'helth.z1'; did you mean 'health.z1'"),
-    ([("pull", "wing.load_factor")], "no connector 'pull'; it has push, seen, percent"),
-    ([("seen", "wing.load_factor")], "connector 'seen' of the system is of the kind output"),
-    ([("push", "seen")], "joins two connectors of the system"),
-    ([("wing.load_factor", "damage.load_factor")], "factor cannot be the source.*declared as input"),
-    ([("damage.z1", "wing.strain[1]")], r"wing.strain\[1\] cannot be the target.*declared as output"),
-    ([("push", "wing.young_modulus_factor")], "as parameter.*a single number is needed as input"),
-    (
-        [("damage.z1", "wing.health.z1"), ("damage.z2", "wing.health.z1")],
-        "wing.health.z1 has two sources, damage.z1 and damage.z2",
-    ),
-    ([("gauges.received[1]", "wing.load_factor")], "type Boolean and cannot feed.*of the type Real"),
-    ([("wing.tip_displacement", "wing.load_factor")], "in 'm' and wing.load_factor in '1'.*no conversion"),
-    ([("damage.status", "wing.load_factor")], "of the type Enumeration and cannot feed.*Real"),
-]
-UNSET: list[tuple[str, dict[str, Setting], str]] = [
-    ("damage", {"rate.z9": Setting(1.0)}, "no variable 'rate.z9'"),
-    ("damage", {"z1": Setting(1.0)}, "damage.z1 cannot be set: it is declared as output"),
-    ("damage", {"seed": Setting(1.5)}, "damage.seed cannot be set to 1.5: it is of the type Integer"),
-    ("damage", {"seed": Setting(True)}, "cannot be set to True"),
-    ("damage", {"level": Setting(float("nan"))}, "cannot be set to nan"),
-    ("damage", {"period": Setting(1.0, "m")}, "is given in 'm', but it is in 's'"),
-    ("wing", {"response": Setting("quick")}, "with the items quasi_static, transient"),
-    ("wing", {"mass.servo": Setting("heavy")}, "a number is needed"),
-]
+REFUSED = tomllib.loads(Path(__file__).with_name("refused.toml").read_text("utf-8"))
 
 
-def test_what_does_not_fit_is_one_sentence(base: SystemStructure, tmp_path: Path) -> None:
+def test_what_does_not_fit_is_one_sentence(base, tmp_path) -> None:
     first = base.components[0]
     refused: list[tuple[dict[str, Any], type[Exception], str]] = [
-        *(({"connections": tuple(link(*pair) for pair in ends)}, CouplingError, w) for ends, w in UNJOINED),
         *(
-            ({"components": (replace(base.component(name), settings=given),)}, CouplingError, words)
-            for name, given, words in UNSET
+            ({"connections": tuple(link(*pair) for pair in ends)}, CouplingError, words)
+            for ends, words in REFUSED["unjoined"]
+        ),
+        *(
+            (
+                {"components": (replace(base.component(name), settings={key: Setting(*value)}),)},
+                CouplingError,
+                w,
+            )
+            for name, key, value, w in REFUSED["unset"]
         ),
         ({"components": ()}, CouplingError, "has no component"),
         ({"components": (*base.components, first)}, CouplingError, "two components named 'damage'"),
@@ -84,7 +64,7 @@ def test_what_does_not_fit_is_one_sentence(base: SystemStructure, tmp_path: Path
             expand(source, target, ["a", "b"])
 
 
-def test_units_and_types_are_converted(base: SystemStructure) -> None:
+def test_units_and_types_are_converted(base) -> None:
     """The value of a connection is converted first, and transformed in the unit of the target."""
     seen = link("wing.tip_displacement", "seen", factor=2.0, offset=0.5)
     for options, conversion in (
@@ -105,7 +85,7 @@ def test_units_and_types_are_converted(base: SystemStructure) -> None:
     assert next(iter(joined.feeds.values())).conversion == (1.0, 0.0)
 
 
-def test_an_input_that_is_only_set_keeps_its_value(base: SystemStructure) -> None:
+def test_an_input_that_is_only_set_keeps_its_value(base) -> None:
     """A start value of an input that nothing feeds holds; without one it is the FMU's own."""
     wing, shown = base.component("wing"), []
     for given in ({"health.z1": Setting(0.4)}, {}):
@@ -117,31 +97,12 @@ def test_an_input_that_is_only_set_keeps_its_value(base: SystemStructure) -> Non
     assert shown[0][1] > 1.05 * shown[1][1]
 
 
-UNBOUND: list[tuple[str, tuple[str, str], str]] = [
-    ("control", ("pull", "1"), "'pull', which is not a variable of the system base"),
-    ("control", ("percent", "1"), "of causality input, but 'percent' is declared as output"),
-    ("control", ("wing.health.z1", "1"), "is declared as an input that is fed by a connection already"),
-    ("control", ("wing.strain[1]", "1"), "declared as output"),
-    ("control", ("push", "m"), "control.x is in 'm', but the FMU has 'push' in '1'"),
-    ("observation", ("seen", "1"), "'seen' is declared as connected to nothing"),
-    ("observation", ("wing.load_factor", "1"), "declared as input"),
-    ("observation", ("percent", "s"), "and there is no conversion"),
-    ("parameter", ("push", "1"), "of causality parameter, but 'push' is declared as input"),
-    ("parameter", ("wing.load_factor", "1"), "parameter, but 'wing.load_factor' is declared as input"),
-    ("monitor", ("wing.load", "1"), "which is not a variable of the system base; did you mean"),
-]
-
-
-def test_bindings_that_do_not_fit(base: SystemStructure) -> None:
+def test_bindings_that_do_not_fit(base) -> None:
     ends = ("push", "wing.load_factor"), ("damage.z1", "wing.health.z1"), ("damage.z1", "percent")
     wiring = Wiring(replace(base, connections=tuple(link(*pair) for pair in ends)))
     observed = {"y": ("damage.z1", "1")}
-    for role, end, words in UNBOUND:
-        given = (
-            {"observation": {"x": end}}
-            if role == "observation"
-            else {"observation": observed, role: {"x": end}}
-        )
+    for role, end, words in REFUSED["unbound"]:
+        given = {"observation": observed} | {role: {"x": end}}
         with pytest.raises(ValueError, match=words):
             CoupledAsset(wiring, bound(1.0, **given))
     right = bound(1.0, observed, control={"x": ("push", "1")})

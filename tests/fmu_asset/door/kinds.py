@@ -1,12 +1,10 @@
 """Assets of every kind behind the one door: what each is flown with, and what it must show."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +17,13 @@ from fe.runtime.transient import ModalIntegrator
 from fe.structure.design import parse_structure
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.companions.damage_growth import DamageGrowth
+from fmu_asset.coupling.structure import Component, Setting, SystemStructure
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.slaves.effects import output_channels
 from fmu_asset.structures.binding import structure_binding
 from scenarios import binding_files
 from tests.conftest import BEAM
-from tests.fmu_asset.making import bound, changed, watch
+from tests.fmu_asset.making import bound, changed, linear, system, watch
 from tests.fmu_asset.ours import REGIONS, OurFmus
 
 Floats = npt.NDArray[np.float64]
@@ -60,8 +59,6 @@ class Kind:
         Parameters by the binding's names.
     arrays : tuple of str
         Inputs that are whole arrays.
-    resets : bool
-        Whether the FMU's own reset is held to work; if not, each start takes a new instance.
     """
 
     file: str
@@ -75,7 +72,6 @@ class Kind:
     start: Inputs = field(default_factory=dict)
     parameters: Mapping[str, Any] = field(default_factory=dict)
     arrays: tuple[str, ...] = ()
-    resets: bool = True
 
     @property
     def steps(self) -> int:
@@ -98,6 +94,8 @@ class Kind:
 # ---------------------------------------------------------------------- structures
 
 WING = load_binding(binding_files()["uav_wing"])
+INPUTS = tomllib.loads(Path(__file__).with_name("inputs.toml").read_text("utf-8"))
+"""Tables of what is refused."""
 BINDINGS_FOLDER = Path(__file__).with_name("bindings")
 BINDINGS = {path.stem: load_binding(path) for path in BINDINGS_FOLDER.glob("*.toml")}
 """Of others' FMUs and systems, by the name of the model."""
@@ -247,46 +245,54 @@ def with_effects(file: str, binding: Binding, names: tuple[str, ...], switch: st
 # ---------------------------------------------------------------------- others' FMUs
 
 
+def after(kind: Kind, first: Any, move: Callable[[Any, dict[str, Any]], Any]) -> Any:
+    """Return the states after each row of inputs."""
+    return np.array([*accumulate(rows_of(kind), move, initial=first)][1:])
+
+
+def calls(kind: Kind) -> Floats:
+    """How often the FMU was asked for a step."""
+    return kind.binding.binding.decimation * np.arange(1.0, kind.steps + 1)
+
+
 def spring(kind: Kind, _: OurFmus) -> Shown:
-    position, velocity, shown = 0.0, 0.0, []
-    for row in rows_of(kind):
+    def move(state: tuple[float, float], row: dict[str, Any]) -> tuple[float, float]:
+        velocity, position = state
         for _ in range(0 if row["lock"] else 100):
             velocity += (row["push"] - row["spring"] * position) * 0.001
             position += velocity * 0.001
-        shown.append([velocity, position])
-    return shown, {"steps": np.arange(1.0, kind.steps + 1)}
+        return velocity, position
+
+    return after(kind, (0.0, 0.0), move), {"steps": calls(kind)}
 
 
 def lag(kind: Kind, _: OurFmus) -> Shown:
     """Out1' = (K In1 - Out1) / T, exact for inputs that are held; `hold` stops it."""
-    out, shown, gain, constant = 0.0, [], kind.parameters["gain"], kind.parameters["time"]
-    for row in rows_of(kind):
-        if not row["hold"]:
-            out = gain * row["speed"] + (out - gain * row["speed"]) * math.exp(
-                -kind.binding.interval / constant
-            )
-        shown.append([out])
-    calls = kind.binding.binding.decimation * np.arange(1.0, kind.steps + 1)
-    return shown, {"count": calls}
+    gain, rest = kind.parameters["gain"], math.exp(-kind.binding.interval / kind.parameters["time"])
+
+    def move(out: float, row: dict[str, Any]) -> float:
+        steady = gain * row["speed"]
+        return out if row["hold"] else steady + (out - steady) * rest
+
+    return after(kind, 0.0, move)[:, np.newaxis], {"count": calls(kind)}
 
 
 def room(kind: Kind, _: OurFmus) -> Shown:
     """Half of the heater's power over 100 W/K, above what it is outside."""
-    warm, shown, rates = 20.0, [], []
-    for row in rows_of(kind):
+
+    def move(state: tuple[float, float], row: dict[str, Any]) -> tuple[float, float]:
         power = 500.0 * row["power"] * row["on"]
         steady = row["outside"] + power / 100.0
-        warm = steady + (warm - steady) * math.exp(-60.0 * 100.0 / 5e4)
-        shown.append([warm, warm])
-        rates.append((power - 100.0 * (warm - row["outside"])) / 5e4)
-    return shown, {"room.T": np.array(shown)[:, 0] + 273.15, "der(room.T)": rates}
+        warm = steady + (state[0] - steady) * math.exp(-60.0 * 100.0 / 5e4)
+        return warm, (power - 100.0 * (warm - row["outside"])) / 5e4
+
+    warm, rate = after(kind, (20.0, 0.0), move).T
+    return np.array([warm, warm]).T, {"room.T": warm + 273.15, "der(room.T)": rate}
 
 
 def fixed(kind: Kind, _: OurFmus) -> Shown:
-    steps = kind.binding.binding.decimation
-    return np.cumsum(kind.course["control"]["u"])[:, np.newaxis] * steps * 0.01, {
-        "calls": steps * np.arange(1.0, kind.steps + 1)
-    }
+    sums = np.cumsum(kind.course["control"]["u"])[:, np.newaxis]
+    return 0.01 * kind.binding.binding.decimation * sums, {"calls": calls(kind)}
 
 
 def array(kind: Kind, _: OurFmus) -> Shown:
@@ -294,13 +300,13 @@ def array(kind: Kind, _: OurFmus) -> Shown:
     matrix = np.arange(1.0, 7.0).reshape(2, 3)
     for place, name in (((0, 0), "first"), ((1, 2), "corner")):
         matrix[place] = kind.parameters.get(name, matrix[place])
-    matrix = np.reshape(kind.parameters.get("A", matrix), (2, 3))
-    total, shown, factor = np.zeros(2), [], kind.parameters.get("gain", 1.0)
-    for row in rows_of(kind):
+    matrix = kind.parameters.get("gain", 1.0) * np.reshape(kind.parameters.get("A", matrix), (2, 3))
+
+    def move(total: Floats, row: dict[str, Any]) -> Floats:
         u = row["u"] if "u" in row else np.array([row["first"], 0.0, row["third"]])
-        total = total + row.get("active", 1.0) * (factor * matrix @ u + row["offset"])
-        shown.append(total)
-    return 1e-3 * np.array(shown), {"calls": np.arange(1.0, kind.steps + 1)}
+        return total + row.get("active", 1.0) * (matrix @ u + row["offset"])
+
+    return 1e-3 * after(kind, np.zeros(2), move), {"calls": calls(kind)}
 
 
 def bounces(restitution: float, gravity: float, until: float) -> tuple[float, float, int]:
@@ -324,24 +330,19 @@ def ball(kind: Kind, _: OurFmus) -> Shown:
 
 
 def decay(kind: Kind, _: OurFmus) -> Shown:
-    x, k, shown = 1.0, kind.parameters["k"], []
-    for row in rows_of(kind):
-        steady = (row["u"] + 273.15) / k
-        x = steady + (x - steady) * math.exp(-k * kind.binding.interval)
-        shown.append([x])
-    return shown, {}
+    k = kind.parameters["k"]
+    rest = math.exp(-k * kind.binding.interval)
+    shown = after(kind, 1.0, lambda x, row: rest * x + (1.0 - rest) * (row["u"] + 273.15) / k)
+    return shown[:, np.newaxis], {}
 
 
 def swing(kind: Kind, _: OurFmus) -> Shown:
     """x'' = -9 (x - a): a becomes 1 at t = 1."""
-    shown = []
-    for time in kind.binding.interval * np.arange(1, kind.steps + 1):
-        x, v = 0.5 * math.cos(3.0 * min(time, 1.0)), -1.5 * math.sin(3.0 * min(time, 1.0))
-        if time > 1.0:
-            c, s = math.cos(3.0 * (time - 1.0)), math.sin(3.0 * (time - 1.0))
-            x, v = 1.0 + (x - 1.0) * c + v / 3.0 * s, v * c - 3.0 * (x - 1.0) * s
-        shown.append([x, v, float(time > 1.0)])
-    return shown, {}
+    time = kind.binding.interval * np.arange(1, kind.steps + 1)
+    x, v = 0.5 * np.cos(3.0 * np.minimum(time, 1.0)), -1.5 * np.sin(3.0 * np.minimum(time, 1.0))
+    late = np.maximum(time - 1.0, 0.0)
+    c, s, a = np.cos(3.0 * late), np.sin(3.0 * late), 1.0 * (time > 1.0)
+    return np.array([a + (x - a) * c + v / 3.0 * s, v * c - 3.0 * (x - a) * s, a]).T, {}
 
 
 LINE = np.array([0.5, 2.0, -1.0, -1.0, 3.0, 3.5, 0.0])
@@ -349,15 +350,16 @@ LINE = np.array([0.5, 2.0, -1.0, -1.0, 3.0, 3.5, 0.0])
 
 def follower(kind: Kind, _: OurFmus) -> Shown:
     """x' = u - x, x(0) = 0, u in straight lines; `seen` is u at the last call."""
-    x, shown, step = 0.0, [], kind.binding.interval
+    step = kind.binding.interval
     lost = 1.0 - math.exp(-step)
-    for first, last in pairwise(LINE):
-        x += lost * (first - x) + (last - first) / step * (step - lost)
-        shown.append([x])
+    shown = accumulate(
+        pairwise(LINE), initial=0.0,
+        func=lambda x, u: x + lost * (u[0] - x) + (u[1] - u[0]) / step * (step - lost),
+    )  # fmt: skip
+    values = np.array([*shown][1:])[:, np.newaxis]
     if kind.file == "follow1" or kind.binding.binding.interface == "model-exchange":
-        return shown, {}
-    quarters = kind.binding.binding.decimation
-    return shown, {"seen": LINE[:-1] + (1.0 - 1.0 / quarters) * np.diff(LINE)}
+        return values, {}
+    return values, {"seen": LINE[:-1] + (1.0 - 1.0 / kind.binding.binding.decimation) * np.diff(LINE)}
 
 
 def following(file: str, *, quarters: bool = False, **header: object) -> Kind:
@@ -366,11 +368,9 @@ def following(file: str, *, quarters: bool = False, **header: object) -> Kind:
         0.25, {"x": ("x", "1")}, control={"u": ("u", "1")}, monitor={"seen": ("seen", "1")},
         header={"interpolation": "linear", **divided, **header},
     )  # fmt: skip
-    exchanged = "interface" in header
     return Kind(
-        file, binding, {"control": {"u": LINE[1:]}}, follower, atol=1e-8 if exchanged else 1e-13,
-        state="replay" if exchanged or file == "follow1" else "serialised", start={"control": {"u": LINE[0]}},
-        resets=not (exchanged and quarters),  # in this process the solver's last digits tell a reset apart
+        file, binding, {"control": {"u": LINE[1:]}}, follower, atol=1e-8 if header else 1e-13,
+        state="replay" if header or file == "follow1" else "serialised", start={"control": {"u": LINE[0]}},
     )  # fmt: skip
 
 
@@ -423,6 +423,37 @@ def recursion(kind: Kind, _: OurFmus) -> Shown:
         force = (C2 @ z + D2 @ seen)[0]
         shown.append([*x, force])
     return shown, {}
+
+
+def oscillator(
+    state_fmu: Path, linear_fmu: Path, substeps: int = 1, *, pushed: bool = False
+) -> SystemStructure:
+    """Return two masses, the components in the wrong order: the right one follows from the dependencies."""
+    first = linear("first", state_fmu, substeps, a=A1, b=B1, c=np.eye(2), initial=OSCILLATOR[:2])
+    second = linear("second", linear_fmu, substeps, a=A2, b=B2, c=C2, d=D2, initial=OSCILLATOR[2:])
+    ends = [("first.y1", "second.u1"), ("first.y2", "second.u2"), ("second.y1", "first.u1")]
+    return system([second, first], [*ends, *([("push", "first.u2")] if pushed else [])])
+
+
+def three(ours: OurFmus) -> SystemStructure:
+    """Return damage growth, a wing in motion and its gauges."""
+    damage = {"probability.z1": Setting(0.5), "probability.z2": Setting(0.4), "seed": Setting(7)}
+    moving = {"response": Setting("transient"), "damping.alpha": Setting(1.0)}
+    gauges = {"noise": Setting(150.0, "microstrain"), "dropout_probability": Setting(10.0, "%")}
+    return system(
+        [
+            Component("damage", ours("damage_growth"), damage),
+            Component("gauges", ours("strain_gauges"), gauges),
+            Component("wing", ours("python"), moving),
+        ],
+        [
+            ("load_factor", "wing.load_factor"),
+            ("load_factor", "damage.load_factor"),
+            ("damage.z1", "wing.health.z1"),
+            ("damage.z2", "wing.health.z2"),
+            ("wing.strain[{1..24}]", "gauges.strain[{1..24}]"),
+        ],
+    )
 
 
 OSCILLATOR_ENDS = watch("first.y1", "first.y2", "second.y1", step_size=0.05, inputs=["push"])
@@ -501,7 +532,7 @@ KINDS: dict[str, Kind] = {
     "model exchange of FMI 1": Kind(
         "decay1", BINDINGS["decay1"],
         {"control": {"u": np.array([0.0, 0.0, 4.0, 4.0, -2.0, -2.0]) - 273.15}}, decay, atol=1e-7,
-        start={"control": {"u": -273.15}}, parameters={"k": 2.0}, resets=False,
+        start={"control": {"u": -273.15}}, parameters={"k": 2.0},
     ),
     "model exchange of FMI 3 with a time event": Kind(
         "swing3", BINDINGS["swing3"],

@@ -1,7 +1,5 @@
 """Binding files: the schema, patterns, units, ranges; and a drafted one can be flown as it is."""
 
-from __future__ import annotations
-
 import cProfile
 import dataclasses
 import itertools
@@ -21,9 +19,10 @@ from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.placement import limits_of
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.units import Conversion, Meaning, contradictions, conversion, meaning_of, same_dimension
+from fmu_asset.door.units import Meaning, contradictions, conversion, meaning_of, same_dimension
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
+from tests.fmu_asset.foreign.workshop import MODELS
 from tests.fmu_asset.making import changed
 
 HERE = Path(__file__).parent
@@ -39,7 +38,7 @@ def drafted(fmu: Any, **options: Any) -> Binding:
 # ---------------------------------------------------------------------- files
 
 
-def test_names_keep_their_order(binding: Binding) -> None:
+def test_names_keep_their_order(binding) -> None:
     good = load_binding(HERE / "good.toml")
     assert good.observation_variables == ("a", "strain[9]", "strain[10]", "strain[11]", "tip")
     assert good.observation_slice("tip") == slice(4, 5)
@@ -55,7 +54,7 @@ def test_names_keep_their_order(binding: Binding) -> None:
 
 
 @pytest.mark.parametrize("case", REFUSED, ids=lambda case: case["new"][-30:])
-def test_bad_files_are_one_sentence(tmp_path: Path, case: dict[str, str]) -> None:
+def test_bad_files_are_one_sentence(tmp_path, case) -> None:
     assert case["old"] in GOOD
     path = tmp_path / "binding.toml"
     path.write_text(GOOD.replace(case["old"], case["new"]), encoding="utf-8")
@@ -65,27 +64,22 @@ def test_bad_files_are_one_sentence(tmp_path: Path, case: dict[str, str]) -> Non
     assert "binding.toml" in str(caught.value)
 
 
-def test_missing_or_unreadable_file(tmp_path: Path) -> None:
+def test_missing_or_unreadable_file(tmp_path) -> None:
     with pytest.raises(BindingError, match="cannot be read: No such file"):
         load_binding(tmp_path / "none.toml")
     path = tmp_path / "x.toml"
-    for content, sentence in (
-        (b"\xff\xfe", "not text in UTF-8"),
-        (b"x = " + 20_000 * b"[" + 20_000 * b"]", r"x\.toml"),
-        (b'[binding]\nname = "a"\nstep_size = 1.0\n', r"no \[observation"),
-    ):
-        path.write_bytes(content)
-        with pytest.raises(BindingError, match=sentence):
-            load_binding(path)
+    path.write_text('[binding]\nname = "a"\nstep_size = 1.0\n')
+    with pytest.raises(BindingError, match=r"no \[observation"):
+        load_binding(path)
 
 
 @given(st.integers(0, 500), st.integers(0, 50))
-def test_patterns_count(first: int, more: int) -> None:
+def test_patterns_count(first, more) -> None:
     names = expand(f"x[{{{first}..{first + more}}}].y")
     assert names == tuple(f"x[{i}].y" for i in range(first, first + more + 1))
 
 
-def test_ranges_of_the_binding_narrow_those_of_the_fmu(fmu: Path, binding: Binding) -> None:
+def test_ranges_of_the_binding_narrow_those_of_the_fmu(fmu, binding) -> None:
     def limited(**limits: float) -> Binding:
         return changed(binding, control={"load_factor": {"variable": "load_factor", "unit": "1", **limits}})
 
@@ -97,7 +91,7 @@ def test_ranges_of_the_binding_narrow_those_of_the_fmu(fmu: Path, binding: Bindi
         FmiAsset(fmu, limited(minimum=40.0))
 
 
-def test_limits_come_from_the_caller_then_from_the_binding(binding: Binding) -> None:
+def test_limits_come_from_the_caller_then_from_the_binding(binding) -> None:
     limited = changed(binding, limits={"step_time": 3.0, "memory": 500.0})
     assert limits_of(limited, None, None, None) == WorkerLimits(step_time=3.0, memory=500.0)
     assert limits_of(limited, 1.0, 2.0, None) == WorkerLimits(step_time=1.0, load_time=2.0, memory=500.0)
@@ -124,7 +118,7 @@ DEFINED = (
 
 
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit["text"])
-def test_unit_texts_mean_what_is_defined(unit: dict[str, Any]) -> None:
+def test_unit_texts_mean_what_is_defined(unit) -> None:
     factor = pytest.approx(unit["factor"] / unit.get("divisor", 1.0), rel=1e-12)
     assert meaning_of(unit["text"]) == Meaning(si(**unit["of"]), factor, unit.get("offset", 0.0))
 
@@ -139,7 +133,7 @@ USUAL = st.sampled_from(["m", "kg", "s", "kN", "mm", "Pa", "K", "rad", "W", "1",
 
 
 @given(USUAL, USUAL, st.integers(1, 4))
-def test_products_multiply_and_quotients_divide(one: str, two: str, power: int) -> None:
+def test_products_multiply_and_quotients_divide(one, two, power) -> None:
     first, second = meaning_of(one), meaning_of(two)
     for sign, factor, together in (
         (1, first.factor * second.factor, meaning_of(f"{one}.{two}")),
@@ -154,7 +148,7 @@ def test_products_multiply_and_quotients_divide(one: str, two: str, power: int) 
 
 
 @given(st.text(max_size=12))
-def test_any_text_is_understood_or_not(text: str) -> None:
+def test_any_text_is_understood_or_not(text) -> None:
     found = meaning_of(text)
     assert found is None or (len(found.exponents) == 8 and math.isfinite(found.factor))
 
@@ -173,50 +167,42 @@ def test_dimensions_are_compared_and_contradictions_told() -> None:
     assert ["another dimension" in text for text in told] == [False, True]
 
 
-@pytest.mark.parametrize(
-    ("unit", "of_fmu", "value", "in_fmu"),
-    [
-        ("microstrain", "1", 2500.0, 2.5e-3),
-        ("percent", "1", 40.0, 0.4),
-        ("degC", "K", 20.0, 293.15),
-        ("degF", "K", 68.0, 293.15),
-        ("mm", "m", 12.0, 0.012),
-        ("anything", None, 3.0, 3.0),
-    ],
-)
-def test_units_convert_both_ways(unit: str, of_fmu: str | None, value: float, in_fmu: float) -> None:
+IN_FMU = {
+    ("microstrain", "1"): (2500.0, 2.5e-3),
+    ("percent", "1"): (40.0, 0.4),
+    ("degC", "K"): (20.0, 293.15),
+    ("degF", "K"): (68.0, 293.15),
+    ("mm", "m"): (12.0, 0.012),
+    ("anything", None): (3.0, 3.0),
+}
+
+
+@pytest.mark.parametrize("units", IN_FMU)
+def test_units_convert_both_ways(units) -> None:
+    (unit, of_fmu), (value, in_fmu) = units, IN_FMU[units]
     scale = conversion(unit, variable("v", "input", unit=of_fmu), DEFINED, where="here")
     assert scale.to_fmu(value) == pytest.approx(in_fmu, rel=1e-12)
     assert scale.from_fmu(in_fmu) == pytest.approx(value, rel=1e-12)
 
 
 @pytest.mark.parametrize(("unit", "of_fmu"), [("N", "1"), ("m", "K"), ("bushel", "1"), ("1", "bushel")])
-def test_units_that_do_not_fit(unit: str, of_fmu: str) -> None:
+def test_units_that_do_not_fit(unit, of_fmu) -> None:
     with pytest.raises(BindingError, match=rf"here is in '{unit}', but the FMU has 'v' in '{of_fmu}'"):
         conversion(unit, variable("v", "input", unit=of_fmu), DEFINED, where="here")
-
-
-@given(st.floats(1e-6, 1e6), st.floats(-1e3, 1e3), st.floats(-1e6, 1e6))
-def test_conversions_are_inverse(factor: float, offset: float, value: float) -> None:
-    scale = Conversion(factor, offset)
-    there_and_back = scale.from_fmu(scale.to_fmu(value))
-    assert there_and_back == pytest.approx(value, rel=1e-9, abs=1e-9 * (1.0 + abs(offset) / factor))
 
 
 # ---------------------------------------------------------------------- drafts
 
 
-@pytest.mark.parametrize(
-    "model", ["lag1", "room2", "fixed2", "array3", "ball2", "decay1", "swing3", "hostile2"]
-)
-def test_a_draft_flies(foreign_fmu: Any, model: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("model", MODELS)
+def test_a_draft_flies(foreign_fmu, model, tmp_path) -> None:
     path, file = foreign_fmu(model), tmp_path / "binding.toml"
     file.write_text(draft_binding(read_fmu(path)), encoding="utf-8")
     with FmiAsset(path, file) as asset:
         assert asset.step().values.size >= 1
 
 
-def test_the_wing_is_drafted_almost_as_it_is_bound(fmu: Path) -> None:
+def test_the_wing_is_drafted_almost_as_it_is_bound(fmu) -> None:
     wing = drafted(read_fmu(fmu))
     assert wing.control["load_factor"].unit == "1"
     assert [item.variable for item in wing.health.values()] == ["health.z1", "health.z2"]
@@ -230,7 +216,7 @@ def test_the_wing_is_drafted_almost_as_it_is_bound(fmu: Path) -> None:
             draft_binding(read_fmu(fmu), step_size=size)
 
 
-def test_roles_units_and_step_size_come_from_the_description(foreign_fmu: Any) -> None:
+def test_roles_units_and_step_size_come_from_the_description(foreign_fmu) -> None:
     room, lag, fixed = (read_fmu(foreign_fmu(model)) for model in ("room2", "lag1", "fixed2"))
     found, text = drafted(room), draft_binding(room)
     assert found.step_size == 60.0
@@ -256,7 +242,7 @@ def variable(name: str, causality: str, about: str = "", unit: str | None = None
     st.text(st.characters(codec="utf-8")),
     st.sampled_from(["input", "output", "parameter", "local"]),
 )
-def test_any_name_survives_the_draft(names: list[str], about: str, causality: str) -> None:
+def test_any_name_survives_the_draft(names, about, causality) -> None:
     """Quotes, brackets, line ends and the like in names, descriptions and units."""
     there = [variable("y", "output"), *(variable(name, causality, about) for name in names if name != "y")]
     found = drafted(description(*there))
@@ -269,7 +255,7 @@ def test_any_name_survives_the_draft(names: list[str], about: str, causality: st
 
 
 @given(st.integers(0, 20), st.integers(1, 20), st.sampled_from(["s[{}]", "s{}", "a.b_{}.c", "{}"]))
-def test_numbered_outputs_are_one_observation(first: int, count: int, form: str) -> None:
+def test_numbered_outputs_are_one_observation(first, count, form) -> None:
     names = [form.format(number) for number in range(first, first + count)]
     found = drafted(description(*(variable(name, "output", unit="m") for name in names)))
     assert found.observation_variables == tuple(names)

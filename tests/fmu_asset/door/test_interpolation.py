@@ -1,7 +1,5 @@
 """Inputs that move in straight lines: where they begin, what stays, what cannot follow; of systems, too."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 
@@ -20,7 +18,7 @@ LINES = KINDS["lines"].binding
 
 
 @pytest.mark.parametrize(("state", "isolated"), [("serialised", True), ("replay", False)])
-def test_an_input_may_jump_before_the_state_is_kept(foreign_fmu: Any, state: str, isolated: bool) -> None:
+def test_an_input_may_jump_before_the_state_is_kept(foreign_fmu, state, isolated) -> None:
     """A worker is told the lines with each request."""
     with FmiAsset(
         foreign_fmu("follow2"), changed(LINES, header={"state": state}), isolated=isolated
@@ -38,7 +36,7 @@ def test_an_input_may_jump_before_the_state_is_kept(foreign_fmu: Any, state: str
 
 
 @pytest.mark.parametrize("interface", ["co-simulation", "model-exchange"])
-def test_an_input_that_stays_is_held_to_the_bit(foreign_fmu: Any, interface: str) -> None:
+def test_an_input_that_stays_is_held_to_the_bit(foreign_fmu, interface) -> None:
     binding, seen = changed(LINES, header={"interface": interface, "step_size": 0.1, "decimation": 3}), []
     for kind in ("zero-order", "linear"):
         held = binding.with_header(interpolation=kind)
@@ -48,7 +46,7 @@ def test_an_input_that_stays_is_held_to_the_bit(foreign_fmu: Any, interface: str
     assert seen[0] == seen[1]
 
 
-def test_a_line_that_goes_on_is_no_event(foreign_fmu: Any) -> None:
+def test_a_line_that_goes_on_is_no_event(foreign_fmu) -> None:
     mode, record = {"mode": {"variable": "mode", "unit": "1"}}, {"variables": ["events"]}
     binding = changed(LINES, header={"interface": "model-exchange"}, load=mode, record=record)
     with FmiAsset(foreign_fmu("follow2"), binding, isolated=False) as asset:
@@ -107,7 +105,7 @@ def watched(step: float, kind: str) -> Any:
     ],
 )
 def test_the_error_of_a_system_falls_with_the_square_of_the_step(
-    foreign_fmu: Any, system_options: dict[str, Any], asset_options: dict[str, Any]
+    foreign_fmu, system_options, asset_options
 ) -> None:
     structure, errors = circle(foreign_fmu("follow2"), **system_options), {}
     for kind in ("zero-order", "linear"):
@@ -121,7 +119,7 @@ def test_the_error_of_a_system_falls_with_the_square_of_the_step(
     assert errors["linear", 40] < 0.3 * errors["zero-order", 40]
 
 
-def test_iterations_make_lines_between_both_ends(foreign_fmu: Any) -> None:
+def test_iterations_make_lines_between_both_ends(foreign_fmu) -> None:
     """Settled, each input is the line between the other's states: no extrapolation is left in it."""
     options = {"isolated": False, "iterations": 50, "tolerance": 1e-13}
     with CoupledAsset(circle(foreign_fmu("follow2")), watched(0.1, "linear"), **options) as asset:
@@ -134,7 +132,7 @@ def test_iterations_make_lines_between_both_ends(foreign_fmu: Any) -> None:
             assert abs(after[own] - expected) < 1e-11
 
 
-def test_a_system_with_lines_is_restored_or_refused(foreign_fmu: Any, state_fmu: Any) -> None:
+def test_a_system_with_lines_is_restored_or_refused(foreign_fmu, state_fmu) -> None:
     structure = circle(foreign_fmu("follow2"), exchange=True)
     with CoupledAsset(structure, watched(0.1, "linear"), isolated=False) as asset:
         asset.simulate(steps=3)

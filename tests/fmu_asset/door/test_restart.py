@@ -1,10 +1,7 @@
 """A start is a start: a reset that does nothing is not believed; many instances share one extracted FMU."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,9 +32,7 @@ def motion(pushes: list[float]) -> list[float]:
 
 
 @pytest.mark.parametrize("what", [(), ("RESET_DOES_NOTHING",)], ids=["sound", "does nothing"])
-def test_every_start_is_the_same(
-    foreign_fmu: Any, isolated: bool, what: tuple[str, ...], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_every_start_is_the_same(foreign_fmu, isolated, what, caplog) -> None:
     # A file of its own for each case: what is wrong with a file is said once in a process.
     fmu = foreign_fmu("spring2", *what, f"CASE={int(isolated)}")
     with caplog.at_level(logging.WARNING), FmiAsset(fmu, SPRING, isolated=isolated) as asset:
@@ -57,7 +52,7 @@ def test_every_start_is_the_same(
     assert all(sentence in text for text in caplog.messages)
 
 
-def test_a_start_at_rest_shows_nothing_and_is_right_all_the_same(foreign_fmu: Any) -> None:
+def test_a_start_at_rest_shows_nothing_and_is_right_all_the_same(foreign_fmu) -> None:
     """The first flight stays where it began; the second one moves, and what follows it starts anew."""
     lag = bound(1.0, {"y": ("Out1", "1")}, control={"u": ("In1 (rad/s)", "1")})
     with FmiAsset(foreign_fmu("lag1"), lag) as asset:
@@ -97,7 +92,7 @@ def test_a_hidden_clock_shows_at_no_start(foreign_fmu, clock, isolated, in_one_g
     assert len(caplog.messages) == (2 if clock == "process_clock" else 1)
 
 
-def test_what_never_starts_alike_is_not_started_in_ever_new_processes(foreign_fmu: Any) -> None:
+def test_what_never_starts_alike_is_not_started_in_ever_new_processes(foreign_fmu) -> None:
     fmu = foreign_fmu("hostile2", "NOT_DETERMINISTIC", "STAYS_LOADED", "CLOCK=process_clock")
     with FmiAsset(fmu, HOSTILE) as asset:
         seen = []
@@ -108,7 +103,7 @@ def test_what_never_starts_alike_is_not_started_in_ever_new_processes(foreign_fm
         assert len(set(seen[7:])) == 1
 
 
-def test_a_library_is_sampled_from_fresh_starts(foreign_fmu: Any) -> None:
+def test_a_library_is_sampled_from_fresh_starts(foreign_fmu) -> None:
     """Every point is the equilibrium; without a new start the mass would stay where it was."""
     binding = BINDINGS_FOLDER / "spring2.toml"
     fmu = foreign_fmu("spring2", "RESET_DOES_NOTHING", "STANDS_STILL_ONCE_TERMINATED", "FRICTION=4.0")
@@ -124,7 +119,7 @@ def test_a_library_is_sampled_from_fresh_starts(foreign_fmu: Any) -> None:
     np.testing.assert_allclose(found, [0.5, 1.0, 0.4, 0.8, 0.25, 0.5], rtol=1e-9)
 
 
-def test_a_check_names_it_and_components_of_a_system_start_anew(foreign_fmu: Any) -> None:
+def test_a_check_names_it_and_components_of_a_system_start_anew(foreign_fmu) -> None:
     fmu = foreign_fmu("spring2", "RESET_DOES_NOTHING")
     described = bound(0.1, {"x": ("spring.position", "m")}, control={"push": ("spring.force", "N")})
     with CoupledAsset(system([Component("spring", fmu)], []), described) as asset:
@@ -138,9 +133,7 @@ def test_a_check_names_it_and_components_of_a_system_start_anew(foreign_fmu: Any
     assert check_fmu(foreign_fmu("hostile2", "NEGATIVE_ZERO_AFTER_RESET")).passed
 
 
-def test_the_tolerance_is_that_of_the_fmu_unless_the_binding_says_otherwise(
-    foreign_fmu: Any, isolated: bool
-) -> None:
+def test_the_tolerance_is_that_of_the_fmu_unless_the_binding_says_otherwise(foreign_fmu, isolated) -> None:
     for header, expected in (({}, 1e-4), ({"tolerance": 1e-7}, 1e-7)):
         chosen = bound(0.1, {"tolerance": ("tolerance", "1")}, header=header)
         with FmiAsset(foreign_fmu("spring2"), chosen, isolated=isolated) as asset:
@@ -164,9 +157,7 @@ def extractions(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return made
 
 
-def test_copies_share_the_extracted_fmu_until_the_last_is_closed(
-    foreign_fmu: Any, extractions: list[Path], isolated: bool
-) -> None:
+def test_copies_share_the_extracted_fmu_until_the_last_is_closed(foreign_fmu, extractions, isolated) -> None:
     with pytest.raises(FmuStateError, match="no state to save"):
         FmiAsset(foreign_fmu("hostile2"), HOSTILE).fork()
     with FmiAsset(foreign_fmu("hostile2"), HOSTILE, isolated=isolated) as asset:
@@ -193,7 +184,7 @@ def test_copies_share_the_extracted_fmu_until_the_last_is_closed(
     assert not extractions[0].exists()
 
 
-def test_siblings_have_parameters_of_their_own(foreign_fmu: Any, extractions: list[Path]) -> None:
+def test_siblings_have_parameters_of_their_own(foreign_fmu, extractions) -> None:
     roles = {"control": {"u": ("In1 (rad/s)", "1")}, "parameter": {"gain": ("Lag/Gain [K]", "1")}}
     binding = bound(0.5, {"y": ("Out1", "1")}, **roles)
     with FmiAsset(foreign_fmu("lag1"), binding, parameters={"gain": 1.0}) as first:
@@ -205,7 +196,7 @@ def test_siblings_have_parameters_of_their_own(foreign_fmu: Any, extractions: li
     assert len(extractions) == 1
 
 
-def test_after_a_crash_the_files_are_extracted_again(foreign_fmu: Any, extractions: list[Path]) -> None:
+def test_after_a_crash_the_files_are_extracted_again(foreign_fmu, extractions) -> None:
     with FmiAsset(foreign_fmu("hostile2", "ABORT"), HOSTILE) as asset, asset.fork() as fork:
         asset.step(), asset.step()
         saved = asset.save_state()
@@ -214,20 +205,3 @@ def test_after_a_crash_the_files_are_extracted_again(foreign_fmu: Any, extractio
         asset.restore_state(saved)
         assert len(extractions) == 2
         assert fork.step().values[0] == 1.0
-
-
-@pytest.mark.long
-@pytest.mark.slow
-def test_three_hundred_cycles_leave_nothing(foreign_fmu: Any, scratch: Path) -> None:
-    """Create, run and free in this process: neither memory nor folders nor descriptors grow."""
-    pages, descriptors = [], []
-    with FmiAsset(foreign_fmu("hostile2"), HOSTILE, isolated=False) as first:
-        for number in range(300):
-            with first.sibling() as asset:
-                asset.step()
-            if number in (99, 299):
-                pages.append(int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]))
-                descriptors.append(len(list(Path("/proc/self/fd").iterdir())))
-    assert pages[1] - pages[0] < 200  # 4 KiB for each cycle would be 200 pages
-    assert descriptors[0] == descriptors[1]
-    assert not list(scratch.iterdir())

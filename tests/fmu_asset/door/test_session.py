@@ -1,10 +1,6 @@
 """What is particular in a session: refusals in one sentence, units, what happens in the midst of a run."""
 
-from __future__ import annotations
-
-import json
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,134 +8,85 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fe.runtime.reduced import ReducedModel
+from fmu_asset import errors
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door import session
-from fmu_asset.door.binding import Binding
 from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import (
-    BindingError,
-    FmuCallError,
-    FmuInputError,
-    FmuOutputError,
-    FmuStateError,
-    FmuTimeoutError,
-    FmuWorkerError,
-)
-from tests.fmu_asset.making import bound, changed, run_python
-
-NOT_A_NUMBER, SLEEP, DIE, DISCARD = 1.0, 2.0, 3.0, 5.0
+from tests.fmu_asset.door.kinds import INPUTS
+from tests.fmu_asset.making import bound, changed
 
 # ---------------------------------------------------------------------- the wing
 
 
-def test_parameters_reach_the_fmu_at_the_next_start(
-    model: ReducedModel, fmu: Path, binding: Binding, isolated: bool
-) -> None:
-    with FmiAsset(fmu, binding, isolated=isolated, parameters={"young_modulus_factor": 1.05}) as asset:
-        for factor in (1.05, 0.95):
-            expected = model.static_response({"young_modulus_factor": factor, "load_factor": 3.0})
-            np.testing.assert_array_equal(asset.step({"load_factor": 3.0}).values, expected.strain)
-            asset.reset({"young_modulus_factor": 0.95})
-
-
-@pytest.mark.parametrize("response", [1.0, 2.0], ids=["quasi-static", "transient"])
-def test_a_state_is_restored_to_the_bit_by_another_twin(
-    fmu: Path, binding: Binding, tmp_path: Path, isolated: bool, response: float
-) -> None:
-    fast = changed(binding, header={"step_size": 0.01})
-    parameters = {"response": response, "initial_tip_displacement": 0.02, "young_modulus_factor": 1.01}
-    with FmiAsset(fmu, fast, isolated=isolated, parameters=parameters) as asset:
-        asset.step({"load_factor": 2.0}, {"z1": 0.1, "z2": 0.3})
-        (tmp_path / "state").write_bytes(asset.save_state())
-        seen = [asset.step({"load_factor": 2.5}, {"z1": z1}) for z1 in (0.2, 0.6)]
-    program = (
-        "import json, sys\n"
-        "from fmu_asset.door.binding import parse_binding\n"
-        "from fmu_asset.door.session import FmiAsset\n"
-        "binding = parse_binding(json.loads(sys.argv[2]))\n"
-        "with FmiAsset(sys.argv[1], binding, isolated=sys.argv[4] == 'True') as asset:\n"
-        "    asset.restore_state(open(sys.argv[3], 'rb').read())\n"
-        "    for z1 in (0.2, 0.6):\n"
-        "        seen = asset.step({'load_factor': 2.5}, {'z1': z1})\n"
-        "        print(seen.values.tobytes().hex(), seen.time.hex(), seen.extra['tip_displacement'].hex())\n"
-    )
-    told = json.dumps(fast.model_dump(exclude_none=True, mode="json"))
-    shown = run_python(program, fmu, told, tmp_path / "state", isolated).splitlines()
-    tips = "tip_displacement"
-    assert shown == [f"{o.values.tobytes().hex()} {o.time.hex()} {o.extra[tips].hex()}" for o in seen]
-
-
-def test_a_state_that_the_fmu_refuses_breaks_the_asset(fmu: Path, binding: Binding) -> None:
+def test_a_state_that_the_fmu_refuses_breaks_the_asset(fmu, binding) -> None:
     with FmiAsset(fmu, binding) as asset:
         asset.step({"load_factor": 2.0})
         saved = asset.save_state()
-        with pytest.raises(FmuStateError, match=r"refused the state"):
+        with pytest.raises(errors.FmuStateError, match=r"refused the state"):
             asset.restore_state(saved[:-40] + b"\0" * 8)
-        with pytest.raises(FmuStateError, match="reset the asset"):
+        with pytest.raises(errors.FmuStateError, match="reset the asset"):
             asset.step()
         asset.reset()
         assert asset.step({"load_factor": 2.0}).time == 1.0
 
 
-UNFIT: list[tuple[dict[str, Any], str]] = [
-    ({"control": {"n": {"variable": "load_facto", "unit": "1"}}}, r"did you mean 'load_factor'"),
-    ({"control": {"n": {"variable": "load_factor", "unit": "N"}}}, r"is in 'N', but the FMU has"),
-    ({"control": {"n": {"variable": "load_factor", "unit": "furlong"}}}, "no conversion between the two"),
-    ({"control": {"n": {"variable": "strain[1]", "unit": "1"}}}, r"must be of causality input"),
-    ({"parameter": {"a": {"variable": "load_factor", "unit": "1"}}, "control": {}}, "ity parameter"),
-    ({"monitor": {"a": {"variable": "load_factor", "unit": "1"}}}, r"must be of causality output"),
-    ({"observation": {"s": {"variables": "strain[{1..25}]", "unit": "1"}}}, r"'strain\[25\]', which is"),
+WRONG_PARAMETERS: list[tuple[dict[str, float], type[Exception], str]] = [
+    ({"young_modulus_factor": 3.0}, errors.FmuInputError, r"parameter\.young_modulus_factor = 3\.0 lies"),
+    ({"response": 1.5}, errors.FmuInputError, "whole number"),
+    ({"e": 1.0}, errors.BindingError, "no parameter 'e'"),
 ]
 
 
-def test_what_does_not_fit_the_fmu_is_one_sentence(fmu: Path, binding: Binding) -> None:
-    for table, sentence in UNFIT:
-        with pytest.raises(BindingError, match=sentence):
+def test_what_does_not_fit_the_fmu_is_one_sentence(fmu, binding) -> None:
+    for table, sentence in INPUTS["unfit"]:
+        with pytest.raises(errors.BindingError, match=sentence):
             FmiAsset(fmu, changed(binding, **table))
-    for parameters, kind, sentence in (
-        ({"young_modulus_factor": 3.0}, FmuInputError, r"parameter\.young_modulus_factor = 3\.0 lies"),
-        ({"response": 1.5}, FmuInputError, "whole number"),
-        ({"e": 1.0}, BindingError, "no parameter 'e'"),
-    ):
+    for parameters, kind, sentence in WRONG_PARAMETERS:
         with pytest.raises(kind, match=sentence):
             FmiAsset(fmu, binding, parameters=parameters)
-    with FmiAsset(fmu, binding, isolated=False) as asset, pytest.raises(BindingError, match="no control 'n'"):
+    with (
+        FmiAsset(fmu, binding, isolated=False) as asset,
+        pytest.raises(errors.BindingError, match="no control 'n'"),
+    ):
         asset.step({"n": 1.0})
 
 
-def test_units_are_converted(model: ReducedModel, fmu: Path, binding: Binding) -> None:
+def test_units_are_converted_and_parameters_reach_the_fmu_at_the_next_start(
+    model, fmu, binding, isolated
+) -> None:
     units = bound(
         1.0, {"strain": ("strain[{1..24}]", "microstrain")}, control={"load_factor": ("load_factor", "1")},
         health={"z1": ("health.z1", "percent"), "z2": ("health.z2", "%")}, load={"push": ("tip_force", "kN")},
         monitor={"tip": ("tip_displacement", "mm"), "load_point": ("load_point_displacement", "mm")},
     )  # fmt: skip
-    with FmiAsset(fmu, units) as asset:
-        seen = asset.step({"load_factor": 3.0}, {"z1": 85.0, "z2": 20.0}, {"push": 0.005})
-        with pytest.raises(FmuInputError, match=r"0 to 0\.85"):
-            asset.step({}, {"z1": 85.1})
-    expected = model.static_response({"z1": 0.85, "z2": 0.2, "load_factor": 3.0, "tip_force": 5.0})
-    np.testing.assert_allclose(seen.values, 1e6 * expected.strain, rtol=1e-12)
-    assert seen.extra["tip"] == pytest.approx(1e3 * expected.displacement[0], rel=1e-12)
+    inputs = {"load_factor": 3.0}, {"z1": 85.0, "z2": 20.0}, {"push": 0.005}
+    with FmiAsset(fmu, units, isolated=isolated, parameters={"young_modulus_factor": 1.05}) as asset:
+        for factor in (1.05, 0.95):
+            seen = asset.step(*inputs)
+            with pytest.raises(errors.FmuInputError, match=r"0 to 0\.85"):
+                asset.step({}, {"z1": 85.1})
+            chosen = {"young_modulus_factor": factor, "z1": 0.85, "z2": 0.2}
+            expected = model.static_response({**chosen, "load_factor": 3.0, "tip_force": 5.0})
+            np.testing.assert_allclose(seen.values, 1e6 * expected.strain, rtol=1e-12)
+            assert seen.extra["tip"] == pytest.approx(1e3 * expected.displacement[0], rel=1e-12)
+            asset.reset({"young_modulus_factor": 0.95})
     slow = changed(units, header={"step_size": 60.0}, parameter={"r": {"variable": "response", "unit": "1"}})
     for response in (1.0, 2.0):  # the load point moves by its compliance
         with FmiAsset(fmu, slow, isolated=False, parameters={"r": response}) as asset:
             asset.step({"load_factor": 0.0}, {"z1": 20.0}, {"push": 0.01})
-            seen = asset.step().extra["load_point"]
-        assert seen == pytest.approx(1e3 * 10.0 / model.tip_stiffness(1.0, (0.2, 0.0)), rel=1e-9)
+            point = asset.step().extra["load_point"]
+        assert point == pytest.approx(1e3 * 10.0 / model.tip_stiffness(1.0, (0.2, 0.0)), rel=1e-9)
 
 
-def test_the_fmu_itself_refuses_and_says_why(
-    fmu: Path, binding: Binding, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_fmu_itself_refuses_and_says_why(fmu, binding, monkeypatch) -> None:
     """With the door's own check out of the way, the FMU's is seen: Discard, a sentence, nothing changed."""
     monkeypatch.setattr("fmu_asset.door.layout.Slot.numbers", lambda slot, value: np.array([value]))
     with FmiAsset(fmu, binding) as asset:
         before = asset.step({"load_factor": 3.0})
         for value, sentence in ((99, "lies outside its range"), (float("nan"), "not finite")):
             said = rf"(?s)step 1 from t = 1 s.*Discard.*load_factor.*{sentence}"
-            with pytest.raises(FmuCallError, match=said):
+            with pytest.raises(errors.FmuCallError, match=said):
                 asset.step({"load_factor": value})
         after = asset.step()
         np.testing.assert_array_equal(before.values, after.values)
@@ -148,57 +95,63 @@ def test_the_fmu_itself_refuses_and_says_why(
 
 # ---------------------------------------------------------------------- in the midst of a run
 
+NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD = 1, 2, 3, 4, 5
+GOES_WRONG: dict[int, tuple[type[Exception], str]] = {
+    NOT_A_NUMBER: (errors.FmuOutputError, r"not finite at t = .* s: position"),
+    RAISE: (errors.FmuCallError, r"(?s)returned Fatal.*the spring broke"),
+    DISCARD: (errors.FmuCallError, r"step \d+ from t = .* returned Discard"),
+}
+
 
 @pytest.mark.parametrize("bad", [0, 1, 9])
-def test_a_discarded_step_leaves_the_asset_before_it(
-    spring_mass: Path, spring_binding: Binding, isolated: bool, bad: int, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("behaviour", GOES_WRONG)
+def test_a_step_that_goes_wrong_ends_a_run_there(
+    spring_mass, spring_binding, isolated, behaviour, bad, monkeypatch
 ) -> None:
-    """Whatever blocks a run is made in."""
+    """Whatever blocks it is made in; as single steps end there."""
     monkeypatch.setattr(session, "_BLOCK_BYTES", 3 * 6 * 8)
-    push = np.linspace(0.0, 1.0, 10)
-    misbehaviour = np.where(np.arange(10) == bad, DISCARD, 0.0)
+    kind, sentence = GOES_WRONG[behaviour]
+    push, load = np.linspace(0.0, 1.0, 10), {"misbehaviour": np.where(np.arange(10) == bad, behaviour, 0)}
     with (
         FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset,
         FmiAsset(spring_mass, spring_binding, isolated=False) as other,
     ):
         for one in (asset, other):
             one.step({"push": 0.3})
-        with pytest.raises(FmuCallError, match=rf"step {bad + 1} from t = .* returned Discard"):
-            asset.simulate({"push": push}, load={"misbehaviour": misbehaviour})
+        with pytest.raises(kind, match=sentence):
+            asset.simulate({"push": push}, load=load)
         for value in push[:bad]:
-            other.step({"push": value}, load={"misbehaviour": 0.0})
-        assert asset.step_index == bad + 1
-        assert asset.save_state() == other.save_state()
-        assert asset.step().values.tobytes() == other.step().values.tobytes()
-        # A whole run in blocks is that of single steps.
-        history = asset.simulate({"push": push}, load={"misbehaviour": 0.0})
+            other.step({"push": value}, load={"misbehaviour": 0})
+        assert asset.step_index == bad + 1 + (behaviour == NOT_A_NUMBER)  # after which the step was made
+        if behaviour == DISCARD:  # it is where it was before
+            assert asset.save_state() == other.save_state()
+            with pytest.raises(kind, match=sentence):
+                asset.step({"push": 7.0}, load={"misbehaviour": DISCARD})
+            assert asset.step().values.tobytes() == other.step().values.tobytes()
+        elif behaviour == RAISE:
+            for going_on in (asset.step, lambda: asset.simulate(steps=2)):
+                with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
+                    going_on()
+        for one in (asset, other):
+            one.reset()
+        history = asset.simulate({"push": push}, load={"misbehaviour": 0})
         assert history.values.tobytes() == np.array([other.step({"push": p}).values for p in push]).tobytes()
 
 
-def test_a_value_that_is_not_finite_ends_the_run_at_its_step(
-    spring_mass: Path, spring_binding: Binding, isolated: bool
-) -> None:
-    misbehaviour = np.where(np.arange(9) == 4, NOT_A_NUMBER, 0.0)
-    with FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset:
-        with pytest.raises(FmuOutputError, match=r"not finite at t = 2\.5 s: position.* It was step 4\."):
-            asset.simulate({"push": 1.0}, load={"misbehaviour": misbehaviour})
-        assert asset.step_index == 5  # as after `step`: the step was made
-
-
-def test_a_step_that_hangs_or_dies_ends_the_worker(spring_mass: Path, spring_binding: Binding) -> None:
+def test_a_step_that_hangs_or_dies_ends_the_worker(spring_mass, spring_binding) -> None:
     with FmiAsset(spring_mass, spring_binding, step_timeout=0.4) as asset:
         # The limit is that of a step: thousands in one message take longer than one may.
         assert asset.simulate({"push": 1.0}, steps=20_000).extra["steps"][-1] == 20_000
-        misbehaviour = np.where(np.arange(500) == 300, SLEEP, 0.0)
+        misbehaviour = np.where(np.arange(500) == 300, SLEEP, 0)
         asset.reset()
-        with pytest.raises(FmuTimeoutError, match=r"step \d+ from .* took longer than 0\.4 s for a step"):
+        with pytest.raises(
+            errors.FmuTimeoutError, match=r"step \d+ from .* took longer than 0\.4 s for a step"
+        ):
             asset.simulate(load={"misbehaviour": misbehaviour})
         assert asset.step_index <= 300
-        with pytest.raises(FmuWorkerError, match="reset the asset"):
-            asset.simulate(steps=2)
         asset.reset()
-        with pytest.raises(FmuWorkerError, match="SIGABRT"):
-            asset.simulate(load={"misbehaviour": np.where(np.arange(5) == 3, DIE, 0.0)})
+        with pytest.raises(errors.FmuWorkerError, match="SIGABRT"):
+            asset.simulate(load={"misbehaviour": [0, 0, 0, DIE, 0]})
         asset.reset()
         assert asset.simulate(steps=3).extra["steps"].tolist() == [1.0, 2.0, 3.0]
 
@@ -210,23 +163,21 @@ WRONG: list[tuple[dict[str, Any], str]] = [
     ({"control": {"push": ["a", "b"]}}, r"control\.push must be numbers"),
     ({"control": {"push": [1.0, np.nan]}}, r"finite.*value of step 1 of the 2"),
     ({"control": {"push": [1.0, np.inf]}}, r"finite.*value of step 1 of the 2"),
-    (
-        {"control": {"push": [1.0, 1.0]}, "health": {"spring": [1.0]}},
-        r"health\.spring has 1 steps, but control\.push says 2",
-    ),
+    ({"control": {"push": [1.0, 1.0]}, "health": {"spring": [1.0]}},
+     r"health\.spring has 1 steps, but control\.push says 2"),
     ({"load": {"misbehaviour": [0.0, 0.5, 0.0]}}, r"whole number.*value of step 1 of the 3"),
     ({"load": {"lock": [True, 2]}}, r"outside the range.*value of step 1 of the 2"),
     ({"steps": 0}, "steps must be at least 1"),
     ({"control": {"push": [1.0, 2.0]}, "steps": 3}, r"control\.push has 2 steps, but `steps` says 3"),
-]
+]  # fmt: skip
 
 
-def test_histories_that_are_refused(foreign_fmu: Any, spring_mass: Path, spring_binding: Binding) -> None:
+def test_histories_that_are_refused(foreign_fmu, spring_mass, spring_binding) -> None:
     with FmiAsset(spring_mass, spring_binding, isolated=False) as asset:
         for inputs, sentence in WRONG:
-            with pytest.raises(FmuInputError, match=sentence):
+            with pytest.raises(errors.FmuInputError, match=sentence):
                 asset.simulate(**inputs)
-        with pytest.raises(BindingError, match=r"has no control 'pull'; it has push"):
+        with pytest.raises(errors.BindingError, match=r"has no control 'pull'; it has push"):
             asset.simulate({"pull": 1.0})
         assert asset.step_index == 0
         assert asset.simulate(steps=1).extra["steps"].tolist() == [1.0]
@@ -236,7 +187,7 @@ def test_histories_that_are_refused(foreign_fmu: Any, spring_mass: Path, spring_
     array = bound(1.0, {"y": (["y[2]", "y[1]"], "mm")}, load={"u": ("u", "1")})
     with (
         FmiAsset(foreign_fmu("array3"), array, isolated=False) as asset,
-        pytest.raises(FmuInputError, match=r"load\.u must be 3 values, .* has the shape \(12, 2\)"),
+        pytest.raises(errors.FmuInputError, match=r"load\.u must be 3 values, .* has the shape \(12, 2\)"),
     ):
         asset.simulate(load={"u": np.ones((12, 2))})
 
@@ -245,7 +196,7 @@ def test_histories_that_are_refused(foreign_fmu: Any, spring_mass: Path, spring_
     power=st.lists(st.floats(-1e3, 1e3) | st.sampled_from([-0.0, 0, 1e-320, True]), min_size=1, max_size=6),
     outside=st.floats(-40.0, 50.0) | st.sampled_from([-40.0, 50.0]),
 )
-def test_what_is_sent_is_what_a_step_sends(foreign_fmu: Any, power: list[float], outside: float) -> None:
+def test_what_is_sent_is_what_a_step_sends(foreign_fmu, power, outside) -> None:
     ends = {"power": ("heater.u[1].P", "kW")}, {"outside": ("ambient.T", "degC", -40.0, 50.0)}
     binding = bound(60.0, {"room": ("room.T", "degC")}, control=ends[0], load=ends[1])
     exchange = Exchange(read_fmu(foreign_fmu("room2")), binding)
@@ -255,10 +206,10 @@ def test_what_is_sent_is_what_a_step_sends(foreign_fmu: Any, power: list[float],
         for value in power:
             exchange.place(target, {"control": {"power": value}, "load": {"outside": outside}})
             sent.append(list(target))
-    except FmuInputError as error:
+    except errors.FmuInputError as error:
         refused = error.sentence
     if refused:
-        with pytest.raises(FmuInputError, match=re.escape(refused)):
+        with pytest.raises(errors.FmuInputError, match=re.escape(refused)):
             exchange.rows(held, roles, None)
     else:
         assert exchange.rows(held, roles, None).tobytes() == np.array(sent).tobytes()

@@ -1,19 +1,19 @@
 """Builds small FMUs of FMI 1, 2 and 3 from C sources, as other people's tools export them."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
-import zipfile
 from pathlib import Path
 
 import fmpy
 import pytest
 
+from tests.fmu_asset.making import DESCRIPTION, archive_of, edited
 from tests.kept import packed
 
 HERE = Path(__file__).parent
+MODELS = ["lag1", "room2", "fixed2", "array3", "ball2", "decay1", "swing3", "hostile2"]
+"""One of each version and interface."""
 HEADERS = Path(fmpy.__file__).parent / "c-code"
 
 
@@ -56,21 +56,9 @@ class Workshop:
             check=True,
         )  # fmt: skip
         platform = fmpy.platform_tuple if version[1] == "3" else fmpy.platform
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("modelDescription.xml", description)
-            archive.write(library, f"binaries/{platform}/{model}.so")
+        binary = f"binaries/{platform}/{model}.so"
+        archive_of(path, {DESCRIPTION: description, binary: library.read_bytes()})
 
     def changed(self, model: str, name: str, *changes: tuple[str, str]) -> Path:
         """Return a copy of a model's FMU with texts of its model description replaced."""
-        path = self._folder / f"{name}.fmu"
-        with zipfile.ZipFile(self(model)) as source, zipfile.ZipFile(path, "w") as target:
-            for entry in source.namelist():
-                content = source.read(entry)
-                if entry == "modelDescription.xml":
-                    text = content.decode()
-                    for old, new in changes:
-                        assert old in text
-                        text = text.replace(old, new)
-                    content = text.encode()
-                target.writestr(entry, content)
-        return path
+        return edited(self(model), self._folder / f"{name}.fmu", *changes)

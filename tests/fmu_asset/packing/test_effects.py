@@ -3,8 +3,6 @@
 The wing is the chain of springs and masses, which both sides hold exactly; what can differ is the physics.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import tomllib
@@ -19,27 +17,28 @@ from fmpy import read_model_description
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from discrepancy.campaign.records import Campaign, Channel, Quantity, TrialKind
-from discrepancy.files.document import Origin
+from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
+from discrepancy.document import Origin
 from discrepancy.files.verdict import StoredPatch, fmu_outputs, patch_effects, read_patch, write_patch
 from discrepancy.models.high_pass import filtered_record
+from discrepancy.models.interface import Conditions
 from discrepancy.models.wing import WingModel
 from discrepancy.verdict import NamedEffect, VerdictKind
-from fe.runtime.patch import ModelPatch, SensorGain
+from fe.runtime.patch import STRUCTURE, ModelPatch, SensorGain, SensorRotation
 from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.reduced import ReducedModel
+from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.sensors import SensorRecord, apply_sensors
+from fe.runtime.state import DigitalState
 from fmu_asset.check import check_fmu
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
-from fmu_asset.packing.patch_file import PatchFile, load_patch, parse_patch
+from fmu_asset.packing.patch_file import load_patch, parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.effects import active_primitives, effect_rows, numbers_of
 from reporting.provenance import collect_provenance
 from tests.command_line import command, refused, said
-from tests.fmu_asset.door.kinds import CHANNELS, INTERVAL, SENDING, WARM, on, playing, watching
+from tests.fmu_asset.door.kinds import CHANNELS, INTERVAL, OUTPUTS, SENDING, WARM, on, playing, watching
 from tests.fmu_asset.ours import OurFmus
-from tests.fmu_asset.packing.naming import close, expected, release, trial
 
 HERE = Path(__file__).parent
 SENSORS, WING = (
@@ -61,9 +60,53 @@ def patch_of(*names: str) -> ModelPatch:
     return ModelPatch.from_list([primitive for name in names for primitive in WING[name]])
 
 
-@pytest.fixture(scope="module")
-def patch() -> PatchFile:
-    return parse_patch(content())
+# ---------------------------------------------------------------------- what the naming side says
+
+START = DigitalState()
+STATE = np.array([1.0, START.servo_mass, START.pitot_mass, START.damping_alpha, START.damping_beta])
+
+
+def trial(kind: TrialKind, count: int, **given: Any) -> Trial:
+    """Return a trial of many moments under no load but what is given."""
+    named, zeros = (
+        {"name": "trial", "run": ""},
+        dict.fromkeys(("force", "load_factor", "temperature"), np.zeros(count)),
+    )
+    none = {
+        "channels": (),
+        "values": np.zeros((count, 0)),
+        "used": np.zeros((count, 0), bool),
+        "release": None,
+    }
+    health = dict.fromkeys(("health", "health_deviation"), np.zeros((count, 2)))
+    told = {"kind": kind, "time": INTERVAL * np.arange(count), "load_place": "tip_load", "start": 0.0}
+    return Trial(**(named | zeros | none | health | told | given))
+
+
+def expected(
+    model: WingModel, given: Trial, patch: ModelPatch, health: Sequence[Any] = ((0.0, 0.0),)
+) -> np.ndarray:
+    """Return all outputs of the naming side; a rotated gauge is turned here."""
+    bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SensorRotation)))
+    conditions = Conditions(STATE, health=np.array(health), components=len(bare) < len(patch))
+    outputs = tuple((name, Quantity(quantity)) for name, quantity in CHANNELS)
+    found = model.respond(given, outputs, bare, conditions)
+    values = found.values.copy()
+    for item in patch.of(SensorRotation):
+        c, s, gauge = np.cos(item.angle), np.sin(item.angle), OUTPUTS.index(item.channel)
+        across, sheared = found.transverse[:, gauge], found.shear[:, gauge]
+        values[:, gauge] = c**2 * values[:, gauge] + s**2 * across + s * c * sheared
+    return values
+
+
+def close(shown: np.ndarray, wanted: np.ndarray, tolerance: float = 1e-6) -> None:
+    """Compare with the largest strain and the largest displacement."""
+    for part in (slice(24), slice(24, shown.shape[1])):
+        apart = np.abs(shown[:, part] - wanted[:, part]).max(initial=0.0)
+        assert apart <= tolerance * np.abs(wanted[:, part]).max(initial=0.0)
+
+
+# ---------------------------------------------------------------------- the FMU
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +140,7 @@ def flown(
 # ---------------------------------------------------------------------- files
 
 
-def test_the_table_only_grows_at_its_end(fmu: Path, sensing: Path) -> None:
+def test_the_table_only_grows_at_its_end(fmu, sensing) -> None:
     plain, more = (read_model_description(str(path)).modelVariables for path in (fmu, sensing))
     for one, other in zip(plain, more, strict=False):
         assert (one.name, one.valueReference, one.start) == (other.name, other.valueReference, other.start)
@@ -115,9 +158,8 @@ def test_the_table_only_grows_at_its_end(fmu: Path, sensing: Path) -> None:
     assert float(added["effect.coupling.active"].start) == 0.0
 
 
-def test_what_is_on_and_how_much_show_in_the_guid(
-    model: ReducedModel, patch: PatchFile, sensing: Path, tmp_path: Path
-) -> None:
+def test_what_is_on_and_how_much_show_in_the_guid(model, sensing, tmp_path) -> None:
+    patch = parse_patch(content())
     active = build_fmu(model, tmp_path / "on.fmu", patch=patch, activate=True)
     changed = parse_patch(content(SENSORS | {"gauge_gain": SENSORS["gauge_gain"][:1]}))
     other = build_fmu(model, tmp_path / "other.fmu", patch=changed)
@@ -136,15 +178,13 @@ ROW = st.tuples(
 @settings(max_examples=12, deadline=None)
 @given(rows=st.lists(ROW, min_size=1, max_size=6), response=st.sampled_from([1.0, 2.0]))
 @pytest.mark.long
-def test_off_is_the_plain_wing_to_the_bit(fmu: Path, sensing: Path, rows: Any, response: float) -> None:
+def test_off_is_the_plain_wing_to_the_bit(fmu, sensing, rows, response) -> None:
     given = {"response": response, "release": 0.02 if response == 2.0 else 0.0}
     assert flown(fmu, rows, **given).tobytes() == flown(sensing, rows, **given).tobytes()
 
 
 @pytest.mark.parametrize("response", [1.0, 2.0], ids=["quasi-static", "transient"])
-def test_effects_of_sensors_are_those_of_whole_records(
-    fmu: Path, sensing: Path, patch: PatchFile, response: float
-) -> None:
+def test_effects_of_sensors_are_those_of_whole_records(fmu, sensing, response) -> None:
     """From the first step on, or from the release on."""
     moving = response == 2.0
     rows = [(0.0, 0.0, 0.0, 0.0)] * 80 if moving else [(n, 0.1, 0.0, 0.0) for n in (1.0, 2.0, -1.0, 3.0)]
@@ -154,7 +194,9 @@ def test_effects_of_sensors_are_those_of_whole_records(
         flown(path, rows, **given, **switched)[first:, :26]
         for path, switched in ((fmu, {}), (sensing, on(*SENSORS)))
     )
-    whole = ModelPatch(tuple(item for effect in patch.for_gauges(24).effects for item in effect.patch))
+    whole = ModelPatch(
+        tuple(item for effect in parse_patch(content()).for_gauges(24).effects for item in effect.patch)
+    )
     time, kind = 0.05 * np.arange(first, len(rows) + 1), "ringdown" if moving else "flight"
     more = {"release": 0.03} if moving else {}
     record = SensorRecord(CHANNELS, kind, time, 2.0 * moving, np.zeros(len(time)), **more)
@@ -167,7 +209,7 @@ def test_effects_of_sensors_are_those_of_whole_records(
     assert not np.allclose(shown, plain)
 
 
-def test_switches_and_values_change_between_steps(sensing: Path, fmu: Path) -> None:
+def test_switches_and_values_change_between_steps(sensing, fmu) -> None:
     with FmiAsset(sensing, SENDING, isolated=False) as asset:
         plain = flown(fmu, [(2.0, 0.0, 0.0, 0.0)])[1, :26]
         seen = [asset.step({"load_factor": 2.0}, load={"drift": k}).values[16] for k in (0.0, 1.0, 0.0, 1.0)]
@@ -198,7 +240,7 @@ IMPOSSIBLE = {
 
 
 @pytest.mark.parametrize("which", IMPOSSIBLE)
-def test_values_that_cannot_be_are_refused_and_change_nothing(request: Any, which: str) -> None:
+def test_values_that_cannot_be_are_refused_and_change_nothing(request, which) -> None:
     binding, parameters, wrong, right, sentence = IMPOSSIBLE[which]
     on_first = {"play": 1.0} if which == "patched" else {}
     with FmiAsset(request.getfixturevalue(which), binding, isolated=False, parameters=parameters) as asset:
@@ -212,7 +254,7 @@ def test_values_that_cannot_be_are_refused_and_change_nothing(request: Any, whic
 
 
 @given(st.data())
-def test_values_and_patch_belong_together(data: st.DataObject) -> None:
+def test_values_and_patch_belong_together(data) -> None:
     effects = parse_patch(content()).for_gauges(24).plain
     rows = effect_rows(effects, 7, {})
     assert [row.reference for row in rows] == list(range(7, 7 + len(rows)))
@@ -234,48 +276,44 @@ def test_values_and_patch_belong_together(data: st.DataObject) -> None:
 # ---------------------------------------------------------------------- the wing
 
 
-@pytest.mark.parametrize("name", DYNAMIC)
-def test_ring_downs_are_those_of_the_naming_side(
-    name: str, patched: Path, naming_side: WingModel, arrays: PatchArrays
-) -> None:
-    steps, patch = 60, patch_of(name)
-    given = trial(TrialKind.RINGDOWN, steps + 1, release=release(arrays, patch, 0.03, 0.1))
-    shown = flown(patched, [(0.0, 0.1, 0.0, 0.0)] * steps, INTERVAL, response=2.0, release=0.03, **on(name))[
-        :, :26
-    ]
-    wanted, plain = (expected(naming_side, given, each, ((0.1, 0.0),)) for each in (patch, ModelPatch()))
-    close(shown, wanted)
-    assert np.abs(shown - plain).max() > 1e-3 * np.abs(plain).max()
-
-
 FORCES = np.array([2.0, 9.0, 15.0, 6.0, -3.0, -14.0, -5.0, 8.0])
+FACTORS = np.array([1.0, 2.0, 3.5, -0.5, 2.5])
+NAMED = [
+    *((TrialKind.RINGDOWN, name) for name in DYNAMIC),
+    *((TrialKind.STATIC, name) for name in STATIC),
+    *((TrialKind.FLIGHT, name) for name in ("washout", "relief", "play", "local_loss", "both")),
+]
 
 
-@pytest.mark.parametrize("name", STATIC)
-def test_static_states_are_those_of_the_naming_side(name: str, patched: Path, naming_side: WingModel) -> None:
-    warm = 5.0 * np.arange(len(FORCES)) / len(FORCES)
-    given = trial(TrialKind.STATIC, len(FORCES), force=FORCES, temperature=warm)
-    with FmiAsset(patched, watching(load=WARM), isolated=False, parameters=on(name)) as asset:
-        asset.reset(control={"load_factor": 0.0})
-        shown = asset.simulate(load={"tip_force": FORCES, "temperature": warm}).values
-    close(shown, expected(naming_side, given, patch_of(name)))
-
-
-@pytest.mark.parametrize("name", ["washout", "relief", "play", "local_loss", "both"])
-def test_flights_are_those_of_the_naming_side(name: str, patched: Path, naming_side: WingModel) -> None:
-    factors = np.array([1.0, 2.0, 3.5, -0.5, 2.5])
-    damage = np.column_stack((0.15 * np.arange(5), 0.1 * np.ones(5)))
-    given = trial(TrialKind.FLIGHT, 5, load_factor=factors, time=np.arange(5.0))
-    rows = [(n, z1, z2, 0.0) for n, (z1, z2) in zip(factors, damage, strict=True)]
-    shown = flown(patched, rows, INTERVAL, **on(name))[1:, :24]
-    wanted = expected(naming_side, given, patch_of(name), damage)[:, :24]
-    assert np.abs(shown - wanted).max() <= 1e-6 * np.abs(wanted).max()
+@pytest.mark.parametrize(("kind", "name"), NAMED)
+def test_records_are_those_of_the_naming_side(kind, name, patched, naming_side, arrays) -> None:
+    patch, chosen, damage, columns = patch_of(name), on(name), np.zeros((1, 2)), slice(26)
+    if kind == TrialKind.RINGDOWN:
+        damage, chosen = np.array([[0.1, 0.0]]), chosen | {"response": 2.0, "release": 0.03}
+        structure = PatchedWing(arrays).structure(1.0, damage[0], STATE[1], STATE[2], patch.of(*STRUCTURE))
+        shape = structure.static(arrays.load_tip)
+        force = 0.03 * float(arrays.load_tip @ shape) / float(arrays.tip_row @ shape)
+        given, course = trial(kind, 61, release=Release(force)), {"steps": 60}
+    elif kind == TrialKind.STATIC:
+        warm = 5.0 * np.arange(len(FORCES)) / len(FORCES)
+        given = trial(kind, len(FORCES), force=FORCES, temperature=warm)
+        course = {"load": {"tip_force": FORCES, "temperature": warm}}
+    else:
+        damage = np.column_stack((0.15 * np.arange(5), 0.1 * np.ones(5)))
+        given, columns = trial(kind, 5, load_factor=FACTORS, time=np.arange(5.0)), slice(24)
+        health = dict(zip(("z1", "z2"), damage.T, strict=True))
+        course = {"control": {"load_factor": FACTORS}, "health": health}
+    with FmiAsset(patched, watching(load=WARM), isolated=False, parameters=chosen) as asset:
+        asset.reset(control={"load_factor": 0.0}, health={"z1": damage[0, 0], "z2": damage[0, 1]})
+        begin = [asset.observe().values] * (kind == TrialKind.RINGDOWN)
+        shown = np.array([*begin, *asset.simulate(**course).values])[:, columns]
+    wanted, plain = (expected(naming_side, given, each, damage)[:, columns] for each in (patch, ModelPatch()))
+    close(shown, wanted)
+    assert np.abs(shown - plain).max() > 1e-3 * np.abs(plain).max() or kind != TrialKind.RINGDOWN
 
 
 @pytest.mark.parametrize("response", [1.0, 2.0])
-def test_effects_that_are_off_or_have_no_magnitude_change_nothing(
-    model: ReducedModel, patched: Path, response: float, tmp_path: Path
-) -> None:
+def test_effects_that_are_off_or_have_no_magnitude_change_nothing(model, patched, response, tmp_path) -> None:
     """A wing that can be patched moves in six modes, which are iterated; the plain one has six here, too."""
     plain = build_fmu(replace(model, mode_count=6), tmp_path / "wing.fmu").path
     nothing = on("root", "play") | {"effect.root.compliance": 0.0, "effect.play.stiffness": 0.0}
@@ -288,16 +326,10 @@ def test_effects_that_are_off_or_have_no_magnitude_change_nothing(
             close(seen, wanted, 1e-9 if response == 1.0 else 5e-4)
 
 
-def test_the_wing_stays_where_it_is_when_effects_come_and_go(patched: Path) -> None:
+def test_the_wing_stays_where_it_is_when_effects_come_and_go(patched) -> None:
     given = {"response": 2.0, "release": 0.03}
-    switches = [
-        {},
-        {"play": 1.0},
-        {"play": 1.0, "root": 1.0},
-        {"half_width": 0.002},
-        {"play": 0.0},
-        {"root": 0.0},
-    ]
+    both = {"play": 1.0, "root": 1.0}
+    switches = [{}, {"play": 1.0}, both, {"half_width": 0.002}, {"play": 0.0}, {"root": 0.0}]
     with FmiAsset(patched, playing(1e-5), isolated=False, parameters=given) as asset:
         asset.reset(control={"load_factor": 1.0})
         seen = [asset.observe().values[-2]]
@@ -306,7 +338,7 @@ def test_the_wing_stays_where_it_is_when_effects_come_and_go(patched: Path) -> N
     assert np.abs(np.diff(seen)).max() < 0.003 * 0.03
 
 
-def test_modal_outputs_are_those_of_the_patched_wing(patched: Path, naming_side: WingModel) -> None:
+def test_modal_outputs_are_those_of_the_patched_wing(patched, naming_side) -> None:
     with FmiAsset(patched, playing(), isolated=False, parameters=on("point_mass")) as asset:
         seen = asset.step({"load_factor": 1.0}, load={"root": 1.0}).extra["frequency[1]"]
         off = asset.step(load={"root": 0.0}).extra["frequency[1]"]
@@ -316,7 +348,7 @@ def test_modal_outputs_are_those_of_the_patched_wing(patched: Path, naming_side:
     assert off > seen
 
 
-def test_whole_numbers_are_whole_and_what_has_no_bounds_is_refused(patched: Path) -> None:
+def test_whole_numbers_are_whole_and_what_has_no_bounds_is_refused(patched) -> None:
     many = on("slip", "crack")
     pushed = [(0.0, 0.0, 0.0, force) for force in (14.0, -6.0)]
     single = many | {"effect.slip.element_count": 1, "effect.crack.side": 0}
@@ -330,27 +362,19 @@ def test_whole_numbers_are_whole_and_what_has_no_bounds_is_refused(patched: Path
     with pytest.raises(FmuCallError, match="takes more stiffness than the structure has"):
         FmiAsset(patched, watching(), parameters=soft).reset()
     wild = on("drifting") | moving | {"effect.drifting.rate": -1e6}
-    with (
-        FmiAsset(patched, watching(), parameters=wild) as asset,
-        pytest.raises(FmuCallError, match="is not finite"),
-    ):
+    asset = FmiAsset(patched, watching(), parameters=wild)
+    with asset, pytest.raises(FmuCallError, match="is not finite"):
         asset.simulate({"load_factor": 0.0}, steps=2000)
 
 
-def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(
-    model: ReducedModel, arrays: PatchArrays, fmu: Path, tmp_path: Path
-) -> None:
+def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(model, arrays, fmu, tmp_path) -> None:
     seen = {"g3": "strain[3]", "tip": "tip_displacement", "rate": "tip_displacement"}
-    quantities = Quantity.STRAIN, Quantity.DISPLACEMENT, Quantity.VELOCITY
-    channels = {
-        name: Channel(name, quantity, output, None)
-        for (name, output), quantity in zip(seen.items(), quantities, strict=True)
-    }
+    quantities = {"g3": Quantity.STRAIN, "tip": Quantity.DISPLACEMENT, "rate": Quantity.VELOCITY}
+    channels = {name: Channel(name, quantities[name], output, None) for name, output in seen.items()}
     outputs = fmu_outputs(Campaign("chain", channels, (), None, {}, "").channels)
     assert outputs == {"g3": "strain[3]", "tip": "tip_displacement"}
-    named = NamedEffect(
-        "gauge_gain", "Gauge gain", "g3", "gain", (), (), ModelPatch((SensorGain("g3", 0.25),))
-    )
+    gain = ModelPatch((SensorGain("g3", 0.25),))
+    named = NamedEffect("gauge_gain", "Gauge gain", "g3", "gain", (), (), gain)
     origin = Origin("chain", "wing", "ab" * 32, "cd" * 32, "uav-twin", collect_provenance(1))
     stored = StoredPatch(VerdictKind.NAMED, "", patch_effects((named,)), outputs, (), origin)
     path = write_patch(tmp_path / "patch.json", stored)
@@ -377,18 +401,12 @@ REFUSED: dict[str, tuple[bytes, str]] = {
     "nothing to do": (content({"gain": []}), "no primitives"),
     "a wrong primitive": (TEXT.replace(b"thermal_strain", b"magic"), "kind 'magic'"),
     "no JSON": (b"{", "is not valid JSON"),
-    "a long number": (TEXT.replace(b'"schema"', b'"n": ' + b"1" * 5000 + b', "schema"'), "5000 digits"),
-    "a number that is none": (content(ONE).replace(b"0.1", b"NaN"), "NaN"),
-    "a nest": (b"[" * 5000 + b"]" * 5000, "nested deeper than 32"),
     "a list for a kind": (TEXT.replace(b'"kind": "thermal_strain"', b'"kind": []'), "the kind []"),
-    "two bytes a letter": (TEXT.decode().encode("utf-16"), "not text in UTF-8"),
 }
 
 
 @pytest.mark.parametrize("case", sorted(REFUSED))
-def test_patches_that_mean_nothing_are_refused_in_one_sentence(
-    case: str, model: ReducedModel, arrays: PatchArrays, tmp_path: Path
-) -> None:
+def test_patches_that_mean_nothing_are_refused_in_one_sentence(case, model, arrays, tmp_path) -> None:
     given, words = REFUSED[case]
     options = {"arrays": arrays} if case in ("beside the wing", "at no place", "on no side") else {}
     with pytest.raises(PatchFileError) as caught:
@@ -405,7 +423,7 @@ def test_a_byte_order_mark_means_nothing_and_an_id_that_comes_twice_is_numbered(
     assert [effect.id for effect in again.effects] == ["gain", "gain_2", "gain_3"]
 
 
-def test_the_command_line_refuses_before_it_models_a_wing(tmp_path: Path) -> None:
+def test_the_command_line_refuses_before_it_models_a_wing(tmp_path) -> None:
     good, broken, out = tmp_path / "patch.json", tmp_path / "broken.json", tmp_path / "wing.fmu"
     good.write_bytes(content())
     broken.write_bytes(b"{")
@@ -421,7 +439,7 @@ def test_the_command_line_refuses_before_it_models_a_wing(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_the_command_line_packs_a_patch_and_lists_its_effects(tmp_path: Path) -> None:
+def test_the_command_line_packs_a_patch_and_lists_its_effects(tmp_path) -> None:
     patch, out = tmp_path / "patch.json", tmp_path / "wing.fmu"
     patch.write_bytes(content())
     said("fmu", "build", "--out", out, "--patch", patch, "--activate")

@@ -1,69 +1,113 @@
-"""An FMU of FMI 2 in this process, call by call, through fmpy."""
+"""An FMU of FMI 2 or 3 in this process, call by call, through fmpy."""
 
-from __future__ import annotations
-
-import ctypes
-import itertools
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from fmpy import calloc, free
+import numpy as np
 from fmpy.fmi1 import FMICallException
-from fmpy.fmi2 import (
-    FMU2Slave,
-    fmi2CallbackAllocateMemoryTYPE,
-    fmi2CallbackFreeMemoryTYPE,
-    fmi2CallbackFunctions,
-    fmi2CallbackLoggerTYPE,
-)
-from fmpy.logging import addLoggerProxy
 
+from fmu_asset.archive.declared import FLOAT_KINDS, VariableInfo
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
+from fmu_asset.instances import open_instance
+from fmu_asset.instances.plan import Plan
 
 OK, DISCARD, ERROR = 0, 2, 3
 
-# fmpy's native proxy, which formats messages, knows one logger in a process: it finds the log by the name.
-_logs: dict[bytes, list[tuple[int, str]]] = {}
-_numbers = itertools.count()
 
-
-def _take(_: object, name: bytes, status: int, category: bytes, message: bytes) -> None:
-    _logs[name].append((status, message.decode()))
-
-
-_LOGGER = fmi2CallbackLoggerTYPE(_take)
+def elements(variable: VariableInfo) -> list[str]:
+    """Return the names of the elements of a variable of FMI 3 in FMI 2."""
+    if not variable.shape:
+        return [variable.name]
+    stem, end = (variable.name[:-1], ")") if variable.name.endswith(")") else (variable.name, "")
+    form = "health.z{}" if stem == "health" else f"{stem}[{{}}]{end}"
+    return [form.format(number) for number in range(1, variable.size + 1)]
 
 
 class Slave:
-    """An FMU in this process, call by call: statuses and log messages are kept, none is an exception.
+    """An instance whose statuses and log messages are kept; none is an exception.
 
-    With `like`, another instance of the FMU that one has extracted.
+    Elements of the arrays of FMI 3 go by the names and value references of FMI 2: those of ours begin at the
+    array's. With `like`, another instance of the FMU that one has extracted.
     """
 
-    def __init__(self, path: Path, *, like: Slave | None = None) -> None:
+    def __init__(self, path: Path, *, like: "Slave | None" = None) -> None:
         self.description = read_fmu(path) if like is None else like.description
         self.folder = extract_fmu(self.description) if like is None else like.folder
         self._owns_folder = like is None
-        name = f"wing-{next(_numbers)}"
-        self.reference = {v.name: v.reference for v in self.description.variables}
-        self.names = [v.name for v in self.description.variables if v.kind == "Real"]
-        self.real = [self.reference[name] for name in self.names]
-        self.log = _logs.setdefault(name.encode(), [])
-        callbacks = fmi2CallbackFunctions()
-        callbacks.logger = _LOGGER
-        callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
-        callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
-        addLoggerProxy(ctypes.byref(callbacks))
-        self.fmu = FMU2Slave(
-            guid=self.description.guid,
-            modelIdentifier=self.description.model_identifier,
-            unzipDirectory=str(self.folder),
-            instanceName=name,
-        )
-        self.fmu.instantiate(callbacks=callbacks, loggingOn=True)
+        self._instance = open_instance(Plan(str(self.folder), self.description.identity, "wing", (), ()))
+        self.fmu, self.log, self.take = self._instance._fmu, self._instance.messages, self._instance.log
+        self.three = self.description.major_version == 3
+        self.real, self.whole = ("Float64", "Int64") if self.three else ("Real", "Integer")
+        self.reference: dict[str, int] = {}
+        self.variables: dict[str, VariableInfo] = {}
+        self._arrays: dict[int, range] = {}
+        for variable in self.description.variables:
+            places = range(variable.reference, variable.reference + variable.size)
+            names = elements(variable)
+            self.reference |= dict(zip(names, places, strict=True))
+            self.variables |= dict.fromkeys(names, variable)
+            self._arrays |= dict.fromkeys(places, places)
+        real = {n: v for n, v in self.variables.items() if v.kind in FLOAT_KINDS and v.name != "time"}
+        self.names = list(real)
+        self.inputs = [name for name, variable in real.items() if variable.causality == "input"]
+
+    # ------------------------------------------------------------------ values
+
+    def read(self, places: Sequence[int]) -> list[float]:
+        """Return real values by value references."""
+        if not self.three:
+            return [float(value) for value in self.fmu.getReal(places)]
+        arrays = list(dict.fromkeys(self._arrays[place] for place in places))
+        order = [place for array in arrays for place in array]
+        values = self.fmu.getFloat64([array.start for array in arrays], len(order))
+        return [values[order.index(place)] for place in places]
+
+    def write(self, places: Sequence[int], values: Sequence[float]) -> None:
+        """Set real values by value references; of an array the others stay."""
+        if not self.three:
+            self.fmu.setReal(places, values)
+            return
+        given = dict(zip(places, values, strict=True))
+        arrays = list(dict.fromkeys(self._arrays[place] for place in places))
+        order = [place for array in arrays for place in array]
+        kept = {} if len(order) == len(given) else dict(zip(order, self.read(order), strict=True))
+        self.fmu.setFloat64([array.start for array in arrays], [(kept | given)[place] for place in order])
+
+    def set(self, values: Mapping[str, float]) -> None:
+        """Set real variables by name."""
+        self.write([self.reference[name] for name in values], list(values.values()))
+
+    def get(self, *names: str) -> list[float]:
+        """Return real variables by name."""
+        return self.read([self.reference[name] for name in names])
+
+    def of(self, name: str) -> float:
+        """Return a real variable."""
+        return self.get(name)[0]
+
+    def everything(self) -> list[float]:
+        """Return all real variables."""
+        return self.get(*self.names)
+
+    @property
+    def status(self) -> int:
+        """The output `status`."""
+        return int(getattr(self.fmu, f"get{self.whole}")([self.reference["status"]])[0])
+
+    def derivative(self, unknowns: Sequence[str], seed: Mapping[str, float]) -> np.ndarray:
+        """Return the directional derivative of variables."""
+        of, by = ([self.reference[name] for name in names] for names in (unknowns, seed))
+        if not self.three:
+            return np.array(self.fmu.getDirectionalDerivative(of, by, list(seed.values())))
+        results, knowns = ([*dict.fromkeys(self._arrays[place] for place in places)] for places in (of, by))
+        order, given = [p for array in results for p in array], dict(zip(by, seed.values(), strict=True))
+        seeds = [given.get(place, 0.0) for array in knowns for place in array]
+        starts = ([array.start for array in arrays] for arrays in (results, knowns))
+        found = self.fmu.getDirectionalDerivative(*starts, seeds, len(order))
+        return np.array([found[order.index(place)] for place in of])
+
+    # ------------------------------------------------------------------ life
 
     def status_of(self, call: Callable[..., object], *arguments: object) -> int:
         """Return the FMI status of a call."""
@@ -73,74 +117,53 @@ class Slave:
             return int(error.status)
         return OK
 
-    def start(self, *, response: int = 1, start_time: float = 0.0, anew: bool = True, **values: float) -> int:
+    def initialising(self, start_time: float = 0.0) -> None:
+        """Enter initialisation."""
+        if self.three:
+            self.fmu.enterInitializationMode(startTime=start_time)
+        else:
+            self.fmu.setupExperiment(startTime=start_time)
+            self.fmu.enterInitializationMode()
+
+    def start(
+        self, *, response: int | None = 1, start_time: float = 0.0, anew: bool = True, **values: float
+    ) -> int:
         """Reset if `anew`, set values, dots in their names written as two underscores, and initialise."""
         if anew:
             self.fmu.reset()
-        self.fmu.setupExperiment(startTime=start_time)
-        self.fmu.enterInitializationMode()
-        self.fmu.setInteger([self.reference["response"]], [response])
+        self.initialising(start_time)
+        if response is not None:
+            getattr(self.fmu, f"set{self.whole}")([self.reference["response"]], [response])
         for name, value in values.items():
-            self.fmu.setReal([self.reference[name.replace("__", ".")]], [value])
+            self.set({name.replace("__", "."): value})
         return self.status_of(self.fmu.exitInitializationMode)
 
     def step(self, inputs: Sequence[float], time: float, size: float) -> int:
         """Set the inputs in order (of a wing load factor, z1, z2, tip force) and make a step."""
-        given = [v.reference for v in self.description.variables if v.causality == "input"]
-        self.fmu.setReal(given, list(inputs))
+        self.set(dict(zip(self.inputs, inputs, strict=True)))
         return self.status_of(self.fmu.doStep, time, size)
-
-    def of(self, name: str) -> float:
-        """Return a real variable."""
-        return float(self.fmu.getReal([self.reference[name]])[0])
-
-    def everything(self) -> list[float]:
-        """Return all real variables."""
-        return [float(value) for value in self.fmu.getReal(self.real)]
-
-    @property
-    def status(self) -> int:
-        """The output `status`."""
-        return int(self.fmu.getInteger([self.reference["status"]])[0])
 
     def saved(self) -> bytes:
         """Return the serialised state."""
-        state = self.fmu.getFMUstate()
+        state = self.fmu.getFMUState()
         try:
-            return bytes(self.fmu.serializeFMUstate(state))
+            return bytes(self.fmu.serializeFMUState(state))
         finally:
-            self.fmu.freeFMUstate(state)
+            self.fmu.freeFMUState(state)
 
     def restore(self, content: bytes) -> int:
         """Restore a serialised state and return the worst status."""
         try:
-            state = self.fmu.deSerializeFMUstate(content)
+            state = self.fmu.deserializeFMUState(content)
         except FMICallException as error:
             return int(error.status)
         try:
-            return self.status_of(self.fmu.setFMUstate, state)
+            return self.status_of(self.fmu.setFMUState, state)
         finally:
-            self.fmu.freeFMUstate(state)
+            self.fmu.freeFMUState(state)
 
     def close(self) -> None:
         """Free the instance."""
-        self.fmu.freeInstance()
+        self._instance.close()
         if self._owns_folder:
             shutil.rmtree(self.folder)
-
-
-@contextmanager
-def instantiated(kind: type, path: Path, **options: Any) -> Iterator[Any]:
-    """Yield an instance of a class of fmpy and the value references of its variables by name."""
-    described = read_fmu(path)
-    folder = extract_fmu(described)
-    made = kind(
-        guid=described.guid,
-        modelIdentifier=described.model_identifier,
-        unzipDirectory=str(folder),
-        instanceName="wing",
-    )
-    made.instantiate(**options)
-    yield made, {variable.name: variable.reference for variable in described.variables}
-    made.freeInstance()
-    shutil.rmtree(folder)

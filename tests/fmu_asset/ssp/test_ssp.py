@@ -1,7 +1,5 @@
 """SSP files: what we write validates, is read by fmpy and by us, and flies the same; others' are applied."""
 
-from __future__ import annotations
-
 import itertools
 import re
 import tomllib
@@ -36,6 +34,7 @@ from fmu_asset.ssp.check import check_ssp, join_ssp, left_out_sentence
 from fmu_asset.ssp.reader import read_ssp
 from fmu_asset.ssp.writer import write_ssp
 from tests.fmu_asset.making import archive_of, bound, system
+from tests.fmu_asset.ours import OurFmus
 
 HERE = Path(__file__).parent
 NAMES = ("damage", "wing", "gauges")
@@ -47,8 +46,8 @@ BINDING = bound(
 
 
 @pytest.fixture(scope="module")
-def fmus(companions: dict[str, Path], fmu: Path) -> dict[str, Path]:
-    return {"damage": companions["damage_growth"], "wing": fmu, "gauges": companions["strain_gauges"]}
+def fmus(ours: OurFmus) -> dict[str, Path]:
+    return {"damage": ours("damage_growth"), "wing": ours("python"), "gauges": ours("strain_gauges")}
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +82,7 @@ def fly(wiring: Wiring, **options: Any) -> np.ndarray:
         return np.array([asset.step({"load_factor": 3.0}).values for _ in range(9)])
 
 
-def test_what_is_written_is_read_back(structure: SystemStructure, ssp: Path, tmp_path: Path) -> None:
+def test_what_is_written_is_read_back(structure, ssp, tmp_path) -> None:
     theirs = join_ssp(read_ssp(ssp, tmp_path))
     assert theirs.structure.name == "three"
     assert [c.name for c in theirs.structure.components] == list(NAMES)
@@ -101,7 +100,7 @@ def test_what_is_written_is_read_back(structure: SystemStructure, ssp: Path, tmp
     assert written.read_bytes() == ssp.read_bytes()
 
 
-def test_fmpy_reads_and_simulates_it_as_our_jacobi_does(ssp: Path, structure: SystemStructure) -> None:
+def test_fmpy_reads_and_simulates_it_as_our_jacobi_does(ssp, structure) -> None:
     """Fmpy validates SSD, SSV and SSM by the schemas that it ships.
 
     It exchanges all values after a step, from zero at the start: in three steps that is forgotten.
@@ -207,7 +206,7 @@ def joined(theirs: Pack, tmp_path: Path) -> Callable[..., Wiring]:
     )
 
 
-def test_nested_systems_parameters_and_mappings(theirs: Pack, joined: Callable[..., Wiring]) -> None:
+def test_nested_systems_parameters_and_mappings(theirs, joined) -> None:
     wiring = joined()
     assert [c.name for c in wiring.structure.components] == ["structure.wing", "damage"]
     # The outer system's set goes before the component's; a value is converted in unit, then scaled.
@@ -254,7 +253,7 @@ MEAN_THE_SAME: dict[str, tuple[Any, dict[str, str]]] = {
 
 
 @pytest.mark.parametrize("case", MEAN_THE_SAME)
-def test_what_means_the_same_is_read_alike(joined: Callable[..., Wiring], case: str) -> None:
+def test_what_means_the_same_is_read_alike(joined, case) -> None:
     assert FILES["SystemStructure.ssd"] != TURNED
     changes, more = MEAN_THE_SAME[case]
     plain, read = joined(), joined(*changes, **more)
@@ -274,7 +273,7 @@ def further(*parameters: tuple[str, str]) -> tuple[str, str]:
     return "</ssd:ParameterBindings>\n  <ssd:Elements>", MORE % more
 
 
-def test_values_go_where_the_standard_says(joined: Callable[..., Wiring]) -> None:
+def test_values_go_where_the_standard_says(joined) -> None:
     """SSP 1.0, 5.2.3 and 6: later bindings of a level go before earlier ones; a set defines its units."""
     wiring = joined(further(("damage.initial.z1", '<ssv:Real value="3" unit="%"/>')))
     assert wiring.settings["damage"]["initial.z1"] == pytest.approx(3 * 0.1)
@@ -289,7 +288,7 @@ def test_values_go_where_the_standard_says(joined: Callable[..., Wiring]) -> Non
     assert mapped.settings["damage"]["initial.z1"] == pytest.approx(0.5 * 0.4 + 0.1)
 
 
-def test_what_is_for_nothing_is_left_out_and_named(joined: Callable[..., Wiring], tmp_path: Path) -> None:
+def test_what_is_for_nothing_is_left_out_and_named(joined, tmp_path) -> None:
     """SSP 2.0, 6.2: a set may hold more than a system takes; a mapping may serve several sets."""
     before = joined().settings
     del before["damage"]["seed"]
@@ -304,7 +303,7 @@ def test_what_is_for_nothing_is_left_out_and_named(joined: Callable[..., Wiring]
     assert write_ssp(wiring, tmp_path / "again.ssp").stat().st_size  # without what is for nothing
 
 
-def test_fmus_of_other_versions_are_joined(foreign_fmu: Any, tmp_path: Path) -> None:
+def test_fmus_of_other_versions_are_joined(foreign_fmu, tmp_path) -> None:
     """A counter of FMI 3 (UInt16) drives a lag of FMI 1 that starts elsewhere: as the lag alone does it."""
     contents = {
         "SystemStructure.ssd": (HERE / "theirs" / "mixed.ssd").read_bytes(),
@@ -324,22 +323,22 @@ def test_fmus_of_other_versions_are_joined(foreign_fmu: Any, tmp_path: Path) -> 
         Wiring(replace(wiring.structure, connections=(array,)))
 
 
-@pytest.mark.parametrize(
-    ("model", "name", "words"),
-    [
-        ("array3", "u", "it is an array; only single numbers"),
-        ("array3", "ticked", "it changes with a clock; only single numbers"),
-        ("array3", "blob", "it is of the type Binary; only single numbers"),
-        ("ball2", r"der(h)", "it is declared as local"),
-    ],
-)
-def test_what_is_no_single_number_or_no_start_is_not_set(foreign_fmu, model, name, words) -> None:
-    wrong = Component("a", foreign_fmu(model), {name: Setting(1.0)})
-    with pytest.raises(CouplingError, match=re.escape(f"a.{name} cannot be set: {words}")):
-        Wiring(SystemStructure("one", (wrong,)))
+NOT_SET = {
+    ("array3", "u"): "it is an array; only single numbers",
+    ("array3", "ticked"): "it changes with a clock; only single numbers",
+    ("array3", "blob"): "it is of the type Binary; only single numbers",
+    ("ball2", "der(h)"): "it is declared as local",
+}
 
 
-def test_start_values_of_outputs_are_set(foreign_fmu: Any) -> None:
+def test_what_is_no_single_number_or_no_start_is_not_set(foreign_fmu) -> None:
+    for (model, name), words in NOT_SET.items():
+        wrong = Component("a", foreign_fmu(model), {name: Setting(1.0)})
+        with pytest.raises(CouplingError, match=re.escape(f"a.{name} cannot be set: {words}")):
+            Wiring(SystemStructure("one", (wrong,)))
+
+
+def test_start_values_of_outputs_are_set(foreign_fmu) -> None:
     """SSP 1.0, 5.2.3: what a parameter binding can set is everything that starts with a given value."""
     ball = Component("ball", foreign_fmu("ball2"), {"h": Setting(3.0), "v": Setting(-1.0)})
     binding = bound(0.1, {"h": (["ball.h", "ball.v"], ["m", "m/s"])})
@@ -353,45 +352,33 @@ LONG = {"old": 'name="z1" kind="output"', "new": f'name="z1" kind="{"o" * 5000}"
 
 
 @pytest.mark.parametrize("case", [*CASES["refused"], LONG], ids=lambda case: case["sentence"][:40])
-def test_what_is_wrong_is_said_in_one_sentence(theirs: Pack, case: dict[str, str]) -> None:
+def test_what_is_wrong_is_said_in_one_sentence(theirs, case) -> None:
     (sentence,) = check_ssp(theirs((case["old"], case["new"]))).problems
     assert re.search(case["sentence"], sentence), sentence
     assert "\n" not in sentence
 
 
-def test_archives_that_are_unsafe_or_damaged(theirs: Pack, tmp_path: Path) -> None:
+def test_archives_that_are_unsafe_or_damaged(theirs, tmp_path) -> None:
+    """Checked as those of FMUs are."""
     (sentence,) = check_ssp(theirs(**{"resources/wing.fmu": "no FMU"})).problems
     assert "resources/wing.fmu is not a sound FMU archive" in sentence
     with pytest.raises(SspError, match="There is no SSP file"):
         check_ssp(tmp_path / "none.ssp")
-    for options, words in (
-        ({"../outside.txt": "x"}, "extracted outside its folder"),
-        ({"/etc/passwd": "x"}, "extracted outside its folder"),
-        ({"without": "SystemStructure.ssd"}, "so it is no SSP file"),
+    good, damaged = theirs().read_bytes(), tmp_path / "damaged.ssp"
+    # Half of the file ends with one of its FMUs, which is an archive as well.
+    damaged.write_bytes(good[: len(good) // 2])
+    for path, words in (
+        (lambda: theirs(**{"../outside.txt": "x"}), "extracted outside its folder"),
+        (lambda: theirs(without="SystemStructure.ssd"), "so it is no SSP file"),
+        (lambda: damaged, "not a sound SSP archive|so it is no SSP file"),
     ):
         with pytest.raises(SspError, match=words):
-            read_ssp(theirs(**options), tmp_path / "fmus")
-    good, kept = theirs().read_bytes(), tmp_path / "kept.ssp"
-    place = len(good) // 2
-    with zipfile.ZipFile(kept, "w", zipfile.ZIP_LZMA) as archive:
-        archive.writestr("SystemStructure.ssd", FILES["SystemStructure.ssd"] * 50)
-    compressed = bytearray(kept.read_bytes())
-    compressed[200:260] = bytes(60)
-    for content, words in (
-        (b"no archive", "not a sound SSP archive|so it is no SSP file"),
-        # Half of the file ends with one of its FMUs, which is an archive as well.
-        (good[:place], "not a sound SSP archive|so it is no SSP file"),
-        (good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :], "damaged|not a sound"),
-        (compressed, "not a sound SSP archive"),
-    ):
-        kept.write_bytes(content)
-        with pytest.raises(SspError, match=words):
-            read_ssp(kept, tmp_path / "fmus")
+            read_ssp(path(), tmp_path / "fmus")
     assert not (tmp_path / "fmus").exists()
     assert not (tmp_path.parent / "outside.txt").exists()
 
 
-def test_an_algebraic_loop_is_reported(theirs: Pack) -> None:
+def test_an_algebraic_loop_is_reported(theirs) -> None:
     """A wing that is loaded by its own tip: sound as a file, and said."""
     change = (
         '<ssd:Connection startConnector="load" endElement="wing" endConnector="load_factor"/>',

@@ -1,13 +1,12 @@
 """FMUs that do what they must not: the twin lives on, says what happened, and leaves nothing behind."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import tomllib
@@ -16,16 +15,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from fmu_asset import errors
 from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import FmuCallError, FmuMemoryError, FmuStateError, FmuTimeoutError, FmuWorkerError
+from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.worker.client import WorkerInstance
 from fmu_asset.worker.protocol import CALL, HEADER
+from tests.fmu_asset.chain import chain_model
 from tests.fmu_asset.door.kinds import HOSTILE
-from tests.fmu_asset.making import ROOT, changed, run_python
+from tests.fmu_asset.making import ROOT, archive_of, changed, members, run_python
 
 MISBEHAVIOURS = tomllib.loads(Path(__file__).with_name("misbehaviours.toml").read_text("utf-8"))
 REPLAYED = changed(HOSTILE, header={"state": "replay"})
@@ -88,11 +89,9 @@ def await_processes(scratch: Path, *counts: int) -> None:
 
 
 @cases("step")
-def test_a_step_that_goes_wrong_is_one_sentence(
-    hostile: Hostile, scratch: Path, what: str, kind: type[Exception], sentence: str
-) -> None:
+def test_a_step_that_goes_wrong_is_one_sentence(hostile, scratch, what, kind, sentence) -> None:
     before = descriptors()
-    limits = LIMITS | ({"step_timeout": 0.5} if kind is FmuTimeoutError else {})
+    limits = LIMITS | ({"step_timeout": 0.5} if kind is errors.FmuTimeoutError else {})
     with hostile(what, **limits) as asset:
         assert [asset.step().values[0] for _ in range(2)] == [1.0, 2.0]
         saved = asset.save_state()
@@ -100,7 +99,7 @@ def test_a_step_that_goes_wrong_is_one_sentence(
             asset.step()
         assert str(asset.description.path) in str(caught.value)
         if what != "NOT_A_NUMBER":
-            with pytest.raises(FmuWorkerError, match="reset the asset"):
+            with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
                 asset.step()
         # The same instance is never used again; another one goes on from the last state.
         asset.restore_state(saved)
@@ -109,27 +108,27 @@ def test_a_step_that_goes_wrong_is_one_sentence(
     assert descriptors() == before
 
 
-def test_a_refused_step_can_be_made_otherwise(hostile: Hostile) -> None:
+def test_a_refused_step_can_be_made_otherwise(hostile) -> None:
     with hostile("REFUSE", **LIMITS) as asset:
         asset.step(), asset.step()
-        with pytest.raises(FmuCallError, match=r"(?s)step 2 from t = 2 s.*returned Discard.*u is too large"):
+        with pytest.raises(
+            errors.FmuCallError, match=r"(?s)step 2 from t = 2 s.*returned Discard.*u is too large"
+        ):
             asset.step({"u": 6.0})
         assert asset.step({"u": 5.0}).values[0] == 7.0
 
 
-def test_a_slow_leak_is_noticed_between_short_steps(hostile: Hostile) -> None:
+def test_a_slow_leak_is_noticed_between_short_steps(hostile) -> None:
     with (
         hostile("LEAK_SLOWLY", **LIMITS) as asset,
-        pytest.raises(FmuMemoryError, match=r"more than the limit of 400 MiB"),
+        pytest.raises(errors.FmuMemoryError, match=r"more than the limit of 400 MiB"),
     ):
         wait_until(lambda: asset.step() is None)
 
 
 @cases("start")
-def test_a_start_that_goes_wrong_is_one_sentence(
-    hostile: Hostile, scratch: Path, what: str, kind: type[Exception], sentence: str
-) -> None:
-    asset = hostile(what, load_timeout=2.0 if kind is FmuTimeoutError else 30.0)
+def test_a_start_that_goes_wrong_is_one_sentence(hostile, scratch, what, kind, sentence) -> None:
+    asset = hostile(what, load_timeout=2.0 if kind is errors.FmuTimeoutError else 30.0)
     for _ in range(2):
         with pytest.raises(kind, match=sentence):
             asset.reset()
@@ -143,7 +142,7 @@ def test_a_start_that_goes_wrong_is_one_sentence(
         ("START_PROCESS_ELSEWHERE", "GROUP=setpgid(0,0)"), ("START_PROCESS_ELSEWHERE", "GROUP=setsid()"),
     ],
 )  # fmt: skip
-def test_what_goes_wrong_at_the_end_leaves_nothing(hostile: Hostile, scratch: Path, what: Any) -> None:
+def test_what_goes_wrong_at_the_end_leaves_nothing(hostile, scratch, what) -> None:
     """Nor a process that leaves the group."""
     with hostile(*([what] if isinstance(what, str) else what)) as asset:
         assert [asset.step().values[0] for _ in range(4)] == [1.0, 2.0, 3.0, 4.0]
@@ -152,7 +151,7 @@ def test_what_goes_wrong_at_the_end_leaves_nothing(hostile: Hostile, scratch: Pa
     await_nothing(scratch)
 
 
-def test_an_fmu_that_removes_its_files_is_extracted_again(hostile: Hostile, scratch: Path) -> None:
+def test_an_fmu_that_removes_its_files_is_extracted_again(hostile, scratch) -> None:
     free = changed(HOSTILE, limits={"programs": True})  # it removes them by a program
     with hostile("REMOVE_FILES", binding=free) as asset:
         for _ in range(4):
@@ -164,9 +163,7 @@ def test_an_fmu_that_removes_its_files_is_extracted_again(hostile: Hostile, scra
 
 
 @cases("state")
-def test_a_state_that_lies_is_found_and_can_be_replayed(
-    hostile: Hostile, what: str, kind: type[Exception], sentence: str
-) -> None:
+def test_a_state_that_lies_is_found_and_can_be_replayed(hostile, what, kind, sentence) -> None:
     with hostile(what) as asset:
         asset.step(), asset.step()
         with pytest.raises(kind, match=sentence):  # noqa: PT012 - either of the two may tell
@@ -181,17 +178,17 @@ def test_a_state_that_lies_is_found_and_can_be_replayed(
         assert asset.observe().values[0] == 4.0
 
 
-def test_what_cannot_be_replayed_says_so(hostile: Hostile) -> None:
+def test_what_cannot_be_replayed_says_so(hostile) -> None:
     with hostile("NOT_DETERMINISTIC", binding=REPLAYED) as asset:
         asset.step()
         saved = asset.save_state()
         asset.close()
-        with pytest.raises(FmuStateError, match="does not give equal outputs for equal inputs"):
+        with pytest.raises(errors.FmuStateError, match="does not give equal outputs for equal inputs"):
             asset.restore_state(saved)
 
 
 @pytest.mark.parametrize("in_one_go", [False, True], ids=["steps", "run"])
-def test_two_processes_that_return_from_one_step(hostile: Hostile, scratch: Path, in_one_go: bool) -> None:
+def test_two_processes_that_return_from_one_step(hostile, scratch, in_one_go) -> None:
     pushes = [float(k) for k in range(1, 11)]
     with hostile("FORK_AND_RETURN") as asset:
         if in_one_go:
@@ -202,7 +199,7 @@ def test_two_processes_that_return_from_one_step(hostile: Hostile, scratch: Path
     await_nothing(scratch)
 
 
-def test_an_answer_to_another_request_is_not_taken(hostile: Hostile) -> None:
+def test_an_answer_to_another_request_is_not_taken(hostile) -> None:
     """A reply that is whole but bears another number, as one that comes late."""
     with hostile() as asset:
         asset.step()
@@ -210,7 +207,7 @@ def test_an_answer_to_another_request_is_not_taken(hostile: Hostile) -> None:
         assert isinstance(instance, WorkerInstance)
         question = instance._pickled("read")
         os.write(instance._out, HEADER.pack(CALL, 0, 77, len(question)) + question)
-        with pytest.raises(FmuWorkerError, match="wrote something else into it"):
+        with pytest.raises(errors.FmuWorkerError, match="wrote something else into it"):
             asset.step()
 
 
@@ -250,13 +247,13 @@ def kill_keeper(worker: int | None) -> None:
 
 
 @pytest.mark.parametrize("end", ["(void)0", "hang()", "kill(getppid(),SIGKILL)"])
-def test_nothing_is_left_when_the_keeper_is_killed(hostile: Hostile, scratch: Path, end: str) -> None:
+def test_nothing_is_left_when_the_keeper_is_killed(hostile, scratch, end) -> None:
     """The worker has cleared its parent-death signal, and what it has started is in a session of its own."""
     with hostile(f"ESCAPE={end}", binding=FREE, step_timeout=1.0) as asset:
         asset.step(), asset.step()
         if end == "hang()":
             threading.Timer(0.3, kill_keeper, [asset.worker_process_id]).start()
-            with pytest.raises(FmuTimeoutError, match=r"longer than 1 s"):
+            with pytest.raises(errors.FmuTimeoutError, match=r"longer than 1 s"):
                 asset.step()
         else:
             asset.step()
@@ -270,9 +267,7 @@ def test_nothing_is_left_when_the_keeper_is_killed(hostile: Hostile, scratch: Pa
 ASKED = "asset.step(), asset.step()", "print(asset.worker_process_id, flush=True)"
 
 
-def test_nothing_is_left_when_twin_and_worker_end_before_the_keeper_looks(
-    foreign_fmu: Any, scratch: Path
-) -> None:
+def test_nothing_is_left_when_twin_and_worker_end_before_the_keeper_looks(foreign_fmu, scratch) -> None:
     with twin(foreign_fmu("hostile2"), HOSTILE, *ASKED, "sys.stdin.read()") as process:
         worker = int(process.stdout.readline())
         keeper = keeper_of(worker)
@@ -282,7 +277,7 @@ def test_nothing_is_left_when_twin_and_worker_end_before_the_keeper_looks(
     await_nothing(scratch)
 
 
-def test_what_a_dead_twin_without_a_keeper_left_is_ended_by_the_next(foreign_fmu: Any, scratch: Path) -> None:
+def test_what_a_dead_twin_without_a_keeper_left_is_ended_by_the_next(foreign_fmu, scratch) -> None:
     with twin(foreign_fmu("hostile2", "ESCAPE=hang()"), HOSTILE, *ASKED, "asset.step()") as process:
         worker = int(process.stdout.readline())
         await_processes(scratch, 3)
@@ -294,9 +289,7 @@ def test_what_a_dead_twin_without_a_keeper_left_is_ended_by_the_next(foreign_fmu
 
 
 @pytest.mark.parametrize("what", ["HANG", "START_PROCESS", "ATTEMPT=(hold_pipes(),hang(),0)"])
-def test_nothing_is_left_when_the_twin_is_killed_during_a_step(
-    foreign_fmu: Any, scratch: Path, what: str
-) -> None:
+def test_nothing_is_left_when_the_twin_is_killed_during_a_step(foreign_fmu, scratch, what) -> None:
     lines = *ASKED, "asset.step()", "print('fourth', flush=True)", "sys.stdin.read()"
     with twin(foreign_fmu("hostile2", what), HOSTILE, *lines) as process:
         assert int(process.stdout.readline())
@@ -306,7 +299,7 @@ def test_nothing_is_left_when_the_twin_is_killed_during_a_step(
     await_nothing(scratch, 30.0)
 
 
-def test_what_a_dead_twin_left_is_removed_by_the_next(hostile: Hostile, scratch: Path) -> None:
+def test_what_a_dead_twin_left_is_removed_by_the_next(hostile, scratch) -> None:
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     with hostile() as asset:
@@ -321,15 +314,15 @@ def test_what_a_dead_twin_left_is_removed_by_the_next(hostile: Hostile, scratch:
 # ---------------------------------------------------------------------- an FMU in Python
 
 SPOILT = [
-    (10, FmuCallError, r"(?s)fmi2DoStep returned Fatal.*the FMU says: .*the spring broke"),
-    (11, FmuWorkerError, r"wrote something else into it"),
-    (12, FmuCallError, r"(?s)fmi2DoStep returned Fatal.*\\x1b\[2J.*the spring \\x9b31mcreaks"),
+    (10, errors.FmuCallError, r"(?s)fmi2DoStep returned Fatal.*the FMU says: .*the spring broke"),
+    (11, errors.FmuWorkerError, r"wrote something else into it"),
+    (12, errors.FmuCallError, r"(?s)fmi2DoStep returned Fatal.*\\x1b\[2J.*the spring \\x9b31mcreaks"),
 ]
 
 
 @pytest.mark.parametrize(("misbehaviour", "kind", "sentence"), SPOILT, ids=["json", "builtins", "escapes"])
 def test_an_fmu_in_python_that_spoils_what_we_share(
-    spring_mass: Path, spring_binding: Binding, misbehaviour: int, kind: type[Exception], sentence: str
+    spring_mass, spring_binding, misbehaviour, kind, sentence
 ) -> None:
     with FmiAsset(spring_mass, spring_binding) as asset:
         with pytest.raises(kind, match=sentence) as caught:
@@ -341,13 +334,11 @@ def test_an_fmu_in_python_that_spoils_what_we_share(
 
 
 @pytest.mark.parametrize("misbehaviour", [8, 9], ids=["loop", "hold"])
-def test_an_fmu_in_python_that_loops(
-    spring_mass: Path, spring_binding: Binding, scratch: Path, misbehaviour: int
-) -> None:
+def test_an_fmu_in_python_that_loops(spring_mass, spring_binding, scratch, misbehaviour) -> None:
     """It holds the interpreter of the worker; neither the limit nor the death of the twin needs that."""
     with (
         FmiAsset(spring_mass, spring_binding, step_timeout=0.5) as asset,
-        pytest.raises(FmuTimeoutError, match=r"longer than 0\.5 s for the step"),
+        pytest.raises(errors.FmuTimeoutError, match=r"longer than 0\.5 s for the step"),
     ):
         asset.step(load={"misbehaviour": misbehaviour})
     lines = (
@@ -358,3 +349,56 @@ def test_an_fmu_in_python_that_loops(
     with twin(spring_mass, spring_binding, *lines) as process:
         assert process.stdout.readline() == b"loops\n"
     await_nothing(scratch, 30.0)
+
+
+# ---------------------------------------------------------------------- a process of its own
+
+FINE, WANDER, TALK = 0.0, 6.0, 7.0
+PUSHED = {"push": 1.0}
+
+
+def test_an_interruption_leaves_no_stale_answer(spring_mass, spring_binding, monkeypatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with FmiAsset(spring_mass, spring_binding) as asset:
+        expected = asset.step(PUSHED).values
+        with monkeypatch.context() as patch:
+            patch.setattr("fmu_asset.worker.client.WorkerInstance._await", interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                asset.step({"push": 2.0})
+        with pytest.raises(errors.FmuWorkerError, match="interrupted; reset the asset"):
+            asset.step()
+        asset.reset()
+        np.testing.assert_array_equal(asset.step(PUSHED).values, expected)
+
+
+def test_what_an_fmu_does_to_its_process_stays_there(
+    spring_mass, spring_binding, fmu, binding, tmp_path, capfd
+) -> None:
+    """Neither its chatter nor its working directory nor its modules are the twin's, or another FMU's."""
+    here, path, modules = Path.cwd(), list(sys.path), set(sys.modules)
+    with FmiAsset(spring_mass, spring_binding) as asset:
+        for behaviour in (TALK, WANDER, FINE):
+            asset.step(load={"misbehaviour": behaviour})
+        assert asset.log[0] == ("OK", "the spring creaks")
+    assert capfd.readouterr().out == ""
+    other = build_fmu(chain_model(1.8e5), tmp_path / "stiff.fmu").path
+    with FmiAsset(fmu, binding, isolated=False) as wing, FmiAsset(other, binding, isolated=False) as stiff:
+        with FmiAsset(spring_mass, spring_binding, isolated=False) as asset:
+            asset.step()
+            assert "SpringMass" in sys.modules
+        for _ in range(2):
+            one, two = wing.step({"load_factor": 3.0}), stiff.step({"load_factor": 3.0})
+            np.testing.assert_allclose(one.values, 2.0 * two.values, rtol=1e-9)
+    assert (Path.cwd(), sys.path) == (here, path)
+    assert not [name for name in set(sys.modules) - modules if name.startswith(("uav_wing_", "SpringMass"))]
+
+
+def test_a_temporary_folder_with_odd_characters(fmu, binding, tmp_path, isolated, monkeypatch) -> None:
+    odd = tmp_path / "Flügel é # % + 翼 'x' \"y\" $z"
+    odd.mkdir()
+    file = archive_of(odd / "wing é.fmu", members(fmu) | {"resources/Größe ß.txt": b"x"})
+    monkeypatch.setattr(tempfile, "tempdir", str(odd))
+    with FmiAsset(file, binding, isolated=isolated) as asset:
+        assert np.all(asset.step({"load_factor": 3.0}).values > 0.0)

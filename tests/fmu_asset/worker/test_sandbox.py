@@ -1,7 +1,5 @@
 """FMUs that reach for what is not theirs: nothing is touched, and the sentence says what to do."""
 
-from __future__ import annotations
-
 import ctypes
 import logging
 import os
@@ -17,12 +15,11 @@ from typing import Any
 
 import pytest
 
+from fmu_asset import errors
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component
 from fmu_asset.door import placement
-from fmu_asset.door.binding import Binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import BindingError, FmuCallError, FmuInputError, FmuWorkerError
 from fmu_asset.folders import remove_folder
 from fmu_asset.worker.sandbox import landlock_version
 from tests.fmu_asset.door.kinds import BINDINGS_FOLDER, HOSTILE
@@ -162,7 +159,7 @@ def granted(asset: FmiAsset) -> None:
         assert [asset.step().values[0] for _ in range(4)] == [1.0, 2.0, 3.0, 4.0]
 
 
-def refused(asset: FmiAsset, sentence: str, kind: type[Exception] = FmuCallError) -> Any:
+def refused(asset: FmiAsset, sentence: str, kind: type[Exception] = errors.FmuCallError) -> Any:
     """Let an asset make its attempt, and return the error that it must be."""
     with asset:
         asset.step(), asset.step()
@@ -175,9 +172,7 @@ WITHOUT_TRACE = ("read", "project", "spy", "watch", "share", "semaphore", "messa
 
 
 @pytest.mark.parametrize("row", MISBEHAVIOURS["attempt"], ids=lambda row: row["call"])
-def test_what_is_not_its_own_is_out_of_reach(
-    attempting: Attempting, targets: Targets, row: dict[str, str]
-) -> None:
+def test_what_is_not_its_own_is_out_of_reach(attempting, targets, row) -> None:
     """And the same FMU reaches it where the sandbox is off: it is the sandbox that holds."""
     reason = row.get("reason", "Permission denied")
     target, happened = targets(row["what"])
@@ -190,16 +185,16 @@ def test_what_is_not_its_own_is_out_of_reach(
 
 
 def test_what_was_refused_is_named_also_where_the_fmu_does_not_say_it(
-    attempting: Attempting, key: Path, spring_mass: Path, spring_binding: Binding
+    attempting, key, spring_mass, spring_binding
 ) -> None:
     silent = attempting("look_into(TARGET)", key, "SILENT")
     refused(silent, r"The system refused it something \(Permission denied\)")
     words = rf"\(Permission denied; the last .* tried was open\('{key}', 'r'\)\)"
-    with FmiAsset(spring_mass, spring_binding) as asset, pytest.raises(FmuCallError, match=words):
+    with FmiAsset(spring_mass, spring_binding) as asset, pytest.raises(errors.FmuCallError, match=words):
         asset.step(load={"misbehaviour": 13.0})
 
 
-def test_rights_of_files_stay_as_they_are(attempting: Attempting, key: Path) -> None:
+def test_rights_of_files_stay_as_they_are(attempting, key) -> None:
     """Landlock does not know them: calls that change them return OK, in vain."""
     for attempt in ("chmod(TARGET,0777)", "chown(TARGET,1,1)"):
         before = key.stat()
@@ -219,17 +214,13 @@ GRANTED = [
 
 
 @pytest.mark.parametrize(("what", "attempt", "limit"), GRANTED, ids=[case[1] for case in GRANTED])
-def test_what_is_granted_can_be_had(
-    attempting, targets: Targets, what: str, attempt: str, limit: str
-) -> None:
+def test_what_is_granted_can_be_had(attempting, targets, what, attempt, limit) -> None:
     target, happened = targets(what)
     granted(attempting(attempt, target, **{limit: [int(target) if limit == "ports" else target]}))
     assert happened()
 
 
-def test_a_port_beside_the_granted_one_and_another_protocol_stay_closed(
-    attempting: Attempting, targets: Targets
-) -> None:
+def test_a_port_beside_the_granted_one_and_another_protocol_stay_closed(attempting, targets) -> None:
     for what, attempt in (
         ("call", STREAM),
         ("call", "call(SOCK_STREAM,262,TARGET)"),
@@ -242,7 +233,7 @@ def test_a_port_beside_the_granted_one_and_another_protocol_stay_closed(
         assert not happened()
 
 
-def test_a_program_that_is_granted_is_as_confined_as_the_fmu(attempting: Attempting, tmp_path: Path) -> None:
+def test_a_program_that_is_granted_is_as_confined_as_the_fmu(attempting, tmp_path) -> None:
     """It makes a file where the FMU may write, and none elsewhere."""
     given = tmp_path / "given"
     given.mkdir()
@@ -251,7 +242,7 @@ def test_a_program_that_is_granted_is_as_confined_as_the_fmu(attempting: Attempt
     assert list(tmp_path.rglob("made")) == [given / "made"]
 
 
-def test_its_own_folder_is_its_own(attempting: Attempting) -> None:
+def test_its_own_folder_is_its_own(attempting) -> None:
     """Also that for temporary files, which is the same; that of the extracted FMU by a key."""
     for attempt in ("create(TARGET)", 'rename("worker.log",TARGET)', "create(in_temporary())"):
         granted(attempting(attempt, "notes.txt"))
@@ -260,21 +251,25 @@ def test_its_own_folder_is_its_own(attempting: Attempting) -> None:
 
 
 REFUSED = [
-    ({"read": ["/there/is/no/such"]}, FmuInputError, r"grants '/there/is/no/such', which does not exist"),
-    ({"ports": [0]}, BindingError, r"limits\.ports.*1"),
-    ({"ports": ["27000"]}, BindingError, r"limits\.ports.*an integer"),
-    ({"read": "/opt"}, BindingError, r"limits\.read.*a list"),
-    ({"sandbox": "no"}, BindingError, r"limits\.sandbox.*true or false"),
+    (
+        {"read": ["/there/is/no/such"]},
+        errors.FmuInputError,
+        r"grants '/there/is/no/such', which does not exist",
+    ),
+    ({"ports": [0]}, errors.BindingError, r"limits\.ports.*1"),
+    ({"ports": ["27000"]}, errors.BindingError, r"limits\.ports.*an integer"),
+    ({"read": "/opt"}, errors.BindingError, r"limits\.read.*a list"),
+    ({"sandbox": "no"}, errors.BindingError, r"limits\.sandbox.*true or false"),
 ]
 
 
-def test_keys_that_are_wrong_are_one_sentence(foreign_fmu: Any) -> None:
+def test_keys_that_are_wrong_are_one_sentence(foreign_fmu) -> None:
     for limits, kind, sentence in REFUSED:
         with pytest.raises(kind, match=sentence):
             FmiAsset(foreign_fmu("hostile2"), changed(HOSTILE, limits=limits)).reset()
 
 
-def test_what_is_not_confined_is_said_once(foreign_fmu, caplog, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_confined_is_said_once(foreign_fmu, caplog, monkeypatch) -> None:
     """Of an FMU whose binding says so, and of a kernel without Landlock."""
     fmu, said = foreign_fmu("hostile2", "CASE=said"), []
     for binding in (changed(HOSTILE, limits={"sandbox": False}), HOSTILE):
@@ -299,13 +294,13 @@ def sampled(fmu: Path, folder: Path, more: str = "") -> SamplingGrid:
     )  # fmt: skip
 
 
-def test_components_and_samplers_are_confined_too(attempting: Attempting, key: Path, tmp_path: Path) -> None:
+def test_components_and_samplers_are_confined_too(attempting, key, tmp_path) -> None:
     """A system of FMUs, and a library."""
     fmu, library = attempting("unlink(TARGET)", key).description.path, tmp_path / "library.nc"
     binding = bound(1.0, {"y": ("thief.y", "m")}, control={"u": ("thief.u", "m/s")})
     words = rf"it cannot have {key}: Permission denied"
     refused(CoupledAsset(system([Component("thief", fmu)], []), binding), words)
-    with pytest.raises(FmuCallError, match=words):
+    with pytest.raises(errors.FmuCallError, match=words):
         sample_library(sampled(fmu, tmp_path), library, workers=1)
     assert key.exists()
     free = sampled(fmu, tmp_path, "[limits]\nsandbox = false\n")
@@ -324,20 +319,18 @@ class Order:
         return os.mkdir, (str(self._path),)
 
 
-def test_what_a_sampled_fmu_writes_to_its_descriptors_is_not_carried_out(
-    attempting: Attempting, tmp_path: Path
-) -> None:
+def test_what_a_sampled_fmu_writes_to_its_descriptors_is_not_carried_out(attempting, tmp_path) -> None:
     """The processes of a sampling send each other pickles, and the FMU is in none of them."""
     made = tmp_path / "made"
     order = pickle.dumps(Order(made), protocol=0).decode()
     fmu = attempting("write_message(TARGET)", order).description.path
-    with pytest.raises(FmuWorkerError, match="closed its pipe, or wrote something else into it"):
+    with pytest.raises(errors.FmuWorkerError, match="closed its pipe, or wrote something else into it"):
         sample_library(sampled(fmu, tmp_path), tmp_path / "library.nc", workers=1)
     assert not made.exists()
 
 
 @pytest.mark.parametrize("version", range(1, 7))
-def test_what_older_kernels_know_is_asked_of_them(tmp_path: Path, key: Path, version: int) -> None:
+def test_what_older_kernels_know_is_asked_of_them(tmp_path, key, version) -> None:
     """By the rights of that version, which newer kernels take as well; its own files can be made."""
     own = tmp_path / "own"
     own.mkdir()
@@ -359,15 +352,13 @@ def test_what_older_kernels_know_is_asked_of_them(tmp_path: Path, key: Path, ver
 
 
 @pytest.mark.parametrize("trap", ['symlink(TARGET,"worker.log")', 'mkfifo("worker.log",0600)'])
-def test_a_trap_in_the_place_of_the_log(attempting: Attempting, key: Path, trap: str) -> None:
+def test_a_trap_in_the_place_of_the_log(attempting, key, trap) -> None:
     """The twin, which may read the key, reads the last words of a worker that has died, not the key."""
     asset = attempting(f'(unlink("worker.log"),{trap},raise(SIGKILL))', key)
-    assert not refused(asset, "SIGKILL", FmuWorkerError).messages
+    assert not refused(asset, "SIGKILL", errors.FmuWorkerError).messages
 
 
-def test_a_link_that_takes_the_place_of_a_folder_while_it_is_removed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_link_that_takes_the_place_of_a_folder_while_it_is_removed(tmp_path, monkeypatch) -> None:
     mine, folder = tmp_path / "mine", tmp_path / "folder"
     (folder / "deep").mkdir(parents=True)
     mine.mkdir()
