@@ -154,7 +154,7 @@ TURNED_WEIGHT = 0.4
 MODE_WEIGHTS = np.array([3.0, 3.0, 6.0, 3.0, 1.5, 1.0, 0.5, 0.3])
 CHANGED = 6
 """Numbers of the changes: start, length, amount of a local loss, root compliance, point mass, its station."""
-PLAIN_WEIGHT = 3.0
+PLAIN_WEIGHT = 10.0
 """How much more the wing as it was counts than one of the patched states."""
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from fe.elements.cells import gradients, strain_matrix
 from fe.elements.kinds import gauss_points
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
@@ -156,10 +155,8 @@ def wing_agreement(
 
 def _strain_tensors(operators: AffineOperators, free: FloatArray) -> FloatArray:
     """Strain tensors (27 cells, 6) in CalculiX's order at the integration points of the gauges' cells."""
-    mesh, cells = operators.wing_mesh, gauge_cells(operators)
-    slopes, _ = gradients(mesh.kind, mesh.nodes[cells], INTEGRATION_POINTS)
-    displacement = operators.full_displacement(free).ravel()[mesh.unknowns_of(cells)]
-    voigt = np.einsum("nqij,nj->nqi", strain_matrix(slopes), displacement).reshape(-1, 6)
+    displacement, cells = operators.full_displacement(free), gauge_cells(operators)
+    voigt = operators.wing_mesh.strains(displacement, cells, INTEGRATION_POINTS).reshape(-1, 6)
     voigt[:, 3:] *= 0.5  # engineering to tensor shear
     return np.asarray(voigt[:, _PRINTED])
 
