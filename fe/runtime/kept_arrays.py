@@ -20,12 +20,17 @@ import numpy.typing as npt
 
 from .errors import ReducedModelFileError
 
-KINDS: Mapping[type, Callable[[Any], Any]] = {
-    **{kind: kind for kind in (str, int, float)},
-    tuple: lambda names: tuple(map(str, names)),
-}
-"""What makes the value of a field that is no array, by its type, of the array that a file has of it."""
 _TIMESTAMP = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip archive can hold
+
+
+def _names(array: npt.NDArray[Any]) -> tuple[str, ...]:
+    if array.dtype.kind != "U" or array.ndim != 1:
+        raise ValueError(f"names are wanted, not {array.dtype} of shape {array.shape}")
+    return tuple(array.tolist())
+
+
+KINDS: Mapping[type, Callable[[Any], Any]] = {str: str, int: int, float: float, tuple: _names}
+"""What makes the value of a field that is no array, by its type, of the array that a file has of it."""
 
 
 def arrays_to_bytes(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
@@ -192,7 +197,10 @@ class KeptArrays:
     def to_bytes(self) -> bytes:
         """Return the bytes of an `.npz` file; equal records give equal bytes."""
         values = {**self.layout, **{item.name: getattr(self, item.name) for item in fields(self)}}
-        return arrays_to_bytes({name: np.array(value) for name, value in values.items()})
+        kinds = {tuple: np.str_}  # also of no names at all
+        return arrays_to_bytes(
+            {name: np.array(value, dtype=kinds.get(type(value))) for name, value in values.items()}
+        )
 
     @classmethod
     def from_bytes(cls, content: bytes, where: str = "") -> Self:
