@@ -23,15 +23,7 @@ from hypothesis import strategies as st
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.state import TIP_FORCE, DigitalState
 from fmu_asset.packing.structure_fmu import build_fmu
-from fmu_asset.slaves.variables import (
-    STATUS_BAD_CALL,
-    STATUS_BAD_STATE,
-    STATUS_BAD_STEP,
-    STATUS_INTERNAL,
-    STATUS_NOT_FINITE,
-    STATUS_OK,
-    STATUS_OUTSIDE_RANGE,
-)
+from fmu_asset.slaves import variables as told
 from tests.fmu_asset.ours import OurFmus
 from tests.fmu_asset.slaves.slave import DISCARD, ERROR, OK, Slave
 from tests.kept import compiled_wing
@@ -68,7 +60,7 @@ def test_a_start_is_the_equilibrium_and_modal_outputs_follow(slave, model) -> No
     everything = slave.everything()
     np.testing.assert_allclose(everything[STRAIN], expected.strain, rtol=1e-12)
     assert everything[TIP] == pytest.approx(expected.displacement[0], rel=1e-12)
-    assert slave.status == STATUS_OK
+    assert slave.status == told.STATUS_OK
     before = slave.of("frequency[1]")
     assert slave.step([2.0, 0.6, 0.0, 0.0], 0.0, 1.0) == OK
     frequency = model.modes({"z1": 0.6}).frequency
@@ -242,7 +234,7 @@ ONCE, AGAIN = (GOOD, 0.0, 0.01), (GOOD, 0.01, 0.01)
 def both_step(pair: tuple[Slave, Slave], *step: Any) -> None:
     for one in pair:
         assert one.step(*step) == OK
-        assert one.status == STATUS_OK
+        assert one.status == told.STATUS_OK
     assert pair[0].everything() == pair[1].everything()
 
 
@@ -264,7 +256,9 @@ def test_refused_inputs_change_nothing(pair, index, value, response) -> None:
     both_step(pair, *ONCE)
     wrong = [value if k == index else given for k, given in enumerate(GOOD)]
     assert_refused(
-        pair, (wrong, *AGAIN[1:]), STATUS_OUTSIDE_RANGE if math.isfinite(value) else STATUS_NOT_FINITE
+        pair,
+        (wrong, *AGAIN[1:]),
+        told.STATUS_OUTSIDE_RANGE if math.isfinite(value) else told.STATUS_NOT_FINITE,
     )
     named = pair[0].inputs[index]
     assert (
@@ -282,7 +276,7 @@ def test_steps_of_no_size_or_from_another_time_are_refused(pair) -> None:
         one.start(response=2, initial_tip_displacement=0.01)
     both_step(pair, *ONCE)
     for times in WRONG_TIMES:
-        assert_refused(pair, (GOOD, *times), STATUS_BAD_STEP)
+        assert_refused(pair, (GOOD, *times), told.STATUS_BAD_STEP)
     assert any("stands at t = 0.01" in text for _, text in list(pair[0].log)[-3:])
     both_step(pair, *AGAIN)
 
@@ -296,7 +290,7 @@ def test_calls_in_the_wrong_phase(slave) -> None:
     assert "before initialisation" in slave.log[-1][1]
     assert slave.start() == OK
     slave.status_of(fmu.enterInitializationMode)
-    assert slave.status == STATUS_BAD_CALL
+    assert slave.status == told.STATUS_BAD_CALL
     for call, name, value in (
         (set_real, "mass.servo", 0.2),
         (set_whole, "response", 2),
@@ -308,7 +302,7 @@ def test_calls_in_the_wrong_phase(slave) -> None:
     ):
         before = slave.everything()
         assert (slave.status_of(call, [reference.get(name, 999)], [value]) != OK) == compiled
-        assert slave.status == STATUS_BAD_CALL
+        assert slave.status == told.STATUS_BAD_CALL
         assert slave.everything() == before
     if compiled:
         for call, place in ((get, 999), (get, reference["status"]), (getattr(fmu, f"get{slave.whole}"), 11)):
@@ -375,7 +369,7 @@ def test_wrong_calls_of_fmi_3_are_refused_and_change_nothing(ours) -> None:
 def test_parameters_that_are_refused_stop_the_start(slave, name, value, right) -> None:
     key = name.replace(".", "__")
     slave.start(**{key: value})
-    assert slave.status in (STATUS_OUTSIDE_RANGE, STATUS_NOT_FINITE)
+    assert slave.status in (told.STATUS_OUTSIDE_RANGE, told.STATUS_NOT_FINITE)
     assert slave.log[-1][1].startswith(name)
     assert slave.step(STILL, 0.0, 1.0) != OK
     assert slave.start(anew=False, **{key: right}) == OK
@@ -400,7 +394,7 @@ def test_a_computation_that_fails_is_a_refusal(compiler, model, tmp_path, kind, 
             packed = sys.modules[f"{one.description.model_identifier}_runtime.fe.reduced"].ReducedModel
             patch.setattr(packed, "static_response", fail)
         assert one.step([1.0, 4.0, 0.0, 0.0], 1.0, 1.0) == DISCARD
-        assert one.status == STATUS_INTERNAL
+        assert one.status == told.STATUS_INTERNAL
         assert "not positive definite" in one.log[-1][1]
         assert one.everything()[RESULTS] == before[RESULTS]
         patch.undo()
@@ -473,7 +467,7 @@ def test_states_of_something_else_are_refused(slave, ours) -> None:
         wrong += [state + b"12345678", tagged, bad_count, not_finite, too_short]
     for content in wrong:
         assert slave.restore(content) == ERROR or not compiled
-        assert slave.status == STATUS_BAD_STATE
+        assert slave.status == told.STATUS_BAD_STATE
         assert "was not restored" in slave.log[-1][1]
     assert slave.everything()[:36] == before[:36]
     assert slave.step(STILL, 0.0, 1.0) == OK
