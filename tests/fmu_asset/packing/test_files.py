@@ -31,9 +31,8 @@ from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.table import structure_table
 from scenarios import asset_scripts, binding_files
 from tests.command_line import command, refused, said
-from tests.fmu_asset.chain import chain_model
 from tests.fmu_asset.making import DESCRIPTION, archive_of, bound, edited, members, run_python
-from tests.fmu_asset.ours import REGIONS, STRUCTURES
+from tests.fmu_asset.ours import REGIONS, STRUCTURES, chain_model
 
 BIN = Path(sys.executable).parent
 PUMP = asset_scripts()["gear_pump"]

@@ -24,9 +24,9 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.worker.client import WorkerInstance
 from fmu_asset.worker.protocol import CALL, HEADER
-from tests.fmu_asset.chain import chain_model
 from tests.fmu_asset.door.kinds import HOSTILE
 from tests.fmu_asset.making import ROOT, archive_of, changed, members, run_python
+from tests.fmu_asset.ours import chain_model
 
 MISBEHAVIOURS = tomllib.loads(Path(__file__).with_name("misbehaviours.toml").read_text("utf-8"))
 REPLAYED = changed(HOSTILE, header={"state": "replay"})
