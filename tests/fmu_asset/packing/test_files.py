@@ -394,9 +394,8 @@ def test_compilers_that_are_not_there_fail_or_are_chosen(compiler, model, tmp_pa
         find_compiler()
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC")
-    with pytest.raises(
-        errors.FmuBuildError, match=r"looked for: cc, gcc, clang\); install one .* --kind source"
-    ):
+    words = r"looked for: cc, gcc, clang\); install one .* --kind source"
+    with pytest.raises(errors.FmuBuildError, match=words):
         build_fmu(model, tmp_path / "wing.fmu", kind="compiled")
     assert not (tmp_path / "wing.fmu").exists()
 

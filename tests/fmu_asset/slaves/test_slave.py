@@ -85,20 +85,6 @@ def test_start_values_come_from_the_state(compiler, model, tmp_path) -> None:
         np.testing.assert_allclose(slave.everything()[STRAIN], expected.strain, rtol=1e-12)
 
 
-@settings(deadline=None)
-@given(size=st.floats(1e-4, 0.5), parts=st.integers(2, 7))
-def test_the_transient_does_not_depend_on_the_step_size(pair, size, parts) -> None:
-    whole, split = pair
-    for slave in pair:
-        slave.start(response=2, initial_tip_displacement=0.02)
-    inputs = [3.0, 0.5, 0.0, 0.0]
-    assert whole.step(inputs, 0.0, size) == OK
-    for part in range(parts):
-        assert split.step(inputs, part * size / parts, size / parts) == OK
-    seen, expected = (one.everything()[STRAIN.start : TIP + 1] for one in (split, whole))
-    np.testing.assert_allclose(seen, expected, rtol=1e-9, atol=1e-12)
-
-
 def random_flight(slave: Slave, seed: int, response: int, damping: str = "", steps: int = 25) -> np.ndarray:
     """Parameters, inputs and steps at random: health mostly stays, a load is often none at all."""
     rng = np.random.default_rng(seed)
@@ -282,9 +268,8 @@ def test_steps_of_no_size_or_from_another_time_are_refused(pair) -> None:
 
 
 def test_calls_in_the_wrong_phase(slave) -> None:
-    fmu, reference, compiled = slave.fmu, slave.reference, is_compiled(slave)
-    get, set_whole = (getattr(fmu, f"get{slave.real}"), getattr(fmu, f"set{slave.whole}"))
-    set_real = getattr(fmu, f"set{slave.real}")
+    fmu, compiled = slave.fmu, is_compiled(slave)
+    set_real, set_whole = getattr(fmu, f"set{slave.real}"), getattr(fmu, f"set{slave.whole}")
     fmu.reset()
     assert slave.status_of(fmu.doStep, 0.0, 1.0) != OK
     assert "before initialisation" in slave.log[-1][1]
@@ -301,13 +286,10 @@ def test_calls_in_the_wrong_phase(slave) -> None:
         (fmu.setString, "load_factor", "x"),
     ):
         before = slave.everything()
-        assert (slave.status_of(call, [reference.get(name, 999)], [value]) != OK) == compiled
+        assert (slave.status_of(call, [slave.reference.get(name, 999)], [value]) != OK) == compiled
         assert slave.status == told.STATUS_BAD_CALL
         assert slave.everything() == before
-    if compiled:
-        for call, place in ((get, 999), (get, reference["status"]), (getattr(fmu, f"get{slave.whole}"), 11)):
-            assert slave.status_of(call, [place]) != OK
-    else:
+    if not compiled:
         for unknown in ([999], [49, 50, 51], [0, 999]):
             assert math.isnan(fmu.getReal(unknown)[-1])
         assert fmu.getString([0]) == [b""]
@@ -322,8 +304,6 @@ def test_calls_in_the_wrong_phase(slave) -> None:
     if compiled:
         fmu.reset()
         assert slave.status_of(fmu.exitInitializationMode) == ERROR
-    if compiled and not slave.three:
-        assert slave.status_of(fmu.setupExperiment, None, math.nan) == ERROR
 
 
 def test_wrong_calls_of_fmi_3_are_refused_and_change_nothing(ours) -> None:
