@@ -269,7 +269,8 @@ def test_numbered_outputs_are_one_observation(first, count, form) -> None:
 def test_other_units_and_shapes_are_another_observation_and_none_is_none() -> None:
     metres, kelvins = variable("s1", "output", unit="m"), variable("s2", "output", unit="K")
     array = dataclasses.replace(variable("s1", "output"), shape=(3,))
-    for first, second in ((metres, kelvins), (array, variable("s2", "output"))):
+    padded = variable("s01", "output"), variable("s2", "output")
+    for first, second in ((metres, kelvins), (array, variable("s2", "output")), padded):
         assert len(drafted(description(first, second)).observation) == 2
     with pytest.raises(BindingError, match="no number that could be observed"):
         draft_binding(description(variable("u", "input")))

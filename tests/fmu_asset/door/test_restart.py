@@ -1,6 +1,7 @@
 """A start is a start: a reset that does nothing is not believed; many instances share one extracted FMU."""
 
 import logging
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -111,11 +112,8 @@ def test_a_library_is_sampled_from_fresh_starts(foreign_fmu) -> None:
         fmu=str(fmu), binding=str(binding), role="motion", parameter="", draws=(0.0,), settling_steps=200,
         states={"spring": (4.0, 5.0, 8.0)}, controls={"weak": {"push": 2.0}, "strong": {"push": 4.0}},
     )  # fmt: skip
-    sampler = GridSampler(grid)
-    try:
+    with closing(GridSampler(grid)) as sampler:
         found = sampler.block(0, 6)[:, 0]
-    finally:
-        sampler.close()
     np.testing.assert_allclose(found, [0.5, 1.0, 0.4, 0.8, 0.25, 0.5], rtol=1e-9)
 
 

@@ -7,6 +7,7 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ from reporting.provenance import collect_provenance
 from tests.command_line import command, refused, said
 from tests.fmu_asset.door.kinds import CHANNELS, INTERVAL, OUTPUTS, SENDING, WARM, on, playing, watching
 from tests.fmu_asset.ours import OurFmus
+from tests.fmu_asset.slaves.slave import OK, Slave
 
 HERE = Path(__file__).parent
 SENSORS, WING = (
@@ -218,6 +220,22 @@ def test_switches_and_values_change_between_steps(sensing, fmu) -> None:
         warm = asset.step(load={"temperature": 4.0}).values
     np.testing.assert_allclose(warm[:24] - cold[:24], 4.8e-5, rtol=1e-9)
     np.testing.assert_array_equal(warm[24:], cold[24:])
+
+
+@pytest.mark.parametrize("response", [1, 2])
+def test_what_is_read_while_initialising_leaves_no_trace(sensing, response) -> None:
+    seen = []
+    for factors in ((3.0, 1.0), (1.0,)):
+        with closing(Slave(sensing)) as slave:
+            slave.initialising()
+            slave.fmu.setInteger([slave.reference["response"]], [response])
+            for factor in factors:
+                slave.set(on("coupling") | {"load_factor": factor})
+                slave.everything()
+            assert slave.status_of(slave.fmu.exitInitializationMode) == OK
+            assert slave.status_of(slave.fmu.doStep, 0.0, 0.05) == OK
+            seen.append(slave.everything())
+    assert seen[0] == seen[1]
 
 
 IMPOSSIBLE = {

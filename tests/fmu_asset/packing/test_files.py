@@ -171,6 +171,7 @@ SCRIPTS: list[tuple[str, str | None, str]] = [
     ("gear-pump.py", "", "name is an identifier"),
     ("missing.py", None, "cannot be read"),
     ("empty.py", "x = 1", "must define one subclass of pythonfmu's Fmi2Slave, and it defines none"),
+    ("two.py", MODEL % ("", "pass") + "class Other(Model):\n    pass\n", "and it defines Model, Other"),
     ("broken.py", "import nowhere_to_be_found", "cannot be run: ModuleNotFoundError"),
     ("units.py", MODEL % (IN_FURLONG, "pass"), "gives u in furlong, which its unit_table does not have"),
     ("table.py", MODEL % (OF_NOTHING, "pass"), "has v, which the model does not register"),
