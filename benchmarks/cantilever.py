@@ -22,9 +22,8 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.models.acting import Acting, Course, Shown
+from discrepancy.models.acting import Acting, Course, Shown, release_of
 from discrepancy.models.interface import Conditions, Model, Outputs, Response
-from discrepancy.models.questions import release_of
 from discrepancy.models.scales import PortScale, Scales
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.sensing import observe

@@ -145,8 +145,7 @@ def problem_of(case: Case) -> Problem:
 def found_in(case: Case) -> FloatArray:
     """Return medians and ends of the 90 % intervals (C, 3) of all changes of a record [s]."""
     search = ForceSearch(problem_of(case))
-    at = search.locate()
-    one = search.rough(max(at, key=lambda name: at[name].evidence))
+    one = search.rough(max(search.at, key=lambda name: search.at[name].evidence))
     ((port, process),) = one.processes.items()
     return events(one.view, port, process).moments(0)
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
+from discrepancy.document import Origin
 from discrepancy.errors import ModelError, VerdictFileError
-from discrepancy.files.document import Origin
 from discrepancy.files.verdict import StoredPatch, read_patch
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.fmu_runs import binding_file
@@ -123,10 +123,10 @@ def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
     if path.suffix == ".json":
         return _patched(path, progress)
     if path.suffix not in ("", ".toml"):
+        names = sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml"))
         raise ModelError(
             f"{path} is no model: a calibration (.nc), a wing design, a structure or a lumped model (.toml), "
-            "a patch (.json), or the name of a "
-            f"shipped lumped model ({', '.join(shipped_lumped_models())}) is expected."
+            f"a patch (.json), or the name of a shipped lumped model ({', '.join(names)}) is expected."
         )
     if path.suffix == ".toml":
         content = read_toml(path, ModelError, what="model")
@@ -216,11 +216,6 @@ def choice_of_run(folder: Path) -> ModelChoice:
     if patch is None:
         return choice
     return replace(choice, source_hash=hash_record({"model": choice.source_hash, "patch": hash_file(patch)}))
-
-
-def shipped_lumped_models() -> tuple[str, ...]:
-    """Return the names of the lumped models that come with the package."""
-    return tuple(sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml")))
 
 
 def _patched(path: Path, progress: Progress | None) -> ModelChoice:

@@ -21,8 +21,8 @@ from scipy.stats import binomtest
 from discrepancy.campaign.records import Campaign
 from discrepancy.campaign.sampling import IntArray
 from discrepancy.catalogue.entry import Effect
+from discrepancy.document import Origin, plain
 from discrepancy.errors import FitError, ModelError
-from discrepancy.files.document import Origin, plain
 from discrepancy.judgement.separability import usable
 from discrepancy.models.interface import Model
 from discrepancy.sources.simulated_campaigns import Hidden, Simulator

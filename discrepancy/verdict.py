@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from math import nan
 
-from discrepancy.document_types import Number, Patch
+from discrepancy.document import Number, Patch
 from reporting.words import brief
 
 

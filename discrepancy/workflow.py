@@ -156,13 +156,11 @@ def investigate(
         kind = VerdictKind.DATA_ERROR
         verdict = Verdict(kind, fatal[0].sentence, nan, nan, remarks=tuple(remarks))
         return Investigation(campaign, model, faults, verdict, seconds=seconds)
-    setting = Setting(campaign, model, model.scales(campaign))
     with stage("Fitting what is known, and searching the catalogue", "name") as tell:
-        problem = Problem(campaign, model, setting)
-        cleaned = without_wrong_ends(problem)
-        if cleaned is not campaign:
-            campaign, setting = cleaned, replace(setting, campaign=cleaned)
-            problem = Problem(campaign, model, setting)
+        problem = without_wrong_ends(
+            Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
+        )
+        campaign, setting = problem.campaign, problem.setting
         catalogue = load_catalogue() if effects is None else effects
         verdict, search, fit = name(problem, catalogue, tell=tell)
         verdict = with_untested(verdict, setting, catalogue)
@@ -253,8 +251,8 @@ def checked(
     return choose_held_out(campaign) if hold_out else campaign, faults
 
 
-def without_wrong_ends(problem: Problem) -> Campaign:
-    """Return a problem's campaign without single wrong readings at the ends of its records in time.
+def without_wrong_ends(problem: Problem) -> Problem:
+    """Return a problem without single wrong readings at the ends of its campaign's records in time.
 
     The model as it is need not fit: see `outliers.wrong_ends`.
     """
@@ -279,8 +277,9 @@ def without_wrong_ends(problem: Problem) -> Campaign:
                 remarks.append(said("remarks.wrong_ends", count=count, total=len(found), **told))
             trials[trial.name] = replace(trial, used=trial.used & ~found)
     if len(remarks) == len(problem.campaign.remarks):
-        return problem.campaign
-    return replace(problem.campaign, trials=tuple(trials.values()), remarks=tuple(remarks))
+        return problem
+    campaign = replace(problem.campaign, trials=tuple(trials.values()), remarks=tuple(remarks))
+    return Problem(campaign, problem.model, replace(problem.setting, campaign=campaign))
 
 
 def strained(problem: Problem, fit: CandidateFit) -> list[str]:

@@ -56,7 +56,7 @@ ROOMS = {
     ),
     "discrepancy": (
         "errors", "sentences", "campaign", "models", "lumped_models", "location", "catalogue",
-        "document_types", "verdict", "files", "search_settings", "fits", "missing_force", "search",
+        "document", "verdict", "files", "search_settings", "fits", "missing_force", "search",
         "judgement", "checks",
         "sources", "model_choice", "workflow", "parameters", "application", "self_calibration", "report",
         "verdict_folder",
@@ -68,7 +68,6 @@ LONGEST_MODULE, LONGEST_FUNCTION = 450, 60
 
 LONGER: dict[str, str] = {
     "discrepancy/workflow.py:investigate": "The whole way, one stage after the other.",
-    "discrepancy/models/fmu_runs.py:_made_binding": "One binding, its tables in the order of the file.",
     "fmu_asset/slaves/table.py:structure_table": "A table: one call a variable.",
 }
 """What may be longer, each with its reason."""

@@ -13,7 +13,7 @@ from uav_twin.options import Effects
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
-    from discrepancy.files.document import Origin
+    from discrepancy.document import Origin
     from discrepancy.model_choice import ModelChoice
     from discrepancy.self_calibration import SelfCalibration
     from discrepancy.verdict import ExplainedShare, Proof
@@ -177,7 +177,7 @@ def one_thread() -> None:
 def _origin(
     data: "Campaign", choice: "ModelChoice", command: str, seed: int, effects: list[Path]
 ) -> "Origin":
-    from discrepancy.files.document import Origin
+    from discrepancy.document import Origin
     from reporting.provenance import collect_provenance, hash_file
 
     inputs = {"campaign": data.data_hash, "model": choice.source_hash}

@@ -12,7 +12,7 @@ import typer
 
 from reporting import terminal
 from uav_twin.options import FmiVersion, Kind, Replace
-from uav_twin.verify import Check, end_with, print_checks
+from uav_twin.wing import Check, end_with, print_checks
 
 if TYPE_CHECKING:
     from fe.reduction.structure_errors import MeasuredErrors
@@ -246,7 +246,8 @@ def verify(
     json: terminal.Json = False,
 ) -> None:
     """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
-    from fe.verification.calculix_comparison import structure_agreement
+    from fe.verification.calculix_comparison import agreement
+    from fe.verification.calculix_deck import structure_deck
     from fe.verification.calculix_job import required_calculix
     from reporting.files import refuse_filled
 
@@ -257,8 +258,8 @@ def verify(
         tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch,
         terminal.progress().stage("CalculiX on the same mesh"),
     ):
-        agreement = structure_agreement(structure, out or Path(scratch), modes)
-    checks = list(_differences(agreement))
+        found = agreement(structure_deck(structure), out or Path(scratch), modes)
+    checks = list(_differences(found))
     if json:
         terminal.print_json(
             {
@@ -266,7 +267,7 @@ def verify(
                     {"of": check.group, "what": check.name, "difference": check.value, "limit": check.limit}
                     for check in checks
                 ],
-                "frequencies": {key: getattr(agreement, key).tolist() for key in ("ours", "calculix")},
+                "frequencies": {key: getattr(found, key).tolist() for key in ("ours", "calculix")},
                 "passed": all(check.passed for check in checks),
             }
         )

@@ -1,5 +1,10 @@
-"""`uav-twin wing`."""
+"""`uav-twin wing` and `uav-twin wing verify`."""
 
+import json
+import math
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -7,21 +12,26 @@ import typer
 
 from reporting import terminal
 from uav_twin.options import Design, refuse_before
-from uav_twin.verify import verify
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import Modes, ReducedModel
     from fe.wing.design import WingDesign
+    from fe.wing.operators import AffineOperators
+    from reporting.progress import Progress
 
 PUBLISHED = {
     "tip stiffness": "0.6770 (eq. 14)",
     "first flapwise bending": "5.632 (step 3, e = 1)",
     "second flapwise bending": "28.544 (step 3, e = 1)",
 }
-
+DAMAGED = (0.4, 0.6)
+REFINEMENTS = (0.5, 1.0, 2.0)
+QUICK_REFINEMENTS = (0.25, 0.5, 1.0)
+RING_DOWN_REFINEMENT = 0.25
+# R. H. MacNeal and R. L. Harder (1985), table 3, HEX20: in plane and out of plane.
+MACNEAL_HARDER = {"regular": (0.970, 0.961), "trapezoid": (0.886, 0.920), "parallelogram": (0.967, 0.941)}
 
 wing_app = typer.Typer(no_args_is_help=False)
-wing_app.command("verify")(verify)
 
 
 @wing_app.callback(invoke_without_command=True)
@@ -32,7 +42,7 @@ def wing(
         Path | None,
         typer.Option(help="Write the undamaged wing at 3g for ParaView, and its modes beside it."),
     ] = None,
-    json: terminal.Json = False,
+    as_json: terminal.Json = False,
 ) -> None:
     """Say what the wing weighs, how it vibrates and how stiff its tip is."""
     if context.invoked_subcommand is not None:
@@ -44,7 +54,7 @@ def wing(
     wing_design = load_design(design)
     record = wing_record(wing_design, reduced_model(wing_design, progress=terminal.progress()))
     written = [] if vtu is None else [str(path) for path in write_fields(wing_design, vtu)]
-    if json:
+    if as_json:
         terminal.print_json(record | {"written": written})
         return
     rows = [
@@ -112,3 +122,239 @@ def write_fields(design: "WingDesign", path: Path) -> tuple[Path, Path]:
     modes = path.with_name(f"{path.stem}-modes{path.suffix}")
     write_modes_vtu(modes, fields, vector)
     return path, modes
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the verification: what, what came, and the limit that it must keep, if it has one.
+
+    Attributes
+    ----------
+    group, name : str
+        What is checked.
+    value : float
+        What came.
+    limit : float, optional
+        Largest allowed value; None for a figure that is only reported.
+    note : str
+        What stands beside the figure.
+    """
+
+    group: str
+    name: str
+    value: float
+    limit: float | None = None
+    note: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the limit is kept."""
+        return self.limit is None or self.value <= self.limit
+
+
+@wing_app.command("verify")
+def verify(
+    design: Design = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the record and the jobs of CalculiX; it must be empty.")
+    ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick",
+            help="Coarser meshes, no limit on their convergence, and a quarter of a period of ring-down.",
+        ),
+    ] = False,
+) -> None:
+    """Check the finite element model: known answers, balances, convergence, and CalculiX where installed."""
+    from fe.verification.calculix_job import calculix_program
+    from fe.wing.design import load_design
+    from reporting.files import refuse_filled
+
+    wing_design = load_design(design)
+    refuse_filled(out)
+    with tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch:
+        jobs = (out or Path(scratch)) / "calculix"
+        checks = all_checks(wing_design, jobs, terminal.progress(), quick=quick)
+    print_checks(checks)
+    if calculix_program() is None:
+        terminal.say("CalculiX is not installed (apt-get install calculix-ccx): its checks are left out.")
+    if out is not None:
+        terminal.say(f"Wrote {write_record(out, wing_design, checks)}")
+    end_with(checks)
+
+
+def print_checks(checks: Sequence[Check]) -> None:
+    """Print every check beside its limit."""
+    rows = []
+    for check in checks:
+        limit = "" if check.limit is None else f"{check.limit:.3g}"
+        verdict = "" if check.limit is None else "kept" if check.passed else "BROKEN"
+        found = f"{check.value:.3g}" + (f" {check.note}" if check.note else "")
+        rows.append((check.group, check.name, found, limit, verdict))
+    terminal.print_table(("check", "figure", "found", "limit", "verdict"), rows)
+
+
+def end_with(checks: Sequence[Check]) -> None:
+    """End with 1, and say which limits are broken, if any is."""
+    broken = [check for check in checks if not check.passed]
+    if broken:
+        names = "; ".join(f"{check.group}, {check.name}" for check in broken)
+        typer.echo(f"{len(broken)} of {len(checks)} checks broke their limit: {names}.", err=True)
+        raise typer.Exit(1)
+
+
+def write_record(folder: Path, design: "WingDesign", checks: Sequence[Check]) -> Path:
+    """Write `verification.json`: each check with its value and limit."""
+    from reporting.files import atomic_write_text
+
+    rows = [
+        {**asdict(check), "value": check.value if math.isfinite(check.value) else None}
+        | {"passed": check.passed}
+        for check in checks
+    ]
+    record = {"design": design.name, "design_hash": design.hash, "checks": rows}
+    return atomic_write_text(folder / "verification.json", json.dumps(record, indent=2) + "\n")
+
+
+def all_checks(design: "WingDesign", jobs: Path, progress: "Progress", *, quick: bool = False) -> list[Check]:
+    """Return every check of a design; those against CalculiX where it is installed.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing.
+    jobs : Path
+        Where CalculiX works.
+    progress : Progress
+        Where each group of checks is announced.
+    quick : bool
+        Coarser meshes and a short ring-down.
+    """
+    from fe.verification.calculix_job import calculix_program
+    from fe.wing.operators import assemble
+
+    checks: list[Check] = []
+
+    def run(title: str, found: Iterable[Check]) -> None:
+        with progress.stage(title) as stage:
+            for check in found:
+                checks.append(check)
+                stage.advance(detail=check.name)
+
+    run("Elements against known answers", element_checks())
+    with progress.stage("Meshing the wing"):
+        mesh = assemble(design.changed(mesh={"refinement": QUICK_REFINEMENTS[0]}) if quick else design)
+    run("Balances of the wing", balance_checks(mesh))
+    refinements = QUICK_REFINEMENTS if quick else REFINEMENTS
+    run("Convergence of the mesh", convergence_checks(design, refinements, limited=not quick))
+    if calculix_program() is not None:
+        run("CalculiX on the same mesh", calculix_checks(mesh, jobs))
+        coarse = assemble(design.changed(mesh={"refinement": RING_DOWN_REFINEMENT}))
+        periods = 0.25 if quick else 5.0
+        run("A ring-down by CalculiX", ring_down_checks(coarse, jobs, periods=periods))
+    return checks
+
+
+def element_checks() -> Iterator[Check]:
+    """Yield the checks of the element and the assembly on bodies of their own."""
+    from fe.verification.known_answers import (
+        cantilever_check,
+        macneal_harder_beam,
+        patch_test,
+        rigid_body_values,
+    )
+
+    for name, error in zip(("displacement", "strain"), patch_test(), strict=True):
+        yield Check("patch test", name, error, 1e-12)
+    rigid = rigid_body_values()
+    yield Check(
+        "unsupported body", "zero eigenvalues, difference to 6", abs(int((rigid < 1e-12).sum()) - 6), 0.0
+    )
+    yield Check("unsupported body", "sixth eigenvalue over the largest", float(rigid[5]), 1e-12)
+    yield Check("cantilever", "against Timoshenko's beam", abs(cantilever_check()), 1e-3)
+    for shape, published in MACNEAL_HARDER.items():
+        for across, value in zip((True, False), published, strict=True):
+            found = macneal_harder_beam(shape, across_depth=across)
+            name = f"{shape}, {'in' if across else 'out of'} plane, against HEX20"
+            yield Check("MacNeal-Harder", name, abs(found - value), 6e-4, f"({found:.4f}, {value:.3f})")
+
+
+def balance_checks(operators: "AffineOperators") -> Iterator[Check]:
+    """Yield the sums that must agree for the wing at the load factor of its lift."""
+    from fe.verification.known_answers import rigid_body_residual, wing_balance
+
+    yield Check("wing", "force of a rigid motion", rigid_body_residual(operators), 1e-12)
+    balance = wing_balance(operators, operators.wing_mesh.design.lift.load_factor)
+    for name, (found, expected, unit) in balance.items():
+        limit = 1e-10 if name == "mass" else 1e-5
+        yield Check("wing", name, abs(found / expected - 1.0), limit, f"({found:.5g} {unit})")
+
+
+def convergence_checks(
+    design: "WingDesign", refinements: tuple[float, ...], *, limited: bool = True
+) -> Iterator[Check]:
+    """Yield the change between the two finest meshes and the observed order of every result.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing.
+    refinements : tuple of float
+        At least three, from coarse to fine, with equal ratios.
+    limited : bool
+        Hold the changes to their bars, which are made for `REFINEMENTS`.
+    """
+    import numpy as np
+
+    from fe.verification.known_answers import mesh_convergence, observed_order
+
+    columns = mesh_convergence(design, refinements)
+    middle, fine = refinements[-2:]
+    group = f"mesh x{middle:g} to x{fine:g}"
+
+    def order(values: list[float]) -> str:
+        found = observed_order(fine / middle, values)
+        return "not monotone" if math.isnan(found) else f"order {found:.2f}"
+
+    limit = 0.01 if limited else None
+    for name, unit in (("tip stiffness", "N/m"), ("first bending", "Hz"), ("second bending", "Hz")):
+        values = columns[name].tolist()
+        note = f"({values[-1]:.5g} {unit}, {order(values)})"
+        yield Check(group, name, abs(values[-1] / values[-2] - 1.0), limit, note)
+    strain = columns["strain"]
+    change = np.abs(strain[-1] / strain[-2] - 1.0)
+    yield Check(group, "gauges, rms", float(np.sqrt(np.mean(change**2))), limit)
+    for gauge, value in enumerate(change, start=1):
+        own = strain[:, gauge - 1].tolist()
+        note = f"({1e6 * own[-1]:.0f} microstrain, {order(own)})"
+        yield Check(group, f"gauge {gauge}", float(value), None, note)
+    yield Check(group, "unknowns of the finest mesh", int(columns["unknowns"][-1]))
+
+
+def calculix_checks(operators: "AffineOperators", jobs: Path) -> Iterator[Check]:
+    """Yield the differences to CalculiX on the identical mesh: statics and six modes."""
+    from fe.runtime.state import DigitalState
+    from fe.verification.calculix_comparison import agreement
+    from fe.verification.calculix_deck import wing_deck
+
+    damaged = tuple(DAMAGED[number % 2] for number in range(len(operators.regions)))
+    for health, loss in (("healthy", ()), ("damaged", damaged)):
+        group = f"CalculiX, {health}"
+        found = agreement(wing_deck(operators, DigitalState(stiffness_loss=loss)), jobs / health)
+        for load, differences in found.loads.items():
+            for what, value in differences.items():
+                yield Check(group, f"{load}: {what}", value, 1e-5 if "displacement" in what else 1e-3)
+        yield Check(group, f"frequencies 1 to {len(found.ours)}", found.modal, 1e-5)
+
+
+def ring_down_checks(operators: "AffineOperators", jobs: Path, periods: float) -> Iterator[Check]:
+    """Yield the difference of a ring-down to direct integration by CalculiX."""
+    from fe.runtime.state import DigitalState
+    from fe.verification.calculix_comparison import ring_down_agreement
+
+    ours, theirs, same = ring_down_agreement(operators, jobs / "ring_down", DigitalState(), periods)
+    note = f"({len(ours)} increments, {operators.unknowns} unknowns)"
+    apart, apart_same = (float(abs(theirs - found).max()) for found in (ours, same))
+    yield Check("CalculiX", f"ring-down over {periods:g} periods", apart, 0.01, note)
+    yield Check("CalculiX", "the same, both by the trapezoidal rule", apart_same, 1e-3)

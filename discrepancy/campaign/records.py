@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.sampling import is_even, nearly_even
+from discrepancy.campaign.sampling import IntArray, nearly_even
 from discrepancy.errors import CampaignDataError
 from reporting.words import brief
 
@@ -213,11 +213,6 @@ class Release:
         Modes whose initial state is free, at least 1: the first entry is the amplitude, within `deviation`.
     time_zero_deviation : float
         Prior standard deviation of the time between release and first sample [s].
-
-    Raises
-    ------
-    CampaignDataError
-        If no mode is free.
     """
 
     displacement: float
@@ -334,11 +329,21 @@ class Trial:
         }  # fmt: skip
         return cls(name, kind, channels, time=time, **{**usual, **given})
 
-    def rows(self, rows: BoolArray, **changes: Any) -> "Trial":
-        """Return the trial with some of its rows (N,) only, and other fields changed."""
-        parts = ("values", "used", "time", "force", "load_factor", "temperature")
-        of_rows = {part: getattr(self, part)[rows] for part in (*parts, "health", "health_deviation")}
-        return replace(self, **of_rows, **changes)
+    def rows(self, rows: BoolArray | IntArray | slice, **changes: Any) -> "Trial":
+        """Return the trial with its rows as an index chooses them, and other fields changed."""
+        parts = (
+            "values",
+            "used",
+            "time",
+            "force",
+            "load_factor",
+            "temperature",
+            "health",
+            "health_deviation",
+        )
+        of_rows: dict[str, Any] = {part: getattr(self, part)[rows] for part in parts}
+        inputs = tuple(replace(item, values=item.values[rows]) for item in self.inputs)
+        return replace(self, inputs=inputs, **{**of_rows, **changes})
 
     @property
     def input_names(self) -> tuple[str, ...]:
@@ -356,11 +361,6 @@ class Trial:
     def interval(self) -> float:
         """Sampling interval [s] of a dynamic trial; the mean one where stamps are uneven."""
         return float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
-
-    @cached_property
-    def is_even(self) -> bool:
-        """Whether the stamps of a dynamic trial are even to a thousandth of the interval."""
-        return is_even(self.time)
 
     @cached_property
     def whitened_at(self) -> float | None:

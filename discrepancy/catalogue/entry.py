@@ -143,16 +143,6 @@ class Setting:
 Build = Callable[[Setting, Mapping[str, float], str], ModelPatch]
 
 
-def nowhere_else(setting: Setting) -> tuple[str, ...]:
-    """Return ("",): the effect has no choice of place."""
-    return ("",)
-
-
-def always_available(setting: Setting) -> str | None:
-    """Return None: every campaign and model can carry the effect."""
-    return None
-
-
 @dataclass(frozen=True)
 class Effect:
     """A named effect.
@@ -197,8 +187,8 @@ class Effect:
     parameters: tuple[EffectParameter, ...]
     build: Build
     shape: tuple[ShapeParameter, ...] = ()
-    places: Callable[[Setting], tuple[str, ...]] = field(default=nowhere_else)
-    unavailable: Callable[[Setting], str | None] = field(default=always_available)
+    places: Callable[[Setting], tuple[str, ...]] = field(default=lambda setting: ("",))
+    unavailable: Callable[[Setting], str | None] = field(default=lambda setting: None)
     confusable: tuple[str, ...] = ()
     spectral: str = ""
 

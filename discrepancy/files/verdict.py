@@ -13,9 +13,8 @@ import numpy as np
 from pydantic import AfterValidator, Field, WithJsonSchema
 
 from discrepancy.campaign.records import Channel, Quantity
-from discrepancy.document_types import PRIMITIVE_UNITS, Number
+from discrepancy.document import PRIMITIVE_UNITS, Number, Origin, read_document, write_document
 from discrepancy.errors import VerdictFileError
-from discrepancy.files.document import Origin, read_document, write_document
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.verdict import CalibratedParameter, NamedEffect, Proof, Verdict, VerdictKind

@@ -213,14 +213,6 @@ class State:
         return tuple(part.response for part in self.linearisations)
 
 
-@dataclass(frozen=True)
-class Base:
-    """Where the derivatives by shared and local unknowns were taken, for chord steps."""
-
-    point: Point
-    parts: tuple[Linearisation, ...]
-
-
 def moved(values: FloatArray, index: int, step: float = PARAMETER_STEP) -> FloatArray:
     """Return the values with one of them a step further."""
     changed = values.copy()

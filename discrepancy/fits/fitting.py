@@ -12,7 +12,7 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
 
-from .candidate import Base, Candidate, Linearisation, Point, Remainder, State
+from .candidate import Candidate, Linearisation, Point, Remainder, State
 from .elimination import Cholesky, eliminated, finite
 from .problem import Problem
 
@@ -89,7 +89,7 @@ def fit(
     candidate: Candidate,
     start: Point,
     *,
-    base: Base | None = None,
+    base: State | None = None,
     iterations: int = 20,
     evidence: bool = True,
     local_only: bool = False,
@@ -105,7 +105,7 @@ def fit(
         What may act.
     start : Point
         Where to begin.
-    base : Base, optional
+    base : State, optional
         Chord steps: the model is evaluated at the base's shared and local unknowns only.
     iterations : int
         Largest number of steps.
@@ -194,7 +194,7 @@ class _Descent:
 
     problem: Problem
     candidate: Candidate
-    base: Base | None
+    base: State | None
     local_only: bool
     central: bool = True
     deviation: FloatArray | None = None  # (E,) of the effect parameters, once known

@@ -162,13 +162,7 @@ def _reached(energy: Callable[[FloatArray], float], centre: FloatArray, axis: Fl
     return axis
 
 
-def ensemble(
-    energy: Callable[[FloatArray], float],
-    centre: FloatArray,
-    axes: FloatArray,
-    *,
-    seed: int = SEED,
-) -> FloatArray:
+def ensemble(energy: Callable[[FloatArray], float], centre: FloatArray, axes: FloatArray) -> FloatArray:
     """Return draws by stretch moves of an ensemble (Goodman and Weare 2010, CAMCoS 5 (1), 65-80).
 
     Blocks of moves are added until the central 90 % of the last two agree in every coordinate, at most
@@ -183,15 +177,13 @@ def ensemble(
         Where the ensemble begins.
     axes : (E, E) ndarray
         Columns along which it is spread at first.
-    seed : int
-        Of the moves.
 
     Returns
     -------
     (N, E) ndarray
         Draws of all members in the last block.
     """
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(SEED)
     size = len(centre)
     count = max(WALKERS, 4 * size)
     walkers = centre + generator.standard_normal((count, size)) @ axes.T

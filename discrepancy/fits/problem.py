@@ -21,7 +21,7 @@ from discrepancy.models.memory import Memory
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
-from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Base, Candidate, Linearisation, Point, moved
+from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Candidate, Linearisation, Point, State, moved
 from .trial_data import GlobalUnknowns, TrialData, TrialDerivatives, global_unknowns, noise_models
 
 KEPT = 2000
@@ -172,7 +172,7 @@ class Problem:
         number: int,
         point: Point,
         candidate: Candidate,
-        base: Base | None = None,
+        base: State | None = None,
         *,
         derivatives: bool = True,
         known: Linearisation | None = None,
@@ -189,7 +189,7 @@ class Problem:
             Where.
         candidate : Candidate
             Effects that act.
-        base : Base, optional
+        base : State, optional
             With it, only the effect is evaluated, at the base's shared and local unknowns; their own steps
             are added to first order (chord).
         derivatives : bool
@@ -214,7 +214,7 @@ class Problem:
         patch = candidate.patch(self.setting, point.effect) if kind in candidate.acts_on else ModelPatch()
         if base is not None:
             shared, local = base.point.shared, base.point.local[number]
-            there = base.parts[number]
+            there = base.linearisations[number]
             response, _ = self.response(number, shared, local, patch)
             at_base = response
             move = (point.shared - shared)[: len(there.parameters)]

@@ -7,7 +7,7 @@ constants of inputs of a driven trial, health where it is uncertain.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import isinf
 
@@ -402,10 +402,3 @@ def stand_in(campaign: Campaign, name: str) -> float:
         if name in trial.channels
     ]
     return 1e-3 * max([*spans, 1e-12])
-
-
-def shortened(trial: Trial, count: int) -> Trial:
-    """Return the first rows of a trial."""
-    rows = ("values", "used", "time", "force", "load_factor", "temperature", "health", "health_deviation")
-    inputs = tuple(replace(item, values=item.values[:count]) for item in trial.inputs)
-    return replace(trial, inputs=inputs, **{name: getattr(trial, name)[:count] for name in rows})

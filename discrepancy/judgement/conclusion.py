@@ -166,10 +166,10 @@ def calibrated_parameters(problem: Problem, found: Hypothetic) -> tuple[Calibrat
 # ---------------------------------------------------------------- words
 
 
-def effects_text(effects: Iterable[NamedEffect], joint: str = "and") -> str:
+def effects_text(effects: Iterable[NamedEffect]) -> str:
     """Return effects with their places."""
     found = (f"{item.name} at {item.place}" if item.place else item.name for item in effects)
-    return listing(dict.fromkeys(found), joint)
+    return listing(dict.fromkeys(found))
 
 
 def probability_text(probability: float) -> str:

@@ -26,7 +26,6 @@ SEED = 20210527
 LEAST_INFORMATION = 0.03
 """Experiments that tell less are not proposed [nat]."""
 PROPOSED = 4
-_BY_ROW = ("values", "used", "force", "load_factor", "temperature", "health", "health_deviation")
 
 
 @dataclass(frozen=True)
@@ -204,9 +203,9 @@ def _changed(problem: Problem, trial: Trial, what: str, by: float) -> tuple[Tria
         return replace(trial, **{what: by * getattr(trial, what)}), 0.0, nothing
     if what == "length":
         count = int(by) * len(trial.time)
-        longer = {name: np.concatenate([getattr(trial, name)] * int(by)) for name in _BY_ROW}
         time = trial.time[0] + trial.interval * np.arange(count)
-        return replace(trial, **longer, time=time), count * trial.interval, nothing  # type: ignore[arg-type]
+        longer = trial.rows(np.arange(count) % len(trial.time), time=time)
+        return longer, count * trial.interval, nothing
     if what == "place" and stations is not None:
         place = (round(stations[0] + by * (stations[1] - stations[0]), 3), 0.35)
         return replace(trial, load_place=place), place[0], nothing

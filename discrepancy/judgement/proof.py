@@ -50,10 +50,8 @@ def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
     Raises
     ------
     FitError
-        If fitted and held-out trials are mixed, or no sample is used.
+        If no sample is used.
     """
-    if len({item.trial.held_out for item in residuals.trials}) > 1:
-        raise FitError("Scores need fitted or held-out trials, but the set mixes them: score each by itself.")
     transforms = [item.residual / item.predictive_deviation for item in residuals.trials]
     used = [item.used for item in residuals.trials]
     z = np.concatenate([values[use] for values, use in zip(transforms, used, strict=True)])
@@ -173,11 +171,6 @@ def score_gain(before: ResidualSet, after: ResidualSet) -> tuple[float, float]:
     Trials are the units: the error is that of a ratio over clusters. With fewer than five trials it is at
     least the error within them, from sums over sixteenths of each record (all channels at once, so that
     neighbouring samples may depend on each other); with one trial it is that alone.
-
-    Raises
-    ------
-    FitError
-        If the two sets are not of the same samples.
     """
     sums, counts, within = [], [], 0.0
     for first, second in zip(before.trials, after.trials, strict=True):
@@ -187,8 +180,6 @@ def score_gain(before: ResidualSet, after: ResidualSet) -> tuple[float, float]:
         counts.append(int(use.sum()))
         within += _variance_within(gain.sum(axis=1))
     total = sum(counts)
-    if total == 0:
-        raise FitError("A gain needs at least one used sample, but there is none.")
     mean = sum(sums) / total
     inner = sqrt(within) / total
     if len(sums) == 1:
@@ -272,34 +263,17 @@ def prove(before: ResidualSet, after: ResidualSet, *, seed: int = 0) -> Proof:
     Raises
     ------
     FitError
-        If the two sets differ in trials, used samples or noise, or no trial was fitted.
+        If no sample of one of the roles is used.
     """
-    _check_alike(before, after)
-    if before.fitted is None or after.fitted is None:
-        raise FitError("A proof needs at least one fitted trial, but all are held out.")
     outside = (before.held_out, after.held_out)
-    held_before = None if outside[0] is None else scores(outside[0], seed=seed)
-    held_after = None if outside[1] is None else scores(outside[1], seed=seed)
-    fitted_after = scores(after.fitted, seed=seed)
-    closed, reason = gap_closed(held_before, held_after)
+    held = [None if one is None else scores(one, seed=seed) for one in outside]
+    fitted = [scores(one.fitted or one, seed=seed) for one in (before, after)]
+    closed, reason = gap_closed(held[0], held[1])
     gain, error = nan, nan
     if outside[0] is not None and outside[1] is not None:
         gain, error = score_gain(outside[0], outside[1])
-    target = after.fitted if outside[1] is None else outside[1]
-    remaining = _remaining(target, fitted_after if held_after is None else held_after)
-    fitted_before = scores(before.fitted, seed=seed)
-    return Proof(held_before, held_after, fitted_before, fitted_after, closed, gain, error, remaining, reason)
-
-
-def _check_alike(before: ResidualSet, after: ResidualSet) -> None:
-    names = [", ".join(item.trial.name for item in one.trials) for one in (before, after)]
-    if names[0] != names[1]:
-        raise FitError(said("proof.other_trials", before=names[0], after=names[1]))
-    for first, second in zip(before.trials, after.trials, strict=True):
-        if first.trial.held_out is not second.trial.held_out or not np.array_equal(first.used, second.used):
-            raise FitError(said("proof.other_samples", trial=first.trial.name))
-        if not np.allclose(first.noise_deviation, second.noise_deviation, rtol=1e-9):
-            raise FitError(said("proof.other_noise", trial=first.trial.name))
+    remaining = _remaining(outside[1] or after.fitted or after, held[1] or fitted[1])
+    return Proof(held[0], held[1], fitted[0], fitted[1], closed, gain, error, remaining, reason)
 
 
 def _remaining(residuals: ResidualSet, after: Scores) -> str:

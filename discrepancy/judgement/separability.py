@@ -11,6 +11,7 @@ from math import inf, sqrt
 from operator import attrgetter
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from discrepancy.campaign.records import Campaign, FloatArray, NoiseRecord, Start, Trial
 from discrepancy.catalogue.entry import Effect, Setting
@@ -255,17 +256,9 @@ def _distance(screen: Screen, target: Change, options: list[Change]) -> float:
 
 def _groups(names: tuple[str, ...], distance: FloatArray) -> tuple[tuple[str, ...], ...]:
     """Return connected sets of effects that are closer than `CONFUSED` in either direction."""
-    near = np.minimum(distance, distance.T) < CONFUSED
-    left, groups = set(range(len(names))), []
-    while left:
-        found, edge = set(), {min(left)}
-        while edge:
-            found |= edge
-            edge = {j for i in edge for j in left if near[i, j]} - found
-        left -= found
-        if len(found) > 1:
-            groups.append(tuple(names[i] for i in sorted(found)))
-    return tuple(groups)
+    _, labels = connected_components(np.minimum(distance, distance.T) < CONFUSED)
+    sets = (np.flatnonzero(labels == label) for label in range(labels.max(initial=-1) + 1))
+    return tuple(tuple(names[i] for i in found) for found in sets if len(found) > 1)
 
 
 def usable(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:

@@ -136,13 +136,12 @@ def excess(items: Sequence[FittedTrial]) -> float:
     return float(sum(np.nansum(i.standardised**2) - np.sum(i.expected_variance[i.used]) for i in items))
 
 
-def _hats(values: FloatArray, low: float, high: float, knots: int = _HATS) -> FloatArray:
-    """Return piecewise linear hat functions between `low` and `high`, (n, knots)."""
+def _hats(values: FloatArray, low: float, high: float) -> FloatArray:
+    """Return piecewise linear hat functions between `low` and `high`, (n, `_HATS`)."""
     if high <= low:
         return np.ones((values.size, 1))
-    centres = np.linspace(low, high, knots)
-    distance = np.abs(values[:, np.newaxis] - centres) / (centres[1] - centres[0])
-    return np.asarray(np.clip(1.0 - distance, 0.0, None))
+    centres = np.linspace(low, high, _HATS)
+    return np.column_stack([np.interp(values, centres, hat) for hat in np.eye(_HATS)])
 
 
 def explanations(residuals: ResidualSet) -> tuple[Explanation, ...]:

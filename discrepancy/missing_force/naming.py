@@ -141,46 +141,41 @@ class ForceSearch:
     ----------
     problem : Problem
         With dynamic trials, of a model that has ports.
+    about : Point, optional
+        Where parameters are, if a fit tells it; what a law alone shows (the speed at which a body began to
+        fall) it alone knows.
+
+    Attributes
+    ----------
+    at : dict of str to Explained
+        The missing force at each port: first along the model's own motion, for the initial states; then along
+        the motion that was, with the parameters about where they are and the laws that the model has itself.
+    whole : Explained
+        Missing forces at all ports at once, or at those that matter most if they are many.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, about: Point | None = None) -> None:
         linear, self.laws = problem.model.apart()
         trials = tuple(data.trial for data in problem.trials)
         self.problem = Problem(problem.campaign, linear, problem.setting, trials, like=problem)
         self.numbers = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
         self.ports = tuple(linear.ports())
         self.at: dict[str, Explained] = {}
-        self.whole: Explained
-        self.point = self.problem.start(Candidate())
-        self.columns = Columns(self.problem, self.numbers, self.point)
-
-    # ---------------------------------------------------------------- where
-
-    def locate(self, about: Point | None = None) -> dict[str, Explained]:
-        """Return the missing force at each port.
-
-        First along the model's own motion, for the initial states; then along the motion that was, with the
-        parameters about where they are and the laws that the model has itself. `about`: where these are, if a
-        fit tells it; what a law alone shows (the speed at which a body began to fall) it alone knows.
-        """
-        problem = self.problem
+        self.point = self.problem.start(NOTHING)
         if about is not None:
-            self.point = Point(about.shared, about.local, np.zeros(0))
+            self.point = Point(about.shared, about.local, NO_VALUES)
         for turn in range(2):
-            trials = [seen_trial(problem, number, self.point) for number in self.numbers]
-            self.columns = Columns(problem, self.numbers, self.point)
+            bare = self._view()
             for port, name in enumerate(self.ports):
-                view = View(trials, problem.shared.precision)
-                if turn:
-                    view = self._along(view, view.smoothed(self.at[name].processes)[2])
+                view = self._along(bare, bare.smoothed(self.at[name].processes)[2]) if turn else bare
                 begins = [scaled(self.about((port,)), 1.0, time) for time in BEGIN_TIMES]
                 begins += [self.at[name].processes] if turn else []
-                found = [seen(view, self.about(one), one, SHARES[:1]) for one in begins]
-                self.at[name] = max(found, key=lambda item: item.evidence)
+                self.at[name] = seen(view, self.about((port,)), begins, SHARES[:1])
             if not turn and about is None:
                 self.point = self._point(self.best())
         self.whole = self._together()
-        return self.at
+
+    # ---------------------------------------------------------------- where
 
     def _together(self) -> Explained:
         """Return missing forces at all ports at once, or at those that matter most if they are many."""
@@ -192,8 +187,8 @@ class ForceSearch:
         for item in ranked[1:]:
             begin |= scaled(item.processes, BESIDE, 1.0)
         view = best.view
-        for _ in range(2):
-            found = seen(view, self.about(begin), begin, SHARES[:1])
+        for shares in (SHARES[:1], ()):
+            found = seen(view, self.about(begin), [begin], shares)
             view = self._along(view, found.motions)
             begin = dict(found.processes)
         return found
@@ -211,6 +206,12 @@ class ForceSearch:
             found[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / pace)
         return found
 
+    def _view(self) -> View:
+        """Return the trials as they are seen about the point, where columns are from then on, too."""
+        self.columns = Columns(self.problem, self.numbers, self.point)
+        trials = [seen_trial(self.problem, number, self.point) for number in self.numbers]
+        return View(trials, self.problem.shared.precision)
+
     def _along(self, view: View, motions: Sequence[Motion]) -> View:
         """Return a view along motions, the laws that the model has itself included."""
         own = self.columns.of_patch(view, motions, self.laws) if len(self.laws) else None
@@ -221,13 +222,11 @@ class ForceSearch:
         found = self.at[port]
         for _ in range(2):
             self.point = self._point(found)
-            trials = [seen_trial(self.problem, number, self.point) for number in self.numbers]
-            self.columns = Columns(self.problem, self.numbers, self.point)
-            view = View(trials, self.problem.shared.precision)
+            view = self._view()
             for _ in range(2):
                 view = self._along(view, view.smoothed(found.processes)[2])
             begin = {at: replace(one, rough=True) for at, one in found.processes.items()}
-            found = seen(view, self.about(begin), begin)
+            found = seen(view, self.about(begin), [begin])
         return found
 
     def whole_point(self, found: Explained) -> Point:
@@ -357,8 +356,8 @@ class ForceSearch:
             if view is None:
                 break
             if turn == 0 or settled or turn == ROUNDS - 1:
-                some = SHARES[: 1 if turn else None]
-                found = seen(view, self.about(processes), processes, some, candidate, effect)
+                some = () if turn else SHARES
+                found = seen(view, self.about(processes), [processes], some, candidate, effect)
                 processes = dict(found.processes)
             else:
                 evidence = view.evidence(self.about(processes), processes)
@@ -406,11 +405,11 @@ class ForceSearch:
 def seen(
     view: View,
     about: Processes,
-    begin: Processes,
+    begins: Sequence[Processes],
     shares: Sequence[float] = SHARES,
     candidate: Candidate = NOTHING,
     effect: FloatArray = NO_VALUES,
 ) -> Explained:
     """Return a hypothesis beside the most probable missing forces, about some and begun at others."""
-    processes, evidence = view.most_probable(about, begin, shares)
+    processes, evidence = view.most_probable(about, begins, shares)
     return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))

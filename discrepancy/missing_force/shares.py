@@ -177,16 +177,16 @@ class ForceShares:
         """
         wide = {**found.processes, **self.search.whole.processes}
         if not held_out:
-            return found.view, found.view.along(wide, found.solution)[2]
+            return found.view, found.view.smoothed(wide, found.solution)[2]
         assert self._outside is not None
         columns, view = self._outside
         solution = replace(found.solution, mean=found.shared)
-        motions = view.along(wide, solution)[2]
+        motions = view.smoothed(wide, solution)[2]
         for _ in range(TURNS):
             known = columns.of(view, motions, found.candidate, found.effect) if len(found.effect) else None
             own = columns.of_patch(view, motions, self.search.laws) if len(self.search.laws) else None
             view = replace(view, motions=motions, known=known, own=own)
-            motions = view.along(wide, solution)[2]
+            motions = view.smoothed(wide, solution)[2]
         return view, motions
 
 
@@ -367,7 +367,10 @@ def seen_force(
         ports = problem.model.ports()
         if not sees_forces(problem) or (terms and not any(term.place in ports for term in terms)):
             return None, None
-        force, found = _along(problem, force, forces, fit)
+        force = force or ForceSearch(problem)
+        found = next((item for item in forces if item.candidate.key == fit.candidate.key), None)
+        if found is None and terms:
+            found = force.followed(force.whole, fit.candidate, fit.point.effect)
         missing = missing_force(force, force.whole if found is None else found)
     except CANNOT:
         return None, None
@@ -385,20 +388,6 @@ def seen_force(
         return missing, replace(told, fitted=_told(shares.of(found, held_out=False)), held_out=outside)
     except CANNOT:
         return missing, told
-
-
-def _along(
-    problem: Problem, force: ForceSearch | None, forces: Sequence[Explained], fit: CandidateFit
-) -> tuple[ForceSearch, Explained | None]:
-    """Return the missing force of a problem, and the hypothesis along it that a fit is."""
-    key = fit.candidate.key
-    if force is None:
-        force = ForceSearch(problem)
-        force.locate()
-    found = next((item for item in forces if item.candidate.key == key), None)
-    if found is None and fit.candidate.terms:
-        found = force.followed(force.whole, fit.candidate, fit.point.effect)
-    return force, found
 
 
 def _told(share: Share) -> ShareOfForce:

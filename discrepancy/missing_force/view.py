@@ -21,6 +21,9 @@ SIZE_DOUBT, TIME_DOUBT = 3.0, 1.2
 SHARES = (1.0, 0.03)
 """Sizes from which the most probable process is looked for: what is left beside a law is a part of it."""
 MOST_PASSES = 30
+NEAR, LONGEST, AT_TOP, MOST_STEPS = 0.02, 0.7, 1e-4, 8
+"""Of Newton's method: difference of logarithms by which slopes are found, the longest step that is taken,
+that after which the top is reached, and how many are taken."""
 FARTHEST = 5.0
 """Prior deviations from which on a process is not looked at."""
 
@@ -212,7 +215,7 @@ class View:
         return self.products(processes).solve(range(len(self.precisions)), self.precisions)
 
     def most_probable(
-        self, about: Processes, begin: Processes, shares: Sequence[float] = SHARES
+        self, about: Processes, begins: Sequence[Processes], shares: Sequence[float] = SHARES
     ) -> tuple[dict[int, Process], float]:
         """Return the processes of the largest evidence times their prior, and its logarithm [nat].
 
@@ -220,18 +223,58 @@ class View:
         ----------
         about : mapping of int to Process
             Medians of the prior.
-        begin : mapping of int to Process
-            From which they are looked for, port after port, and from some shares of their sizes.
+        begins : sequence of mapping of int to Process
+            From each of which they are looked for, port after port, and from some shares of their sizes; with
+            no share from what is near alone.
         """
-        found, greatest = dict(begin), -np.inf
-        for _ in range(min(len(begin), 2)):
-            for port in begin:
-                first = np.log((found[port].size, found[port].time))
-                for share in shares:
-                    best, value = self._climbed(about, found, port, first + np.array([np.log(share), 0.0]))
-                    if value > greatest:
-                        found, greatest = best, value
-        return found, greatest
+        climbs = []
+        for begin in begins:
+            found, greatest = dict(begin), -np.inf
+            for _ in range(min(len(begin), 2)):
+                for port in begin:
+                    first = np.log((found[port].size, found[port].time))
+                    for share in shares:
+                        best, value = self._climbed(
+                            about, found, port, first + np.array([np.log(share), 0.0])
+                        )
+                        if value > greatest:
+                            found, greatest = best, value
+            climbs.append((greatest, found))
+        return self._settled(about, max(climbs, key=lambda item: item[0])[1])
+
+    @np.errstate(invalid="ignore")
+    def _settled(self, about: Processes, begin: Processes) -> tuple[dict[int, Process], float]:
+        """Return the processes at the top near some, and the logarithm there [nat], by Newton's method.
+
+        Where a climb ends a rounding decides; the top does not depend on it.
+        """
+        first = np.log([(one.size, one.time) for one in begin.values()])
+        unit, logs, far = NEAR * np.eye(first.size), np.zeros(first.size), np.inf
+
+        def at(move: FloatArray) -> dict[int, Process]:
+            items = zip(begin.items(), np.exp(first + move.reshape(first.shape)).tolist(), strict=True)
+            return {port: replace(one, size=size, time=time) for (port, one), (size, time) in items}
+
+        for _ in range(MOST_STEPS):
+            ahead, back = (
+                np.array([self.evidence(about, at(logs + step)) for step in steps]) for steps in (unit, -unit)
+            )
+            if far > NEAR:
+                top = self.evidence(about, at(logs))
+                bend = np.diag(ahead + back - 2.0 * top)
+                for i, k in zip(*np.triu_indices(first.size, 1), strict=True):
+                    both = self.evidence(about, at(logs + unit[i] + unit[k]))
+                    bend[i, k] = bend[k, i] = both - ahead[i] - ahead[k] + top
+            if not np.isfinite((*bend.flat, *ahead, *back)).all():
+                break
+            values, axes = np.linalg.eigh(bend)  # uphill where it is hollow, too
+            step = axes @ (axes.T @ (0.5 * NEAR * (ahead - back)) / np.maximum(np.abs(values), 1e-300))
+            far = np.abs(step).max()
+            logs = logs + step / max(1.0, far / LONGEST)
+            if far < AT_TOP:
+                break
+        ends = ((item, self.evidence(about, item)) for item in (dict(begin), at(logs)))
+        return max(ends, key=lambda item: item[1])
 
     @cached_property
     def times(self) -> tuple[float, float]:
@@ -271,20 +314,17 @@ class View:
         low, high = np.log(self.times)
         first = np.array([first[0], np.clip(first[1], low, high - 0.7)])
         simplex = first + np.array([[0.0, 0.0], [0.9, 0.0], [0.0, 0.7]])
-        options = {"xatol": 0.05, "fatol": 0.2, "maxfev": MOST_PASSES, "initial_simplex": simplex}
+        options = {"xatol": 0.2, "fatol": 1.0, "maxfev": MOST_PASSES, "initial_simplex": simplex}
         found = minimize(
             lambda logs: -self.evidence(about, at(logs)), first, method="Nelder-Mead", options=options
         )
         return at(found.x), -float(found.fun)
 
-    def smoothed(self, processes: Processes) -> tuple[Solution, list[FloatArray], list[Motion]]:
-        """Return the unknowns, those of the trials alone, and motion and missing forces of each trial."""
-        return self.along(processes, self.solve(processes))
-
-    def along(
-        self, processes: Processes, solution: Solution
+    def smoothed(
+        self, processes: Processes, given: Solution | None = None
     ) -> tuple[Solution, list[FloatArray], list[Motion]]:
-        """Return what `smoothed` does, for unknowns that are given."""
+        """Return the unknowns, those of the trials alone, and motion and missing forces of each trial."""
+        solution = given or self.solve(processes)
         motions, local = [], []
         count = len(self.shared_precision)
         for number, one in enumerate(self.filtered(processes)):

@@ -63,8 +63,7 @@ def gap_windows(
 def _of_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
     """Return when a force is missing at the port, or the reading, that tells most."""
     search = ForceSearch(problem)
-    at = search.locate()
-    port = max(at, key=lambda name: at[name].evidence)
+    port = max(search.at, key=lambda name: search.at[name].evidence)
     law = _law_at(search, fit, port)
     number, found = _most_telling(search.ports.index(port), search.rough(port))
     if found.evidence < of_nothing(found) + GROUND:
@@ -123,7 +122,7 @@ def _most_telling(port: int, at: Explained) -> tuple[int, Explained]:
         ]
         about = max(processes, key=lambda item: on_reading.solve(item).evidence)
         if on_reading.solve(about).evidence > best[1].evidence:
-            best = 0, seen(on_reading, about, about)
+            best = 0, seen(on_reading, about, [about])
     return best
 
 
@@ -156,7 +155,7 @@ def of_series(
     )  # fmt: skip
     size = max(float(np.sqrt(np.mean(trial.residual**2))), 1.0)
     about = {0: Process(size, 0.1 * float(np.ptp(time)), rough=True)}
-    found = seen(View([trial], np.zeros(0)), about, about)
+    found = seen(View([trial], np.zeros(0)), about, [about])
     return found, pattern[0]
 
 

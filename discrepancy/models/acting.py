@@ -1,4 +1,4 @@
-"""What acts on a system in a trial, between the samples too, and what its outputs show."""
+"""What acts on a system in a trial, between the samples too and under a patch, and what its outputs show."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -10,12 +10,18 @@ import numpy as np
 from scipy.interpolate import CubicSpline, PPoly
 
 from discrepancy.campaign.records import FloatArray, Hold, Quantity, Release, Start, Trial
+from discrepancy.errors import ModelError
+from discrepancy.models.interface import Place
 from discrepancy.models.memory import Memory
 from fe.runtime.expression import Expression
+from fe.runtime.patch import LoadGain, LoadPlace, Primitive
 
 KEPT_COURSES, KEPT_TIMES = 64, 48
 """Records whose courses are kept, and times at which each of them is: a search asks for the same ones."""
 _courses = Memory(KEPT_COURSES)
+
+DEFAULT_PLACE = "tip_load"
+"""What a campaign says when it does not say where the force acts; a model with one input takes that one."""
 
 SMOOTH_PARTS = 8
 """Steps of an interval under an input that is a spline; straight lines on them err by 1e-6 of it."""
@@ -266,6 +272,64 @@ def order_of(quantity: Quantity) -> int:
 def shown_rows(rows: Iterable[FloatArray], outputs: Sequence[tuple[str, Quantity]]) -> list[Shown]:
     """Return what sensors of displacements and their derivatives show at rows (n,)."""
     return [Shown.of(row, order_of(quantity)) for row, (_, quantity) in zip(rows, outputs, strict=True)]
+
+
+def place_among(places: Sequence[str], place: Place, what: str, where: str = "a trial") -> str:
+    """Return the load place of a model, `what`, that a trial means: the only one where it says none.
+
+    Raises
+    ------
+    ModelError
+        If there is no such place, or none is named of several.
+    """
+    if place == DEFAULT_PLACE and place not in places and len(places) == 1:
+        return places[0]
+    if not isinstance(place, str) or place not in places:
+        said = "no load_place is said" if place == DEFAULT_PLACE else f"the load place is {place!r}"
+        known = f"forces at {', '.join(places)}: name one of these" if places else "no force"
+        raise ModelError(f"In {where} {said}, and {what} takes {known}.")
+    return place
+
+
+def release_of(trial: Trial) -> Release:
+    """Return how a ring-down began; raises `ModelError` where it does not say it."""
+    if trial.release is None:
+        raise ModelError(f"The ring-down {trial.name!r} does not say how it was released.")
+    return trial.release
+
+
+class LoadChange(NamedTuple):
+    """What of recorded loads changes.
+
+    Attributes
+    ----------
+    gain, tare : float
+        The acting force is (1 + gain) times the recorded one, plus the tare [N] where it is not zero.
+    along_span, along_chord : float
+        How far the acting force is moved [m].
+    """
+
+    gain: float = 0.0
+    tare: float = 0.0
+    along_span: float = 0.0
+    along_chord: float = 0.0
+
+    @classmethod
+    def of(cls, patch: Iterable[Primitive]) -> "LoadChange":
+        """Return the change by gains and places, one upon the other."""
+        gain, tare, span, chord = cls()
+        for item in patch:
+            if isinstance(item, LoadGain):
+                gain, tare = (1.0 + gain) * (1.0 + item.gain) - 1.0, tare * (1.0 + item.gain) + item.tare
+            elif isinstance(item, LoadPlace):
+                span, chord = span + item.along_span, chord + item.along_chord
+        return cls(gain, tare, span, chord)
+
+    def changed(self, values: FloatArray, recorded: FloatArray) -> FloatArray:
+        """Return what acts (N,) of recorded values [N, or N m], the values themselves or with a constant."""
+        if not (self.gain or self.tare):
+            return values
+        return np.asarray((1.0 + self.gain) * values + self.tare * (recorded != 0.0))
 
 
 def refined(trial: Trial, parts: int) -> Trial:

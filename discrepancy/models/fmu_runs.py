@@ -48,10 +48,10 @@ class Excitation:
     Attributes
     ----------
     kind : str
-        "displacement", "velocity": parameters of the release; "hold": a force is let go that had brought the
-        release point to the displacement; "input": an input.
+        "parameter": a parameter of the release; "hold": an input that holds until the start; "input": one
+        that has a course.
     name : str
-        The input.
+        The key of the parameter, or the FMU's name of the input.
     series : (N,) ndarray
         Its values, each held over a step.
     begin : float
@@ -59,7 +59,7 @@ class Excitation:
     """
 
     kind: str
-    name: str = ""
+    name: str
     series: FloatArray = field(default_factory=lambda: np.zeros(0))
     begin: float = 0.0
 
@@ -155,8 +155,15 @@ class FmuRuns:
 
     def _made_binding(self) -> Binding:
         given, base = self.description, self._base
-        wanted = given.inputs
-        self.input_factors: dict[str, float] = {}
+        header: dict[str, Any] = {} if base is None else base.binding.model_dump(exclude={"decimation"})
+        header |= {"name": given.name, "step_size": given.motion.step or given.static.step}
+        content: dict[str, Any] = {"binding": header, "load": self._inputs(), "parameter": self._parameters()}
+        if base is not None:
+            content["limits"] = base.limits
+        return Binding.model_validate(content | {"observation": self._observed()})
+
+    def _inputs(self) -> dict[str, Input]:
+        given, wanted = self.description, self.description.inputs
         units: dict[str | None, str] = {
             **dict.fromkeys(wanted.forces.values(), "N"),
             **dict.fromkeys((wanted.load_factor, *wanted.regions.values()), "1"),
@@ -165,6 +172,7 @@ class FmuRuns:
             given.release.hold if given.release else None: "N",
         }  # fmt: skip
         units |= {port.force: "N.m" if port.rotation else "N" for port in given.port}
+        self.input_factors = dict[str, float]()
         for held in given.input:
             driven = held.variable or held.name
             unit = self._own_unit(self.variable(driven))
@@ -172,66 +180,52 @@ class FmuRuns:
             self.input_factors[self.variable(driven)] = 30.0 / pi if turning else 1.0
             units[driven] = unit if turning or held.quantity is Quantity.SIGNAL else _si(held.quantity)
         named = ((self.variable(name), unit) for name, unit in units.items() if name is not None)
-        inputs = {variable: Input(variable=variable, unit=unit) for variable, unit in named}
-        parameters = {
-            key: Parameter(variable=item.variable, unit=item.unit, value=item.value)
-            for key, item in (base.parameter if base is not None else {}).items()
+        return {variable: Input(variable=variable, unit=unit) for variable, unit in named}
+
+    def _parameters(self) -> dict[str, Parameter]:
+        given, found = self.description, {} if self._base is None else dict(self._base.parameter)
+        # without a unit here, one has that of the binding, or its own
+        units: dict[str | None, str | None] = {
+            **dict.fromkeys((*given.static.parameters, *given.motion.parameters)),
+            **{f"effect.{identifier}.active": None for identifier in given.effects.values()},
+            **{item.variable or item.name: item.unit for item in given.parameter},
         }
-        effects = (f"effect.{identifier}.active" for identifier in given.effects.values())
-        further = (*given.static.parameters, *given.motion.parameters, *effects)
-        own: list[tuple[str | None, str]] = [
-            *((name, self._own_unit(name)) for name in further if self.parameter(name) not in parameters),
-            *((item.variable or item.name, item.unit) for item in given.parameter),
-        ]
         if given.release is not None:
-            own += [(given.release.displacement, "m"), (given.release.velocity, "m/s")]
-        for name, unit in own:
-            if name is None:
-                continue
-            key = self.parameter(name)
-            known = parameters.get(key)
-            parameters[key] = Parameter(
-                variable=key if known is None else known.variable,
-                unit=unit,
-                value=None if known is None or known.unit != unit else known.value,
-            )
-        columns: dict[tuple[str, str], int] = {}
+            units |= {given.release.displacement: "m", given.release.velocity: "m/s"}
+        for key, unit in ((self.parameter(name), unit) for name, unit in units.items() if name is not None):
+            known = found.get(key) or Parameter(variable=key, unit=self._own_unit(key))
+            if unit not in (None, known.unit):  # a value of another unit is none of this
+                known = known.model_copy(update={"unit": unit, "value": None})
+            found[key] = known
+        return found
+
+    def _observed(self) -> dict[str, Vector]:
+        given, shown = self.description, list[tuple[str, str | None, str]]()
         self.columns, self.quantities = dict[str, int](), dict[str, Quantity]()
-
-        def column(variable: str, unit: str) -> int:
-            return columns.setdefault((self.variable(variable), unit), len(columns))
-
         for item in given.output:
-            names = expand(item.name)
-            variables = expand(item.variable or item.name)
+            names, variables = expand(item.name), expand(item.variable or item.name)
             if len(names) != len(variables):
                 raise ModelError(
                     f"The FMU model {given.name!r}: the output {item.name!r} stands for "
                     f"{counted(len(names), 'name')}, but its variable for {len(variables)}; give as many."
                 )
-            for name, variable in zip(names, variables, strict=True):
-                unit = "" if item.quantity is Quantity.SIGNAL else _si(item.quantity)
-                self.columns[name], self.quantities[name] = column(variable, unit), item.quantity
+            self.quantities |= dict.fromkeys(names, item.quantity)
+            unit = "" if item.quantity is Quantity.SIGNAL else _si(item.quantity)  # what the FMU gives it
+            shown += [(name, variable, unit) for name, variable in zip(names, variables, strict=True)]
         for port in given.port:
-            for quantity, name, unit in (
-                ("displacement", port.displacement, "rad" if port.rotation else "m"),
-                ("velocity", port.velocity, "rad/s" if port.rotation else "m/s"),
-            ):
-                if name is not None:
-                    self.columns[f"port.{port.name}.{quantity}"] = column(name, unit)
-        if given.release is not None and given.release.output is not None:
-            self.columns["release"] = column(given.release.output, "m")
-        header: dict[str, Any] = {} if base is None else base.binding.model_dump(exclude={"decimation"})
-        header |= {"name": given.name, "step_size": given.motion.step or given.static.step}
-        content: dict[str, Any] = {"binding": header, "load": inputs, "parameter": parameters}
-        if base is not None:
-            content["limits"] = base.limits
-        # A signal has whatever unit the FMU gives it.
-        content["observation"] = {
+            unit = "rad" if port.rotation else "m"
+            shown.append((f"port.{port.name}.displacement", port.displacement, unit))
+            shown.append((f"port.{port.name}.velocity", port.velocity, f"{unit}/s"))
+        if given.release is not None:
+            shown.append(("release", given.release.output, "m"))
+        columns: dict[tuple[str, str], int] = {}
+        for name, wanted, unit in shown:
+            if wanted is not None:
+                self.columns[name] = columns.setdefault((self.variable(wanted), unit), len(columns))
+        return {
             f"y{at}": Vector(variables=(variable,), unit=unit or self._own_unit(variable))
             for (variable, unit), at in columns.items()
         }
-        return Binding.model_validate(content)
 
     def _own_unit(self, variable: str) -> str:
         found = self._fmu.variable(variable)

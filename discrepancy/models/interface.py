@@ -1,7 +1,7 @@
 """What the workflow asks of a model: structural response under a patch, before any sensor touches it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -14,6 +14,8 @@ from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, 
 from discrepancy.errors import ModelError
 from discrepancy.models.memory import Memory
 from discrepancy.models.scales import Scales
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.state import Losses
 from reporting.words import brief, capital, counted
@@ -143,6 +145,10 @@ class Model(ABC):
         Damage regions.
     kinds : frozenset of TrialKind
         Trials that it can follow.
+    load_places : tuple of str, optional
+        Where forces can act, by name; None: anywhere along it.
+    largest_force : float
+        Force there that it takes with ease [N].
     holds_inputs : bool
         Whether static trials can hold other inputs than a force.
     follows_windows : bool
@@ -159,6 +165,8 @@ class Model(ABC):
     patch: ModelPatch = NO_PATCH
     regions: tuple[str, ...] = ()
     kinds: frozenset[TrialKind] = frozenset(TrialKind)
+    load_places: tuple[str, ...] | None = None
+    largest_force: float = np.inf
     holds_inputs: ClassVar[bool] = False
     follows_windows: ClassVar[bool] = False
     shows_ports: ClassVar[bool] = False
@@ -197,7 +205,7 @@ class Model(ABC):
     def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial under a patch that holds what is added, see `respond`.
 
-        All of it was checked: the model has the outputs and carries the patch.
+        The model has the outputs and carries the patch.
         """
 
     def ports(self) -> tuple[str, ...]:
@@ -232,14 +240,17 @@ class Model(ABC):
         """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""
         return ""
 
-    # ------------------------------------------------------------ what is asked of it
-
     def check(self, trial: Trial) -> None:
         """Refuse a trial that it cannot follow."""
         name = f"The trial {trial.name!r}"
         if trial.kind is TrialKind.FLIGHT and trial.kind not in self.kinds:
             raise ModelError(
                 f"{name} is a flight, but {self.what} has no input load_factor: give it one, or leave it out."
+            )
+        if trial.kind not in self.kinds and trial.kind is TrialKind.RINGDOWN:
+            raise ModelError(
+                f"{name} is a ring-down, which {self.what} cannot begin, since it is free, driven or has "
+                'states; say kind = "driven" and begins = "unknown".'
             )
         driven = trial.kind is TrialKind.DRIVEN
         if TrialKind.DRIVEN not in self.kinds and (driven or trial.begins is not Start.SETTLED):
@@ -275,6 +286,15 @@ class Model(ABC):
             if not (isinstance(item, SENSORS) or self.supports(type(item)) or at_port):
                 port = " (it has no port)" if isinstance(item, INTERNAL_FORCES) and not self.ports() else ""
                 raise ModelError(f"{capital(self.what)} cannot carry the primitive {item.kind!r}{port}.")
+
+    def laws_at(self, forces: ModelPatch, ports: Collection[str]) -> Laws:
+        """Return the laws of internal forces at ports; raises `ModelError` where one cannot be."""
+        if not len(forces):
+            return NO_LAWS
+        try:
+            return laws_of(forces, ports, in_windows=self.follows_windows)
+        except InvalidPatchError as cause:
+            raise ModelError(str(cause)) from cause
 
     def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
         """Return the losses of its regions in each row from those (N, K) that a trial names.

@@ -1,22 +1,29 @@
 """A lumped linear structure as a model: masses, springs, dampers with named inputs, outputs and ports."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar, Self
 
 import numpy as np
 
-from discrepancy.campaign.records import Campaign, FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
+from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, Shown, order_of
-from discrepancy.models.interface import Outputs, Place
+from discrepancy.models.acting import (
+    Acting,
+    Course,
+    FormulaCourse,
+    Load,
+    LoadChange,
+    Shown,
+    order_of,
+    place_among,
+)
+from discrepancy.models.interface import NO_PATCH, Outputs, Place
 from discrepancy.models.lumped_file import LumpedDescription, load_lumped
 from discrepancy.models.lumped_rig import Loop, LumpedRig
 from discrepancy.models.lumped_sections import InputSection
 from discrepancy.models.memory import Memory
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.questions import LoadChange, place_among, release_of
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.runtime.laws import LAWS
@@ -36,7 +43,6 @@ from fe.runtime.patch import (
 )
 from fe.runtime.state import Losses
 
-UNCHANGED = LoadChange()
 KEPT_RIGS = 128
 """Values of the parameters and structures that are remembered."""
 LEAST_STIFFNESS = 0.05
@@ -60,6 +66,10 @@ class LumpedModel(DescribedModel, SystemModel):
     def __init__(self, description: LumpedDescription) -> None:
         self.description = description
         super().__init__(description, {item.name: item.quantity for item in description.output})
+        self.load_places = tuple(item.name for item in description.input)
+        self.kinds = frozenset(TrialKind) - {TrialKind.FLIGHT}
+        if not description.is_plain:
+            self.kinds -= {TrialKind.RINGDOWN}
         self.displacements, self.length = description.size, description.characteristic_length
         self.port_rows = {item.name: description.padded(item.vector) for item in description.port}
         self._stations = sorted(place.station for place in description.place)
@@ -76,24 +86,21 @@ class LumpedModel(DescribedModel, SystemModel):
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
-        description, n = self.description, self.description.size
+        description, ports = self.description, list(self.port_rows.values())
+        if primitive in LAWS and not primitive.of_speed:  # the position of a state's port means nothing
+            return bool(ports) and all(np.any(row[: description.size]) for row in ports)
         carried: dict[type[Primitive], bool] = {
-            StiffnessDrift: n > 0,
+            StiffnessDrift: description.size > 0,
             ModulusTemperature: True,
             PointMass: bool(self._stations),
             RootCompliance: description.root is not None,
             LoadGain: True,
             LoadPlace: any(item.station_derivative is not None for item in description.input),
-            PortLoad: bool(self.port_rows),
+            PortLoad: bool(ports),
         }
-        if primitive in carried:
-            return carried[primitive]
-        if primitive in LAWS and not primitive.of_speed:  # the position of a state's port means nothing
-            return bool(self.port_rows) and all(np.any(row[:n]) for row in self.port_rows.values())
-        return primitive in SENSORS or (primitive in INTERNAL_FORCES and bool(self.port_rows))
+        return carried.get(primitive, primitive in SENSORS or (primitive in INTERNAL_FORCES and bool(ports)))
 
     follows_windows: ClassVar[bool] = True
-    kinds = frozenset(TrialKind) - {TrialKind.FLIGHT}
 
     def stations(self) -> tuple[float, float] | None:
         """Return the least and largest station [m] of the places, None without places."""
@@ -110,14 +117,16 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the rig, with prescribed motions and controllers as the state says."""
         return self.rig(state).system(state.drives, closed=state.closed)
 
-    def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
-        """Return the load (N,) at whose place stiffness and modal mass are the natural ones."""
-        places = [trial.load_place for trial in campaign.trials]
-        item = self._input_at(places[0]) if places else self.description.input[0]
-        return self._moved_row(self.rig(State(parameters)), item)
+    def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
+        """Return the load (N,) of 1 N, or of what else an input is, at its place."""
+        return self._moved_row(self.rig(state), self._input_at(place), LoadChange.of(change))
 
-    def acting(self, case: Case) -> Acting:
-        """Return what acts in a dynamic trial.
+    def constant(self, case: Case) -> FloatArray:
+        """Return the load (N,) that always acts."""
+        return self.rig(case.state).constant
+
+    def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
+        """Return loads and prescribed motions in a trial.
 
         Every motion that an input can prescribe and that the trial does not record is held at zero, if an
         output is its reaction; else it is free.
@@ -127,15 +136,8 @@ class LumpedModel(DescribedModel, SystemModel):
         ModelError
             If the trial records an input that the model does not have or that is of another quantity.
         """
-        trial, conditions, patch, _ = case
-        rig, change = self.rig(case.state), LoadChange.of(patch)
-        at_ports = [item for item in patch if isinstance(item, PortLoad)]
-        if trial.kind is TrialKind.RINGDOWN:
-            self._check_released(trial, at_ports)
-            release = self._moved_row(rig, self._input_at(trial.load_place)), release_of(trial)
-            return Acting(
-                trial.time, rig.constant, initial=conditions.initial, clock=conditions.clock, release=release
-            )
+        trial, _, patch, state = case
+        rig, change = self.rig(state), LoadChange.of(patch)
         loads = [load for loop in rig.loops.values() for load in self._reference(case, loop)]
         followed = {loop.section.reference for loop in rig.loops.values()}
         reactions = {item.reaction for item in self.description.output}
@@ -159,16 +161,8 @@ class LumpedModel(DescribedModel, SystemModel):
             if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
                 values = change.changed(values, item.values)
             loads.append((self._moved_row(rig, section, change), Course.of(trial.time, values, item.hold)))
-        loads += [self._at_port(rig, item) for item in at_ports]
-        return Acting(
-            trial.time,
-            rig.constant,
-            loads,
-            drives,
-            trial.begins,
-            conditions.initial.ravel(),
-            conditions.clock,
-        )
+        loads += [self._at_port(rig, item) for item in patch if isinstance(item, PortLoad)]
+        return loads, drives
 
     def _recorded(self, case: Case) -> list[tuple[RecordedInput, float]]:
         """Return the recorded inputs of a trial, or its force at its place, and what each lacks."""
@@ -193,7 +187,7 @@ class LumpedModel(DescribedModel, SystemModel):
         known = [*self._inputs] if place in self._inputs else forces
         return self._inputs[place_among(known, place, self.what)]
 
-    def _moved_row(self, rig: LumpedRig, item: InputSection, change: LoadChange = UNCHANGED) -> FloatArray:
+    def _moved_row(self, rig: LumpedRig, item: InputSection, change: LoadChange) -> FloatArray:
         """Return the row (N,) along which an input acts, where its place has been moved to."""
         row = np.array(item.vector)
         if change.along_span or change.along_chord:
@@ -220,16 +214,6 @@ class LumpedModel(DescribedModel, SystemModel):
                 f"the trial {trial.name!r} records {item.quantity.value}."
             )
         return section
-
-    def _check_released(self, trial: Trial, at_ports: Sequence[PortLoad]) -> None:
-        """Refuse a ring-down that the model cannot begin."""
-        why = "which no force with a course in time can act on" if at_ports else ""
-        if not self.description.is_plain:
-            why = f"which {self.what} cannot begin: it is free, driven or has states"
-        if why:
-            raise ModelError(
-                f'The trial {trial.name!r} is a ring-down, {why}; say kind = "driven" and begins = "unknown".'
-            )
 
     def _at_port(self, rig: LumpedRig, load: PortLoad) -> Load:
         """Return the row and the course of a load at a port."""
@@ -339,6 +323,6 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the factors of the terms at values of the parameters."""
         factors: dict[str, float] = {}
         for item, value in zip(self.description.parameter, parameters, strict=True):
-            for term in item.scaled:
+            for term in item.terms:
                 factors[term] = factors.get(term, 1.0) * float(value)
         return factors

@@ -153,8 +153,8 @@ class LumpedDescription(ModelDescription):
                 if not count:
                     raise ValueError(f"{place} is there, but {reference} is missing")
                 _check_matrix(place, matrix, count, reference, symmetric=kind != "conductance")
-            whole, loose = self.whole(kind), _LOOSE if kind == "stiffness" else ""
-            least, most = np.linalg.eigvalsh(whole)[[0, -1]] if count else (1.0, 1.0)
+            loose, own = _LOOSE if kind == "stiffness" else "", self.unknowns(kind)
+            least, most = np.linalg.eigvalsh(self.whole(kind)[own, own])[[0, -1]] if count else (1.0, 1.0)
             singular = kind == "stiffness" and self.free and least >= -1e-9 * max(abs(most), 1e-300)
             if kind in ("mass", "capacity", "stiffness") and least <= 0.0 and not singular:
                 raise ValueError(f"{kind} (with its parts) must be positive definite{loose}")
@@ -173,15 +173,21 @@ class LumpedDescription(ModelDescription):
         return found
 
     def whole(self, kind: str, factors: Mapping[str, float] = MappingProxyType({})) -> FloatArray:
-        """Return the matrix of a kind with its parts, each times its factor.
+        """Return the matrix (N, N) of a kind with its parts, each times its factor.
 
         The factor of the matrix itself is that of the whole. Damping by modes is left out.
         """
-        count = self.states if kind in OF_STATES else self.size
-        whole = np.array(self._base(kind) or np.zeros((count, count)))
+        whole = self.placed(self._base(kind), kind)
         for part in self.parts(kind):
-            whole = whole + factors.get(part.name, 1.0) * np.array(part.matrix)
-        return np.asarray(whole * factors.get(kind, 1.0))
+            whole += factors.get(part.name, 1.0) * self.placed(part.matrix, kind)
+        return whole * factors.get(kind, 1.0)
+
+    def placed(self, matrix: Matrix, kind: str) -> FloatArray:
+        """Return a matrix of a kind, zero where there is none, among all unknowns (N, N)."""
+        found, own = np.zeros((self.width, self.width)), self.unknowns(kind)
+        if matrix:
+            found[own, own] = matrix
+        return found
 
     def _check_vectors(self, kind: str, item: NamedVector | OutputSection | ControllerSection) -> None:
         """Refuse vectors of another length and zero ones, and what sees both displacements and states."""
@@ -197,9 +203,9 @@ class LumpedDescription(ModelDescription):
         if kind in ("port", "controller") and any(row[:n]) and any(row[n:]):
             raise ValueError(f"the {kind} {item.name!r} sees displacements or states, not both")
         if isinstance(item, PortSection) and item.acts is not None:
-            push = np.array(item.acts)
+            push, capacity = np.array(item.acts), self.whole("capacity")[n : n + m, n : n + m]
             of_states = not any(row[:n]) and not any(push[:n])
-            if not of_states or row[n:] @ np.linalg.solve(self.whole("capacity"), push[n:]) <= 0.0:
+            if not of_states or row[n:] @ np.linalg.solve(capacity, push[n:]) <= 0.0:
                 raise ValueError(
                     f"`acts` of the port {item.name!r} is for states, and must take from what its vector sees"
                 )
@@ -228,27 +234,21 @@ class LumpedDescription(ModelDescription):
             check_unique(kind, given)
         kinds = (*(KINDS[:3] if self.size else ()), *(OF_STATES if self.states else ()))
         terms, gains = [*kinds, *parts], [f"{name}.{gain}" for name in names["controller"] for gain in GAINS]
-        named = ("law",) if self.is_plain else ("input", "load", "law", "controller")
-        scaled = [*terms, *(name for kind in named for name in names[kind]), *gains]
+        more = ("law",) if self.is_plain else ("input", "load", "law", "controller")
+        scaled = list(dict.fromkeys([*terms, *(name for kind in more for name in names[kind]), *gains]))
         driven = [item.name for item in self.input if item.quantity.moving]
-        pushing: tuple[InputSection | LoadSection, ...] = (*self.input, *self.load)
-        for what, name, known in (
-            *((f"{item.name!r} acts through", item.through, terms) for item in pushing),
-            *((f"the law {law.name!r} acts on the port", law.port, names["port"]) for law in self.law),
-            *(
-                (f"the output {output.name!r} is {role}", name, known)
-                for output in self.output
-                for role, name, known in (
-                    ("the reaction of the prescribed motion", output.reaction, driven),
-                    ("what a controller gives,", output.controller, names["controller"]),
-                )
-            ),
-            *(
-                (f"parameter {item.name!r} scales", term, [*dict.fromkeys(scaled)])
-                for item in self.parameter
-                for term in item.scaled
-            ),
-        ):
+        named = list[tuple[str, str | None, Sequence[str]]]()
+        for pushing in (*self.input, *self.load):
+            named.append((f"{pushing.name!r} acts through", pushing.through, terms))
+        for law in self.law:
+            named.append((f"the law {law.name!r} acts on the port", law.port, names["port"]))
+        for output in self.output:
+            is_ = f"the output {output.name!r} is"
+            named.append((f"{is_} the reaction of the prescribed motion", output.reaction, driven))
+            named.append((f"{is_} what a controller gives,", output.controller, names["controller"]))
+        for item in self.parameter:
+            named += [(f"parameter {item.name!r} scales", term, scaled) for term in item.terms]
+        for what, name, known in named:
             if name is not None and name not in known:
                 raise ValueError(f"{what} {name!r}, but there are {', '.join(known) or 'none'}")
 

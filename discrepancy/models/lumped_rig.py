@@ -126,14 +126,11 @@ class LumpedRig:
     ) -> None:
         self.description, self.factors, self._systems = description, factors, Memory()
         softened = {**factors, "stiffness": factors.get("stiffness", 1.0) * (1.0 - softening)}
-        width, self._terms = description.width, dict[str, FloatArray]()
-        for kind in KINDS:
-            own = description.unknowns(kind)
-            for part in description.parts(kind):
-                self._terms[part.name] = np.zeros((width, width))
-                self._terms[part.name][own, own] = factors.get(part.name, 1.0) * np.array(part.matrix)
-            self._terms[kind] = np.zeros((width, width))
-            self._terms[kind][own, own] = description.whole(kind, softened)
+        self._terms = {kind: description.whole(kind, softened) for kind in KINDS} | {
+            part.name: factors.get(part.name, 1.0) * description.placed(part.matrix, kind)
+            for kind in KINDS
+            for part in description.parts(kind)
+        }
         if n := description.size:
             mass, stiffness, damping = (self._terms[kind][:n, :n] for kind in KINDS[:3])
             for change in structure:
@@ -141,14 +138,14 @@ class LumpedRig:
             damping += factors.get("damping", 1.0) * self._damping(mass, stiffness)
         self.constant = sum(
             (self.along(item.vector, item.through, item.name) for item in description.load),
-            np.zeros(width),
+            np.zeros(description.width),
         )
         self.loops, state = dict[str, Loop](), n + description.states
         for item in description.controller:
             named = (factors.get(f"{item.name}.{gain}", 1.0) * getattr(item, gain) for gain in GAINS)
             gains = [factors.get(item.name, 1.0) * gain for gain in named]
             row, acts = description.padded(item.vector), description.padded(item.acts)
-            sees = Shown.of(row, order_of(item.quantity), states=width - n).rows
+            sees = Shown.of(row, order_of(item.quantity), states=description.width - n).rows
             self.loops[item.name] = Loop(item, gains, sees, acts, state if item.integral else None)
             state += item.integral != 0.0
 

@@ -1,22 +1,19 @@
-"""Structures that springs hold as models: what all have, and one from a mesh or matrices by its modes."""
+"""A structure from a mesh or matrices as a model, by its modes."""
 
-from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 from scipy.linalg import inv
 
 from calibration.result.record import ParameterPrior
-from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Course, Shown, shown_rows
+from discrepancy.models.acting import Acting, Shown, place_among, shown_rows
 from discrepancy.models.interface import NO_PATCH, Outputs, Place
 from discrepancy.models.memory import Memory
-from discrepancy.models.questions import LoadChange, place_among, release_of
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
-from fe.runtime.patch import INTERNAL_FORCES, LOADS, SENSORS, LoadGain, ModelPatch, PointMass, Primitive
+from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, ModelPatch, Primitive
 from fe.runtime.reduced import ReducedModel, ReducedState, dense_sum
 from fe.runtime.state import Losses
 
@@ -28,49 +25,7 @@ SAME = 1e-9
 """Difference of two rows, relative to the largest entry, that is rounding."""
 
 
-class StructuralModel(SystemModel):
-    """A structure that springs hold, under a force or lift.
-
-    Attributes
-    ----------
-    reference : str
-        Place whose stiffness and modal mass are the natural ones.
-    """
-
-    reference: str
-    kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
-
-    @abstractmethod
-    def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
-        """Return the load (n,) of 1 N at a place, as load primitives have it."""
-
-    @abstractmethod
-    def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
-        """Return the loads (2, n) of a load factor and of its square in a flight, as load primitives do."""
-
-    def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
-        """Return the load (n,) at whose place stiffness and modal mass are the natural ones."""
-        return self.force_row(self.reference, parameters, NO_PATCH)
-
-    def acting(self, case: Case) -> Acting:
-        """Return what acts in a trial: a force at a place, lift, or what holds it until it is let go."""
-        trial, conditions, patch, state = case
-        loads = NO_PATCH if trial.kind is TrialKind.RINGDOWN else patch.of(*LOADS)
-        if trial.kind is TrialKind.FLIGHT:
-            # where a mass has weight; other zeros are read with it in place
-            rows = self.lift(trial, state.parameters, patch.of(*LOADS, PointMass))
-            amounts = [trial.load_factor, trial.load_factor**2]
-        else:
-            rows = self.force_row(trial.load_place, state.parameters, loads)[None]
-            amounts = [LoadChange.of(loads).changed(trial.force, trial.force)]
-        acting = Acting(trial.time, np.zeros(rows.shape[1]), clock=conditions.clock)
-        if trial.kind is TrialKind.RINGDOWN:
-            return replace(acting, release=(rows[0], release_of(trial)), initial=conditions.initial)
-        courses = [Course.of(trial.time, values, trial.hold) for values in amounts]
-        return replace(acting, loads=list(zip(rows, courses, strict=True)))
-
-
-class StructureModel(StructuralModel):
+class StructureModel(SystemModel):
     """A structure from a mesh or matrices; its parameters and free masses have `DEVIATION`.
 
     A control in N is a force, and where a load of it meets a displacement output along it there is a port,
@@ -107,7 +62,8 @@ class StructureModel(StructuralModel):
             )
         if LOAD_FACTOR not in model.controls:
             self.kinds -= {TrialKind.FLIGHT}
-        self.reference = (*self.forces, LOAD_FACTOR)[0]
+        self.reference, self.load_places = (*self.forces, LOAD_FACTOR)[0], self.forces
+        self.largest_force = 0.5 * min((model.validity[name][1] for name in self.forces), default=np.inf)
         _, outputs, accelerations = model.rows
         strains, displacements = np.split(outputs, [len(model.gauges)])
         named = (
@@ -159,7 +115,7 @@ class StructureModel(StructuralModel):
         forces = primitive is LoadGain and bool(self.forces)
         return primitive in SENSORS or forces or (primitive in INTERNAL_FORCES and bool(self.port_names))
 
-    def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+    def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
         """Return the load (n,) of 1 N of a force, or, where there is none, of the load factor.
 
         Raises
@@ -167,11 +123,11 @@ class StructureModel(StructuralModel):
         ModelError
             If there is no such force, or none is named of several.
         """
-        return self._load(parameters, place_among(self.forces or (self.reference,), place, self.what))
+        return self._load(state.parameters, place_among(self.forces or (LOAD_FACTOR,), place, self.what))
 
-    def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+    def lift(self, state: State, change: ModelPatch) -> FloatArray:
         """Return the loads (2, n) of the load factor and of its square, which is zero."""
-        row = self._load(parameters, LOAD_FACTOR)
+        row = self._load(state.parameters, LOAD_FACTOR)
         return np.stack((row, np.zeros_like(row)))
 
     def _always(self, parameters: FloatArray) -> FloatArray:
@@ -180,12 +136,9 @@ class StructureModel(StructuralModel):
         coefficients = self.model.load_coefficients(self._vector(parameters, recorded))
         return np.asarray(self.model.rows[0] @ coefficients)
 
-    def acting(self, case: Case) -> Acting:
-        """Return what acts in a trial; what always acts is in what a motion shows."""
-        acting = super().acting(case)
-        return (
-            acting if case.trial.is_dynamic else replace(acting, constant=self._always(case.state.parameters))
-        )
+    def constant(self, case: Case) -> FloatArray:
+        """Return the load (n,) that always acts at rest; in motion it is in what is shown."""
+        return self._always(case.state.parameters) * (not case.trial.is_dynamic)
 
     def system(self, state: State) -> SecondOrderSystem:
         """Return the structure at parameters and losses, in the coordinates of `ReducedModel.at`.

@@ -10,16 +10,23 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Shown
+from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, release_of
 from discrepancy.models.interface import NO_PATCH, Conditions, Model, Outputs, Place, PortedSystem, Response
 from discrepancy.models.linear_system import Resting, at_rest
 from discrepancy.models.natural_scales import PortSizes
-from discrepancy.models.questions import laws_at
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws
-from fe.runtime.patch import INTERNAL_FORCES, STRUCTURE, ModelPatch, ModulusTemperature, PortLoad
+from fe.runtime.patch import (
+    INTERNAL_FORCES,
+    LOADS,
+    STRUCTURE,
+    ModelPatch,
+    ModulusTemperature,
+    PointMass,
+    PortLoad,
+)
 from fe.runtime.state import Losses
 
 
@@ -72,6 +79,8 @@ class SystemModel(Model):
         Rows of all ports where laws act.
     missing : tuple of str
         Further ports of `port_rows` where missing forces are looked for.
+    reference : str or None
+        Place whose stiffness and modal mass are the natural ones; None: that of the first trial.
     displacements : int or None
         How many of the coordinates are displacements, the others being states; None: all.
     components : int
@@ -80,6 +89,8 @@ class SystemModel(Model):
 
     port_rows: Mapping[str, FloatArray]
     missing: tuple[str, ...] = ()
+    reference: str | None = None
+    kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
     displacements: int | None = None
     components: ClassVar[int] = 1
     shows_ports: ClassVar[bool] = True
@@ -95,8 +106,33 @@ class SystemModel(Model):
         return self.system(state).resting
 
     @abstractmethod
-    def acting(self, case: Case) -> Acting:
-        """Return what acts in a trial; at rest the values of the loads' courses count, one for each row."""
+    def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
+        """Return the load (N,) of 1 N at a place, as load primitives have it."""
+
+    @abstractmethod
+    def constant(self, case: Case) -> FloatArray:
+        """Return the load (N,) that always acts."""
+
+    def lift(self, state: State, change: ModelPatch) -> FloatArray:
+        """Return the loads (2, N) of a load factor and of its square, as load primitives have them."""
+        raise NotImplementedError
+
+    def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
+        """Return loads, and prescribed motions, in a trial; at rest the values of their courses are by row.
+
+        These are a force at a place, or lift.
+        """
+        trial, _, patch, state = case
+        loads = patch.of(*LOADS)
+        if trial.kind is TrialKind.FLIGHT:
+            # where a mass has weight; other zeros are read with it in place
+            rows = self.lift(state, patch.of(*LOADS, PointMass))
+            amounts = [trial.load_factor, trial.load_factor**2]
+        else:
+            rows = self.force_row(trial.load_place, state, loads)[None]
+            amounts = [LoadChange.of(loads).changed(trial.force, trial.force)]
+        courses = [Course.of(trial.time, values, trial.hold) for values in amounts]
+        return list(zip(rows, courses, strict=True)), {}
 
     @abstractmethod
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
@@ -104,10 +140,6 @@ class SystemModel(Model):
 
         `component` 1 and 2: transverse and shear strain.
         """
-
-    @abstractmethod
-    def reference_load(self, parameters: FloatArray, campaign: Campaign) -> FloatArray:
-        """Return the load (N,) at whose place stiffness and modal mass are the natural ones."""
 
     def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
         """Return the scales of forces that are spread over the structure, by the first mode (N,)."""
@@ -122,7 +154,7 @@ class SystemModel(Model):
     def laws(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> Laws:
         """Return the laws at its ports, its own and those of a patch."""
         forces = self.at_ports(self.own_laws(parameters) + patch.of(*INTERNAL_FORCES))
-        return laws_at(forces, self.port_rows, in_windows=self.follows_windows)
+        return self.laws_at(forces, self.port_rows)
 
     def case(self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH) -> Case:
         """Return a trial as it is at its begin."""
@@ -130,6 +162,21 @@ class SystemModel(Model):
         return Case(
             trial, conditions, patch, State(conditions.parameters, losses, patch.of(*STRUCTURE), warmer)
         )
+
+    def acting(self, case: Case) -> Acting:
+        """Return what acts in a trial."""
+        trial, conditions, patch, state = case
+        acting = Acting(trial.time, self.constant(case), begins=trial.begins, clock=conditions.clock)
+        if trial.kind is TrialKind.RINGDOWN:
+            if len(patch.of(PortLoad)):
+                raise ModelError(
+                    f"The trial {trial.name!r} is a ring-down, which no force with a course in time can act "
+                    'on; say kind = "driven" and begins = "unknown".'
+                )
+            release = self.force_row(trial.load_place, state), release_of(trial)
+            return replace(acting, release=release, initial=conditions.initial)
+        loads, drives = self.pushes(case)
+        return replace(acting, loads=loads, drives=drives, initial=conditions.initial.ravel())
 
     def begun(self, case: Case, ports: tuple[str, ...]) -> tuple[SecondOrderSystem, Acting]:
         """Return what moves under forces at ports, and what acts on it."""
@@ -304,7 +351,8 @@ class SystemModel(Model):
         (peak, speed, weight), sizes = largest, campaign_sizes(campaign)
         shape, still = np.zeros(0), [0.0] * len(names)
         if held:
-            row, shape = self.reference_load(parameters, campaign), system.shapes[:, 0]
+            known = [*(trial.load_place for trial in trials), *(self.load_places or ())]
+            row, shape = self.force_row(self.reference or known[0], state), system.shapes[:, 0]
             shape = shape if system.basis is None else system.basis @ shape
             still = [1.0 / float(own @ rest(own[None])[0]) for own in rows]
             frequency, participation = float(system.angular_frequency[0]), float(row @ shape) ** 2

@@ -10,16 +10,15 @@ from calibration.errors import CalibrationError
 from calibration.joint.wing_table import wing_priors
 from calibration.result.file import load_calibration
 from calibration.result.record import STATE
-from discrepancy.campaign.records import FloatArray, Quantity, Trial
+from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown, shown_rows
-from discrepancy.models.interface import Outputs, Place
+from discrepancy.models.interface import NO_PATCH, Outputs, Place
 from discrepancy.models.linear_system import Resting, springs
 from discrepancy.models.memory import Memory
-from discrepancy.models.reduced_structure import StructuralModel
 from discrepancy.models.scales import PortScale
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.system_model import Case, State
+from discrepancy.models.system_model import Case, State, SystemModel
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import PLANFORM, STATION_PORTS
@@ -54,7 +53,7 @@ paper, its masses, and the damping of the joint posterior, whose spread holds th
 ROTATING_PORT = "root"
 
 
-class WingModel(StructuralModel):
+class WingModel(SystemModel):
     """The wing in the states and under the structural patches that are asked for, each made once.
 
     Parameters
@@ -171,13 +170,17 @@ class WingModel(StructuralModel):
         """Return forces as they act at ports of `port_rows`."""
         return self.wing.internal_forces(forces)
 
-    def force_row(self, place: Place, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+    def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
         """Return the load (n,) of 1 N at a place; raises `InvalidPatchError` if it is off the wing."""
-        return self.wing.force_row(place, loads)
+        return self.wing.force_row(place, change)
 
-    def lift(self, trial: Trial, parameters: FloatArray, loads: ModelPatch) -> FloatArray:
+    def lift(self, state: State, change: ModelPatch) -> FloatArray:
         """Return the parts (2, n) of the lift."""
-        return self.wing.load_parts(loads)
+        return self.wing.load_parts(change)
+
+    def constant(self, case: Case) -> FloatArray:
+        """Return nothing (n,): what always acts is in the zeros of readings."""
+        return np.zeros(self.wing.size)
 
     def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
         """Return the scales of a force over the planform, from those of its mean and the first mode."""

@@ -72,11 +72,8 @@ def calibrate_parameters(
     fatal = [fault for fault in faults if fault.fatal]
     if fatal:
         raise CampaignDataError(fatal[0].sentence)
-    problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-    cleaned = without_wrong_ends(problem)
-    if cleaned is not campaign:
-        campaign = cleaned
-        problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
+    problem = without_wrong_ends(Problem(campaign, model, Setting(campaign, model, model.scales(campaign))))
+    campaign = problem.campaign
     with progress.stage("Posterior of the parameters"):
         posterior = parameter_posterior(problem, samples, seed)
     gate = absolute_gate(problem, posterior.optima[0])

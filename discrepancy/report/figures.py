@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.files.document import Origin
+from discrepancy.document import Origin
 from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
 from discrepancy.location.residuals import ResidualSet

@@ -31,7 +31,8 @@ def add_verdict(page: Page, content: ReportInput, picture: Callable[[], None] = 
     page.add_paragraph(words.meaning(verdict))
     if shares := words.shares_sentence(verdict):
         page.add_paragraph(f"{shares} {words.remainders_sentence(verdict)}".strip())
-    catalogue = words.catalogue_of(investigation)
+    search = investigation.search
+    catalogue = {} if search is None else {item.identifier: item for item in search.effects}
     if verdict.kind is VerdictKind.UNEXPLAINED and verdict.resembles:
         names = [catalogue[name].name if name in catalogue else name for name in verdict.resembles]
         page.add_paragraph(WORDS.say("nearest", names=names))

@@ -5,7 +5,7 @@ from functools import partial
 from math import isfinite, isnan, nan
 
 from discrepancy.campaign.units import UNITS
-from discrepancy.files.document import Origin
+from discrepancy.document import Origin
 from discrepancy.judgement.conclusion import calibrated_parameters, probability_text
 from discrepancy.judgement.when import NO_GAP
 from discrepancy.report import findings
@@ -102,14 +102,6 @@ def _beside(value: float, deviation: float) -> str:
     return f"{show(value)} ± {show(NINETY * deviation)}" if deviation > 0.0 else f"{value:.6g}, exact"
 
 
-def add_parameters(page: Page, investigation: Investigation) -> None:
-    """Add the table, where the model has calibrated parameters."""
-    rows = parameter_rows(investigation)
-    added = words.added_label(investigation)
-    told = f"without and with {added}" if added else "without any effect"
-    WORDS.add_table(page, "parameters", rows, added=told)
-
-
 _SCORES: dict[str, Callable[[Scores], str]] = {
     "χ²/dof (1 is noise)": lambda s: words.number(s.chi_square_per_dof, 4),
     "its deviation if the model is right": lambda s: words.number(s.chi_square_deviation, 2),
@@ -152,16 +144,6 @@ def add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
         closed = f"Gap closed: {words.percent(proof.gap_closed)} %."
     trials = f" Held out: {', '.join(held)}; only their own releases and zeros were adapted." if held else ""
     WORDS.add_table(page, "proof", rows, more=scores, gain=gain, closed=closed, trials=trials)
-
-
-def add_separability(page: Page, content: ReportInput) -> None:
-    """Add detectable sizes and confusion groups."""
-    found = content.separability
-    if found is None:
-        return
-    for line in group_lines(found):
-        page.add_paragraph(line)
-    WORDS.add_table(page, "decide", can_decide_rows(found))
 
 
 def _share(share: Share) -> str:
@@ -277,14 +259,19 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
     add_gates(page, investigation)
     add_evidence(page, verdict)
     add_not_compared(page, verdict)
-    add_parameters(page, investigation)
+    added = words.added_label(investigation)
+    told = f"without and with {added}" if added else "without any effect"
+    WORDS.add_table(page, "parameters", parameter_rows(investigation), added=told)
     if investigation.proof is not None:
         page.add_section("Proof on held-out trials")
         add_proof(page, investigation, investigation.proof)
         show("pit")
     if content.separability is not None or content.self_calibration is not None:
         page.add_section("What this campaign can decide")
-        add_separability(page, content)
+        if content.separability is not None:
+            for line in group_lines(content.separability):
+                page.add_paragraph(line)
+            WORDS.add_table(page, "decide", can_decide_rows(content.separability))
         show("separability")
         add_self_calibration(page, content)
         show("self_calibration")

@@ -1,13 +1,12 @@
 """Numbers, sizes in SI units and sentences of the report and of the summary on the terminal."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from math import floor, isfinite, isnan, log10
 
 from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.campaign.units import UNITS
-from discrepancy.catalogue.entry import Effect
-from discrepancy.document_types import PRIMITIVE_UNITS
+from discrepancy.document import PRIMITIVE_UNITS
 from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.judgement.conclusion import effects_text, probability_text
 from discrepancy.models.interface import Model
@@ -184,34 +183,26 @@ def meaning(verdict: Verdict) -> str:
     return meant[verdict.kind]
 
 
+def _labels(effects: Iterable[tuple[str, str, bool]]) -> str:
+    """Return effects joined, each of a name and a place, and whether its shape is free."""
+    found = []
+    for name, place, free_shape in effects:
+        marks = ", ".join(filter(None, (place, "free shape" if free_shape else "")))
+        found.append(f"{name} ({marks})" if marks else name)
+    return " + ".join(found)
+
+
 def hypothesis_name(hypothesis: Hypothesis) -> str:
     """Return the effects of a hypothesis in words."""
-    if not hypothesis.effects:
-        return "nothing missing"
-    return " + ".join(
-        _with_place(effect.name, effect.place, free_shape=bool(effect.shape)) for effect in hypothesis.effects
+    return (
+        _labels((item.name, item.place, bool(item.shape)) for item in hypothesis.effects) or "nothing missing"
     )
-
-
-def _with_place(name: str, place: str, *, free_shape: bool) -> str:
-    marks = [mark for mark in (place, "free shape" if free_shape else "") if mark]
-    return name + (f" ({', '.join(marks)})" if marks else "")
 
 
 def added_label(investigation: Investigation) -> str:
     """Return what the model "after" has more than the model "before"; empty if nothing."""
-    fit = investigation.fit
-    if fit is None or not fit.candidate.terms:
-        return ""
-    return " + ".join(
-        _with_place(term.effect.name, term.place, free_shape=term.free_shape) for term in fit.candidate.terms
-    )
-
-
-def catalogue_of(investigation: Investigation) -> dict[str, Effect]:
-    """Return the effects that could be tested, by identifier."""
-    effects = () if investigation.search is None else investigation.search.effects
-    return {item.identifier: item for item in effects}
+    terms = () if investigation.fit is None else investigation.fit.candidate.terms
+    return _labels((term.effect.name, term.place, term.free_shape) for term in terms)
 
 
 _GREEK = {

@@ -16,7 +16,6 @@ from discrepancy.fits.fitting import CandidateFit, attempt, fit, objective
 from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
-from discrepancy.fits.trial_data import shortened
 from discrepancy.search_settings import SEARCH
 
 from .hypotheses import Tell, each, in_silence, starts
@@ -60,7 +59,7 @@ class Beginnings:
                 least = max(SEARCH.least_samples, ceil(SEARCH.beginning * period / trial.interval))
                 late = gap_row(self.residuals[number]) if self.residuals else 0
                 count = min(count, least if late < least else late + least)
-            trials.append(shortened(trial, count))
+            trials.append(trial.rows(slice(count)))
         return self.problem.with_trials(tuple(trials))
 
     def scan(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:

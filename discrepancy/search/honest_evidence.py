@@ -14,7 +14,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from discrepancy.campaign.noise_tests import SHORTEST_SERIES, combine, ljung_box, variance_p_value
+from discrepancy.campaign.noise_tests import (
+    SHORTEST_SERIES,
+    combine,
+    lag_products,
+    ljung_box,
+    variance_p_value,
+)
 from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.fits.candidate import Key, Remainder
 from discrepancy.fits.fitting import CandidateFit, attempt
@@ -134,8 +140,7 @@ def _autocorrelation(series: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
     lags = max(int(LAGS * max(len(item) for item in series)), 2)
     products, pairs = np.zeros(lags + 1), np.zeros(lags + 1)
     for item in series:
-        power = np.abs(np.fft.rfft(item, 2 * len(item))) ** 2
-        own = np.fft.irfft(power)[: min(lags + 1, len(item))]
+        own = lag_products(item, min(lags, len(item) - 1))[0]
         products[: len(own)] += own
         pairs[: len(own)] += len(item) - np.arange(len(own))
     return products[1:] / max(products[0], 1e-300), pairs[1:] / pairs[0] ** 2

@@ -9,7 +9,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.errors import ModelError
-from discrepancy.fits.candidate import Base, Candidate, Point
+from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit, attempt, fit
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
@@ -124,14 +124,8 @@ class Search(Hypotheses):
     ) -> CandidateFit | None:
         """Fit a candidate by chord steps from a base, None where it cannot; see `fit` for `give_up`."""
         start = Point(base.point.shared, base.point.local, np.concatenate((base.point.effect, added)))
-        return attempt(
-            self.problem,
-            candidate,
-            start,
-            base=Base(base.point, base.linearisations),
-            iterations=SEARCH.chord_steps,
-            give_up=give_up,
-        )
+        steps = SEARCH.chord_steps
+        return attempt(self.problem, candidate, start, base=base, iterations=steps, give_up=give_up)
 
     def exactly(self, rough: CandidateFit) -> CandidateFit:
         """Fit a candidate to convergence from a rough fit, and keep it."""
@@ -183,7 +177,7 @@ class Search(Hypotheses):
         if self._open and 0 < len(self.best().candidate.terms) < self.longest:
             self._extended(self.best())  # what stood in for a smaller set hid what is beside it
         self.settle()
-        self.other_places()
+        self.keep(elsewhere(self.problem, self.best()), exact=True)  # from other places of the structure
 
     @property
     def _open(self) -> bool:
@@ -195,9 +189,8 @@ class Search(Hypotheses):
         if not sees_forces(self.problem) or not all(data.trial.is_dynamic for data in self.problem.trials):
             return False
         self.tell("looking for the missing force")
-        force = ForceSearch(self.problem)
         try:
-            force.locate()
+            force = ForceSearch(self.problem)
             self.forces = force.name(self.effects)
         except (ModelError, np.linalg.LinAlgError) as cause:
             self.tell(f"the missing force cannot be seen: {cause}")
@@ -283,10 +276,6 @@ class Search(Hypotheses):
                 kept[key] = family
         for family in kept.values():
             self.keep(family, exact=True)
-
-    def other_places(self) -> None:
-        """Fit the best candidate from other places of the structure."""
-        self.keep(elsewhere(self.problem, self.best()), exact=True)
 
     def _settle_steps(self) -> None:
         """Halve the time steps while they cost the best candidate too much, and fit the best ones again."""

@@ -13,10 +13,7 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.checks.model_check import prior_mean
 from discrepancy.errors import CampaignFileError, ModelError
-from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Conditions, Model
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.reduced_structure import StructureModel
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
@@ -89,27 +86,14 @@ def plan_of(model: Model) -> ExamplePlan:
     ModelError
         If no force can act on the model.
     """
-    bare, largest = model, np.inf
-    if isinstance(bare, LumpedModel):
-        places = [item.name for item in bare.description.input]
-        outputs = [item.name for item in bare.description.output]
-    elif isinstance(bare, FmuModel):
-        forces = bare.description.inputs.forces
-        places, outputs = [*forces], [name for name, item in bare.runs.quantities.items() if not item.is_rate]
-        known = [bare.runs.asset.description.variable(bare.runs.variable(name)) for name in forces.values()]
-        limits = [item.maximum for item in known if item is not None and item.maximum is not None]
-        largest = 0.5 * min(limits, default=np.inf)
-    elif isinstance(bare, StructureModel):
-        reduced = bare.model
-        places, outputs = [*bare.forces], [*reduced.gauges, *reduced.displacements]
-        largest = 0.5 * min((reduced.validity[name][1] for name in places), default=np.inf)
-    else:
+    if model.load_places is None:
         return wing_plan()
-    if not places:
+    if not model.load_places:
         raise ModelError(
             f"{model.name} has no force, and an example is made by forces: write a campaign of it."
         )
-    return plan_for(model, tuple(outputs), places[0], largest)
+    outputs = tuple(name for name, quantity in model.quantities.items() if not quantity.is_rate)
+    return plan_for(model, outputs, model.load_places[0], model.largest_force)
 
 
 def plan_for(

@@ -21,7 +21,7 @@ from fe.wing.design import load_design
 from fe.wing.operators import AffineOperators, assemble
 from reporting import terminal
 from twin_master.command import guarded
-from uav_twin.verify import QUICK_REFINEMENTS, Check, end_with, print_checks
+from uav_twin.wing import QUICK_REFINEMENTS, Check, end_with, print_checks
 
 
 def compare(

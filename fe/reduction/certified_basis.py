@@ -113,6 +113,11 @@ class StaticReduction:
     def model(self) -> ReducedModel:
         """Return the reduced model of the present bases."""
         terms, basis, (stiffness,) = self.terms, self.basis.vectors, self.basis.inner
+        # residuals in the images of the basis under the norm, then in what is orthogonal to them
+        own = np.tensordot(self.residual_stiffness, terms.reference, (1, 0))
+        across, images = np.linalg.qr(own)[0], self.residual_stiffness[:, :-1]
+        load = self.residual_load - across @ (across.T @ self.residual_load)
+        images = images - np.tensordot(across, np.tensordot(across, images, (0, 0)), 1)
         # |sum c_q a_j d_qj| <= |c| |a| |d| with c = (1, theta); plus rounding
         largest = (terms.reference + terms.farthest())[:-1]
         dropped = np.sqrt((2.0 + largest @ largest) * self.residual_basis.dropped_square)
@@ -121,11 +126,11 @@ class StaticReduction:
             static_load=terms.loads.T @ basis,
             static_output=terms.outputs.T @ basis,
             bound_reference=terms.reference[:-1],
-            residual_load=self.residual_load,
-            residual_stiffness=self.residual_stiffness,
+            residual_load=np.concatenate((basis.T @ terms.loads, load)),
+            residual_stiffness=np.concatenate((np.moveaxis(stiffness[:-1], 1, 0), images)),
             residual_allowance=float(dropped) + 1e-7,
             rounding_allowance=max(ROUNDING_FACTOR * self.rounding, LEAST_ROUNDING),
-            dual_correction=self.correction,
+            dual_correction=np.concatenate((self.correction @ own, self.correction), axis=2),
             cross_mass=np.stack([self.modal_basis.T @ (term @ basis) for term in terms.mass_terms]),
             **self.fixed,
         )
@@ -242,21 +247,25 @@ def compressed(model: ReducedModel, directions: FloatArray) -> ReducedModel:
         The Galerkin model on the combinations; its bound is as certified as before.
     """
     stiffness = directions.T @ model.static_stiffness @ directions
-    # what changes with health first: its columns of the triangular factor are the shortest
-    order = np.argsort(model.stiffness_factors[:, 1] == 0, kind="stable")
-    images = (model.residual_stiffness @ directions)[:, order]
-    orthonormal, factor = np.linalg.qr(
-        np.concatenate((images.reshape(len(images), -1), model.residual_load), axis=1)
-    )
-    terms = factor[:, : -model.residual_load.shape[1]].reshape(len(factor), len(stiffness), -1)
+    stiffness = 0.5 * (stiffness + stiffness.transpose(0, 2, 1))
+    # what changes with health first, the loads, then the rest: columns of the triangular factor become longer
+    lasting = model.stiffness_factors[:-1, 1] == 0
+    order, first = np.argsort(lasting, kind="stable"), directions.shape[1] * np.count_nonzero(~lasting)
+    images = (model.residual_stiffness @ directions)[:, order].reshape(len(model.residual_load), -1)
+    images = np.concatenate((images[:, :first], model.residual_load, images[:, first:]), axis=1)
+    own = np.eye(len(images), len(directions)) @ directions
+    orthonormal, factor = np.linalg.qr(images - own @ (own.T @ images))
+    loads = slice(first, first + len(model.load_factors))
+    terms = np.delete(factor, loads, axis=1).reshape(len(factor), len(order), -1)[:, np.argsort(order)]
+    static_load = model.static_load @ directions
     return replace(
         model,
-        static_stiffness=0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
-        static_load=model.static_load @ directions,
+        static_stiffness=stiffness,
+        static_load=static_load,
         static_output=model.static_output @ directions,
-        residual_load=np.ascontiguousarray(factor[:, -model.residual_load.shape[1] :]),
-        residual_stiffness=np.ascontiguousarray(terms[:, np.argsort(order)]),
-        dual_correction=model.dual_correction @ orthonormal,
+        residual_load=np.concatenate((static_load.T, factor[:, loads])),
+        residual_stiffness=np.concatenate((np.moveaxis(stiffness[:-1], 1, 0), terms)),
+        dual_correction=model.dual_correction @ np.concatenate((own, orthonormal), axis=1),
         cross_mass=model.cross_mass @ directions,
     )
 

@@ -43,13 +43,12 @@ class OnlineArrays:
         self.square = stiffness.shape[1:]
         self.stiffness = np.ascontiguousarray(stiffness.reshape(len(stiffness), -1))
         self._load, self._output = arrays.static_load, arrays.static_output
-        residual = arrays.residual_load
-        # times the loads, then the stiffness coefficients times the coordinates: the residual
-        self._residual = np.concatenate(
-            (residual, -arrays.residual_stiffness.reshape(len(residual), -1)), axis=1
-        )
+        residual = arrays.residual_load[len(stiffness[0]) :]
+        terms = arrays.residual_stiffness[len(stiffness[0]) :].reshape(len(residual), -1)
+        # times the loads, then the changes of the coefficients times the coordinates: the residual
+        self._residual = np.concatenate((residual, -terms), axis=1)
         self._allowance = arrays.residual_allowance
-        self._reference = (*arrays.bound_reference.tolist(), 1.0)
+        self._reference = np.append(arrays.bound_reference, 1.0)
         self._dual = (_combined if arrays.dual_output.shape[-1] else _nearest)(arrays)
 
     def solution(
@@ -73,12 +72,11 @@ class OnlineArrays:
         coefficients = np.empty(self._residual.shape[1])
         loads = load.size
         coefficients[:loads] = load
-        multiply_outer(theta, coordinates, out=coefficients[loads:].reshape(theta.size, -1))
+        change = (theta - self._reference)[:-1]
+        multiply_outer(change, coordinates, out=coefficients[loads:].reshape(change.size, -1))
         residual = self._residual @ coefficients
         correction, dual = self._dual(theta, loss)
-        coercivity = min(
-            value / reference for value, reference in zip(theta.tolist(), self._reference, strict=True)
-        )
+        coercivity = min((theta / self._reference).tolist())
         outside = self._allowance * sqrt(coordinates @ coordinates)
         remainder = (sqrt(residual @ residual) + outside) / coercivity
         bound = remainder * np.sqrt(einsum("ij,ij->i", dual, dual)) + np.abs(correction @ residual)
@@ -91,12 +89,12 @@ class OnlineArrays:
 
 def _nearest(arrays: ReducedArrays) -> Dual:
     """Return the dual solution of the anchor that is next to the losses."""
-    terms, dual = len(arrays.static_stiffness), arrays.dual_residual
+    (terms, inside, _), dual = arrays.static_stiffness.shape, arrays.dual_residual
     # to be multiplied by theta, as the stiffness
     factors = np.concatenate((-dual[..., 1:], dual[..., :1]), axis=-1)
     anchors = [
         (np.ascontiguousarray(correction), np.ascontiguousarray(factor.reshape(-1, terms)))
-        for correction, factor in zip(arrays.dual_correction, factors, strict=True)
+        for correction, factor in zip(arrays.dual_correction[..., inside:], factors, strict=True)
     ]
     splits = np.split(arrays.dual_split, np.cumsum(arrays.dual_counts - 1)[:-1])
     return partial(_at_anchor, anchors, [split.tolist() for split in splits])
@@ -114,7 +112,8 @@ def _at_anchor(
 
 def _combined(arrays: ReducedArrays) -> Dual:
     """Return the Galerkin solution of each output in its M dual functions."""
-    terms, by_output = len(arrays.static_stiffness), arrays.dual_correction.transpose(1, 0, 2)
+    terms, inside, _ = arrays.static_stiffness.shape
+    by_output = arrays.dual_correction[..., inside:].transpose(1, 0, 2)
     stiffness = np.ascontiguousarray(arrays.dual_stiffness.transpose(1, 0, 2, 3)).reshape(terms, -1)
     corrections, factor = np.ascontiguousarray(by_output), arrays.dual_residual[0]
     return partial(_galerkin, stiffness, arrays.dual_output[:, :, np.newaxis], corrections, factor)

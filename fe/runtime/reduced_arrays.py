@@ -98,9 +98,11 @@ class ReducedArrays(RegionArrays):
     bound_reference : (T - 1,) ndarray
         Coefficients of the stiffness terms whose sum is the norm of the error bound; the last is one.
     residual_load : (R, L) ndarray
-        Loads in an orthonormal basis of the residuals (norm dual to the one of `bound_reference`).
-    residual_stiffness : (R, T, N) ndarray
-        Stiffness terms times static basis vectors, in the same basis.
+        Loads in an orthonormal basis of the residuals (norm dual to the one of `bound_reference`). Its first
+        N directions are the norm's own images of the static basis, along which a solution leaves nothing.
+    residual_stiffness : (R, T - 1, N) ndarray
+        Stiffness terms times static basis vectors, in the same basis: the residual is that of the loads less
+        the changes of the coefficients from `bound_reference` times these.
     residual_allowance : float
         Bound of what that basis leaves out of a residual, per unit length of the reduced coordinates.
     rounding_allowance : float
@@ -134,7 +136,7 @@ class ReducedArrays(RegionArrays):
     """
 
     what = "a reduced model"
-    layout: ClassVar[Mapping[str, int]] = {"format": 4}
+    layout: ClassVar[Mapping[str, int]] = {"format": 5}
     parameters = _words("parameter_names")
     masses = _words("mass_names")
     controls = _words("control_names")
@@ -162,7 +164,7 @@ class ReducedArrays(RegionArrays):
     static_output: Annotated[FloatArray, "outputs", "static"]
     bound_reference: Annotated[FloatArray, "varied terms"]
     residual_load: Annotated[FloatArray, "residual", "loads"]
-    residual_stiffness: Annotated[FloatArray, "residual", "terms", "static"]
+    residual_stiffness: Annotated[FloatArray, "residual", "varied terms", "static"]
     residual_allowance: Annotated[float, 0.0, inf]
     rounding_allowance: Annotated[float, 0.0, inf]
     dual_counts: Annotated[IntArray, "regions"]

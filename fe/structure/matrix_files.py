@@ -10,7 +10,7 @@ import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy import io as scipy_io
@@ -29,12 +29,6 @@ Place = tuple[int, int]
 
 _PLACE = re.compile(r"\s*(\d+)\s*[.,;\s]\s*([1-6])\s*")
 _SQUARE, _REAL = (1, 6), (1, 2)  # forms and types of Nastran
-
-
-class _Table(NamedTuple):
-    """The numbers of a text file, line by line: a place and a value, or two places and a value."""
-
-    lines: FloatArray
 
 
 def read_unknowns(path: Path) -> list[Place]:
@@ -70,13 +64,12 @@ def read_matrix(folder: Path, name: str) -> tuple[sparse.csr_array, list[Place] 
     """
     file, chosen = file_of(name)
     path = folder / file
-    stored = _read(path, chosen)
-    if not isinstance(stored, _Table):
-        if stored.ndim != 2 or stored.shape[0] != stored.shape[1] or stored.dtype.kind not in "fiu":
-            came = f"{stored.dtype} of shape {stored.shape}"
+    table, is_table = _read(path, chosen)
+    if not is_table:
+        if table.ndim != 2 or table.shape[0] != table.shape[1] or table.dtype.kind not in "fiu":
+            came = f"{table.dtype} of shape {table.shape}"
             fail(str(path), f"a square matrix of real numbers is expected, but {came} came.")
-        return sparse.csr_array(stored, dtype=np.float64), None
-    table = stored.lines
+        return sparse.csr_array(table, dtype=np.float64), None
     width = table.shape[1]
     if width not in (3, 5) or not table.size or not np.array_equal(table[:, :-1], np.rint(table[:, :-1])):
         fail(
@@ -121,12 +114,10 @@ def read_vector(folder: Path, name: str, named: Callable[[Place], FloatArray], s
         If it cannot be read or has another length.
     """
     file, chosen = file_of(name)
-    found = _read(folder / file, chosen)
-    if isinstance(found, _Table):
-        found = found.lines
-        if found.shape[1] == 3:
-            parts = [value * named((int(node), int(component))) for node, component, value in found]
-            return np.asarray(np.sum(parts, axis=0))
+    found, is_table = _read(folder / file, chosen)
+    if is_table and found.shape[1] == 3:
+        parts = [value * named((int(node), int(component))) for node, component, value in found]
+        return np.asarray(np.sum(parts, axis=0))
     values = np.asarray(found.todense() if sparse.issparse(found) else found, dtype=np.float64)
     if values.size != size or max(values.shape) != size:
         fail(
@@ -137,18 +128,20 @@ def read_vector(folder: Path, name: str, named: Callable[[Place], FloatArray], s
     return values.ravel()
 
 
-def _read(path: Path, chosen: str) -> Any:
+def _read(path: Path, chosen: str) -> tuple[Any, bool]:
+    """Return the array of a file, and whether it is a table: lines of a place or two, and a value."""
     try:
         if path.suffix in (".npz", ".npy"):
-            return _archived(path, chosen)
+            return _archived(path, chosen), False
         text = read_text(path, MeshError, what="matrix file", otherwise="latin-1")
         if text.startswith("%%MatrixMarket"):
-            return scipy_io.mmread(path)
+            return scipy_io.mmread(path), False
         if re.search(r"^DMIG", text, re.MULTILINE):
-            return _nastran(path, chosen)
+            return _nastran(path, chosen), True
         if not text.strip():
             raise ValueError("it is empty")
-        return _Table(np.loadtxt(io.StringIO(text.replace(",", " ")), comments=("**", "#", "$"), ndmin=2))
+        lines = io.StringIO(text.replace(",", " "))
+        return np.loadtxt(lines, comments=("**", "#", "$"), ndmin=2), True
     except (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile) as error:
         fail(str(path), f"the file cannot be read as a matrix: {' '.join(str(error).split())}.")
 
@@ -165,7 +158,7 @@ def _archived(path: Path, chosen: str) -> Any:
         return archive[chosen or names[0]]
 
 
-def _nastran(path: Path, chosen: str) -> _Table:
+def _nastran(path: Path, chosen: str) -> FloatArray:
     """Read a real square matrix from the DMIG of the bulk data."""
     kind: dict[str, int] = {}
     entries: dict[str, list[tuple[float, ...]]] = {}
@@ -189,4 +182,4 @@ def _nastran(path: Path, chosen: str) -> _Table:
         fail(str(path), f"one of its matrices is expected, as FILE:MATRIX; it has {', '.join(kind)}.")
     if kind[wanted] not in _SQUARE:
         fail(str(path), f"a square or symmetric matrix is expected, but {wanted} is of form {kind[wanted]}.")
-    return _Table(np.array(entries[wanted]))
+    return np.array(entries[wanted])

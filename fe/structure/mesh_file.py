@@ -19,6 +19,7 @@ from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.full.factorisation import analyse
 from fe.runtime.arrays import IntArray
 from fe.runtime.errors import MeshError
+from reporting.memory import memory_left
 
 from .abaqus_file import read_abaqus
 from .deck import FLAT, Deck
@@ -222,18 +223,6 @@ def memory_estimate(mesh: StructureMesh) -> float:
     return float(_PROGRAM + _MATRICES * _ENTRY * 9 * graph.nnz + 8 * 9 * most)
 
 
-def available_memory() -> float:
-    """Bytes that the machine, or the container, has left; infinite where it does not say."""
-    left = np.inf
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        text = Path("/proc/meminfo").read_text(encoding="ascii")
-        left = 1024.0 * float(text.split("MemAvailable:")[1].split()[0])
-    with contextlib.suppress(OSError, ValueError):  # no such files, or the limit is "max"
-        limit, used = (Path(f"/sys/fs/cgroup/memory.{key}").read_text("ascii") for key in ("max", "current"))
-        left = min(left, float(limit) - float(used))
-    return left
-
-
 def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
     """Refuse a mesh whose assembly and factorisation would take more than `limit` bytes.
 
@@ -249,7 +238,7 @@ def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
     MeshError
         If it would take more.
     """
-    allowed = available_memory() if limit is None else limit
+    allowed = memory_left() if limit is None else limit
     entries = 9 * mesh.cells.size * mesh.cells.shape[1]  # four times those that are left of them
     bulky = _PROGRAM + _MATRICES * _ENTRY * entries / 4.0 + _BULKY * mesh.unknowns ** (4.0 / 3.0)
     if bulky > allowed and (needed := memory_estimate(mesh)) > allowed:

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.elements.cells import centre_strains
 from fe.elements.kinds import meshio_with_wedges
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError, MeshError
@@ -272,7 +271,7 @@ def write_structure_vtu(
         (mesh.kind.file_type, mesh.cells),
         {"displacement": displacement},
         {
-            "strain": centre_strains(mesh, displacement),
+            "strain": mesh.strains(displacement)[:, 0],
             "material": structure.material_of + 1,
             "region": structure.region_of + 1,
             "stiffness_loss": loss,

@@ -19,24 +19,7 @@ from fe.structure.tables import Part, StructureDesign
 from reporting.section import checked
 from reporting.toml_file import read_toml
 
-from .parts import (
-    AddedDensity,
-    Airfoil,
-    Defect,
-    Gauges,
-    Lift,
-    Masses,
-    MeshSettings,
-    Planform,
-    PointMassPlace,
-    Rib,
-    Rod,
-    Root,
-    Skin,
-    TipLoad,
-    Web,
-    four_digit_half_thickness,
-)
+from . import parts
 
 SHIPPED_DESIGN = Path(__file__).parents[1] / "designs" / "uav_wing.toml"
 """The design of the wing of Kapteyn et al. 2021."""
@@ -66,21 +49,21 @@ class WingDesign(Part):
     """
 
     name: str = Field(min_length=1)
-    planform: Planform
-    airfoil: Airfoil
-    skin: Skin
-    webs: tuple[Web, ...] = Field(min_length=2)
-    ribs: tuple[Rib, ...] = ()
-    rods: tuple[Rod, ...] = ()
-    added_density: tuple[AddedDensity, ...] = ()
-    root: Root
-    masses: Masses
-    point_masses: tuple[PointMassPlace, ...] = ()
-    gauges: Gauges
-    defects: tuple[Defect, ...] = Field(min_length=1, max_length=MOST_REGIONS)
-    lift: Lift
-    tip_load: TipLoad
-    mesh: MeshSettings
+    planform: parts.Planform
+    airfoil: parts.Airfoil
+    skin: parts.Skin
+    webs: tuple[parts.Web, ...] = Field(min_length=2)
+    ribs: tuple[parts.Rib, ...] = ()
+    rods: tuple[parts.Rod, ...] = ()
+    added_density: tuple[parts.AddedDensity, ...] = ()
+    root: parts.Root
+    masses: parts.Masses
+    point_masses: tuple[parts.PointMassPlace, ...] = ()
+    gauges: parts.Gauges
+    defects: tuple[parts.Defect, ...] = Field(min_length=1, max_length=MOST_REGIONS)
+    lift: parts.Lift
+    tip_load: parts.TipLoad
+    mesh: parts.MeshSettings
 
     @model_validator(mode="after")
     def _parts_fit_together(self) -> "WingDesign":
@@ -154,7 +137,7 @@ def _check_webs(design: WingDesign) -> None:
     if design.front_chord <= 0.0 or design.rear_chord >= 1.0:
         raise ValueError("webs[0] and the last web must lie inside the chord, between 0 and 1")
     for web in design.webs:
-        half = float(four_digit_half_thickness(web.chord, design.airfoil.thickness_ratio)) * smallest
+        half = float(parts.four_digit_half_thickness(web.chord, design.airfoil.thickness_ratio)) * smallest
         if half <= 1.5 * design.skin.thickness:
             raise ValueError(
                 f"the skin of {design.skin.thickness:g} m does not fit into the section at chord "

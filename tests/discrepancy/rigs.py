@@ -12,7 +12,7 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
-from discrepancy.files.document import Origin
+from discrepancy.document import Origin
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import parse_lumped
 from discrepancy.sources.examples import example_campaign, plan_for

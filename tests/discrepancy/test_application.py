@@ -18,8 +18,8 @@ from discrepancy.application import _again, apply_verdict, gives
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
+from discrepancy.document import Origin
 from discrepancy.errors import ModelError, VerdictFileError
-from discrepancy.files.document import Origin
 from discrepancy.files.verdict import read_patch
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit

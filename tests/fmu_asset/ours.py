@@ -74,7 +74,7 @@ def chain_model(stiffness: float = 9.0e4, regions: tuple[str, ...] = ("z1", "z2"
         static_output=output,
         bound_reference=np.ones(count + 1),
         residual_load=np.zeros((32, 2)),
-        residual_stiffness=np.zeros((32, count + 2, NODES)),
+        residual_stiffness=np.zeros((32, count + 1, NODES)),
         dual_counts=np.full(count, 2),
         dual_split=np.full(count, 0.4),
         dual_correction=np.zeros((2**count, outputs, 32)),

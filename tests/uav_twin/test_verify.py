@@ -10,8 +10,8 @@ import pytest
 from fe.wing.design import load_design
 from fe.wing.operators import assemble
 from tests import command_line
-from uav_twin import verify
-from uav_twin.verify import Check
+from uav_twin import wing as command
+from uav_twin.wing import Check
 
 
 def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
@@ -22,7 +22,7 @@ def checks_of(monkeypatch: pytest.MonkeyPatch, *checks: Check) -> None:
     def given(*_: object, **__: object) -> list[Check]:
         return list(checks)
 
-    monkeypatch.setattr(verify, "all_checks", given)
+    monkeypatch.setattr(command, "all_checks", given)
 
 
 def test_checks_are_listed_and_kept(
@@ -63,7 +63,7 @@ def test_wrong_calls(
 
 def test_every_check_of_the_elements_and_of_a_coarse_wing_is_kept() -> None:
     design = load_design().changed(mesh={"refinement": 0.25})
-    checks = [*verify.element_checks(), *verify.balance_checks(assemble(design))]
+    checks = [*command.element_checks(), *command.balance_checks(assemble(design))]
     assert {check.group for check in checks} == {
         "patch test",
         "unsupported body",
@@ -78,7 +78,7 @@ def test_every_check_of_the_elements_and_of_a_coarse_wing_is_kept() -> None:
 def test_convergence_names_every_gauge() -> None:
     # Three coarse meshes: the names and the kind of figures, not their size.
     design = load_design().changed(mesh={"refinement": 0.25})
-    checks = list(verify.convergence_checks(design, (0.25, 0.3, 0.36), limited=False))
+    checks = list(command.convergence_checks(design, (0.25, 0.3, 0.36), limited=False))
     names = [check.name for check in checks]
     assert names[:3] == ["tip stiffness", "first bending", "second bending"]
     assert [name for name in names if name.startswith("gauge ")] == [f"gauge {n}" for n in range(1, 25)]

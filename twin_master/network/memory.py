@@ -1,10 +1,9 @@
 """What a twin needs in memory, told before it is built."""
 
-import os
 from collections.abc import Mapping
 from math import prod
-from pathlib import Path
 
+from reporting.memory import memory_left
 from twin_master.errors import InvalidModelError
 from twin_master.scenario.schema import Scenario
 
@@ -16,19 +15,6 @@ _PREDICTION_COPIES = 8
 """The table, the checked copy, the copy ordered for the likelihood, and what the quantiles are taken from."""
 _HISTORY_COPIES = 4
 """Belief before and after the observation, its logarithm, and the smoothed one."""
-_CONTROL_GROUP = Path("/sys/fs/cgroup/memory.max")
-
-
-def memory_size() -> float:
-    """Return the memory of this machine, or what of it this process may take [bytes]; infinite if unknown."""
-    try:
-        size = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (AttributeError, ValueError, OSError):
-        return float("inf")
-    try:
-        return min(size, float(_CONTROL_GROUP.read_text(encoding="ascii")))
-    except (OSError, ValueError):  # no control group, or `max`
-        return size
 
 
 def check_fits(parts: Mapping[str, float], advice: str) -> None:
@@ -46,12 +32,12 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
     InvalidModelError
         They do not; the sentence has all sizes.
     """
-    needed, there = sum(parts.values()), memory_size()
+    needed, there = sum(parts.values()), memory_left()
     if needed > there:
         listed = ", ".join(f"{_gigabytes(size)} for {what}" for what, size in parts.items())
         raise InvalidModelError(
-            f"this does not fit in memory: {listed}, together {_gigabytes(needed)}, and there are "
-            f"{_gigabytes(there)}: {advice}."
+            f"this does not fit in memory: {listed}, together {_gigabytes(needed)}, and "
+            f"{_gigabytes(there)} are left: {advice}."
         )
 
 

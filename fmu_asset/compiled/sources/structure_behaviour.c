@@ -25,11 +25,11 @@ bool structure_behaviour_make(structure_behaviour *behaviour, const structure_mo
     behaviour->model = model;
     structure_arena count = {NULL, 0};
     lay_out(behaviour, &count);
-    behaviour->memory = calloc(count.used, sizeof *behaviour->memory);
+    behaviour->memory = calloc(count.used + STRUCTURE_SPARE, sizeof *behaviour->memory);
     if (behaviour->memory == NULL) {
         return structure_fail(problem, "there is no memory for an instance");
     }
-    structure_arena arena = {behaviour->memory, 0};
+    structure_arena arena = structure_arena_of(behaviour->memory);
     lay_out(behaviour, &arena);
     return true;
 }

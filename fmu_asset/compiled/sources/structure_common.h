@@ -21,12 +21,16 @@ typedef struct {
 /* Write the sentence and return false, so that a function can end with `return structure_fail(...)`. */
 bool structure_fail(structure_problem *problem, const char *format, ...);
 
-/* Doubles handed out from one block. With `base` NULL it only counts, so that laying out twice, first to count
-   and then for real, finds the size. */
+/* Doubles handed out from one block, by lines of the cache. With `base` NULL it only counts, so that laying out twice,
+   first to count and then for real, finds the size. */
 typedef struct {
     double *base;
     size_t used;
 } structure_arena;
+
+/* The arena in a block of memory that has room for one line more than is taken. */
+#define STRUCTURE_SPARE 8
+structure_arena structure_arena_of(double *memory);
 
 /* Return room for `count` doubles (NULL while counting). */
 double *structure_take(structure_arena *arena, size_t count);

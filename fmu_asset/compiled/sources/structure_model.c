@@ -4,6 +4,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "structure_linear_algebra.h"
+
 #define LARGEST_SIZE 4096.0
 
 /* Return the values of an array with the given shape, or NULL with the problem. */
@@ -41,10 +43,12 @@ static void transpose(double *result, const double *matrix, size_t rows, size_t 
 
 static void lay_out(structure_model *model, size_t anchors, structure_arena *arena) {
     const size_t n = model->static_size, outputs = model->output_count, r = model->residual_size;
-    model->stiffness_terms = structure_take(arena, model->terms * n * n);
+    model->stiffness_terms = structure_take(arena, model->terms * model->padded_size * model->stride);
     model->output_columns = structure_take(arena, n * outputs);
+    model->modal_output = structure_take(arena, model->modal_size * model->modal_outputs);
+    model->cross_mass = structure_take(arena, (model->masses + 1) * n * model->modal_size);
     model->load_residual = structure_take(arena, model->loads * r);
-    model->stiffness_residual = structure_take(arena, model->terms * n * r);
+    model->stiffness_residual = structure_take(arena, (model->terms - 1) * n * r);
     model->correction_columns = structure_take(arena, (model->functions ? model->functions : anchors) * r * outputs);
     model->dual_factor = structure_take(arena, anchors * outputs * model->dual_rows * model->dual_columns);
 }
@@ -164,23 +168,37 @@ static bool take_terms(structure_model *model, structure_problem *problem) {
     return true;
 }
 
-/* Find behind which place only zeros follow in each block of columns of the residuals, which were made triangular. */
-static bool find_ends(structure_model *model, structure_problem *problem) {
-    const size_t n = model->static_size, r = model->residual_size;
-    const size_t blocks = (n + STRUCTURE_BLOCK - 1) / STRUCTURE_BLOCK;
-    model->residual_ends = calloc((1 + model->terms - model->lasting) * blocks, sizeof *model->residual_ends);
-    if (model->residual_ends == NULL) {
+/* Return behind which of some numbers only zeros follow. */
+static size_t end_of(const double *values, size_t count) {
+    while (count > 0 && values[count - 1] == 0.0) {
+        --count;
+    }
+    return count;
+}
+
+static size_t larger(size_t first, size_t second) { return first > second ? first : second; }
+
+/* Find with which column each tile of the residuals begins, which were made triangular. */
+static bool find_begins(structure_model *model, structure_problem *problem) {
+    const size_t n = model->static_size, r = model->residual_size, tiles = (r + STRUCTURE_TILE - 1) / STRUCTURE_TILE;
+    model->residual_begins = calloc((model->terms - model->lasting) * tiles, sizeof *model->residual_begins);
+    if (model->residual_begins == NULL) {
         return structure_fail(problem, "there is no memory for the model");
     }
-    for (size_t i = 0; i < model->terms; ++i) {
-        const size_t part = i < model->lasting ? 0 : 1 + i - model->lasting; /* those that last are joined */
-        for (size_t column = 0; column < n; ++column) {
-            const double *values = model->stiffness_residual + (i * n + column) * r;
-            size_t *end = model->residual_ends + part * blocks + column / STRUCTURE_BLOCK, here = r;
-            while (here > *end && values[here - 1] == 0.0) {
-                --here;
+    model->health_residual = 0;
+    for (size_t k = 0; k < model->loads; ++k) {
+        model->health_residual = larger(model->health_residual, end_of(model->load_residual + k * r, r));
+    }
+    for (size_t i = model->lasting; i < model->terms; ++i) {
+        const double *columns = model->stiffness_residual + (i - 1) * n * r;
+        size_t *begin = model->residual_begins + (i - model->lasting) * tiles;
+        for (size_t tile = 0; tile < tiles; ++tile) {
+            while (begin[tile] < n && end_of(columns + begin[tile] * r, r) <= tile * STRUCTURE_TILE) {
+                ++begin[tile];
             }
-            *end = here;
+        }
+        for (size_t column = 0; column < n; ++column) {
+            model->health_residual = larger(model->health_residual, end_of(columns + column * r, r));
         }
     }
     return true;
@@ -189,7 +207,7 @@ static bool find_ends(structure_model *model, structure_problem *problem) {
 static bool take_arrays(structure_model *model, structure_problem *problem) {
     const structure_data *data = &model->data;
     const size_t n = extent(data, "static_load", 1), outputs = extent(data, "static_output", 0),
-                 r = extent(data, "residual_load", 0), nm = extent(data, "modal_load", 1),
+                 all = extent(data, "residual_load", 0), nm = extent(data, "modal_load", 1),
                  modal_outputs = extent(data, "modal_output", 0);
     model->terms = extent(data, "static_stiffness", 0);
     model->loads = extent(data, "static_load", 0);
@@ -202,9 +220,15 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
         anchors *= model->anchors[k];
     }
     model->static_size = n;
+    model->padded_size = structure_padded(n);
+    model->stride = model->padded_size + structure_padded(loads);
     model->modal_size = nm;
     model->output_count = outputs;
     model->modal_outputs = modal_outputs;
+    if (n > all) {
+        return structure_fail(problem, "the data file has residuals in fewer directions than the static basis");
+    }
+    const size_t r = all - n; /* along the basis a solution leaves nothing */
     model->residual_size = r;
     const size_t functions = extent(data, "dual_output", 1); /* arrays without values are not in the file */
     model->functions = functions;
@@ -223,7 +247,8 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
     }
     const double *static_stiffness = NULL, *static_output = NULL, *load_residual = NULL,
                  *stiffness_residual = NULL, *correction = NULL, *modes = NULL, *gauges = NULL,
-                 *residual_allowance = NULL, *rounding_allowance = NULL, *dual_residual = NULL;
+                 *residual_allowance = NULL, *rounding_allowance = NULL, *dual_residual = NULL, *modal_output = NULL,
+                 *cross_mass = NULL;
     const struct {
         const char *name;
         const double **values;
@@ -234,17 +259,17 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
         {"static_load", &model->static_load, 2, {loads, n}},
         {"static_output", &static_output, 2, {outputs, n}},
         {"bound_reference", &model->bound_reference, 1, {terms - 1}},
-        {"residual_load", &load_residual, 2, {r, loads}},
-        {"residual_stiffness", &stiffness_residual, 3, {r, terms, n}},
+        {"residual_load", &load_residual, 2, {all, loads}},
+        {"residual_stiffness", &stiffness_residual, 3, {all, terms - 1, n}},
         {"residual_allowance", &residual_allowance, 0, {0}},
         {"rounding_allowance", &rounding_allowance, 0, {0}},
-        {"dual_correction", &correction, 3, {functions ? functions : anchors, outputs, r}},
+        {"dual_correction", &correction, 3, {functions ? functions : anchors, outputs, all}},
         {"dual_residual", &dual_residual, 4, {anchors, outputs, model->dual_rows, model->dual_columns}},
         {"modal_stiffness", &model->modal_stiffness, 3, {terms, nm, nm}},
         {"modal_mass", &model->modal_mass, 3, {mass_terms, nm, nm}},
         {"modal_load", &model->modal_load, 2, {loads, nm}},
-        {"modal_output", &model->modal_output, 2, {modal_outputs, nm}},
-        {"cross_mass", &model->cross_mass, 3, {mass_terms, nm, n}},
+        {"modal_output", &modal_output, 2, {modal_outputs, nm}},
+        {"cross_mass", &cross_mass, 3, {mass_terms, nm, n}},
         {"mode_count", &modes, 0, {0}},
         {"gauge_count", &gauges, 0, {0}},
     };
@@ -269,23 +294,41 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
 
     structure_arena count = {NULL, 0};
     lay_out(model, anchors, &count);
-    model->memory = calloc(count.used, sizeof *model->memory);
+    model->memory = calloc(count.used + STRUCTURE_SPARE, sizeof *model->memory);
     if (model->memory == NULL) {
         return structure_fail(problem, "there is no memory for the model");
     }
-    structure_arena arena = {model->memory, 0};
+    structure_arena arena = structure_arena_of(model->memory);
     lay_out(model, anchors, &arena);
     transpose(model->output_columns, static_output, outputs, n, n, 1.0);
-    transpose(model->load_residual, load_residual, r, loads, loads, 1.0);
+    transpose(model->modal_output, modal_output, modal_outputs, nm, nm, 1.0);
+    for (size_t i = 0; i < mass_terms; ++i) {
+        transpose(model->cross_mass + i * nm * n, cross_mass + i * nm * n, nm, n, n, 1.0);
+    }
+    transpose(model->load_residual, load_residual + n * loads, r, loads, loads, 1.0);
     for (size_t i = 0; i < terms; ++i) {
         const size_t t = model->order[i];
-        memcpy(model->stiffness_terms + i * n * n, static_stiffness + t * n * n, n * n * sizeof *static_stiffness);
-        /* The residual is the load minus the stiffness times the coordinates. */
-        transpose(model->stiffness_residual + i * n * r, stiffness_residual + t * n, r, n, terms * n, -1.0);
+        double *term = model->stiffness_terms + i * model->padded_size * model->stride;
+        for (size_t row = 0; row < model->padded_size; ++row, term += model->stride) {
+            if (row < n) {
+                memcpy(term, static_stiffness + (t * n + row) * n, n * sizeof *term);
+            } else if (i == 0) {
+                term[row] = 1.0;
+            }
+            for (size_t k = 0; k < loads && i == 0 && row < n; ++k) {
+                term[model->padded_size + k] = model->static_load[k * n + row];
+            }
+        }
+        if (i > 0) { /* The residual is the load minus the changes of the stiffness times the coordinates. */
+            transpose(model->stiffness_residual + (i - 1) * n * r, stiffness_residual + (n * (terms - 1) + t) * n, r, n,
+                      (terms - 1) * n, -1.0);
+        }
     }
-    memcpy(model->correction_columns, correction, functions * outputs * r * sizeof *correction);
+    for (size_t i = 0; i < functions * outputs; ++i) {
+        memcpy(model->correction_columns + i * r, correction + i * all + n, r * sizeof *correction);
+    }
     for (size_t a = 0; a < anchors && functions == 0; ++a) {
-        transpose(model->correction_columns + a * outputs * r, correction + a * outputs * r, outputs, r, r, 1.0);
+        transpose(model->correction_columns + a * outputs * r, correction + a * outputs * all + n, outputs, r, all, 1.0);
     }
     for (size_t a = 0; a < anchors; ++a) {
         const size_t values = outputs * model->dual_rows * model->dual_columns;
@@ -298,7 +341,7 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
             }
         }
     }
-    return find_ends(model, problem);
+    return find_begins(model, problem);
 }
 
 static double value_at(const double *chosen, size_t place) { return place == 0 ? 1.0 : chosen[place - 1]; }
@@ -354,7 +397,7 @@ void structure_model_free(structure_model *model) {
     structure_data_free(&model->data);
     free(model->memory);
     free(model->places);
-    free(model->residual_ends);
+    free(model->residual_begins);
     free(model->factors);
     memset(model, 0, sizeof *model);
 }

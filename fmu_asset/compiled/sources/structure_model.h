@@ -14,7 +14,7 @@
 #endif
 
 #define STRUCTURE_MOST_REGIONS 8
-#define STRUCTURE_BLOCK 4 /* columns of residuals that are added at once */
+#define STRUCTURE_TILE 16 /* directions of residuals that are found at once */
 
 /* Two positions in the vector of what can be chosen, counted from one; zero for none. */
 typedef struct {
@@ -29,7 +29,8 @@ typedef struct {
     size_t gauges;        /* G, strains, the first outputs */
     size_t output_count;  /* O: strains, then displacements */
     size_t modal_outputs; /* O and the accelerations */
-    size_t residual_size; /* R, basis of the residuals */
+    size_t residual_size; /* R, basis of the residuals, without its part along the static basis */
+    size_t health_residual; /* the first of them, in which residuals are where only losses differ from the reference */
     size_t terms;         /* T, terms of the stiffness, of which the last is times one */
     size_t loads;         /* L */
     size_t masses;        /* P, masses that can be chosen; the terms of the mass are one more */
@@ -54,16 +55,17 @@ typedef struct {
     const double *modal_stiffness;  /* (T, Nm, Nm) */
     const double *modal_mass;       /* (1 + P, Nm, Nm) */
     const double *modal_load;       /* (L, Nm) */
-    const double *modal_output;     /* (modal_outputs, Nm) */
-    const double *cross_mass;       /* (1 + P, Nm, N) */
     double residual_allowance;
     double rounding_allowance;
     /* laid out anew: columns one after another */
-    double *stiffness_terms;    /* (T, N, N) in the order of `order` */
+    size_t padded_size, stride; /* of the static basis, and with the loads behind it */
+    double *stiffness_terms;    /* (T, padded size, stride) in the order of `order`; the first with the loads */
     double *output_columns;     /* (N, O) */
+    double *modal_output;       /* (Nm, modal_outputs) */
+    double *cross_mass;         /* (1 + P, N, Nm) */
     double *load_residual;      /* (L, R) */
-    double *stiffness_residual; /* (T, N, R) in the order of `order` */
-    size_t *residual_ends;      /* (1 + damaged terms, blocks of columns) behind which only zeros follow */
+    double *stiffness_residual; /* (T - 1, N, R) in the order of `order`, without the first of it */
+    size_t *residual_begins;    /* (damaged terms, tiles of R) columns before which a tile has only zeros */
     double *correction_columns; /* (A, R, O) or, as they are in the file, (M, O, R) */
     double *dual_factor;        /* (A, dual columns, dual rows, O) */
     structure_data data;        /* owns the arrays */

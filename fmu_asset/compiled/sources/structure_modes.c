@@ -24,6 +24,7 @@ void structure_modes_lay_out(structure_modes *modes, const structure_model *mode
     modes->mass = structure_take(arena, size * size);
     modes->cross_mass = structure_take(arena, size * model->static_size);
     modes->basis = structure_take(arena, size * size);
+    modes->factor = structure_take(arena, structure_padded(size) * structure_padded(size));
     modes->stiffness = structure_take(arena, (1 + damaged_terms(model)) * size * size);
     modes->present = structure_take(arena, size * size);
     modes->images = structure_take(arena, 2 * count * size);
@@ -58,26 +59,28 @@ static void project(double *result, const structure_modes *modes, const double *
 static bool make_basis(structure_modes *modes, const double *chosen, structure_problem *problem) {
     const structure_model *model = modes->model;
     const size_t size = model->modal_size, n = model->static_size, square = size * size;
-    double *factor = modes->stiffness;
+    const size_t stride = structure_padded(size);
+    double *factor = modes->factor;
     memcpy(modes->basis_key, chosen, model->key * sizeof *chosen);
     memset(modes->basis_key + model->parameters, 0, model->regions * sizeof *chosen);
     structure_stiffness_coefficients(model, modes->basis_key, modes->theta);
     structure_mass_coefficients(model, chosen, modes->mass_theta);
-    structure_sum_terms(factor, size, model->modal_stiffness, model->terms, modes->theta);
+    structure_sum_terms(modes->matrix, size, model->modal_stiffness, model->terms, modes->theta);
+    structure_pad(factor, modes->matrix, size);
     structure_sum_terms(modes->mass, size, model->modal_mass, model->masses + 1, modes->mass_theta);
     memset(modes->cross_mass, 0, size * n * sizeof *modes->cross_mass);
     structure_add_columns(modes->cross_mass, size * n, model->cross_mass, size * n, model->masses + 1,
                           modes->mass_theta);
-    if (!structure_cholesky(factor, size)) {
+    if (!structure_cholesky(factor, size, stride, factor, NULL, 0, NULL)) {
         return structure_fail(problem, "the modal stiffness under these parameters is not positive definite");
     }
     /* M x = K x / omega^2 with K = U' U: the eigenvalues of U'^-1 M U^-1 are 1 / omega^2. The stiffness is well
        conditioned in this basis, the mass is not, and the low modes are the largest eigenvalues, which keep all
        their digits. */
     memcpy(modes->matrix, modes->mass, square * sizeof *modes->matrix);
-    structure_solve_lower_columns(factor, size, modes->matrix);
+    structure_solve_lower_columns(factor, size, stride, modes->matrix);
     transpose_square(modes->matrix, size);
-    structure_solve_lower_columns(factor, size, modes->matrix);
+    structure_solve_lower_columns(factor, size, stride, modes->matrix);
     if (!structure_symmetric_eigen(modes->matrix, size, size, modes->values, modes->basis, modes->work)) {
         return structure_fail(problem, "the modes under these parameters and masses were not found");
     }
@@ -87,7 +90,7 @@ static bool make_basis(structure_modes *modes, const double *chosen, structure_p
     for (size_t i = 0; i < size; ++i) {
         double *shape = modes->basis + i * size;
         const double scale = 1.0 / sqrt(modes->values[i]);
-        structure_solve_upper(factor, size, shape);
+        structure_solve_upper(factor, size, stride, shape);
         for (size_t j = 0; j < size; ++j) {
             shape[j] *= scale;
         }
@@ -172,8 +175,7 @@ bool structure_modes_find(structure_modes *modes, const double *chosen, structur
     }
     memcpy(modes->present, modes->stiffness, square * sizeof *modes->present);
     structure_add_columns(modes->present, square, modes->stiffness + square, square, damaged, losses);
-    memcpy(modes->matrix, modes->present, square * sizeof *modes->matrix);
-    if (!structure_symmetric_eigen(modes->matrix, size, model->mode_count, modes->values, modes->vectors,
+    if (!structure_symmetric_eigen(modes->present, size, model->mode_count, modes->values, modes->vectors,
                                    modes->work)) {
         return structure_fail(problem, "the modes under these parameters and losses were not found");
     }
@@ -187,12 +189,16 @@ bool structure_modes_find(structure_modes *modes, const double *chosen, structur
         double *shape = modes->shape + mode * size, *output = modes->output + mode * outputs;
         memset(shape, 0, size * sizeof *shape);
         structure_add_columns(shape, size, modes->basis, size, size, modes->vectors + mode * size);
-        if (structure_dot(model->modal_output + (outputs - 1) * size, shape, size) < 0.0) {
+        memset(output, 0, outputs * sizeof *output);
+        structure_add_columns(output, outputs, model->modal_output, outputs, size, shape);
+        if (output[outputs - 1] < 0.0) {
             for (size_t i = 0; i < size; ++i) {
                 shape[i] = -shape[i];
             }
+            for (size_t i = 0; i < outputs; ++i) {
+                output[i] = -output[i];
+            }
         }
-        structure_multiply(output, model->modal_output, outputs, size, shape);
         structure_multiply(modes->participation + mode * loads, model->modal_load, loads, size, shape);
     }
     memcpy(modes->key, chosen, model->key * sizeof *chosen);
@@ -231,10 +237,11 @@ double structure_modes_square_derivative(const structure_modes *modes, size_t mo
 void structure_modes_project(const structure_modes *modes, const double *modal, const double *static_part, double *result,
                         double *work) {
     const structure_model *model = modes->model;
-    const size_t size = model->modal_size, n = model->static_size;
-    structure_multiply(work, modes->mass, size, size, modal);
-    for (size_t i = 0; i < size; ++i) {
-        work[i] += structure_dot(modes->cross_mass + i * n, static_part, n);
+    const size_t size = model->modal_size;
+    memset(work, 0, size * sizeof *work);
+    structure_add_columns(work, size, modes->mass, size, size, modal); /* symmetric */
+    if (static_part != NULL) {
+        structure_add_columns(work, size, modes->cross_mass, size, model->static_size, static_part);
     }
     structure_multiply(result, modes->shape, model->mode_count, size, work);
 }

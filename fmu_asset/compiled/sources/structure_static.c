@@ -7,6 +7,8 @@
 
 static size_t larger(size_t first, size_t second) { return first > second ? first : second; }
 
+static size_t smaller_size(size_t first, size_t second) { return first < second ? first : second; }
+
 static double smaller(double first, double second) { return first < second ? first : second; }
 
 void structure_static_lay_out(structure_static *steady, const structure_model *model, structure_arena *arena) {
@@ -16,16 +18,18 @@ void structure_static_lay_out(structure_static *steady, const structure_model *m
     steady->health = structure_take(arena, model->health);
     steady->theta = structure_take(arena, model->terms);
     steady->theta_damaged = structure_take(arena, damaged);
+    steady->theta_change = structure_take(arena, model->terms - 1);
     steady->lasting_parameters = structure_take(arena, model->parameters);
-    steady->lasting_stiffness = structure_take(arena, n * n);
+    steady->lasting_stiffness = structure_take(arena, model->padded_size * model->stride);
     steady->lasting_residual = structure_take(arena, n * r);
-    steady->factor = structure_take(arena, n * n);
+    steady->factor = structure_take(arena, model->padded_size * model->stride);
     steady->dual_norm = structure_take(arena, outputs);
     const size_t functions = model->functions;
     steady->dual_weights = structure_take(arena, outputs * functions);
     steady->dual_correction = structure_take(arena, functions ? r * outputs : 0);
-    steady->dual_work = structure_take(arena, functions * functions + model->dual_rows * outputs +
-                                                  larger(model->dual_columns, outputs));
+    const size_t padded = structure_padded(functions);
+    steady->dual_work = structure_take(arena, functions * functions + larger(padded * padded, model->dual_rows * outputs +
+                                                  larger(model->dual_columns, outputs)));
     /* Flags in the room of doubles, of which every byte is zero at first. */
     steady->solved = (bool *)(void *)structure_take(arena, model->loads);
     steady->bounded = (bool *)(void *)structure_take(arena, model->loads);
@@ -39,13 +43,24 @@ void structure_static_lay_out(structure_static *steady, const structure_model *m
     steady->work = structure_take(arena, larger((damaged + 1) * larger(n, larger(r, outputs)), model->terms));
 }
 
-/* sum = what losses do not change, of the terms of an array (T, size) in the order of the model */
-static void join_lasting(double *sum, const structure_static *steady, const double *terms, size_t size) {
+/* Join what losses do not change. */
+static void join_lasting(structure_static *steady, const double *chosen) {
     const structure_model *model = steady->model;
-    memcpy(sum, terms, size * sizeof *sum);
+    const size_t square = model->padded_size * model->stride, columns = model->static_size * model->residual_size;
+    memcpy(steady->lasting_stiffness, model->stiffness_terms, square * sizeof *chosen);
+    memset(steady->lasting_residual, 0, columns * sizeof *chosen);
+    steady->residual_size = model->health_residual;
     for (size_t i = 1; i < model->lasting; ++i) {
-        structure_add(sum, size, steady->theta[model->order[i]], terms + i * size);
+        structure_add(steady->lasting_stiffness, square, steady->theta[model->order[i]],
+                      model->stiffness_terms + i * square);
+        structure_add(steady->lasting_residual, columns, steady->theta_change[i - 1],
+                      model->stiffness_residual + (i - 1) * columns);
+        if (steady->theta_change[i - 1] != 0.0) {
+            steady->residual_size = model->residual_size;
+        }
     }
+    memcpy(steady->lasting_parameters, chosen, model->parameters * sizeof *chosen);
+    steady->lasting_known = true;
 }
 
 bool structure_static_prepare(structure_static *steady, const double *chosen, structure_problem *problem) {
@@ -59,20 +74,20 @@ bool structure_static_prepare(structure_static *steady, const double *chosen, st
     steady->dual_known = false;
     memset(steady->solved, 0, model->loads * sizeof *steady->solved);
     memset(steady->bounded, 0, model->loads * sizeof *steady->bounded);
-    const size_t n = model->static_size, lasting = model->lasting, damaged = model->terms - lasting;
+    const size_t lasting = model->lasting, damaged = model->terms - lasting;
+    for (size_t i = 1; i < model->terms; ++i) {
+        const size_t t = model->order[i];
+        steady->theta_change[i - 1] = steady->theta[t] - model->bound_reference[t];
+        if (i >= lasting) {
+            steady->theta_damaged[i - lasting] = steady->theta[t];
+        }
+    }
     if (!steady->lasting_known || memcmp(steady->lasting_parameters, chosen, parameters) != 0) {
-        join_lasting(steady->lasting_stiffness, steady, model->stiffness_terms, n * n);
-        join_lasting(steady->lasting_residual, steady, model->stiffness_residual, n * model->residual_size);
-        memcpy(steady->lasting_parameters, chosen, parameters);
-        steady->lasting_known = true;
+        join_lasting(steady, chosen);
     }
-    for (size_t i = 0; i < damaged; ++i) {
-        steady->theta_damaged[i] = steady->theta[model->order[lasting + i]];
-    }
-    memcpy(steady->factor, steady->lasting_stiffness, n * n * sizeof *steady->factor);
-    structure_add_columns(steady->factor, n * n, model->stiffness_terms + lasting * n * n, n * n, damaged,
-                          steady->theta_damaged);
-    steady->factorised = structure_cholesky(steady->factor, n);
+    steady->factorised = structure_cholesky(
+        steady->factor, model->static_size, model->stride, steady->lasting_stiffness,
+        model->stiffness_terms + lasting * model->padded_size * model->stride, damaged, steady->theta_damaged);
     return steady->factorised ||
            structure_fail(problem, "the stiffness under these parameters and losses is not positive definite");
 }
@@ -84,9 +99,10 @@ void structure_static_solve(structure_static *steady, size_t load) {
     }
     const size_t n = model->static_size, outputs = model->output_count;
     double *coordinates = steady->coordinates + load * n, *output = steady->output + load * outputs;
-    memcpy(coordinates, model->static_load + load * n, n * sizeof *coordinates);
-    structure_solve_lower(steady->factor, n, coordinates);
-    structure_solve_upper(steady->factor, n, coordinates);
+    for (size_t i = 0; i < n; ++i) {
+        coordinates[i] = steady->factor[i * model->stride + model->padded_size + load];
+    }
+    structure_solve_upper(steady->factor, n, model->stride, coordinates);
     memset(output, 0, outputs * sizeof *output);
     structure_add_columns(output, outputs, model->output_columns, outputs, n, coordinates);
     steady->solved[load] = true;
@@ -145,11 +161,12 @@ void structure_static_derivative(structure_static *steady, const double *chosen,
         const double factor = structure_stiffness_derivative(model, model->order[i], chosen, which);
         for (size_t row = 0; row < n && factor != 0.0; ++row) {
             change[row] -=
-                factor * structure_dot(model->stiffness_terms + (i * n + row) * n, steady->whole_coordinates, n);
+                factor * structure_dot(model->stiffness_terms + (i * model->padded_size + row) * model->stride,
+                                       steady->whole_coordinates, n);
         }
     }
-    structure_solve_lower(steady->factor, n, change);
-    structure_solve_upper(steady->factor, n, change);
+    structure_solve_lower(steady->factor, n, model->stride, change);
+    structure_solve_upper(steady->factor, n, model->stride, change);
     memset(output, 0, outputs * sizeof *output);
     structure_add_columns(output, outputs, model->output_columns, outputs, n, change);
     *load_point = structure_dot(model->static_load + point * n, change, n);
@@ -177,15 +194,17 @@ static size_t anchor_of(const structure_static *steady) {
 static void combine_duals(structure_static *steady) {
     const structure_model *model = steady->model;
     const size_t outputs = model->output_count, r = model->residual_size, m = model->functions;
-    double *stiffness = steady->dual_work;
+    const size_t stride = structure_padded(m);
+    double *stiffness = steady->dual_work, *factor = stiffness + m * m;
     memset(steady->dual_correction, 0, r * outputs * sizeof *steady->dual_correction);
     for (size_t o = 0; o < outputs; ++o) {
         double *weights = steady->dual_weights + o * m;
         structure_sum_terms(stiffness, m, model->dual_stiffness + o * model->terms * m * m, model->terms, steady->theta);
-        (void)structure_cholesky(stiffness, m); /* positive definite where the stiffness is */
+        structure_pad(factor, stiffness, m);
+        (void)structure_cholesky(factor, m, stride, factor, NULL, 0, NULL); /* positive definite where the stiffness is */
         memcpy(weights, model->dual_output + o * m, m * sizeof *weights);
-        structure_solve_lower(stiffness, m, weights);
-        structure_solve_upper(stiffness, m, weights);
+        structure_solve_lower(factor, m, stride, weights);
+        structure_solve_upper(factor, m, stride, weights);
         for (size_t j = 0; j < m; ++j) {
             const double *function = model->correction_columns + (j * outputs + o) * r;
             for (size_t i = 0; i < r; ++i) {
@@ -195,34 +214,33 @@ static void combine_duals(structure_static *steady) {
     }
 }
 
-/* residual += columns (N, R) times coefficients (N), up to the end of each block of them */
-static void add_blocks(double *residual, const structure_model *model, const double *columns, const size_t *ends,
-                       const double *coefficients) {
-    const size_t n = model->static_size, r = model->residual_size;
-    for (size_t c = 0; c < n; c += STRUCTURE_BLOCK) {
-        const size_t count = n - c < STRUCTURE_BLOCK ? n - c : STRUCTURE_BLOCK;
-        structure_add_columns(residual, ends[c / STRUCTURE_BLOCK], columns + c * r, r, count, coefficients + c);
-    }
-}
-
 /* Make a residual of that of the loads, which it holds, and find its product with the approximate dual solutions. */
 static void take_residual(structure_static *steady, const double *coordinates, double *residual, double *correction) {
     const structure_model *model = steady->model;
     const size_t n = model->static_size, r = model->residual_size, outputs = model->output_count;
-    const size_t lasting = model->lasting, damaged = model->terms - lasting;
-    const size_t blocks = (n + STRUCTURE_BLOCK - 1) / STRUCTURE_BLOCK;
-    add_blocks(residual, model, steady->lasting_residual, model->residual_ends, coordinates);
+    const size_t lasting = model->lasting, damaged = model->terms - lasting, rows = steady->residual_size;
+    const size_t tiles = (r + STRUCTURE_TILE - 1) / STRUCTURE_TILE;
     for (size_t k = 0; k < damaged; ++k) {
         for (size_t i = 0; i < n; ++i) {
-            steady->work[i] = steady->theta_damaged[k] * coordinates[i];
+            steady->work[k * n + i] = steady->theta_change[lasting - 1 + k] * coordinates[i];
         }
-        add_blocks(residual, model, model->stiffness_residual + (lasting + k) * n * r,
-                   model->residual_ends + (1 + k) * blocks, steady->work);
+    }
+    for (size_t i = 0, tile = 0; i < rows; i += STRUCTURE_TILE, ++tile) {
+        const size_t size = smaller_size(rows - i, STRUCTURE_TILE);
+        for (size_t k = 0; k < damaged; ++k) {
+            const size_t begin = model->residual_begins[k * tiles + tile];
+            structure_add_columns(residual + i, size,
+                                  model->stiffness_residual + ((lasting - 1 + k) * n + begin) * r + i, r, n - begin,
+                                  steady->work + k * n + begin);
+        }
+        if (rows > model->health_residual) {
+            structure_add_columns(residual + i, size, steady->lasting_residual + i, r, n, coordinates);
+        }
     }
     memset(correction, 0, outputs * sizeof *correction);
     const double *columns =
         model->functions ? steady->dual_correction : model->correction_columns + anchor_of(steady) * r * outputs;
-    structure_add_columns(correction, outputs, columns, outputs, r, residual);
+    structure_add_columns(correction, outputs, columns, outputs, rows, residual);
 }
 
 /* The same of one unit response, which is kept. */
@@ -315,7 +333,7 @@ structure_bounds structure_static_error_bounds(structure_static *steady, const d
         superpose(correction, outputs, model, load, steady->correction);
     }
     /* |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha */
-    double remainder = structure_norm(residual, r);
+    double remainder = structure_norm(residual, steady->residual_size);
     remainder += model->residual_allowance * structure_norm(steady->whole_coordinates, n);
     double coercivity = 1.0;
     for (size_t k = 0; k + 1 < model->terms; ++k) {

@@ -19,11 +19,13 @@ typedef struct {
     double *health;                   /* parameters and losses of the factor */
     double *theta;                    /* (T) coefficients of the stiffness terms */
     double *theta_damaged;            /* those that losses change, in the order of the model */
+    double *theta_change;             /* (T - 1) of all but the last from the reference, in the order of the model */
     /* What losses do not change, since parameters hardly ever change. */
     bool lasting_known;
     double *lasting_parameters;       /* of these sums */
     double *lasting_stiffness;        /* (N, N) */
     double *lasting_residual;         /* (N, R) */
+    size_t residual_size;             /* how many directions of residuals may not be zero */
     double *factor;                   /* (N, N) */
     double *dual_norm;                /* (O) */
     /* Where dual functions are combined: their coefficients in the solutions, and the solutions. */

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier
-from discrepancy.fits.candidate import PARAMETER_STEP, Base, Candidate, Term
+from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Term
 from discrepancy.fits.problem import Problem
 
 FloatArray = NDArray[np.float64]
@@ -120,9 +120,7 @@ def test_chord_steps_are_exact_at_the_base_and_second_order_away(kit, bench, cat
             local=(*none.point.local[:number], none.point.local[number] + size * away[1]),
             effect=np.array([0.3]),
         )
-        chord = problem.linearise(
-            number, point, candidate, Base(none.point, none.linearisations), derivatives=False
-        ).response
+        chord = problem.linearise(number, point, candidate, none, derivatives=False).response
         exact = problem.linearise(number, point, candidate, derivatives=False).response
         errors.append(float(np.abs((chord - exact) / problem.trials[number].deviation).max()))
     assert errors[0] < 1e-9

@@ -11,39 +11,11 @@ from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model, prior_left, unobservable
 from discrepancy.models.lumped import LumpedModel
 from tests.discrepancy.rigs import model_of
+from tests.refusals import Inputs
 
-MODEL = """
-format = 1
-name = "Cart"
-mass = 2.0
-free = true
-damping = { matrix = 0.5 }
-input = [{ name = "motor", vector = 1.0 }]
-output = [{ name = "cart", vector = 1.0 }]
-parameter = [
-  { name = "mass_factor", terms = "mass", deviation = 0.2, low = 0.2, high = 5.0 },
-  { name = "damping_factor", terms = "damping", deviation = 0.01, low = 0.2, high = 5.0 },
-]
-"""
-TOML = """
-format = 1
-name = "Cart"
-[[channel]]
-name = "x"
-quantity = "displacement"
-unit = "mm"
-output = "cart"
-noise = { standard_deviation = 0.5 }
-[[input]]
-name = "motor"
-quantity = "force"
-unit = "N"
-[[trial]]
-name = "push"
-kind = "driven"
-file = "push.csv"
-begins = "still"
-"""
+INPUTS = Inputs(__file__)
+MODEL = INPUTS.text("cart.toml")
+TOML = INPUTS.text("cart_campaign.toml")
 
 
 @pytest.fixture

@@ -7,16 +7,17 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 from math import inf, nan
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import TypeAdapter
 
 from discrepancy.campaign.records import NoiseRecord
-from discrepancy.document_types import PRIMITIVE_UNITS
+from discrepancy.document import PRIMITIVE_UNITS, Origin, shipped_schema
 from discrepancy.errors import VerdictFileError
-from discrepancy.files.document import Origin, json_schema, shipped_schema
 from discrepancy.files.residuals import read_residuals, write_residuals
 from discrepancy.files.verdict import (
     PATCH_SCHEMA,
@@ -179,6 +180,29 @@ def test_every_real_parameter_of_every_primitive_has_a_unit() -> None:
             name for name, own in primitive.values().items() if own is float
         }
     assert set(PRIMITIVE_UNITS) == set(PRIMITIVES)
+
+
+def json_schema(record: type, schema: str) -> str:
+    """Return the JSON Schema (draft 2020-12) of a document as it is shipped: every key is always there."""
+    found = TypeAdapter(record).json_schema()
+    definitions: dict[str, Any] = found["$defs"]
+    own = {name: table for name, table in found["properties"].items() if name != "origin"}
+    of_origin = definitions.pop("Origin")["properties"]
+    properties = {"schema": {"const": schema, "type": "string"}, **of_origin, **own}
+    for table in definitions.values():
+        table["description"] = table.get("description", "").split("\n")[0]
+        if "properties" in table:
+            table |= {"required": list(table["properties"]), "additionalProperties": False}
+    content = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": schema,
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+        "additionalProperties": False,
+        "$defs": definitions,
+    }
+    return json.dumps(content, indent=1, ensure_ascii=False)
 
 
 @pytest.mark.parametrize(

@@ -33,59 +33,15 @@ from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
 from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness
 from tests.discrepancy.rigs import fmu_rig
+from tests.refusals import Inputs
 
 FloatArray = NDArray[np.float64]
 
 CART, CART_IN_AIR, SHAKEN, SERVO, STORES = 0, 5, 8, 12, 14
 """Campaigns of seed 1: friction on a rail, drag, one on a support, a cubic spring in a loop, an outflow."""
-DRIVE = """format = 1
-name = "positioning drive"
-mass = 95.0
-free = true
-damping = { matrix = 200.0 }
-[[input]]
-name = "force"
-vector = 1.0
-quantity = "force"
-[[output]]
-name = "position"
-vector = 1.0
-[[port]]
-name = "carriage"
-vector = 1.0
-[[parameter]]
-name = "mass"
-terms = "mass"
-deviation = 0.1
-low = 0.3
-high = 3.0
-[[parameter]]
-name = "viscous friction"
-terms = "damping"
-deviation = 0.2
-low = 0.3
-high = 3.0
-"""
-DRIVEN = """format = 1
-name = "drive"
-[[channel]]
-name = "position"
-quantity = "displacement"
-unit = "m"
-output = "position"
-noise = { standard_deviation = 2e-6 }
-[[input]]
-name = "force"
-quantity = "force"
-unit = "N"
-hold = "zero_order"
-offset_deviation = 5.0
-[[trial]]
-name = "there and back"
-kind = "driven"
-file = "run.csv"
-begins = "still"
-"""
+INPUTS = Inputs(__file__)
+DRIVE = INPUTS.text("drive.toml")
+DRIVEN = INPUTS.text("driven.toml")
 
 
 def share_of(missing: MissingForce) -> float:
@@ -161,8 +117,7 @@ def test_the_law_of_the_missing_force_is_ahead_of_all_others(
 ) -> None:
     problem = problem_of(tmp_path, number)
     search = ForceSearch(problem)
-    at = search.locate()
-    assert max(at, key=lambda name: at[name].evidence) == port
+    assert max(search.at, key=lambda name: search.at[name].evidence) == port
     ranked = [item for item in search.name(available(problem)) if len(item.candidate.terms) == 1]
     (term,) = ranked[0].candidate.terms
     assert (term.effect.identifier, term.place) == (effect, port)
@@ -248,7 +203,7 @@ def assert_alike(campaign: Campaign, one: Model, other: Model, share: float) -> 
     """Two models that are the same miss the same force with the same evidence."""
     scales = one.scales(campaign)
     first, second = (
-        next(iter(ForceSearch(Problem(campaign, item, Setting(campaign, item, scales))).locate().values()))
+        next(iter(ForceSearch(Problem(campaign, item, Setting(campaign, item, scales))).at.values()))
         for item in (one, other)
     )
     assert second.evidence == pytest.approx(first.evidence, abs=0.5)
@@ -297,7 +252,6 @@ def test_a_patch_and_the_same_in_the_file_of_a_model_miss_the_same_force() -> No
 def seen_force(problem: Problem, effect: Effect | None = None, place: str = "") -> MissingForce | None:
     """Return the missing force of a problem, an effect drawn through it if one is given."""
     search = ForceSearch(problem)
-    search.locate()
     found = None
     if effect is not None:
         term = Term(effect, place)
@@ -341,7 +295,6 @@ def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path: 
     write_drive(tmp_path)
     problem = read(tmp_path)
     search = ForceSearch(problem)
-    search.locate()
     found = [search.followed(search.whole, Candidate((term,)), start)
              for _, term, start in search.screened(search.whole, available(problem))[:12]]  # fmt: skip
     best, *_ = sorted((item for item in found if item is not None), key=lambda item: -item.evidence)
@@ -383,7 +336,7 @@ def test_the_missing_force_does_not_depend_on_where_it_is_linear_about() -> None
     problem = chain("ringdown", "coulomb_friction", "joint", friction_ratio=0.004)
     candidate = Candidate((Term(FRICTION, "joint"),))
     there = fit(problem, candidate, problem.start(candidate)).point
-    one, other = (ForceSearch(problem).locate(about)["joint"] for about in (None, there))
+    one, other = (ForceSearch(problem, about).at["joint"] for about in (None, there))
     assert one.evidence == pytest.approx(other.evidence, abs=40.0)  # of 15,000 readings
 
 

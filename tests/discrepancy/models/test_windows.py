@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from math import atan2, cos, hypot, pi, sin
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from discrepancy.campaign.records import Channel, Quantity, Release, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
@@ -19,7 +17,7 @@ from discrepancy.models.sensing import observe
 from fe.runtime import patch
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import BoucWen, ChannelOffset, Line, PortLoad, PowerDamping, Primitive, Window
-from tests.discrepancy.asking import FloatArray, campaign, seen
+from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
 from tests.discrepancy.asking import trial as asked
 from tests.discrepancy.rigs import one_mass
 
@@ -67,18 +65,13 @@ def rubbed(begin: float, force: float) -> FloatArray:
 
 def pushed(law: Callable[[float, float, float], float], edges: tuple[float, float]) -> FloatArray:
     """Return the motion under the force with `law(t, x, v)` between two edges, piece by piece."""
-    state, found = np.zeros(2), np.zeros(len(TIME))
-    for number, (begin, end) in enumerate(pairwise((0.0, *edges, float(TIME[-1])))):
+    time = np.union1d(TIME, edges)
 
-        def slope(t: float, y: FloatArray, on: bool = number == 1) -> list[float]:
-            own = law(t, *y) if on else 0.0
-            return [y[1], (np.interp(t, TIME, FORCE) - STIFFNESS * y[0] - own) / MASS]
+    def slope(t: float, y: FloatArray, k: int) -> list[float]:
+        own = law(t, *y) if edges[0] <= time[k] < edges[1] else 0.0
+        return [y[1], (np.interp(t, TIME, FORCE) - STIFFNESS * y[0] - own) / MASS]
 
-        limits = {"rtol": 1e-9, "atol": 1e-12, "dense_output": True, "max_step": 0.02}
-        solution = solve_ivp(slope, (begin, end), state, **limits)
-        inside = (begin <= TIME) & (end >= TIME)
-        found[inside], state = solution.sol(TIME[inside])[0], solution.y[:, -1]
-    return found
+    return integrated(slope, time, np.zeros(2), parts=True, rtol=1e-9)[np.isin(time, TIME), 0]
 
 
 @pytest.mark.parametrize("begin", [1.2345, 2.0, 3.33])

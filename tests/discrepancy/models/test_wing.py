@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.linalg import eigh
-from scipy.optimize import brentq
 
 from calibration.result.file import save_calibration
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
@@ -115,15 +114,6 @@ def test_each_row_has_its_own_health_and_temperature(wing: Wing) -> None:
         assert values[row] == pytest.approx(wing.rows() @ u, rel=1e-9)
 
 
-def test_a_cubic_spring_at_the_tip_solves_its_scalar_equation(wing: Wing) -> None:
-    u = wing.static(wing.tip)
-    compliance, values = float(wing.tip @ u), wing.seen(STATIC, PowerStiffness("tip", 5.0, 3.0, 0, 0.02))
-    for level, force in enumerate(STATIC.force):
-        x = brentq(lambda x, f=force: x - compliance * (f - 5.0 * (x / 0.02) ** 3), -1.0, 1.0, xtol=1e-14)
-        acting = force - 5.0 * (x / 0.02) ** 3
-        assert values[level] == pytest.approx(acting * (wing.rows() @ u), rel=1e-7, abs=1e-12)
-
-
 def test_a_cubic_spring_over_the_planform_solves_the_equations_of_all_unknowns(wing: Wing) -> None:
     stiffness, *_ = wing.matrices()
     rows, share = np.stack([wing.wing.port_rows[port] for port in STATION_PORTS]), wing.wing.planform.share
@@ -218,21 +208,6 @@ def test_a_harmonic_force_reaches_the_frequency_response(wing: Wing) -> None:
     amplitude = wing.rows() @ np.linalg.solve(dynamic, 3.0 * wing.tip)
     wanted = (amplitude[:, None] * np.exp(1j * omega * time[-1000:])).imag.T
     assert np.abs((values - wanted) / np.abs(amplitude)).max() < 2e-3
-
-
-def test_a_small_mass_lowers_the_frequency_as_rayleigh_says(wing: Wing) -> None:
-    stiffness, mass, _ = wing.matrices()
-    # M x = x / omega^2 in the norm of K, which is well conditioned in this basis where M is not
-    last = [len(mass) - 1] * 2
-    inverse, shapes = eigh(mass, stiffness, subset_by_index=last)
-    shapes = shapes / np.sqrt(inverse)
-    station, added = 1.6, 1e-4
-    rows = [wing.wing._along(station) @ part for part in wing.arrays.line_rows[:3]]
-    share = sum(float(row @ shapes[:, 0]) ** 2 for row in rows)
-    heavy = wing.matrices(PointMass(added, station))[1]
-    lower = eigh(heavy, stiffness, subset_by_index=last, eigvals_only=True)
-    assert inverse[0] / lower[0] == pytest.approx(1.0 / (1.0 + added * share), rel=1e-9)
-    assert inverse[0] / lower[0] < 1.0 / (1.0 + added * share)  # Rayleigh's quotient is an upper bound
 
 
 def test_scales(wing: Wing) -> None:

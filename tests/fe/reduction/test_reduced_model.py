@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fe.full.factorisation import Factorisation
 from fe.reduction.certified_basis import compressed
 from fe.reduction.reduced_basis import reduce_structure
 from fe.reduction.structure_errors import measured_errors
@@ -217,21 +216,6 @@ def test_the_wing_bends_in_the_modes_of_the_full_one(coarse_operators, model: Re
         )
         strain = coarse_operators.gauge_output @ shape
         np.testing.assert_allclose(output[:-1], strain, rtol=0, atol=1e-2 * np.abs(strain).max())
-
-
-def test_a_beam_in_all_its_parts(beam, beam_reduction) -> None:
-    """Parameter times loss, controls, the weight of a free mass and modes are those of the full sums."""
-    model, masses = beam_reduction.model, {"pump": 0.07}
-    stiffness, mass = beam.stiffness({"e": 1.05}, {"z1": 0.6, "z2": 0.3}), beam.mass(masses)
-    full = Factorisation(stiffness).solve(beam.load("weight", 3.0, masses) + beam.load("pushed", -120.0))
-    found = model.static_response(HURT)
-    np.testing.assert_allclose(found.strain, beam.gauge_output @ full, atol=found.strain_error_bound, rtol=0)
-    tip = beam.displacement_output @ full
-    np.testing.assert_allclose(found.displacement, tip, atol=found.displacement_error_bound, rtol=0)
-    _, shapes = natural_frequencies(beam, 6, HURT)
-    np.testing.assert_allclose(shapes.T @ (mass @ shapes), np.eye(6), atol=1e-7)
-    wanted = np.abs(np.vstack((beam.gauge_output @ shapes, beam.displacement_output @ shapes)))
-    np.testing.assert_allclose(np.abs(model.modes(HURT).output[:4]), wanted, atol=2e-3 * wanted.max())
 
 
 @pytest.mark.parametrize(

@@ -348,21 +348,6 @@ def test_outputs_and_places_by_name(both: Compared) -> None:
 # ---------------------------------------------------------------- no change, softer, impossible
 
 
-def test_no_change_is_no_change_to_the_last_bit(both: Compared) -> None:
-    nothing = (
-        PointMass(0.0, 1.0), RootCompliance(0.0), LocalStiffnessLoss(0.0, 0.3, 0.2),
-        patch.ModulusTemperature(0.0), patch.PowerDamping("tip", 1.0, 1.0, 0.0, 1.0, 1.0),
-    )  # fmt: skip
-    one, other = both.structure(*nothing, temperature=10.0), both.structure()
-    assert np.array_equal(one.stiffness, other.stiffness)
-    assert np.array_equal(one.mass, other.mass)
-    loads = LoadPlace(0.0, 0.0), patch.Washout(0.0, 2.0), patch.InertiaRelief(0.0)
-    assert np.array_equal(both.load(2.0, *loads), both.load(2.0))
-    assert np.array_equal(both.wing.force_row("tip_load", ModelPatch(loads)), both.row)
-    factors = both.wing.strain_factors(ModelPatch(nothing))
-    assert factors is None or np.array_equal(factors, np.ones(len(both.arrays.gauge_stations)))
-
-
 @settings(max_examples=25, deadline=None)
 @given(
     loss=st.floats(0.0, 0.9),

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
-from scipy.signal import freqs
 from scipy.special import hyp1f1
 
 from discrepancy.models.high_pass import filtered_record, high_pass
@@ -172,17 +171,6 @@ def test_step_response_of_any_order(order: float, ratio: float) -> None:
     assert high_pass(np.ones(80), ratio, 1.0, order, 0.0) == pytest.approx(expected, abs=2e-9)
 
 
-@pytest.mark.parametrize("order", [0.5, 1.0, 1.4, 2.0])
-def test_frequency_response_of_any_order(order: float) -> None:
-    tau, omega, times = 0.3, 9.0, np.arange(20000) * 0.002
-    output = high_pass(np.cos(omega * times), 0.002, tau, order)[-4000:]
-    # The tail of a fractional order dies off like a power of time: a line in time by the record's end.
-    basis = np.stack([np.cos(omega * times), -np.sin(omega * times), 1 + 0 * times, times], axis=1)[-4000:]
-    real, imaginary = np.linalg.lstsq(basis, output, rcond=None)[0][:2]
-    _, transfer = freqs([tau, 0.0], [tau, 1.0], [omega])
-    assert complex(real, imaginary) == pytest.approx(transfer[0] ** order, abs=1e-4)
-
-
 def test_limits_of_the_high_pass() -> None:
     signal = np.random.default_rng(3).normal(size=(50, 2))
     assert high_pass(signal, 0.01, 0.3, 0.0, 0.0) == pytest.approx(signal, abs=1e-12)
@@ -225,7 +213,7 @@ def test_a_high_pass_follows_uneven_stamps() -> None:
 STREAMED = ModelPatch(
     (
         SensorGain("g0", 0.07),
-        HighPass("g0", 0.4, 2.0),
+        HighPass("g0", 0.4, 4.0),
         SensorDrift("*", 2e-5, 10.0, 0.5, "strain"),
         HighPass("*", 0.9, 1.0, "strain"),
         patch.ThermalStrain("*", 1.2e-5),
@@ -251,7 +239,7 @@ def test_samples_are_the_rows_of_the_whole_record(kind: str) -> None:
         (read,), _ = applied(STREAMED, sample, *parts, filtered=filters.filtered)
         memory = filters.after
         found.append(read)
-        assert len(memory) == (7 if dynamic else 0)  # signal and stages: 3 of one gauge, then 2 of each gauge
+        assert len(memory) == (9 if dynamic else 0)  # signal and stages: 5 of one gauge, then 2 of each gauge
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
 
 
@@ -265,13 +253,3 @@ def test_a_change_in_pieces_is_the_change_at_once(order: int, ratio: float, piec
     for _ in range(pieces):
         parts = high_pass_step(parts, step / pieces, ratio / pieces)
     np.testing.assert_allclose(parts, at_once, rtol=0.0, atol=1e-11)
-
-
-@pytest.mark.parametrize("order", [1, 2, 3, 4])
-def test_the_filter_of_samples_is_that_of_whole_records(order: int) -> None:
-    signal = np.random.default_rng(5).normal(size=200).cumsum()
-    states, shown = np.zeros(order), [0.0]
-    for increment in np.diff(signal):
-        states = high_pass_step(states, increment, 0.13)
-        shown.append(states[-1])
-    np.testing.assert_allclose(shown, high_pass(signal, 0.13, 1.0, float(order), signal[0]), atol=1e-11)

@@ -1,14 +1,9 @@
 """A structure in motion, a wing's and a beam's, against general integrators, closed forms and full models."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from fe.full.factorisation import Factorisation
 from fe.runtime.errors import InvalidStateError, OutsideModelError
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
@@ -39,7 +34,7 @@ def moving(integrator: ModalIntegrator) -> TransientState:
     return integrator.advance(integrator.released(0.03, (2.0, 0.0), TIP_FORCE), 0.013, (2.7, 1.0))
 
 
-@pytest.mark.parametrize("beta", [BETA, 0.05])  # with 0.05 s all but the first mode are overdamped
+@pytest.mark.parametrize("beta", [0.0, BETA, 0.05])  # with 0.05 s all but the first mode are overdamped
 def test_loads_that_are_held_are_integrated_exactly(model: ReducedModel, beta: float) -> None:
     integrator = wing_integrator(model, **{**HEALTHY, "damping_beta": beta})
     assert (integrator.damping_ratio[1:] > 1).all() == (beta == 0.05)
@@ -81,6 +76,11 @@ def test_the_load_point_rests_where_its_compliance_puts_it(integrator, model: Re
 
 
 def test_a_released_tip_starts_where_it_was_held_and_rings_down(integrator: ModalIntegrator) -> None:
+    under = integrator.released(-0.01, (2.0, 0.0), TIP_FORCE)
+    rest = integrator.outputs(integrator.at_rest((2.0, 0.0)))
+    assert integrator.outputs(under)[-1] == pytest.approx(rest[-1] - 0.01, rel=5e-3)
+    later = integrator.outputs(integrator.advance(under, 60.0, (2.0, 0.0)))
+    np.testing.assert_allclose(later[:-1], rest[:-1], rtol=1e-6)
     state = integrator.released(0.02, (0.0, 0.0), TIP_FORCE)
     # the static correction belongs to the load, which is gone: what is left is what six modes can hold
     assert integrator.outputs(state)[-1] == pytest.approx(0.02, rel=5e-3)
@@ -97,63 +97,12 @@ def test_a_released_tip_starts_where_it_was_held_and_rings_down(integrator: Moda
     np.testing.assert_allclose(zeta, ratio, rtol=1e-14)
 
 
-def test_released_under_load_returns_to_the_static_shape(integrator: ModalIntegrator) -> None:
-    state = integrator.released(-0.01, (2.0, 0.0), TIP_FORCE)
-    rest = integrator.outputs(integrator.at_rest((2.0, 0.0)))
-    assert integrator.outputs(state)[-1] == pytest.approx(rest[-1] - 0.01, rel=5e-3)
-    later = integrator.outputs(integrator.advance(state, 60.0, (2.0, 0.0)))
-    np.testing.assert_allclose(later[:-1], rest[:-1], rtol=1e-6)
-
-
 def energy_of(integrator: ModalIntegrator, state: TransientState) -> float:
     """Kinetic plus strain energy of the kept modes about the equilibrium under the load [J]."""
     omega, structure = 2.0 * np.pi * integrator.modes.frequency, integrator.structure
     rest = structure.shapes.T @ structure.loads @ state.load / omega**2
     deviation = omega * (state.displacement - rest)
     return float(0.5 * (state.velocity @ state.velocity + deviation @ deviation))
-
-
-@given(
-    durations=st.lists(st.floats(1e-4, 1.0), min_size=1, max_size=20),
-    tip=st.floats(-0.05, 0.05),
-    beta=st.sampled_from((0.0, BETA, 0.05)),
-)
-def test_energy_never_grows_under_constant_load(model, durations, tip: float, beta: float) -> None:
-    integrator = wing_integrator(model, **{**HEALTHY, "damping_alpha": 0.0, "damping_beta": beta})
-    state = integrator.released(tip, (2.0, 0.0), TIP_FORCE)
-    energy = begin = energy_of(integrator, state)
-    for duration in durations:
-        state = integrator.advance(state, duration, (2.0, 0.0))
-        assert energy_of(integrator, state) <= energy * (1 + 1e-12) + 1e-15
-        energy = energy_of(integrator, state)
-    if beta == 0.0:
-        assert energy == pytest.approx(begin, rel=1e-9, abs=1e-15)
-
-
-@pytest.mark.parametrize(("ramp", "tolerance"), [(0.05, 4e-3), (0.005, 1.5e-2)])
-def test_the_full_wing_step_by_step_agrees(
-    coarse_operators, integrator, ramp: float, tolerance: float
-) -> None:
-    # the trapezoidal rule on all unknowns, from rest at 2 g, ramp to 3 g
-    step, K, M = ramp / 25, coarse_operators.stiffness(), coarse_operators.mass()
-    V = ALPHA * M + BETA * K
-    factors = Factorisation((4 / step**2 * M + 2 / step * V + K).tocsr())
-    u = Factorisation(K).solve(2.0 * coarse_operators.load_lift)
-    v = a = np.zeros_like(u)
-    state, load, worst, scale = integrator.at_rest((2.0, 0.0)), 2.0, 0.0, 0.0
-    for k in range(60):
-        after = min(3.0, 2.0 + (k + 1) * step / ramp)
-        right = M @ (4 / step**2 * u + 4 / step * v + a) + V @ (2 / step * u + v)
-        new = factors.riesz(right + after * coarse_operators.load_lift)
-        new_v = 2 / step * (new - u) - v
-        u, v, a = new, new_v, 4 / step**2 * (new - u) - 4 / step * v - a
-        # the mean load of the step is held: of second order, as the rule itself
-        state = integrator.advance(state, step, (0.5 * (load + after), 0.0))
-        state, load = replace(state, load=np.array((after, 0.0))), after
-        strain = coarse_operators.gauge_output @ u
-        worst = max(worst, float(np.abs(integrator.outputs(state)[:-1] - strain).max()))
-        scale = max(scale, float(np.abs(strain).max()))
-    assert worst < tolerance * scale
 
 
 def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction) -> None:
@@ -175,8 +124,6 @@ def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction) -> None:
     wanted = np.concatenate((rows @ moved[:n], acceleration))
     size = np.concatenate((np.abs(rows @ start), np.abs(acceleration)))
     assert np.all(np.abs(motion.outputs(state) - wanted) < 5e-3 * size)
-    kept = TransientState.from_list(state.to_list(), model.mode_count)
-    assert np.array_equal(motion.outputs(kept), motion.outputs(state))
     same = ModalIntegrator(model, vector, beam.damping_alpha, beam.damping_beta)
     taken = motion.outputs(same.take_over(state, motion))
     np.testing.assert_allclose(taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max()))
@@ -191,15 +138,6 @@ def test_state_is_plain_floats_and_goes_on_to_the_last_bit(model: ReducedModel, 
     two = other.advance(TransientState.from_list(values, model.mode_count), 0.02, (3.0, 0.0))
     assert one.to_list() == two.to_list()
     np.testing.assert_array_equal(integrator.outputs(one)[:-1], other.outputs(two)[:-1])
-
-
-def test_taking_over_an_unchanged_wing_changes_nothing(model: ReducedModel, integrator, moving) -> None:
-    taken = wing_integrator(model, **HEALTHY).take_over(moving, integrator)
-    np.testing.assert_allclose(
-        taken.displacement, moving.displacement, atol=1e-4 * np.abs(moving.displacement).max()
-    )
-    np.testing.assert_allclose(taken.velocity, moving.velocity, rtol=1e-9)
-    assert taken.load is moving.load
 
 
 def test_damage_in_flight_keeps_motion_and_changes_strain(model: ReducedModel, integrator) -> None:

@@ -1,4 +1,4 @@
-"""Structures against closed forms and against each other: loads, supports, masses, regions, parameters."""
+"""Structures against closed forms, CalculiX and each other; every fault of their files is one sentence."""
 
 from __future__ import annotations
 
@@ -9,54 +9,114 @@ import numpy as np
 import pytest
 
 from fe.elements.kinds import KINDS
-from fe.runtime.errors import FiniteElementError, InvalidDesignError, InvalidStateError, MeshError
+from fe.runtime.errors import (
+    CalculixError,
+    FiniteElementError,
+    InvalidDesignError,
+    InvalidStateError,
+    MeshError,
+    SolutionError,
+)
 from fe.structure.affine import natural_frequencies, static_responses
 from fe.structure.mesh_file import check_memory, memory_estimate, read_mesh
 from fe.structure.operators import Structure, load_and_assemble, weighed, write_structure_vtu
-from tests.refusals import Inputs
+from fe.verification.calculix_comparison import agreement
+from fe.verification.calculix_deck import structure_deck
+from tests.calculix_decks import needs_calculix
+from tests.refusals import Inputs, refused
 
 INPUTS = Inputs(__file__)
 INNER, OUTER = 1.0, 2.0
 HELD = 'set = "root"\nhold = ["x", "y", "z"]'
 FLANGE = 'set = "root"\nrigid_about = [0, 30, 5]\n'
+CURVED = ("hexahedron20", "tetra10", "wedge15")
+ON_SPRINGS = (
+    ('"root", hold = ["x", "y", "z"]',
+     '"root", rigid_about = [-5, 10, 3], hold = ["x", "rz"], springs = [0, 2e6, 1e6, 300, 500, 0]'),
+    ("point = [31, 11, 10]", "point = [9, 11, 10]"),
+    ('name = "push", set = "tip=1"', 'name = "push", set = "root"'),
+)  # fmt: skip
+ROSETTE = (
+    '[[rosette]]\nname = "r"\npoint = [10, 5, 10]\naxes = [[1, 0, 0], [1, 2, 0]]\nangles = [0, 45, 90, 60]\n'
+)
+
+
+USED = {
+    "ring": ("bore", "all"), "cantilever": (), "plate": ("line",), "body": ("top", "tip"),
+    "strip": ("x", "y", "z", "top", "all"), "ply": ("x", "y", "z", "top", "all"),
+}  # fmt: skip
+
+
+def bent(name: str, kind: str, points: np.ndarray) -> np.ndarray:
+    """Points of the unit cube as those of a body; second order edges follow its curves."""
+    if name == "ring":  # a quarter of a thick one
+        radius, angle = INNER + (OUTER - INNER) * points[:, 0], 0.5 * np.pi * points[:, 1]
+        place = np.column_stack((radius * np.cos(angle), radius * np.sin(angle), 0.1 * points[:, 2]))
+        return np.where(np.abs(place) < 1e-12, 0.0, place)
+    place = points * {"cantilever": (1000, 60, 10), "plate": (20, 10, 10), "body": (100, 25, 10)}.get(name, 1)
+    if name == "body" and kind in CURVED:  # in the plane of the top
+        place[:, 1] += 12.0 * (place[:, 0] / 100.0) ** 2 * (place[:, 1] / 25.0)
+    return place
 
 
 @pytest.fixture
-def ring(box, write) -> Callable[[str, int], Structure]:
-    """A quarter of a thick ring in plane strain; second order edges follow the circle."""
+def made(box, write) -> Callable[..., Path]:
+    """A maker of a structure file on a mesh, with texts exchanged; each of its sets is a mask of nodes."""
 
-    def make(kind: str, count: int) -> Structure:
-        points, cells = box(kind, (count, 2 * count, 1))
-        radius, angle = INNER + (OUTER - INNER) * points[:, 0], 0.5 * np.pi * points[:, 1]
-        bent = np.column_stack((radius * np.cos(angle), radius * np.sin(angle), 0.1 * points[:, 2]))
-        bent[np.abs(bent) < 1e-12] = 0.0
-        data = {"bore": (points[:, 0] == 0.0).astype(np.int64), "all": np.ones(len(points), dtype=np.int64)}
-        text = INPUTS.text("ring.toml", *[("0.7071067811865476", "0.70")] * (2 * (kind == "tetra")))
-        return load_and_assemble(write(bent, kind, cells, text, point_data=data))
+    def make(name: str, *changes: tuple[str, str], kind: str = "hexahedron20", parts=(1, 1, 1)) -> Path:
+        points, cells = box(kind, parts)
+        x, y, z = points.T
+        sets = {"x": x == 0.0, "y": y == 0.0, "z": z == 0.0, "top": z == 1.0, "all": z >= 0.0}
+        sets |= {"bore": x == 0.0, "tip": x == 1.0, "line": x + y == 0.0}
+        data = {own: nodes.astype(np.int64) for own, nodes in sets.items() if own in USED[name]}
+        text = INPUTS.text(f"{name}.toml", *changes)
+        return write(bent(name, kind, points), kind, cells, text, point_data=data)
 
     return make
 
 
 @pytest.fixture
-def beam(box, write) -> Callable[..., Structure]:
-    """A cantilever of 1000 x 60 x 10 mm with texts of its file exchanged."""
-    points, cells = box("hexahedron20", (20, 1, 1))
-    place = points * (1000, 60, 10)
-    return lambda *changes: load_and_assemble(
-        write(place, "hexahedron20", cells, INPUTS.text("cantilever.toml", *changes))
-    )
+def ring(made) -> Callable[[str, int], Structure]:
+    """A maker of a quarter of a thick ring in plane strain."""
+
+    def make(kind: str, count: int) -> Structure:
+        straight = [("0.7071067811865476", "0.70")] * (2 * (kind == "tetra"))
+        return load_and_assemble(made("ring", *straight, kind=kind, parts=(count, 2 * count, 1)))
+
+    return make
 
 
 @pytest.fixture
-def cube(box, write) -> Callable[..., Structure]:
-    """One cell, with sets of the faces through the origin, of the top, and of all."""
-    points, cells = box("hexahedron20", (1, 1, 1))
-    sets = {name: points[:, axis] == 0.0 for axis, name in enumerate("xyz")}
-    sets |= {"top": points[:, 2] == 1.0, "all": points[:, 2] >= 0.0}
-    data = {name: chosen.astype(np.int64) for name, chosen in sets.items()}
-    return lambda name, *changes: load_and_assemble(
-        write(points, "hexahedron20", cells, INPUTS.text(name, *changes), point_data=data)
-    )
+def beam(made) -> Callable[..., Structure]:
+    """A maker of a cantilever of 1000 x 60 x 10 mm."""
+    return lambda *changes: load_and_assemble(made("cantilever", *changes, parts=(20, 1, 1)))
+
+
+@pytest.fixture
+def body(made) -> Callable[..., Structure]:
+    """A maker of a bent body of a kind of cells."""
+
+    def make(kind: str, *changes: tuple[str, str], **options: bool) -> Structure:
+        parts = (4, 2, 1 if kind in CURVED else 2)
+        return load_and_assemble(made("body", *changes, kind=kind, parts=parts), **options)
+
+    return make
+
+
+@pytest.fixture
+def plate(made) -> Callable[..., Path]:
+    """A maker of the file of a plate in two cells, with a rosette at its end if that is asked for."""
+
+    def make(*changes: tuple[str, str], rosette: bool = True) -> Path:
+        file = made("plate", kind="hexahedron", parts=(2, 1, 1))
+        text = file.read_text(encoding="utf-8") + ROSETTE * rosette
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new, 1)
+        file.write_text(text, encoding="utf-8")
+        return file
+
+    return make
 
 
 @pytest.mark.parametrize(
@@ -171,25 +231,27 @@ def test_a_rigid_root_on_springs_shifts_and_turns(beam) -> None:
 
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("cantilever"))
 def test_a_rigid_set_that_cannot_be(old: str, new: str, sentence: str, beam) -> None:
-    with pytest.raises(FiniteElementError, match=sentence):
+    with refused(FiniteElementError, sentence):
         beam((old, new))
 
 
-def test_a_gauge_reads_the_mean_over_its_area(cube) -> None:
+def test_a_gauge_reads_the_mean_over_its_area(made) -> None:
     """Of u = x y^2, which the 20-node cell holds exactly: the mean of y^2 over ten strips of the width."""
-    structure = cube("strip.toml")
+    structure = load_and_assemble(made("strip"))
     field = np.zeros_like(structure.mesh.points)
     field[:, 0] = structure.mesh.points[:, 0] * structure.mesh.points[:, 1] ** 2
     seen = structure.gauge_output @ (structure.expansion.T @ field.ravel())
     assert seen == pytest.approx([0.4**2 + 0.6**2 / 12.0 * (1.0 - 1.0 / 100.0)])
-    with pytest.raises(InvalidDesignError, match=r"0\.2 m long and 1\.2 m wide, the gauge reaches over"):
-        cube("strip.toml", ("width = 0.6", "width = 1.2"))
+    with refused(InvalidDesignError, r"0\.2 m long and 1\.2 m wide, the gauge reaches over"):
+        load_and_assemble(made("strip", ("width = 0.6", "width = 1.2")))
 
 
-def test_an_orthotropic_material_follows_its_axes(cube) -> None:
+def test_an_orthotropic_material_follows_its_axes(made) -> None:
     # Axis 1 along z, axis 2 along x, axis 3 along y.
     wanted = 1e6 * np.array([1.0, -0.3, -0.25]) / 1.3e11
-    np.testing.assert_allclose(static_responses(cube("ply.toml"))["p"].strain, wanted, rtol=1e-9)
+    np.testing.assert_allclose(
+        static_responses(load_and_assemble(made("ply")))["p"].strain, wanted, rtol=1e-9
+    )
 
 
 def test_memory_is_estimated_before_it_is_taken(beam) -> None:
@@ -198,3 +260,71 @@ def test_memory_is_estimated_before_it_is_taken(beam) -> None:
     check_memory(mesh)
     with pytest.raises(MeshError, match=r"744 unknowns would take about 0\.\d GiB, but 0\.1 GiB are allowed"):
         check_memory(mesh, 0.1 * 2**30)
+
+
+@needs_calculix
+@pytest.mark.parametrize(
+    ("kind", "changes"),
+    [*((kind, ()) for kind in ("tetra", "hexahedron", *CURVED)), ("hexahedron", ON_SPRINGS)],
+)
+def test_both_codes_agree(kind: str, changes: tuple[tuple[str, str], ...], body, tmp_path: Path) -> None:
+    """The last one stands on a rigid flange, which the push and two gauges near it load, on springs."""
+    deck = structure_deck(body(kind, *changes, mass_as_stiffness=True))
+    found = agreement(deck, tmp_path / "ccx", 5)
+    assert list(found.loads) == ["weight", "suction", "push"]
+    for differences in found.loads.values():
+        assert list(differences) == ["nodal displacements", "gauge strains", "displacement outputs"]
+        assert max(differences.values()) < 1e-5
+    assert len(found.ours) == 5
+    assert found.modal < 1e-6
+
+
+def test_wedges_cannot_be_compared(body) -> None:
+    with pytest.raises(CalculixError, match=r"integrates 6-node wedges \(C3D6\) in another way"):
+        structure_deck(body("wedge"))
+
+
+# ---------------------------------------------------------------- its file
+
+
+def test_the_file_without_a_fault_is_taken(plate) -> None:
+    structure = load_and_assemble(plate(rosette=False))
+    assert set(static_responses(structure)) == {"weight", "push"}
+    assert structure.unknowns == 24
+    assert len(structure.design_hash) == 64
+    for old, new, same in (("[[support]]", "# a comment\n[[support]]", True), ("2700", "2701", False)):
+        other = load_and_assemble(plate((old, new), rosette=False))
+        assert (other.design_hash == structure.design_hash) is same
+
+
+@pytest.mark.parametrize(("old", "new", "sentence"), [*INPUTS.refused("plate"), *INPUTS.refused("rosette")])
+def test_a_fault_is_one_sentence(old: str, new: str, sentence: str, plate) -> None:
+    file = plate((old, new))
+    with refused(FiniteElementError, sentence):
+        load_and_assemble(file)
+
+
+def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with pytest.raises(FiniteElementError, match=r"structure file .*none\.toml"):
+        load_and_assemble(tmp_path / "none.toml")
+
+
+def test_parts_that_turn_on_a_hinge_cannot_be_solved(box, write) -> None:
+    """Two cubes share one edge only: no check of sets sees it, the factorisation does."""
+    points, (cube,) = box("hexahedron", (1, 1, 1))
+    places = np.concatenate((points[cube], points[cube] + (1.0, 1.0, 0.0)))
+    corners, numbers = np.unique(places, axis=0, return_inverse=True)
+    file = write(corners, "hexahedron", numbers.reshape(2, 8), INPUTS.text("hinge.toml"))
+    with pytest.raises(SolutionError, match=r"some part of the structure is not held|hardly held"):
+        static_responses(load_and_assemble(file))
+
+
+def test_a_rosette_is_gauges_at_one_point(plate) -> None:
+    """Its strains are those of one plane strain state; beside gauges of their own they come last."""
+    structure = load_and_assemble(plate())
+    assert structure.gauges == ("a", "r_a", "r_b", "r_c", "r_d")
+    own, first, middle, last, fourth = structure.gauge_output.toarray()
+    np.testing.assert_array_equal(own, first)
+    half = 0.5 * (2.0 * middle - first - last)
+    wanted = 0.25 * first + 0.75 * last + half * np.sin(np.radians(120.0))
+    np.testing.assert_allclose(fourth, wanted, atol=1e-12 * np.abs(first).max())

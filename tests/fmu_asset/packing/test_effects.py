@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
-from discrepancy.files.document import Origin
+from discrepancy.document import Origin
 from discrepancy.files.verdict import StoredPatch, fmu_outputs, patch_effects, read_patch, write_patch
 from discrepancy.models.high_pass import filtered_record
 from discrepancy.models.interface import Conditions

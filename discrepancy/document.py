@@ -1,7 +1,7 @@
-"""What `verdict.json` and `patch.json` share: origin, numbers that JSON lacks, checks, atomic writing.
+"""How records stand in JSON: numbers that JSON lacks, and patches by their primitives.
 
-A document is the JSON form of a record; the record's own fields say what it holds. Keys are described in
-docs/verdict.md.
+A number that is not a number is null, an infinite one "Infinity" or "-Infinity", because JSON has neither.
+The records themselves (`verdict`) say what a file holds; pydantic checks it against them.
 """
 
 import json
@@ -9,18 +9,98 @@ import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from importlib import resources
-from math import isnan
+from math import inf, isfinite, isnan, nan
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import PlainValidator, TypeAdapter, ValidationError, WithJsonSchema
 
 from discrepancy.errors import VerdictFileError
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
 from reporting.files import atomic_write_text
 from reporting.json_file import read_json
 from reporting.provenance import Provenance
 from reporting.record_json import plain as json_of
+
+PRIMITIVE_UNITS: dict[str, dict[str, str]] = {kind: item.units for kind, item in PRIMITIVES.items()}
+"""Unit of every real parameter of every primitive (translational or rotational port: the first or second)."""
+
+_WORDS = {None: nan, "Infinity": inf, "-Infinity": -inf}
+_JSON_TYPES: dict[Any, str] = {float: "number", int: "integer", str: "string"}
+_SECONDS = {"type": ["number", "null"], "description": "[s]; null: open."}
+_WINDOWS = {
+    "type": "array",
+    "description": "It acts within these only: stretches of trials, in their time.",
+    "items": {
+        "type": "object",
+        "properties": {"trial": {"type": "string"}, "begin": _SECONDS, "end": _SECONDS},
+        "required": ["trial", "begin", "end"],
+        "additionalProperties": False,
+    },
+}
+
+
+def _number(value: object) -> float:
+    if value is None or isinstance(value, str):
+        if value not in _WORDS:
+            raise ValueError(f'a number, null, "Infinity" or "-Infinity" is expected, and {value!r} came')
+        return _WORDS[value]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+        raise ValueError(f"a finite number is expected, and {value!r} came")
+    return float(value)
+
+
+def _patch(rows: object) -> ModelPatch:
+    try:
+        return ModelPatch.from_list(rows)
+    except InvalidPatchError as cause:
+        raise ValueError(str(cause)) from cause
+
+
+def _primitive_schema(primitive: type[Primitive]) -> dict[str, Any]:
+    """Return the JSON Schema of one kind of primitive, from its own fields."""
+    units = PRIMITIVE_UNITS[primitive.kind]
+    columns: dict[str, Any] = {"kind": {"const": primitive.kind, "type": "string"}}
+    for name, kind in primitive.values().items():
+        columns[name] = {"type": _JSON_TYPES[kind]}
+        if name in units:
+            columns[name]["description"] = f"[{units[name]}]"
+    return {
+        "type": "object",
+        "title": primitive.__name__,
+        "description": (primitive.__doc__ or "").split("\n")[0],
+        "properties": {**columns, **({"windows": _WINDOWS} if primitive.in_windows else {})},
+        "required": list(columns),
+        "additionalProperties": False,
+    }
+
+
+Number = Annotated[
+    float,
+    PlainValidator(_number),
+    WithJsonSchema(
+        {
+            "anyOf": [{"type": "number"}, {"enum": ["Infinity", "-Infinity"]}, {"type": "null"}],
+            "description": "null: not a number, or not known.",
+        }
+    ),
+]
+Patch = Annotated[
+    ModelPatch,
+    PlainValidator(_patch),
+    WithJsonSchema(
+        {
+            "type": "array",
+            "items": {"oneOf": [_primitive_schema(primitive) for primitive in PRIMITIVES.values()]},
+        }
+    ),
+]
+
+
+# ---------------------------------------------------------------- documents
+
 
 _Record = TypeVar("_Record")
 
@@ -72,29 +152,6 @@ def shipped_schema(name: str) -> dict[str, Any]:
     text = resources.files("discrepancy").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
     schema: dict[str, Any] = json.loads(text)
     return schema
-
-
-def json_schema(record: type, schema: str) -> str:
-    """Return the JSON Schema (draft 2020-12) of a document as it is shipped: every key is always there."""
-    found = TypeAdapter(record).json_schema()
-    definitions: dict[str, Any] = found["$defs"]
-    own = {name: table for name, table in found["properties"].items() if name != "origin"}
-    of_origin = definitions.pop("Origin")["properties"]
-    properties = {"schema": {"const": schema, "type": "string"}, **of_origin, **own}
-    for table in definitions.values():
-        table["description"] = table.get("description", "").split("\n")[0]
-        if "properties" in table:
-            table |= {"required": list(table["properties"]), "additionalProperties": False}
-    content = {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": schema,
-        "type": "object",
-        "properties": properties,
-        "required": list(properties),
-        "additionalProperties": False,
-        "$defs": definitions,
-    }
-    return json.dumps(content, indent=1, ensure_ascii=False) + "\n"
 
 
 def plain(value: Any) -> Any:
