@@ -29,7 +29,7 @@ def _names(array: npt.NDArray[Any]) -> tuple[str, ...]:
     return tuple(array.tolist())
 
 
-KINDS: Mapping[type, Callable[[Any], Any]] = {str: str, int: int, float: float, tuple: _names}
+KINDS: Mapping[object, Callable[[Any], Any]] = {str: str, int: int, float: float, tuple: _names}
 """What makes the value of a field that is no array, by its type, of the array that a file has of it."""
 
 
