@@ -10,7 +10,6 @@ from scipy.interpolate import CubicSpline
 from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State
-from discrepancy.models.interface import Response
 from discrepancy.models.memory import Memory
 from discrepancy.models.port_system import LINEAR, PortSystem, port_system
 from fmu_asset.door.session import FmiAsset
@@ -28,19 +27,16 @@ SAME_PACE = 1e-2
 """A mode that turns by more than half a circle in a step looks like a slower one there: half the step tells
 by more than this share of the motion."""
 
-SLOPES = (
-    np.array(
-        [
-            [-25, 48, -36, 16, -3],
-            [-3, -10, 18, -6, 1],
-            [1, -8, 0, 8, -1],
-            [-1, 6, -18, 10, 3],
-            [3, -16, 36, -48, 25],
-        ]
-    )
-    / 12.0
-)
+SLOPES = np.array([
+    [-25, 48, -36, 16, -3],
+    [-3, -10, 18, -6, 1],
+    [1, -8, 0, 8, -1],
+    [-1, 6, -18, 10, 3],
+    [3, -16, 36, -48, 25],
+]) / 12.0  # fmt: skip
 """Weights by which five values on an even grid give the slope at each of them, of fourth order."""
+Sampled = tuple[FloatArray, FloatArray]
+"""Values and rates (N, C) at the samples of a trial."""
 
 
 class FmuMotion:
@@ -322,7 +318,7 @@ class FmuMotion:
         return (at_rest if of_mode * at_rest < 1e-6 else 1.0 / of_mode), at_rest
 
 
-def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Sequence[int]) -> Response:
+def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Sequence[int]) -> Sampled:
     """Return values and rates at times, from values on an even grid.
 
     Parameters
@@ -345,7 +341,7 @@ def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Seq
         around = values[first[:, np.newaxis] + np.arange(len(SLOPES))]
         rates = np.einsum("nk,nkc->nc", SLOPES[at_index - first] / step, around)
         rates[before] = 0.0
-        return Response(values[at_index], rates)
+        return values[at_index], rates
     grid = step * np.arange(len(values))
     curve = CubicSpline(grid, values)
     at = np.clip(times, 0.0, grid[-1])
@@ -355,11 +351,9 @@ def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Seq
     rates[before] = 0.0
     for column, order in enumerate(derivatives):
         if order > 0:
-            shown = shown if shown.flags.owndata else shown.copy()
             # derivatives of the derivative's own spline keep the order of the first one
-            slope = curve.derivative()(grid)[:, column]
-            own = CubicSpline(grid, slope)
+            own = CubicSpline(grid, curve(grid, 1)[:, column])
             shown[:, column] = own(at, order - 1)
             rates[:, column] = own(at, order)
             shown[before, column] = rates[before, column] = 0.0
-    return Response(np.ascontiguousarray(shown), np.ascontiguousarray(rates))
+    return np.ascontiguousarray(shown), np.ascontiguousarray(rates)

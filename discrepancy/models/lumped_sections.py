@@ -66,7 +66,13 @@ class NamedVector(NamedSection):
     vector: Vector
 
 
-class InputSection(NamedVector):
+class LoadSection(NamedVector):
+    """`[[load]]`: a constant load; with `through` the part or matrix of that name times the vector."""
+
+    through: Name | None = None
+
+
+class InputSection(LoadSection):
     """`[[input]]`: what acts along a vector, and how this changes when the place of a force moves [1/m].
 
     A motion (displacement, velocity, acceleration, of an angle too) is prescribed to vector . u; anything
@@ -74,7 +80,6 @@ class InputSection(NamedVector):
     """
 
     quantity: Annotated[Quantity, Field(strict=False)] = Quantity.FORCE
-    through: Name | None = None
     station_derivative: Vector | None = None
     chord_derivative: Vector | None = None
 
@@ -101,12 +106,6 @@ class OutputSection(NamedSection):
                 f'the output {self.name!r} is a reaction: give it quantity = "force" or "torque"'
             )
         return self
-
-
-class LoadSection(NamedVector):
-    """`[[load]]`: a constant load; with `through` the part or matrix of that name times the vector."""
-
-    through: Name | None = None
 
 
 class CouplingSection(Section):
@@ -206,13 +205,8 @@ class RootSection(Section):
 class ScaledParameter(ParameterSection):
     """`[[parameter]]`: a factor of the terms named."""
 
-    terms: Name | tuple[Name, ...]
+    terms: Annotated[tuple[Name, ...], BeforeValidator(_listed)]
     mean: Number = 1.0
-
-    @property
-    def scaled(self) -> tuple[str, ...]:
-        """Names of the terms."""
-        return (self.terms,) if isinstance(self.terms, str) else self.terms
 
     @model_validator(mode="after")
     def _in_range(self) -> Self:

@@ -184,7 +184,7 @@ class WingModel(SystemModel):
 
     def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
         """Return the scales of a force over the planform, from those of its mean and the first mode."""
-        share = self.wing.planform.share
+        share = self.wing.planform[1]
         motion = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
         ratio = motion / float(share @ motion)
         by_place = tuple(zip(share.tolist(), ratio.tolist(), strict=True))

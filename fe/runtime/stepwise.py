@@ -1,6 +1,6 @@
 """Motion of a linear system with laws at its ports, at any time stamps: exact between them without laws.
 
-Steps are those of `fe.runtime.modal_system.exact_step`; lengths that differ by less than `ALIKE` of the
+Steps are those of `ModalSystem.exact_steps`; lengths that differ by less than `ALIKE` of the
 usual one are one. NumPy and relative imports only: this file is copied into the FMU.
 """
 
@@ -117,8 +117,8 @@ class ModalMotion(NamedTuple):
     q: FloatArray
     v: FloatArray
     port_forces: FloatArray
-    memory: FloatArray
     lagged: FloatArray
+    memory: FloatArray
 
 
 class Begin(NamedTuple):
@@ -168,7 +168,7 @@ def advance(
         before = acting
     if laws.spans:
         out = Samples(*(item[steps.sample] for item in out))
-    return ModalMotion(out.q, out.v, out.forces, kept, out.lagged)
+    return ModalMotion(*out, kept)
 
 
 def _sections(laws: Laws, time: FloatArray) -> Iterator[tuple[int, int, BoolArray]]:
