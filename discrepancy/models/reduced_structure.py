@@ -52,7 +52,7 @@ class StructureModel(SystemModel):
             for name in names
             for low, high in [model.validity[name]]
         )
-        units = zip(model.controls, model.control_units.split(), strict=True)
+        units = zip(model.controls, model.control_units, strict=True)
         self.forces = tuple(name for name, unit in units if unit == "N")
         if not self.forces and LOAD_FACTOR not in model.controls:
             raise ModelError(
