@@ -74,7 +74,7 @@ from fe.full.factorisation import Factorisation
 from fe.reduction.reduced_basis import reduce_structure
 from fe.elements.kinds import KINDS
 from fe.structure.operators import load_and_assemble
-from fe.verification.calculix_deck import load_step, structure_deck
+from fe.verification.calculix_deck import structure_deck
 
 folder, divisions, with_superlu = Path(sys.argv[1]), json.loads(sys.argv[2]), sys.argv[3] == "superlu"
 mesh = MeshTet.init_tensor(*(np.linspace(0.0, 1.0, count + 1) for count in divisions))
@@ -98,7 +98,7 @@ load = structure.load_terms[0].vector
 solution, ours = timed(lambda: Factorisation(stiffness).solve(load))
 found = {"unknowns": structure.unknowns, "assembly": assembly, "solution": solution}
 deck = structure_deck(structure)
-text = deck.text(*(load_step(structure, load) for load in structure.design.load))
+text = deck.text(*deck.loads.values())
 (folder / "static.inp").write_text(text, encoding="ascii")
 found["reduction"], reduction = timed(lambda: reduce_structure(structure))
 found["bound"] = reduction.bound_history[-1]

@@ -335,12 +335,13 @@ def convergence_checks(
 def calculix_checks(operators: "AffineOperators", jobs: Path) -> Iterator[Check]:
     """Yield the differences to CalculiX on the identical mesh: statics and six modes."""
     from fe.runtime.state import DigitalState
-    from fe.verification.calculix_comparison import wing_agreement
+    from fe.verification.calculix_comparison import agreement
+    from fe.verification.calculix_deck import wing_deck
 
     damaged = tuple(DAMAGED[number % 2] for number in range(len(operators.regions)))
     for health, loss in (("healthy", ()), ("damaged", damaged)):
         group = f"CalculiX, {health}"
-        found = wing_agreement(operators, jobs / health, DigitalState(stiffness_loss=loss))
+        found = agreement(wing_deck(operators, DigitalState(stiffness_loss=loss)), jobs / health)
         for load, differences in found.loads.items():
             for what, value in differences.items():
                 yield Check(group, f"{load}: {what}", value, 1e-5 if "displacement" in what else 1e-3)

@@ -14,7 +14,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course, LoadChange, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
 from discrepancy.models.fmu_laws import FmuLaws
-from discrepancy.models.fmu_motion import FmuMotion, sampled
+from discrepancy.models.fmu_motion import FmuMotion, Sampled, sampled
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State
 from discrepancy.models.interface import Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.memory import Memory
@@ -154,11 +154,25 @@ class FmuModel(DescribedModel):
             else:
                 moved = self._at_rest(Asked(trial, replace(conditions, health=trial.health)))
             largest = np.maximum(largest, np.max(np.abs(moved[:, self.motion.x]), axis=0))
-        stiffness, frequency = self._stiffness(campaign, conditions)
+        ports, frequency, trials = range(len(largest)), given.angular_frequency, campaign.trials
+        moving = next((trial for trial in trials if trial.is_dynamic), None)
+        if moving is not None:
+            state, step = self._state(Asked(moving, conditions)), self.motion.step(moving)
+            stiffness = [self.motion.stiffness(number, state, step) for number in ports]
+            frequency = frequency or self.motion.measured_frequency(moving, state)
+        else:
+            still, interval = trials[0] if trials else _any_trial(TrialKind.STATIC, 1.0), 0.01
+            state = self._state(Asked(still, replace(conditions, health=still.health)))
+            flexible = self.motion.flexibility(state)
+            stiffness = [(1.0 / float(flexible[port, port]),) * 2 for port in ports]
+            for _ in range(0 if trials or given.angular_frequency else 3):  # until the interval suits it
+                trial = _any_trial(TrialKind.RINGDOWN, interval)
+                frequency = self.motion.measured_frequency(trial, self._state(Asked(trial, conditions)))
+                interval = 0.3 / frequency
         forces = zip(self.motion.forces, stiffness, strict=True)
         pushed = [pair for force, pair in forces if force in self._forces.values()]
         modal, tip = (pushed or stiffness or [(1.0, 1.0)])[0]
-        frequency = given.angular_frequency or frequency or 1.0
+        frequency = frequency or 1.0
         return Scales(
             length=given.length or 1.0,
             tip_stiffness=given.tip_stiffness or tip,
@@ -170,28 +184,6 @@ class FmuModel(DescribedModel):
                 for port, most, own in zip(self.ports(), largest, stiffness, strict=True)
             },
         )
-
-    def _stiffness(
-        self, campaign: Campaign, conditions: Conditions
-    ) -> tuple[list[tuple[float, float]], float | None]:
-        """Return modal and static stiffness at each port, and the frequency if the FMU was asked for it."""
-        given, ports = self.description.scales.angular_frequency, range(len(self.ports()))
-        for trial in campaign.trials:
-            if trial.is_dynamic:
-                state = self._state(Asked(trial, conditions))
-                step = self.motion.step(trial, 1)
-                found = [self.motion.stiffness(number, state, step) for number in ports]
-                return found, given or self.motion.measured_frequency(trial, state)
-        still = campaign.trials[0] if campaign.trials else _any_trial(TrialKind.STATIC, 1.0)
-        state = self._state(Asked(still, replace(conditions, health=still.health)))
-        flexible = self.motion.flexibility(state)
-        frequency, interval = given, 0.01
-        for _ in range(0 if campaign.trials or given else 3):  # until the interval suits the frequency
-            trial = _any_trial(TrialKind.RINGDOWN, interval)
-            state = self._state(Asked(trial, conditions))
-            frequency = self.motion.measured_frequency(trial, state)
-            interval = 0.3 / frequency
-        return [(1.0 / float(flexible[port, port]),) * 2 for port in ports], frequency
 
     # ------------------------------------------------------------ response
 
@@ -208,17 +200,17 @@ class FmuModel(DescribedModel):
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )
             return Response(self._at_rest(asked)[:, columns])
-        return self._moving(asked, columns, self._orders(outputs))
+        return Response(*self._moving(asked, columns, self._orders(outputs)))
 
-    def _moving(self, asked: Asked, columns: Sequence[int], orders: Sequence[int]) -> Response:
-        """Return columns of the FMU's outputs at the samples of a dynamic trial, derived so many times."""
+    def _moving(self, asked: Asked, columns: Sequence[int], orders: Sequence[int]) -> Sampled:
+        """Return columns of the FMU's outputs in a dynamic trial, derived so many times, and their rates."""
         trial, conditions, patch = asked
         excite = partial(self._run, asked)
         laws, (rate, zero) = patch.laws, conditions.clock
         finer = FINER if len(laws) and trial.kind is TrialKind.FORCED else 1
         run = excite(conditions.refinement * finer)
 
-        def shown(values: FloatArray, step: float) -> Response:
+        def shown(values: FloatArray, step: float) -> Sampled:
             return sampled(values, step, (1.0 + rate) * trial.time + zero, orders)
 
         free = self.motion.free(run)
@@ -229,10 +221,8 @@ class FmuModel(DescribedModel):
         found = self._shown.get(key, lambda: shown(free[:, columns], run.step))
         if added is None:
             return found
-        further = shown(*added)
-        assert found.rates is not None  # of a motion there are
-        assert further.rates is not None
-        return Response(found.values + further.values, found.rates + further.rates)
+        values, rates = shown(*added)
+        return found[0] + values, found[1] + rates
 
     # ------------------------------------------------------------ ports
 
@@ -263,9 +253,7 @@ class FmuModel(DescribedModel):
     def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         asked = Asked(trial, conditions, self._parts(self.patch)._replace(laws=NO_LAWS))
-        found = self._moving(asked, self.motion.x, [0] * len(self.ports()))
-        assert found.rates is not None  # of a motion there are
-        return found.values, found.rates
+        return self._moving(asked, self.motion.x, [0] * len(self.ports()))
 
     # ------------------------------------------------------------ rest
 
@@ -289,14 +277,13 @@ class FmuModel(DescribedModel):
     def _parts(self, patch: ModelPatch) -> FmuPatch:
         """Return a patch by what is done with it; raises `ModelError` if the file lacks what it needs."""
         effects, what = self.description.effects, f"The FMU model {self.name!r}"
+        own = [item for item in patch if item.kind in effects]
         rest = ModelPatch(tuple(item for item in patch if item.kind not in effects))
         load = LoadChange.of(rest)
         if load.along_chord and self.description.inputs.torque is None:
             raise ModelError(f"{what} names no torque in [inputs], so a load cannot move along the chord.")
         settings: dict[str, float] = {}
-        for item in patch:
-            if item.kind not in effects:
-                continue
+        for item in own:
             effect = f"effect.{effects[item.kind]}"
             if f"{effect}.active" in settings:
                 raise ModelError(
@@ -325,13 +312,12 @@ class FmuModel(DescribedModel):
         end = max((1.0 + rate) * float(trial.time[-1]) + zero, float(trial.time[-1]))
         # a little longer, so that a clock that is being fitted does not ask for another run
         steps = ceil(end / step * (1.0 + 2e-9) - 1e-6) + (0 if (rate, zero) == (0.0, 0.0) else 1)
-        if trial.kind is TrialKind.RINGDOWN:
-            loads = self._release(trial, conditions)
-        else:
-            loads = self._forced(asked, step, steps)
-        return Run(self._state(asked), step, steps, loads)
+        run = Run(self._state(asked), step, steps, [])
+        loads = self._release if trial.kind is TrialKind.RINGDOWN else self._forced
+        return run._replace(loads=loads(asked, run))
 
-    def _release(self, trial: Trial, conditions: Conditions) -> Loads:
+    def _release(self, asked: Asked, run: Run) -> Loads:
+        (trial, conditions, _), (state, step, *_) = asked, run
         release, way = release_of(trial), self.description.release
         if way is None:
             raise ModelError(
@@ -340,23 +326,18 @@ class FmuModel(DescribedModel):
             )
         first = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
         if release.at_rest:
-            size = release.displacement * (1.0 + float(first[0]))
-            kind = "hold" if way.displacement is None else "displacement"
-            return [(Excitation(kind), size)]
+            return [self.motion.let_go(state, step, release.displacement * (1.0 + float(first[0])))]
         if way.displacement is None or way.velocity is None:
             raise ModelError(
                 f"The ring-down {trial.name!r} does not begin at rest, which the FMU model {self.name!r} "
                 f"can follow only if [release] names parameters of displacement and velocity."
             )
-        unit = release.displacement
-        speed = self.motion.angular_frequency(trial)
-        return [
-            (Excitation("displacement"), unit * float(first[0])),
-            (Excitation("velocity"), unit * speed * float(first[1])),
-        ]
+        at, speed = release.displacement * first * (1.0, self.motion.angular_frequency(trial))
+        moving = Excitation("parameter", self.runs.parameter(way.velocity))
+        return [self.motion.let_go(state, step, float(at)), (moving, float(speed))]
 
-    def _forced(self, asked: Asked, step: float, steps: int) -> Loads:
-        trial, _, patch = asked
+    def _forced(self, asked: Asked, run: Run) -> Loads:
+        (trial, _, patch), (_, step, steps, _) = asked, run
         course = Course.of(trial.time, trial.force, trial.hold)
         begins, ends = course.ends(np.linspace(0.0, steps * step, steps + 1))
         held, first = 0.5 * (begins + ends), float(trial.force[0])

@@ -207,10 +207,8 @@ class FmuModelDescription(ModelDescription):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
-        for kind, items in (
-            ("port", self.port), ("parameter", self.parameter), ("output", self.output), ("input", self.input)
-        ):  # fmt: skip
-            check_unique(kind, [item.name for item in items])
+        for kind in ("port", "parameter", "output", "input"):
+            check_unique(kind, [item.name for item in getattr(self, kind)])
         for kind in self.effects:
             if kind not in CARRIED:
                 raise ValueError(

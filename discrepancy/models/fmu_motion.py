@@ -10,7 +10,6 @@ from scipy.interpolate import CubicSpline
 from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State
-from discrepancy.models.interface import Response
 from discrepancy.models.memory import Memory
 from discrepancy.models.port_system import LINEAR, PortSystem, port_system
 from fmu_asset.door.session import FmiAsset
@@ -28,19 +27,16 @@ SAME_PACE = 1e-2
 """A mode that turns by more than half a circle in a step looks like a slower one there: half the step tells
 by more than this share of the motion."""
 
-SLOPES = (
-    np.array(
-        [
-            [-25, 48, -36, 16, -3],
-            [-3, -10, 18, -6, 1],
-            [1, -8, 0, 8, -1],
-            [-1, 6, -18, 10, 3],
-            [3, -16, 36, -48, 25],
-        ]
-    )
-    / 12.0
-)
+SLOPES = np.array([
+    [-25, 48, -36, 16, -3],
+    [-3, -10, 18, -6, 1],
+    [1, -8, 0, 8, -1],
+    [-1, 6, -18, 10, 3],
+    [3, -16, 36, -48, 25],
+]) / 12.0  # fmt: skip
 """Weights by which five values on an even grid give the slope at each of them, of fourth order."""
+Sampled = tuple[FloatArray, FloatArray]
+"""Values and rates (N, C) at the samples of a trial."""
 
 
 class FmuMotion:
@@ -102,12 +98,12 @@ class FmuMotion:
             self._units.setdefault((kind[0], part.kind, part.name), 2.0 ** round(log2(abs(value))))
             for part, value in zip(parts, values, strict=True)
         ]
-        moved = [asked(one) for one in np.diag(units).tolist()]
+        moved = np.array([asked(one) for one in np.diag(units).tolist()])
         zero = np.zeros_like(moved[0])
         if not self._silent.get(kind):  # an FMU that shows nothing without excitation does so always
             zero = asked([0.0] * len(parts))
             self._silent.setdefault(kind, not np.any(zero))
-        moved, result = [part - zero for part in moved], zero.copy()
+        moved -= zero
         if kind not in self._linear:  # half of all excitations gives half of the sum of what each gives
             half = asked([0.5 * size for size in units]) - zero
             size = np.atleast_2d(np.sum(np.abs(moved), axis=0)).max(axis=0)
@@ -115,15 +111,11 @@ class FmuMotion:
             self._linear[kind] = bool(np.all(np.abs(half - 0.5 * np.sum(moved, axis=0)) <= allowed))
             if not self._linear[kind]:
                 return asked(values)
-        for value, unit, part in zip(values, units, moved, strict=True):
-            result += value / unit * part
-        return result
+        return np.asarray(zero + np.tensordot(np.array(values) / units, moved, 1))
 
     def _rest(self, run: Run) -> FloatArray:
-        parameters, inputs = (
-            run.state.parameters,
-            self.runs.inputs(run.state, {part.name: value for part, value in run.loads}),
-        )
+        parameters = run.state.parameters
+        inputs = self.runs.inputs(run.state, {part.name: value for part, value in run.loads})
         if self._description.static.settle:
             return self.runs.started(run.step, dict(parameters), inputs, settle=True)[1]
         if self._resting != parameters:  # inputs change from step to step, parameters need a reset
@@ -139,27 +131,20 @@ class FmuMotion:
     def begin(self, run: Run) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
         """Return an instance at the begin of a motion, its outputs there, and the inputs (steps,) to come."""
         state, step, steps, loads = run
-        parameters = dict(state.parameters)
+        parameters, held = dict(state.parameters), dict[str, float]()
         histories = {name: np.full(steps, value) for name, value in self.runs.inputs(state).items()}
-        held: dict[str, float] = {}
-        way = self._description.release
         for part, value in loads:
-            if part.kind in ("displacement", "velocity"):
-                amount = value if part.kind == "velocity" else self._released(state, step, value)
-                parameters[self.runs.parameter(str(getattr(way, part.kind)))] = amount
-            elif part.kind == "hold":
-                assert way is not None
-                name = self.runs.variable(str(way.hold))
-                held[name] = held.get(name, 0.0) + self._released(state, step, value)
+            if part.kind == "parameter":
+                parameters[part.name] = value
             else:
                 histories[part.name][: len(part.series)] += value * part.series[:steps]
                 held[part.name] = held.get(part.name, 0.0) + value * part.begin
-        settle = any(value != 0.0 for value in held.values())
+        settle = any(part.begin for part, _ in loads)
         asset, first = self.runs.started(step, parameters, self.runs.inputs(state, held), settle=settle)
         return asset, first, histories
 
-    def _released(self, state: State, step: float, displacement: float) -> float:
-        """Return force [N] or parameter [m] that puts the release point at a displacement [m].
+    def let_go(self, state: State, step: float, displacement: float) -> tuple[Excitation, float]:
+        """Return the force and its size [N], or the parameter [m], that put the release point somewhere [m].
 
         Raises
         ------
@@ -168,28 +153,21 @@ class FmuMotion:
         """
         way = self._description.release
         assert way is not None
-        if way.output is None:
-            return displacement
-        column = self.runs.columns["release"]
+        what, first = Excitation("parameter", self.runs.parameter(str(way.displacement))), displacement
+        if way.hold is not None:
+            what = Excitation("hold", self.runs.variable(way.hold), begin=1.0)
+            first = min(1.0, 0.1 * self.runs.input_limit(way.hold))
+        if way.output is None or displacement == 0.0:
+            return what, displacement
 
         def shown(amount: float) -> float:
-            def start() -> FloatArray:
-                parameters, held = dict(state.parameters), {}
-                if way.hold is not None:
-                    held = {self.runs.variable(way.hold): amount}
-                else:
-                    parameters[self.runs.parameter(str(way.displacement))] = amount
-                inputs = self.runs.inputs(state, held)
-                return self.runs.started(step, parameters, inputs, settle=bool(held))[1]
+            run = Run(state, step, 0, [(what, amount)])
+            found = self.runs.remembered(("begin", run.key), lambda: self.begin(run)[1])
+            return float(found[self.runs.columns["release"]])
 
-            return float(self.runs.remembered(("released", state, amount), start)[column])
-
-        first = displacement if way.hold is None else min(1.0, 0.1 * self.runs.input_limit(way.hold))
-        if displacement == 0.0:
-            return 0.0
-        kind = (False, (("hold", ""),))
+        kind = (False, ((what.kind, what.name),))
         if way.hold is not None and self._linear.get(kind) and self._silent.get(kind):
-            return displacement * first / shown(first)
+            return what, displacement * first / shown(first)
         zero = shown(0.0)
         amount, reached = first, shown(first) - zero
         slope = reached / first
@@ -202,7 +180,7 @@ class FmuMotion:
                 slope = (now - reached) / (new - amount)
             amount, reached = new, now
         if abs(reached - displacement) <= 1e-6 * abs(displacement):
-            return amount
+            return what, amount
         raise ModelError(
             f"Nothing that [release] names puts {way.output!r} of the FMU model "
             f"{self._description.name!r} at {displacement:g} m; correct displacement, hold or output there."
@@ -236,9 +214,8 @@ class FmuMotion:
             return mode[0]
         way = self._description.release
         if way is not None:
-            kind = "displacement" if way.displacement is not None else "hold"
             size = trial.release.displacement if trial.release is not None else 1e-3
-            loads: Loads = [(Excitation(kind), size)]
+            loads: Loads = [self.let_go(state, step, size)]
         else:
             name = self.forces[0] if self.forces else next(iter(self.runs.asset.binding.load))
             loads = [(Excitation("input", name, np.eye(1, len(trial.time)).ravel()), 1.0)]
@@ -289,23 +266,27 @@ class FmuMotion:
 
     def records(self, state: State, step: float, count: int) -> FloatArray:
         """Return the outputs (count, C, P) after unit forces over the first step, less those without."""
-        zero: FloatArray | float = 0.0
-        if not self._quiet:
-            zero = self.stepped(Run(state, step, count, []))
-            self._quiet = not np.any(zero)
-        pulse, parts = np.eye(1, count).ravel(), []
+        pulse, parts = np.eye(1, count).ravel(), list[FloatArray]()
         for name, size in zip(self.forces, self.sizes.tolist(), strict=True):
-            moved = self.stepped(Run(state, step, count, [(Excitation("input", name, pulse), size)]))
-            parts.append((moved - zero)[1:] / size)
+            run = Run(state, step, count, [(Excitation("input", name, pulse), size)])
+            parts.append(self._moved(run)[1:] / size)
         return np.stack(parts, axis=2)
+
+    def _moved(self, run: Run) -> FloatArray:
+        """Return the outputs (steps + 1, C) of a motion by the FMU itself, less those without loads."""
+        moved, still = self.stepped(run), run._replace(loads=[])
+        if self._quiet:
+            return moved
+        zero = self.runs.remembered(("without", still.key), lambda: self.stepped(still))
+        self._quiet = not np.any(zero)
+        return moved - zero
 
     def _confirmed(self, system: PortSystem, state: State, step: float, count: int, tolerance: float) -> bool:
         """Whether the FMU answers to many forces as the system says that was made of single ones."""
         signs = np.random.default_rng(0).uniform(-1.0, 1.0, (count, len(self.forces)))
         series = zip(self.forces, signs.T.copy(), self.sizes.tolist(), strict=True)
         loads = [(Excitation("input", name, values), size) for name, values, size in series]
-        moved = self.stepped(Run(state, step, count, loads))
-        moved -= self.stepped(Run(state, step, count, []))
+        moved = self._moved(Run(state, step, count, loads))
         error = np.max(np.abs(moved - system.motion(signs * self.sizes, step)), axis=0)
         return bool(np.all(error <= tolerance * np.max(np.abs(moved), axis=0) + 1e-300))
 
@@ -337,7 +318,7 @@ class FmuMotion:
         return (at_rest if of_mode * at_rest < 1e-6 else 1.0 / of_mode), at_rest
 
 
-def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Sequence[int]) -> Response:
+def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Sequence[int]) -> Sampled:
     """Return values and rates at times, from values on an even grid.
 
     Parameters
@@ -360,7 +341,7 @@ def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Seq
         around = values[first[:, np.newaxis] + np.arange(len(SLOPES))]
         rates = np.einsum("nk,nkc->nc", SLOPES[at_index - first] / step, around)
         rates[before] = 0.0
-        return Response(values[at_index], rates)
+        return values[at_index], rates
     grid = step * np.arange(len(values))
     curve = CubicSpline(grid, values)
     at = np.clip(times, 0.0, grid[-1])
@@ -370,11 +351,9 @@ def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Seq
     rates[before] = 0.0
     for column, order in enumerate(derivatives):
         if order > 0:
-            shown = shown if shown.flags.owndata else shown.copy()
             # derivatives of the derivative's own spline keep the order of the first one
-            slope = curve.derivative()(grid)[:, column]
-            own = CubicSpline(grid, slope)
+            own = CubicSpline(grid, curve(grid, 1)[:, column])
             shown[:, column] = own(at, order - 1)
             rates[:, column] = own(at, order)
             shown[before, column] = rates[before, column] = 0.0
-    return Response(np.ascontiguousarray(shown), np.ascontiguousarray(rates))
+    return np.ascontiguousarray(shown), np.ascontiguousarray(rates)

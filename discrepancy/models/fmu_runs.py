@@ -48,10 +48,10 @@ class Excitation:
     Attributes
     ----------
     kind : str
-        "displacement", "velocity": parameters of the release; "hold": a force is let go that had brought the
-        release point to the displacement; "input": an input.
+        "parameter": a parameter of the release; "hold": an input that holds until the start; "input": one
+        that has a course.
     name : str
-        The input.
+        The key of the parameter, or the FMU's name of the input.
     series : (N,) ndarray
         Its values, each held over a step.
     begin : float
@@ -59,7 +59,7 @@ class Excitation:
     """
 
     kind: str
-    name: str = ""
+    name: str
     series: FloatArray = field(default_factory=lambda: np.zeros(0))
     begin: float = 0.0
 

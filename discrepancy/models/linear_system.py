@@ -253,7 +253,7 @@ class LinearSystem:
         if not (self.truncated and self.ports):
             return None
         rows = np.array(list(self.ports.values()))
-        left_out = np.einsum("pn,np->p", rows, self.residual(rows.T))
+        left_out = np.einsum("pn,np->p", rows, self.residual @ rows.T)
         whole = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
         flexible = [name not in self.on_modes for name in self.ports]
         return np.where((left_out > 1e-9 * whole) & flexible, left_out, 0.0)  # less is rounding
@@ -272,12 +272,9 @@ class LinearSystem:
             return springs(self.stiffness)
         return lambda loads: np.asarray(compliance @ loads)
 
-    def residual(self, loads: FloatArray) -> FloatArray:
-        """Return the part of K^-1 loads, (n,) or (n, k), that the modes leave out."""
-        return np.asarray(self._residual @ loads)
-
     @cached_property
-    def _residual(self) -> FloatArray:
+    def residual(self) -> FloatArray:
+        """The part (N, N) of K^-1 that the modes leave out."""
         held = (self.shapes / self.angular_frequency**2) @ self.shapes.T
         return self.flexibility(np.eye(len(self.mass))) - held
 
@@ -364,7 +361,7 @@ class LinearSystem:
             if item.reaction is not None:
                 force[:, number] = acts @ self.lift[:, item.reaction]
             elif self.truncated:
-                force[:, number] = -acts @ self.residual(item.rows[0])
+                force[:, number] = -acts @ (self.residual @ item.rows[0])
         mass, *others = (shapes.T @ matrix @ shapes for matrix in (self.mass, self.damping, self.stiffness))
         sees, acts = sees @ shapes, acts @ shapes
         push, by_damping, by_stiffness = (np.linalg.solve(mass, item) for item in (acts.T, *others))

@@ -323,6 +323,6 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the factors of the terms at values of the parameters."""
         factors: dict[str, float] = {}
         for item, value in zip(self.description.parameter, parameters, strict=True):
-            for term in item.scaled:
+            for term in item.terms:
                 factors[term] = factors.get(term, 1.0) * float(value)
         return factors

@@ -203,12 +203,9 @@ class LumpedDescription(ModelDescription):
         if kind in ("port", "controller") and any(row[:n]) and any(row[n:]):
             raise ValueError(f"the {kind} {item.name!r} sees displacements or states, not both")
         if isinstance(item, PortSection) and item.acts is not None:
-            push = np.array(item.acts)
+            push, capacity = np.array(item.acts), self.whole("capacity")[n : n + m, n : n + m]
             of_states = not any(row[:n]) and not any(push[:n])
-            if (
-                not of_states
-                or row[n:] @ np.linalg.solve(self.whole("capacity")[n : n + m, n : n + m], push[n:]) <= 0.0
-            ):
+            if not of_states or row[n:] @ np.linalg.solve(capacity, push[n:]) <= 0.0:
                 raise ValueError(
                     f"`acts` of the port {item.name!r} is for states, and must take from what its vector sees"
                 )
@@ -237,27 +234,21 @@ class LumpedDescription(ModelDescription):
             check_unique(kind, given)
         kinds = (*(KINDS[:3] if self.size else ()), *(OF_STATES if self.states else ()))
         terms, gains = [*kinds, *parts], [f"{name}.{gain}" for name in names["controller"] for gain in GAINS]
-        named = ("law",) if self.is_plain else ("input", "load", "law", "controller")
-        scaled = [*terms, *(name for kind in named for name in names[kind]), *gains]
+        more = ("law",) if self.is_plain else ("input", "load", "law", "controller")
+        scaled = list(dict.fromkeys([*terms, *(name for kind in more for name in names[kind]), *gains]))
         driven = [item.name for item in self.input if item.quantity.moving]
-        pushing: tuple[InputSection | LoadSection, ...] = (*self.input, *self.load)
-        for what, name, known in (
-            *((f"{item.name!r} acts through", item.through, terms) for item in pushing),
-            *((f"the law {law.name!r} acts on the port", law.port, names["port"]) for law in self.law),
-            *(
-                (f"the output {output.name!r} is {role}", name, known)
-                for output in self.output
-                for role, name, known in (
-                    ("the reaction of the prescribed motion", output.reaction, driven),
-                    ("what a controller gives,", output.controller, names["controller"]),
-                )
-            ),
-            *(
-                (f"parameter {item.name!r} scales", term, [*dict.fromkeys(scaled)])
-                for item in self.parameter
-                for term in item.scaled
-            ),
-        ):
+        named = list[tuple[str, str | None, Sequence[str]]]()
+        for pushing in (*self.input, *self.load):
+            named.append((f"{pushing.name!r} acts through", pushing.through, terms))
+        for law in self.law:
+            named.append((f"the law {law.name!r} acts on the port", law.port, names["port"]))
+        for output in self.output:
+            is_ = f"the output {output.name!r} is"
+            named.append((f"{is_} the reaction of the prescribed motion", output.reaction, driven))
+            named.append((f"{is_} what a controller gives,", output.controller, names["controller"]))
+        for item in self.parameter:
+            named += [(f"parameter {item.name!r} scales", term, scaled) for term in item.terms]
+        for what, name, known in named:
             if name is not None and name not in known:
                 raise ValueError(f"{what} {name!r}, but there are {', '.join(known) or 'none'}")
 

@@ -2,10 +2,8 @@
 
 from dataclasses import replace
 from functools import partial
-from math import isfinite
 from typing import Annotated, Literal, Self
 
-import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from discrepancy.campaign.records import Quantity
@@ -14,38 +12,28 @@ from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
-from reporting.section import Name, NotNegative, Number, shown
+from reporting.section import Name, NotNegative, Number
 
 
-def _numbers(value: object) -> tuple[float, ...]:
-    """Return one number, or a list of them, as numbers: with one unknown nobody needs brackets."""
-    found = value if isinstance(value, list | tuple) else (value,)
-    if not found or not all(type(item) in (int, float) and isfinite(item) for item in found):
-        raise ValueError(
-            f"a list of finite numbers such as [1.0, 0.0] is expected, or one number, but {shown(value)} came"
-        )
-    return tuple(map(float, found))
+def _listed(value: object) -> list[object] | tuple[object, ...]:
+    """Return one number as a list: with one unknown nobody needs brackets."""
+    return value if isinstance(value, list | tuple) else [value]
 
 
-def _rows(value: object, *, diagonal: bool = False) -> tuple[tuple[float, ...], ...]:
+def _rows(value: object, *, diagonal: bool = False) -> object:
     """Return a matrix by rows from these, from its `diagonal` or only row, or from one number."""
-    try:
-        if isinstance(value, list | tuple) and value and all(isinstance(row, list | tuple) for row in value):
-            return tuple(map(_numbers, value))
-        numbers = _numbers(value)
-    except ValueError:
-        raise ValueError(
-            "a matrix of finite numbers by rows such as [[2.0, -1.0], [-1.0, 2.0]] is expected, or its "
-            f"diagonal, or one number, but {shown(value)} came"
-        ) from None
-    return tuple(map(tuple, np.diag(numbers).tolist())) if diagonal else (numbers,)
+    listed = _listed(value)
+    if listed and isinstance(listed[0], list | tuple):
+        return listed
+    if not diagonal:
+        return [listed]
+    count = range(len(listed))
+    return [[listed[row] if row == column else 0.0 for column in count] for row in count]
 
 
-Vector = Annotated[tuple[Number, ...], BeforeValidator(_numbers)]
+Vector = Annotated[tuple[Number, ...], Field(min_length=1), BeforeValidator(_listed)]
 Rows = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_rows)]
 Matrix = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(partial(_rows, diagonal=True))]
-
-
 Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
 """Share of critical damping; overdamped modes are carried, but far above one a percentage was meant."""
 
@@ -53,7 +41,7 @@ Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
 class Damping(Section):
     """`[damping]`: exactly one of modal ratios, a matrix, or Rayleigh coefficients alpha M + beta K."""
 
-    ratios: Annotated[tuple[Ratio, ...], BeforeValidator(_numbers)] | None = None
+    ratios: Annotated[tuple[Ratio, ...], BeforeValidator(_listed)] | None = None
     matrix: Matrix | None = None
     alpha: NotNegative | None = None
     beta: NotNegative | None = None
@@ -78,7 +66,13 @@ class NamedVector(NamedSection):
     vector: Vector
 
 
-class InputSection(NamedVector):
+class LoadSection(NamedVector):
+    """`[[load]]`: a constant load; with `through` the part or matrix of that name times the vector."""
+
+    through: Name | None = None
+
+
+class InputSection(LoadSection):
     """`[[input]]`: what acts along a vector, and how this changes when the place of a force moves [1/m].
 
     A motion (displacement, velocity, acceleration, of an angle too) is prescribed to vector . u; anything
@@ -86,7 +80,6 @@ class InputSection(NamedVector):
     """
 
     quantity: Annotated[Quantity, Field(strict=False)] = Quantity.FORCE
-    through: Name | None = None
     station_derivative: Vector | None = None
     chord_derivative: Vector | None = None
 
@@ -113,12 +106,6 @@ class OutputSection(NamedSection):
                 f'the output {self.name!r} is a reaction: give it quantity = "force" or "torque"'
             )
         return self
-
-
-class LoadSection(NamedVector):
-    """`[[load]]`: a constant load; with `through` the part or matrix of that name times the vector."""
-
-    through: Name | None = None
 
 
 class CouplingSection(Section):
@@ -218,13 +205,8 @@ class RootSection(Section):
 class ScaledParameter(ParameterSection):
     """`[[parameter]]`: a factor of the terms named."""
 
-    terms: Name | tuple[Name, ...]
+    terms: Annotated[tuple[Name, ...], BeforeValidator(_listed)]
     mean: Number = 1.0
-
-    @property
-    def scaled(self) -> tuple[str, ...]:
-        """Names of the terms."""
-        return (self.terms,) if isinstance(self.terms, str) else self.terms
 
     @model_validator(mode="after")
     def _in_range(self) -> Self:

@@ -48,14 +48,9 @@ class PortSystem:
 
     def over(self, step: float) -> tuple[FloatArray, FloatArray]:
         """Return A (n, n) and B (n, P) of s(k+1) = A s(k) + B f(k), f held over steps [s]."""
-
-        def found() -> tuple[FloatArray, FloatArray]:
-            transition, drive, *_ = cont2discrete(
-                (self.generator, self.push, self.outputs, self.direct), step
-            )
-            return transition, drive
-
-        return self._steps.get(step, found)
+        system = self.generator, self.push, self.outputs, self.direct
+        found: tuple[FloatArray, FloatArray] = self._steps.get(step, lambda: cont2discrete(system, step)[:2])
+        return found
 
     def in_state_of(self, base: "PortSystem") -> "PortSystem":
         """Return the same system in the state of another of its order.

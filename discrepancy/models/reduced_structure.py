@@ -1,6 +1,5 @@
-"""Structures that springs hold as models: what all have, and one from a mesh or matrices by its modes."""
+"""A structure from a mesh or matrices as a model, by its modes."""
 
-from abc import abstractmethod
 from collections.abc import Mapping
 
 import numpy as np
@@ -9,20 +8,12 @@ from scipy.linalg import inv
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import (
-    Acting,
-    Course,
-    Load,
-    LoadChange,
-    Shown,
-    place_among,
-    shown_rows,
-)
+from discrepancy.models.acting import Acting, Shown, place_among, shown_rows
 from discrepancy.models.interface import NO_PATCH, Outputs, Place
 from discrepancy.models.memory import Memory
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
-from fe.runtime.patch import INTERNAL_FORCES, LOADS, SENSORS, LoadGain, ModelPatch, PointMass, Primitive
+from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, ModelPatch, Primitive
 from fe.runtime.reduced import ReducedModel, ReducedState, dense_sum
 from fe.runtime.state import Losses
 
@@ -34,31 +25,7 @@ SAME = 1e-9
 """Difference of two rows, relative to the largest entry, that is rounding."""
 
 
-class StructuralModel(SystemModel):
-    """A structure that springs hold, under a force or lift."""
-
-    kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
-
-    @abstractmethod
-    def lift(self, state: State, change: ModelPatch) -> FloatArray:
-        """Return the loads (2, n) of a load factor and of its square, as load primitives have them."""
-
-    def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
-        """Return what acts in a trial: a force at a place, or lift."""
-        trial, _, patch, state = case
-        loads = patch.of(*LOADS)
-        if trial.kind is TrialKind.FLIGHT:
-            # where a mass has weight; other zeros are read with it in place
-            rows = self.lift(state, patch.of(*LOADS, PointMass))
-            amounts = [trial.load_factor, trial.load_factor**2]
-        else:
-            rows = self.force_row(trial.load_place, state, loads)[None]
-            amounts = [LoadChange.of(loads).changed(trial.force, trial.force)]
-        courses = [Course.of(trial.time, values, trial.hold) for values in amounts]
-        return list(zip(rows, courses, strict=True)), {}
-
-
-class StructureModel(StructuralModel):
+class StructureModel(SystemModel):
     """A structure from a mesh or matrices; its parameters and free masses have `DEVIATION`.
 
     A control in N is a force, and where a load of it meets a displacement output along it there is a port,
@@ -85,7 +52,7 @@ class StructureModel(StructuralModel):
             for name in names
             for low, high in [model.validity[name]]
         )
-        units = zip(model.controls, model.control_units.split(), strict=True)
+        units = zip(model.controls, model.control_units, strict=True)
         self.forces = tuple(name for name, unit in units if unit == "N")
         if not self.forces and LOAD_FACTOR not in model.controls:
             raise ModelError(

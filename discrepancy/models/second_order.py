@@ -32,6 +32,8 @@ class Motion:
         What moved.
     acting : Acting
         What acted.
+    laws : Laws
+        Internal forces.
     time : (N,) ndarray
         Times of the motion since the release or the begin of the record [s].
     q, velocity : (N, M + P) ndarray
@@ -40,8 +42,6 @@ class Motion:
         Internal forces.
     lagged : (N, J) ndarray
         Internal forces as omitted modes follow them.
-    laws : Laws
-        Their laws.
     held : int
         First samples that lie before the release, where the shape is held.
     holding : (n,) ndarray, optional
@@ -50,12 +50,12 @@ class Motion:
 
     system: LinearSystem
     acting: Acting
+    laws: Laws
     time: FloatArray
     q: FloatArray
     velocity: FloatArray
     port_forces: FloatArray
     lagged: FloatArray
-    laws: Laws
     held: int = 0
     holding: FloatArray | None = None
 
@@ -99,7 +99,7 @@ class Motion:
         of their damping.
         """
         system = self.system
-        residual, found = system.residual(rows.T), np.zeros((len(self.time), len(rows)))
+        residual, found = system.residual @ rows.T, np.zeros((len(self.time), len(rows)))
         if self.acting.loads:
             found += self.acting.load_at(self.time, residual)
         if len(self.laws):
@@ -177,7 +177,7 @@ class SecondOrderSystem(LinearSystem):
         found = self._followed(acting, laws, first, times, begin, refinement)
         if acting.begins is not Start.UNKNOWN and times[0] <= first:
             self._rest_on_drives(found, begin.v, laws)
-        return Motion(self, acting, times, found.q, found.v, found.port_forces, found.lagged, laws)
+        return Motion(self, acting, laws, times, *found[:4])
 
     def _let_go(
         self, row: FloatArray, release: Release, acting: Acting, laws: Laws, refinement: int
@@ -192,14 +192,16 @@ class SecondOrderSystem(LinearSystem):
         held = int(np.searchsorted(times, 0.0)) if release.at_rest else 0
         stamps = times[held:] if held < len(times) else np.zeros(1)  # which nobody looks at
         if stamps[0] < 0.0:
-            begin = self._backwards(q, v, -float(stamps[0]))
+            back = self.modal.exact_steps(-stamps[:1])[0][0]
+            begin = Begin(*np.split(np.linalg.solve(back, np.concatenate((q, v))), 2))
         found = self._followed(acting, laws, 0.0, stamps, begin, refinement)
-        felt = np.zeros(len(laws)) if begin.memory is None else begin.memory[:, 2]
-        parts = zip((q, v, felt, felt), (found.q, found.v, found.port_forces, found.lagged), strict=True)
-        q, v, forces, lagged = (
-            np.vstack((np.tile(still, (held, 1)), part))[: len(times)] for still, part in parts
-        )
-        return Motion(self, acting, times, q, v, forces, lagged, laws, held, holding)
+        parts = list(found[:4])
+        if held:
+            felt = np.zeros(len(laws)) if begin.memory is None else begin.memory[:, 2]
+            still = (np.tile(part, (held, 1)) for part in (q, v, felt, felt))
+            parts = [np.vstack(both)[: len(times)] for both in zip(still, parts, strict=True)]
+        q, v, forces, lagged = parts
+        return Motion(self, acting, laws, times, q, v, forces, lagged, held, holding)
 
     # ------------------------------------------------------------ begin
 
@@ -266,16 +268,10 @@ class SecondOrderSystem(LinearSystem):
             holding += float(along @ solution.forces[0]) / compliance
             acts, memory = holding * row - solution.forces[0] @ rows, solution.memory
             if self.truncated:  # of the port's position, fades after the release
-                memory[:, 3] = holding * (rows @ self.residual(row))
+                memory[:, 3] = holding * (rows @ self.residual @ row)
         deviation = given[:, 0] * unit
         deviation[0] = 0.0
         return Begin(acts @ self.shapes / w**2 + deviation, np.zeros(len(w)), memory), holding * row
-
-    def _backwards(self, q: FloatArray, v: FloatArray, duration: float) -> Begin:
-        """Return the state a duration [s] earlier, without internal forces."""
-        step = self.modal.exact_steps(np.array([duration]))[0][0]
-        state = np.linalg.solve(step, np.concatenate((q, v)))
-        return Begin(state[: len(q)], state[len(q) :])
 
     # ------------------------------------------------------------ steps
 
@@ -294,18 +290,20 @@ class SecondOrderSystem(LinearSystem):
         """Return the motion at stamps from a state at the first of them."""
         if len(stamps) == 1:  # a step that nobody looks at
             found = self._advanced(acting, laws, stamps[0] + np.array([0.0, INSTANT]), begin, refinement)
-            return ModalMotion(*(part if part is found.memory else part[:1] for part in found))
+            return found._replace(
+                q=found.q[:1], v=found.v[:1], port_forces=found.port_forces[:1], lagged=found.lagged[:1]
+            )
         pushed = acting.loads or acting.drives or acting.constant.any() or not laws.linear
         free = None if pushed else self.modal.free(begin.q, begin.v, stamps - stamps[0])
         if free is not None:
             none = np.zeros((len(stamps), 0))
-            return ModalMotion(*free, none, NO_LAWS.memory(), none)
+            return ModalMotion(*free, none, none, NO_LAWS.memory())
         smooth = bool(acting.drives) or any(course.is_smooth for _, course in acting.loads)
         edges = (*laws.edges, *(moment for _, course in acting.loads for moment in course.edges))
         boundaries = substeps(self.modal, laws, stamps, refinement, SMOOTH_PARTS if smooth else 1, edges)
         feed = np.zeros((len(boundaries.time), len(laws)))
         if self.truncated and len(laws) and acting.loads:
-            feed = acting.load_at(boundaries.time, self.residual(self.port_rows(laws).T))
+            feed = acting.load_at(boundaries.time, self.residual @ self.port_rows(laws).T)
         return advance(self.modal, laws, self._steps(acting, boundaries, feed), begin, compiled_kernel())
 
     def _steps(self, acting: Acting, boundaries: Boundaries, feed: FloatArray) -> Steps:

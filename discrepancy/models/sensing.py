@@ -10,12 +10,7 @@ from discrepancy.models.high_pass import filtered_record
 from discrepancy.models.interface import Conditions, Model, Response
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive, SensorRotation
-from fe.runtime.sensors import (
-    SensorRecord,
-    apply_sensors,
-    check_channels,
-    clock_of,
-)
+from fe.runtime.sensors import SensorRecord, apply_sensors, check_channels, clock_of
 
 
 def observe(

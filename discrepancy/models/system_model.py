@@ -10,7 +10,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Course, Load, Shown, release_of
+from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, release_of
 from discrepancy.models.interface import NO_PATCH, Conditions, Model, Outputs, Place, PortedSystem, Response
 from discrepancy.models.linear_system import Resting, at_rest
 from discrepancy.models.natural_scales import PortSizes
@@ -18,7 +18,15 @@ from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws
-from fe.runtime.patch import INTERNAL_FORCES, STRUCTURE, ModelPatch, ModulusTemperature, PortLoad
+from fe.runtime.patch import (
+    INTERNAL_FORCES,
+    LOADS,
+    STRUCTURE,
+    ModelPatch,
+    ModulusTemperature,
+    PointMass,
+    PortLoad,
+)
 from fe.runtime.state import Losses
 
 
@@ -82,6 +90,7 @@ class SystemModel(Model):
     port_rows: Mapping[str, FloatArray]
     missing: tuple[str, ...] = ()
     reference: str | None = None
+    kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
     displacements: int | None = None
     components: ClassVar[int] = 1
     shows_ports: ClassVar[bool] = True
@@ -104,9 +113,26 @@ class SystemModel(Model):
     def constant(self, case: Case) -> FloatArray:
         """Return the load (N,) that always acts."""
 
-    @abstractmethod
+    def lift(self, state: State, change: ModelPatch) -> FloatArray:
+        """Return the loads (2, N) of a load factor and of its square, as load primitives have them."""
+        raise NotImplementedError
+
     def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
-        """Return loads and prescribed motions in a trial; at rest the values of their courses are by row."""
+        """Return loads, and prescribed motions, in a trial; at rest the values of their courses are by row.
+
+        These are a force at a place, or lift.
+        """
+        trial, _, patch, state = case
+        loads = patch.of(*LOADS)
+        if trial.kind is TrialKind.FLIGHT:
+            # where a mass has weight; other zeros are read with it in place
+            rows = self.lift(state, patch.of(*LOADS, PointMass))
+            amounts = [trial.load_factor, trial.load_factor**2]
+        else:
+            rows = self.force_row(trial.load_place, state, loads)[None]
+            amounts = [LoadChange.of(loads).changed(trial.force, trial.force)]
+        courses = [Course.of(trial.time, values, trial.hold) for values in amounts]
+        return list(zip(rows, courses, strict=True)), {}
 
     @abstractmethod
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:

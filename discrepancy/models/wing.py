@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,9 @@ from discrepancy.models.acting import Acting, Shown, shown_rows
 from discrepancy.models.interface import NO_PATCH, Outputs, Place
 from discrepancy.models.linear_system import Resting, springs
 from discrepancy.models.memory import Memory
-from discrepancy.models.reduced_structure import StructuralModel
 from discrepancy.models.scales import PortScale
 from discrepancy.models.second_order import SecondOrderSystem
-from discrepancy.models.system_model import Case, State
+from discrepancy.models.system_model import Case, State, SystemModel
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import PLANFORM, STATION_PORTS
@@ -54,7 +54,7 @@ paper, its masses, and the damping of the joint posterior, whose spread holds th
 ROTATING_PORT = "root"
 
 
-class WingModel(StructuralModel):
+class WingModel(SystemModel):
     """The wing in the states and under the structural patches that are asked for, each made once.
 
     Parameters
@@ -92,7 +92,7 @@ class WingModel(StructuralModel):
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
         self.name, self.parameters = name, wing_priors(box, **prior)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
-        self.port_names = tuple(PORTS)
+        self.port_names, self._row = tuple(PORTS), cache(wing.output_row)
         self._stiffnesses, self._systems, self._rows, self._answers = (Memory() for _ in range(4))
 
     @classmethod
@@ -142,15 +142,13 @@ class WingModel(StructuralModel):
 
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
         """Return what outputs show; `component` 1 and 2: transverse and shear strain."""
-        rows = np.array([self._row(output, component) for output, _ in outputs]).reshape(-1, self.wing.size)
+        known = (self._row(output, component) for output, _ in outputs)
+        rows = self._rows.get((outputs, component), lambda: np.array([*known]).reshape(-1, self.wing.size))
         factors = self.wing.strain_factors(case.patch.of(LocalStiffnessLoss))
         if factors is not None:
             gauges = np.array([strain_gauge(output) for output, _ in outputs])
             rows = rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
         return shown_rows(rows if acting is None or acting.basis is None else rows @ acting.basis, outputs)
-
-    def _row(self, output: str, component: int = 0) -> FloatArray | None:
-        return self._rows.get((output, component), lambda: self.wing.output_row(output, component))
 
     @property
     def shown_outputs(self) -> tuple[str, ...]:
@@ -185,7 +183,7 @@ class WingModel(StructuralModel):
 
     def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
         """Return the scales of a force over the planform, from those of its mean and the first mode."""
-        share = self.wing.planform.share
+        share = self.wing.planform[1]
         motion = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
         ratio = motion / float(share @ motion)
         by_place = tuple(zip(share.tolist(), ratio.tolist(), strict=True))

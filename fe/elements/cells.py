@@ -52,29 +52,6 @@ def point_jacobians(kind: ElementKind, nodes: FloatArray, local: FloatArray) -> 
     return np.asarray(np.einsum("pai,paj->pij", nodes, slopes))
 
 
-def strain_weights(
-    kind: ElementKind, nodes: FloatArray, local: FloatArray, direction: FloatArray
-) -> FloatArray:
-    """Weights (p, k, 3) [1/m] of nodal displacements in the strain along unit vectors.
-
-    Parameters
-    ----------
-    kind : ElementKind
-        Of the cells.
-    nodes : (p, k, 3) m
-        Their nodes.
-    local : (p, 3)
-        One local place in each cell.
-    direction : (p, 3) or (3,)
-        Unit vectors.
-    """
-    _, slopes = kind.shape_functions(local)
-    inverse = np.linalg.inv(point_jacobians(kind, nodes, local))
-    direction = np.broadcast_to(direction, local.shape)
-    slope = np.einsum("pai,pij,pj->pa", slopes, inverse, direction)
-    return np.asarray(slope[:, :, None] * direction[:, None, :])
-
-
 def stiffness_blocks(
     kind: ElementKind, nodes: FloatArray, elasticity: FloatArray, factor: FloatArray | float = 1.0
 ) -> FloatArray:
@@ -198,6 +175,49 @@ class CellMesh:
         values, _ = self.kind.shape_functions(local)
         return np.asarray(np.einsum("qa,nai->nqi", values, self.nodes[cells]))
 
+    def strains(
+        self, displacement: FloatArray, cells: IntArray | slice = slice(None), local: FloatArray | None = None
+    ) -> FloatArray:
+        """Strains (n, q, 6) xx, yy, zz, yz, xz, xy, shear as engineering strain.
+
+        Parameters
+        ----------
+        displacement : (nodes, 3) m
+            Of all nodes.
+        cells : (n,) or slice, optional
+            All cells by default.
+        local : (q, 3), optional
+            Local places in them; by default their centre.
+        """
+        places = np.mean(self.kind.corners, axis=0)[None] if local is None else local
+        slopes, _ = gradients(self.kind, self.nodes[cells], places)
+        moved = displacement[self.cells[cells]].reshape(len(slopes), -1)
+        return np.asarray(np.einsum("nqij,nj->nqi", strain_matrix(slopes), moved))
+
+    def strain_rows(
+        self, owner: ArrayLike, share: ArrayLike, cells: IntArray, local: FloatArray, direction: FloatArray
+    ) -> sparse.csr_array:
+        """Strains as rows on the displacements, csr (rows, unknowns) [1/m]: sums of p strains at places.
+
+        Parameters
+        ----------
+        owner, share : (p,)
+            Row that each strain is part of, all rows from 0 on, and times what.
+        cells, local : (p,), (p, 3)
+            A cell, and a local place in it.
+        direction : (p, 3)
+            Unit vectors along which the strain is.
+        """
+        nodes = self.nodes[cells]
+        _, slopes = self.kind.shape_functions(local)
+        inverse = np.linalg.inv(point_jacobians(self.kind, nodes, local))
+        slope = np.asarray(share)[:, None] * np.einsum("pai,pij,pj->pa", slopes, inverse, direction)
+        values = slope[:, :, None] * direction[:, None, :]
+        rows = np.repeat(owner, 3 * self.kind.node_count)
+        places = (rows, self.unknowns_of(cells).ravel())
+        shape = (int(rows.max(initial=-1)) + 1, self.unknowns)
+        return sparse.coo_array((values.ravel(), places), shape).tocsr()
+
     def stiffness(
         self, cells: IntArray, elasticity: FloatArray, factor: FloatArray | float = 1.0
     ) -> sparse.csr_array:
@@ -236,22 +256,6 @@ class CellMesh:
             places = (np.repeat(unknowns, width, axis=1).ravel(), np.tile(unknowns, (1, width)).ravel())
             total = total + sparse.coo_array((values, places), shape=total.shape).tocsr()
         return total
-
-
-def centre_strains(mesh: CellMesh, displacement: FloatArray) -> FloatArray:
-    """Strains (nc, 6) xx, yy, zz, yz, xz, xy, shear as engineering strain, at the centres of the cells.
-
-    Parameters
-    ----------
-    mesh : CellMesh
-        The cells.
-    displacement : (nodes, 3) m
-        Of all nodes.
-    """
-    centre = np.mean(mesh.kind.corners, axis=0)
-    slopes, _ = gradients(mesh.kind, mesh.nodes, centre[None])
-    moved = displacement[mesh.cells].reshape(len(mesh.cells), -1)
-    return np.asarray(np.einsum("nij,nj->ni", strain_matrix(slopes[:, 0]), moved))
 
 
 def hexahedra_20(points: FloatArray, cells: IntArray) -> CellMesh:

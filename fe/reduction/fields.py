@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
-from fe.elements.cells import CellMesh, centre_strains
+from fe.elements.cells import CellMesh
 from fe.elements.kinds import HEXAHEDRA_20
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import ReducedModelFileError
@@ -111,15 +111,13 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
         If the file cannot be written.
     """
     displacement = wing.static_displacement @ wing.static_response(vector).coordinates
-    loss = np.zeros(len(wing.region))
-    for number, name in enumerate(wing.regions, start=1):
-        loss[wing.region == number] = vector[wing.chosen.index(name)]
-    strain = centre_strains(CellMesh(HEXAHEDRA_20, wing.points, wing.cells), displacement)
+    lost = [0.0, *(vector[wing.chosen.index(name)] for name in wing.regions), 0.0, 0.0]  # of each region
+    strain = CellMesh(HEXAHEDRA_20, wing.points, wing.cells).strains(displacement)[:, 0]
     cells = {
         "strain": strain,
         "spanwise_strain": -strain[:, 1],
         "region": wing.region,
-        "stiffness_loss": loss,
+        "stiffness_loss": np.array(lost)[wing.region],
     }
     write_vtu(path, wing.points, (_CELLS, wing.cells), {"displacement": displacement}, cells)
 

@@ -1,9 +1,9 @@
 """Offline: the wing in a basis that is rich enough for the changes of `fe.runtime.patch`.
 
 In two steps. A working basis of several hundred vectors holds what the full model answers to loads, to point
-forces and to each stiffness and mass term, at two states of health, and representatives of the gauges (whose
-presence squares the error of a strain). In it, many patched states are solved; the singular directions of
-their solutions and modes, weighed by what is looked at most, are the basis that is kept.
+forces, to the gauges as loads (whose presence squares the error of a strain) and to each stiffness and mass
+term, at two states of health. In it, many patched states are solved; the singular directions of their
+solutions and modes, weighed by what is looked at most, are the basis that is kept.
 """
 
 from typing import Any
@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 from scipy.linalg import eigh
+from scipy.stats import qmc
 
 from fe.full.subspace import Norm
 from fe.runtime.arrays import FloatArray
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedState, PatchedWing
-from fe.runtime.state import DigitalState
+from fe.structure.affine import natural_frequencies
 from fe.wing.operators import AffineOperators
 from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
 from reporting.progress import Progress, SilentProgress
@@ -28,10 +29,12 @@ DAMAGED_ANCHOR = 0.7
 """Stiffness loss of every damage region in the second state of health at which the full model is solved."""
 LIFT_MOMENTS = 6
 """Courses of the lift along the span for which the full model is solved: Legendre polynomials."""
-MODES = 8
-SUBSPACE_ITERATIONS = 6
+MODES, SHAPES = 8, 6
+"""Modes that are snapshots, and those of them whose inertia and parts of the skin are answered, too."""
 START_SHAPES = 16
 """Modes from which those of a patched wing are iterated."""
+WORKING_TOLERANCE = 3e-7
+"""Squared size, relative to the largest, of a direction that the working basis leaves out."""
 
 
 def reduce_patches(
@@ -56,86 +59,48 @@ def reduce_patches(
     settings, progress = settings or PatchSettings(), progress or SilentProgress()
     with progress.stage("Solving the wing for changes"):
         full = assemble_patch_operators(operators, settings.strip_count)
-        healthy = Norm(operators.stiffness())
-        damaged = Norm(operators.stiffness(None, (DAMAGED_ANCHOR,) * len(operators.regions)))
-        snapshots = np.concatenate(
-            [_responses(full, healthy, settings, main=True), _responses(full, damaged, settings, main=False)],
-            axis=1,
-        )
-        basis = _orthonormal(snapshots, healthy.stiffness)
+        healthy, damaged = _responses(full, 0.0), _responses(full, DAMAGED_ANCHOR)
+        snapshots = np.concatenate((healthy, damaged), axis=1)
+        values, vectors = np.linalg.eigh(snapshots.T @ (operators.stiffness() @ snapshots))
+        kept = values > WORKING_TOLERANCE * values[-1]
+        basis = snapshots @ (vectors[:, kept] / np.sqrt(values[kept]))
     with progress.stage("Reducing the patched wing"):
         directions = _directions(project(full, basis, settings), settings)
         return project(full, basis @ directions, settings)
 
 
-def _unit_energy(vectors: FloatArray, stiffness: Any) -> FloatArray:
-    energy = np.einsum("ik,ik->k", vectors, stiffness @ vectors)
-    return np.asarray(vectors / np.sqrt(np.where(energy > 0.0, energy, 1.0)))
-
-
-def _responses(full: PatchOperators, norm: Norm, settings: PatchSettings, *, main: bool) -> FloatArray:
-    """Return solutions (n, k) of the full model at one state of health, in their natural sizes.
-
-    `main`: more of them, for the state of health that is looked at most.
-    """
-    operators, stiffness, rows, plain = full.operators, norm.stiffness, full.rows, full.plain
-    eta = plain["stations"] / plain["stations"][-1]
-    moments = np.polynomial.legendre.legvander(2.0 * eta - 1.0, LIFT_MOMENTS - 1)
-    step = max(1, len(eta) // 13)
+def _responses(full: PatchOperators, loss: float) -> FloatArray:
+    """Return solutions (n, k) of the full model, all damage regions with one loss, in their natural sizes."""
+    operators, rows, stations = full.operators, full.rows, full.plain["stations"]
+    health = dict.fromkeys(operators.regions, loss)
+    norm, modes = Norm(operators.stiffness(None, health)), natural_frequencies(operators, MODES, health)[1]
+    step = max(1, len(stations) // 13)
     along_x, along_y, elastic, *others = rows["line_rows"]
     along, *turned = rows["strain_rows"]
-    lines = [
-        elastic[2 : None : 1 if main else step],  # where point masses may sit
+    lines = (
+        *turned,
+        elastic[2:],  # where point masses may sit
         *(line[step::step] for line in others),
         *(line[2 * step :: 2 * step] for line in (along_x, along_y)),
-        *(turned if main else ()),
-        along,
-    ]
-    loads = np.vstack(
-        [
-            *(rows[name] for name in ("load_tip", "load_lift", "tip_row")),
-            (rows["lift_rows"].T @ moments).T,
-            *(rows[name] for name in ("weight", "flap_row")),
-            *(line.toarray() for line in lines),
-        ]
-    ).T
-    solutions = norm.riesz(loads)
-    gauges = solutions[:, -operators.gauge_output.shape[0] :]
-    solutions = _unit_energy(solutions, stiffness)
-    mass = operators.mass({name: float(np.mean(operators.ranges[name])) for name in operators.masses})
-    vectors = np.random.default_rng(settings.seed).normal(size=(operators.unknowns, MODES + 6))
-    for _ in range(SUBSPACE_ITERATIONS):
-        vectors = np.linalg.qr(norm.riesz(np.asarray(mass @ vectors)))[0]
-    _, coordinates = eigh(vectors.T @ (stiffness @ vectors), vectors.T @ (mass @ vectors))
-    modes = _unit_energy(vectors @ coordinates[:, :MODES], stiffness)
+    )
+    single = [rows[name] for name in ("load_tip", "load_lift", "tip_row", "weight", "flap_row")]
+    moments = np.polynomial.legendre.legvander(2.0 * stations / stations[-1] - 1.0, LIFT_MOMENTS - 1)
+    inertia = [(term @ modes[:, :SHAPES]).T for term in operators.mass_terms]
+    several = (line.toarray() for line in lines)
+    loads = (along.toarray(), *single, moments.T @ rows["lift_rows"], *several, *inertia)
+    solutions = np.concatenate((norm.riesz(np.vstack(loads).T), modes), axis=1)
+    solutions /= np.sqrt(np.einsum("ik,ik->k", solutions, norm.product(solutions)))
     # what each part of the skin does to the main solutions, and to the gauges near it
-    shapes = np.concatenate((solutions[:, :2], modes[:, : 6 if main else 3]), axis=1)
-    changes = [np.asarray(part @ shapes) for part in full.strips]
-    places, edges = plain["gauge_stations"], plain["strip_lines"]
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    reach = 1.5 * float(np.diff(edges).max())
-    gauges = _unit_energy(gauges, stiffness)
-    for part, strip in zip(full.strips, plain["strip_of"], strict=True):
-        near = np.flatnonzero(np.abs(places - middle[strip]) < reach)
-        if main and near.size:
-            changes.append(np.asarray(part @ gauges[:, near]))
-    inertia = [np.asarray(term @ modes[:, :6]) for term in operators.mass_terms]
-    answered = norm.riesz(np.concatenate((*changes, *inertia), axis=1))
-    count = inertia[0].shape[1] * len(inertia)
-    answered[:, -count:] = 0.3 * _unit_energy(answered[:, -count:], stiffness)
-    return np.concatenate((solutions, modes, answered), axis=1)
-
-
-def _orthonormal(snapshots: FloatArray, stiffness: Any) -> FloatArray:
-    """Basis (n, k), orthonormal in the energy, of all but the least directions of snapshots."""
-    gram = snapshots.T @ (stiffness @ snapshots)
-    values, vectors = np.linalg.eigh(0.5 * (gram + gram.T))
-    kept = values > WORKING_TOLERANCE * values[-1]
-    return np.asarray(snapshots @ (vectors[:, kept] / np.sqrt(values[kept])))
-
-
-WORKING_TOLERANCE = 3e-7
-"""Squared size, relative to the largest, of a direction that the working basis leaves out."""
+    places, edges = full.plain["gauge_stations"], full.plain["strip_lines"]
+    gauges, under_loads, _ = np.split(solutions, [len(places), len(places) + 2], axis=1)
+    main = np.concatenate((under_loads, solutions[:, -MODES:][:, :SHAPES]), axis=1)
+    middle = 0.5 * (edges[1:] + edges[:-1])[full.plain["strip_of"], np.newaxis]
+    near = np.abs(places - middle) < 1.5 * np.diff(edges).max()
+    changes = [
+        part @ np.concatenate((main, gauges[:, close]), axis=1)
+        for part, close in zip(full.strips, near, strict=True)
+    ]
+    return np.concatenate((solutions, norm.riesz(np.concatenate(changes, axis=1))), axis=1)
 
 
 def _inner(matrix: sparse.csr_array, basis: FloatArray) -> FloatArray:
@@ -162,7 +127,7 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
     shapes = eigh(whole, nominal, subset_by_index=[0, START_SHAPES - 1])[1]
     return PatchArrays(
         design_hash=operators.design_hash,
-        region_names=" ".join(operators.regions),
+        regions=operators.regions,
         validity_box=np.array(list(operators.ranges.values())),
         largest_loss=settings.largest_loss,
         largest_compliance=settings.compliance_share
@@ -178,69 +143,61 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
     )
 
 
-def _directions(arrays: PatchArrays, settings: PatchSettings) -> FloatArray:
-    """Return the kept directions (N, n) of the working basis."""
-    generator, wing = np.random.default_rng(settings.seed), PatchedWing(arrays)
-    span_row = arrays.station_weights @ arrays.line_rows[2]
-    gauges = np.concatenate(arrays.strain_rows).T
-    all_snapshots = np.zeros((wing.size, wing.size))
-    for number in range(settings.states):
-        structure, loads = _patched_state(wing, settings, generator, plain=number == 0)
-        columns = np.concatenate((loads, gauges, arrays.flap_row[:, None], span_row[:, None]), axis=1)
-        weights = np.ones(columns.shape[1])
-        weights[:3] = LOAD_WEIGHT
-        weights[len(loads.T) + len(gauges.T) // 3 : -2] = TURNED_WEIGHT
-        solutions = _unit(structure.static(columns)) * weights
-        modes = _unit(structure.lowest(MODES).shapes) * MODE_WEIGHTS
-        plainly = 10.0 if number == 0 else 1.0  # the wing as it was is looked at most
-        shapes = np.concatenate((solutions, modes), axis=1) * plainly
-        all_snapshots += shapes @ shapes.T
-    first = max(0, wing.size - settings.vectors)
-    return np.asarray(eigh(all_snapshots, subset_by_index=[first, wing.size - 1])[1][:, ::-1])
-
-
 LOAD_WEIGHT = 3.0
-"""How much more the solutions under tip force, lift and a washed-out lift count than those under others."""
+"""How much more the solutions under tip force, lift and washed-out lifts count than those under others."""
+WASHOUTS = (0.5, 1.0, 2.0, 4.0)
+"""Exponents of these."""
+OUTBOARD = (0.75, 1.0)
+"""Where point forces act, in semi-spans."""
 TURNED_WEIGHT = 0.4
 """How much representatives of strain across a gauge and of shear count."""
-MODE_WEIGHTS = np.array([3.0, 3.0, 4.0, 3.0, 1.5, 1.0, 0.5, 0.3])
+MODE_WEIGHTS = np.array([3.0, 3.0, 6.0, 3.0, 1.5, 1.0, 0.5, 0.3])
+CHANGED = 6
+"""Numbers of the changes: start, length, amount of a local loss, root compliance, point mass, its station."""
+PLAIN_WEIGHT = 10.0
+"""How much more the wing as it was counts than one of the patched states."""
+
+
+def _directions(arrays: PatchArrays, settings: PatchSettings) -> FloatArray:
+    """Return the kept directions (N, n) of the working basis."""
+    wing = PatchedWing(arrays)
+    eta, upwards = arrays.stations / wing.span, arrays.line_rows[2:]
+    washed = np.power.outer(eta, WASHOUTS).T @ arrays.lift_rows
+    forces = upwards[:, np.searchsorted(eta, OUTBOARD)].reshape(-1, wing.size)
+    span_row, (along, *turned) = arrays.station_weights @ upwards[0], arrays.strain_rows
+    groups = (
+        np.vstack((arrays.load_tip, arrays.load_lift, washed)),
+        np.vstack((arrays.weight, forces, along, arrays.flap_row, span_row)),
+        np.vstack(turned),
+    )
+    columns = np.concatenate(groups).T
+    weights = np.repeat((LOAD_WEIGHT, 1.0, TURNED_WEIGHT), [len(rows) for rows in groups])
+    all_snapshots = np.zeros((wing.size, wing.size))
+    places = qmc.Halton(len(arrays.validity_box) - 2 + CHANGED, scramble=False).random(settings.states)
+    for number, shares in enumerate(places):
+        structure = _patched_state(wing, shares, number)
+        solutions, modes = _unit(structure.static(columns)), _unit(structure.lowest(MODES).shapes)
+        shapes = np.concatenate((solutions * weights, modes * MODE_WEIGHTS), axis=1)
+        all_snapshots += shapes @ shapes.T * (1.0 if number else PLAIN_WEIGHT**2)
+    first = max(0, wing.size - settings.vectors)
+    return np.asarray(eigh(all_snapshots, subset_by_index=[first, wing.size - 1])[1][:, ::-1])
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=0))
 
 
-def _patched_state(
-    wing: PatchedWing, settings: PatchSettings, generator: np.random.Generator, *, plain: bool
-) -> tuple[PatchedState, FloatArray]:
-    """Return a random state and its loads (N, 3 + 2 L); `plain`: of the wing as it was."""
+def _patched_state(wing: PatchedWing, shares: FloatArray, number: int) -> PatchedState:
+    """Return a state at shares of all ranges; its number says what is changed, 0 is the wing as it was."""
     arrays, span = wing.arrays, wing.span
-    drawn = np.array(generator.uniform(*arrays.validity_box[:-2].T))  # all but the loads
-    e, *losses, servo, pitot = drawn.tolist()
-    damaged, *changed = generator.random(4) < (0.5, 0.75, 0.4, 0.6)
-    start, length = generator.uniform(-0.05, 0.9) * span, generator.uniform(0.02, 0.3) * span
+    start, length, loss, compliance, mass, station = shares[:CHANGED].tolist()
+    low, high = arrays.validity_box[:-2].T  # all but the loads
+    e, *losses, servo, pitot = (low + (high - low) * (shares[CHANGED:] if number else 0.5)).tolist()
     changes = (
-        LocalStiffnessLoss(generator.uniform(0.1, arrays.largest_loss), start, length),
-        RootCompliance(generator.uniform(0.0, arrays.largest_compliance)),
-        PointMass(generator.uniform(0.0, arrays.largest_mass), generator.uniform(0.1, 1.0) * span),
+        LocalStiffnessLoss(loss**0.5 * arrays.largest_loss, start * span, (0.02 + 0.28 * length) * span),
+        RootCompliance(compliance * arrays.largest_compliance),
+        PointMass(mass * arrays.largest_mass, (0.1 + 0.9 * station) * span),
     )
-    exponent, stations = generator.uniform(0.5, 4.0), arrays.stations
-    outboard = int(generator.integers(int(0.55 * len(stations)), len(stations)))
-    if plain:
-        e, servo, pitot = DigitalState().values.values()
-        damaged, changed = False, [False] * len(changes)
-    patch = ModelPatch(tuple(change for change, taken in zip(changes, changed, strict=True) if taken))
-    structure = wing.structure(e, tuple(losses) if damaged else (), servo, pitot, patch)
-    loads = np.stack(
-        (
-            arrays.load_tip,
-            arrays.load_lift,
-            (stations / span) ** exponent @ arrays.lift_rows,
-            arrays.weight,
-            arrays.line_rows[2, outboard],
-            *arrays.line_rows[3:, outboard],
-            *arrays.line_rows[3:, -1],
-        ),
-        axis=1,
-    )
-    return structure, loads
+    taken = zip(changes, (number, number & 2, number & 4), strict=True)
+    patch = ModelPatch(tuple(change for change, wanted in taken if wanted))
+    return wing.structure(e, tuple(losses) if number & 1 else (), servo, pitot, patch)

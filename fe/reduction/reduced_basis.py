@@ -161,13 +161,12 @@ def _named(terms: ReductionTerms, name: str) -> dict[str, Any]:
     structure = terms.structure
     chosen = (*structure.parameters, *structure.regions, *structure.masses, *structure.controls)
     nominal = structure.parameters | structure.masses | structure.controls
-    kinds = ("region", "parameter", "control", "gauge", "displacement", "acceleration")
+    kinds = ("regions", "parameters", "masses", "controls", "gauges", "displacements", "accelerations")
     return {
         "design_hash": structure.design_hash,
         "name": name,
-        **{f"{kind}_names": " ".join(getattr(structure, f"{kind}s")) for kind in kinds},
-        "mass_names": " ".join(structure.masses),
-        "control_units": " ".join(structure.control_units[name] for name in structure.controls),
+        **{kind: tuple(getattr(structure, kind)) for kind in kinds},
+        "control_units": tuple(structure.control_units[name] for name in structure.controls),
         "validity_box": np.array([structure.ranges[name] for name in chosen], dtype=np.float64),
         "nominal": np.array([nominal.get(name, 0.0) for name in chosen], dtype=np.float64),
         "damping": np.array((structure.damping_alpha, structure.damping_beta)),

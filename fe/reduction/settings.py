@@ -81,17 +81,14 @@ class PatchSettings:
         Root compliance, as a share of the tip's compliance.
     largest_mass : float
         Point mass [kg].
-    seed : int
-        Of the states.
     """
 
     strip_count: int = 64
     vectors: int = 240
-    states: int = 160
+    states: int = 240
     largest_loss: float = 0.7
     compliance_share: float = 0.4
     largest_mass: float = 0.25
-    seed: int = 1
 
 
 def default_anchors(regions: int) -> tuple[int, ...]:

@@ -9,7 +9,7 @@ import io
 import os
 import tempfile
 import zipfile
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
 from math import isfinite
 from pathlib import Path
@@ -21,6 +21,16 @@ import numpy.typing as npt
 from .errors import ReducedModelFileError
 
 _TIMESTAMP = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip archive can hold
+
+
+def _names(array: npt.NDArray[Any]) -> tuple[str, ...]:
+    if array.dtype.kind != "U" or array.ndim != 1:
+        raise ValueError(f"names are wanted, not {array.dtype} of shape {array.shape}")
+    return tuple(array.tolist())
+
+
+KINDS: Mapping[object, Callable[[Any], Any]] = {str: str, int: int, float: float, tuple: _names}
+"""What makes the value of a field that is no array, by its type, of the array that a file has of it."""
 
 
 def arrays_to_bytes(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
@@ -135,7 +145,8 @@ class KeptArrays:
 
     An array is declared with its axes, `Annotated[FloatArray, "loads", 2]`: a number is the length, and a
     name means one length in all arrays, which `_lengths` or else the first array with that axis tells. A
-    number may be declared with its least and largest value, `Annotated[float, 0.0, 1.0]`.
+    number may be declared with its least and largest value, `Annotated[float, 0.0, 1.0]`. A tuple holds
+    names.
 
     Class attributes
     ----------------
@@ -186,7 +197,10 @@ class KeptArrays:
     def to_bytes(self) -> bytes:
         """Return the bytes of an `.npz` file; equal records give equal bytes."""
         values = {**self.layout, **{item.name: getattr(self, item.name) for item in fields(self)}}
-        return arrays_to_bytes({name: np.array(value) for name, value in values.items()})
+        kinds = {tuple: np.str_}  # also of no names at all
+        return arrays_to_bytes(
+            {name: np.array(value, dtype=kinds.get(type(value))) for name, value in values.items()}
+        )
 
     @classmethod
     def from_bytes(cls, content: bytes, where: str = "") -> Self:
@@ -214,7 +228,7 @@ class KeptArrays:
         require_arrays(arrays, where, (item.name for item in fields(cls)))
         try:
             values: dict[str, Any] = {
-                item.name: kind(arrays[item.name]) if kind in (str, int, float) else arrays[item.name]
+                item.name: KINDS[kind](arrays[item.name]) if kind in KINDS else arrays[item.name]
                 for item in fields(cls)
                 for kind in (getattr(item.type, "__origin__", item.type),)
             }

@@ -128,13 +128,18 @@ class ModalSystem:
         return np.diag(self.stiffness) if self.stiffness_matrix is None else self.stiffness_matrix
 
     @cached_property
+    def _eigen(self) -> tuple[FloatArray, Any, Any]:
+        """Units (M,) of the speeds, eigenvalues (2M,) [1/s] and eigenvectors (2M, 2M) of (q, v) in them."""
+        none, unit = np.zeros_like(self.damping), np.where(self.stiffness > 0.0, self.angular_frequency, 1.0)
+        matrix = np.block([[none, np.diag(unit)], [-self.whole / unit[:, None], -self.damping]])
+        return unit, *np.linalg.eig(matrix)
+
+    @cached_property
     def paces(self) -> FloatArray:
         """Frequencies, or magnitudes (2M,) of the eigenvalues [1/s] of the motion that are not zero."""
-        count = len(self.angular_frequency)
         if self.stiffness_matrix is None and np.all(self.angular_frequency > 0.0):
             return self.angular_frequency
-        matrix = np.block([[np.zeros((count, count)), np.eye(count)], [-self.whole, -self.damping]])
-        found = np.abs(np.linalg.eigvals(matrix))
+        found = np.abs(self._eigen[1])
         return np.asarray(found[found > 1e-7 * np.max(found, initial=0.0)])
 
     @cached_property
@@ -143,9 +148,7 @@ class ModalSystem:
 
         None where shapes are hardly apart, as under critical damping.
         """
-        none, unit = np.zeros_like(self.damping), np.where(self.stiffness > 0.0, self.angular_frequency, 1.0)
-        matrix = np.block([[none, np.diag(unit)], [-self.whole / unit[:, None], -self.damping]])
-        rates, shapes = np.linalg.eig(matrix)
+        unit, rates, shapes = self._eigen
         if not np.linalg.cond(shapes) < APART:
             return None
         scale, kept = np.concatenate((np.ones_like(unit), unit)), rates.imag >= 0.0
@@ -169,19 +172,20 @@ class ModalSystem:
         return found[:, : len(q)], found[:, len(q) :]
 
     def exact_steps(self, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return its `exact_step` for lengths (S,): transitions, and the parts of the forces."""
+        """Return the exact steps under forces that are linear in time, for lengths (S,) [s].
+
+        The exponential of one matrix (Van Loan 1978) by scaling, a Taylor polynomial and squaring, all
+        lengths at once.
+
+        Returns
+        -------
+        transition : (S, 2M, 2M) ndarray
+            Of (q, v).
+        begin, end : (S, 2M, M) ndarray
+            By the forces at the begin and at the end of a step.
+        """
         matrix = self.whole if self.coupled else self.stiffness
-        return _kept_steps(matrix.tobytes(), self.damping.tobytes(), lengths.tobytes())
-
-
-@lru_cache(maxsize=16)  # the same system is often moved again with other laws
-def _kept_steps(
-    stiffness: bytes, damping: bytes, lengths: bytes
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    own, matrix = np.frombuffer(stiffness), np.frombuffer(damping)
-    count = math.isqrt(len(matrix))
-    own = own if len(own) == count else own.reshape(count, count)
-    return exact_step(own, matrix.reshape(count, count), np.frombuffer(lengths))
+        return _exact_steps(matrix.tobytes(), self.damping.tobytes(), lengths.tobytes())
 
 
 _TAYLOR = 14
@@ -189,35 +193,19 @@ APART = 1e4
 """Condition up to which the shapes of free motion are apart."""
 
 
-def exact_step(
-    stiffness: FloatArray, damping: FloatArray, lengths: FloatArray
+@lru_cache(maxsize=16)  # the same system is often moved again with other laws
+def _exact_steps(
+    stiffness: bytes, damping: bytes, lengths: bytes
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the exact steps of q'' + D q' + S q = f under forces that are linear in time.
-
-    The exponential of one matrix (Van Loan 1978) by scaling, a Taylor polynomial and squaring, all lengths at
-    once.
-
-    Parameters
-    ----------
-    stiffness : (M,) or (M, M) ndarray
-        S [1/s^2]; (M,) where neither it nor D couples the coordinates: each is then stepped by itself.
-    damping : (M, M) ndarray
-        D [1/s].
-    lengths : (S,) ndarray
-        [s].
-
-    Returns
-    -------
-    transition : (S, 2M, 2M) ndarray
-        Of (q, v).
-    begin, end : (S, 2M, M) ndarray
-        By the forces at the begin and at the end of a step.
-    """
-    if stiffness.ndim == 2:
-        transition, begin, end = _exponential(stiffness[None], damping[None], lengths)
+    """Return the steps by S (M, M), or (M,) where nothing couples the coordinates, and by D (M, M)."""
+    own, duration = np.frombuffer(stiffness), np.frombuffer(lengths)
+    count, size = math.isqrt(len(damping) // 8), len(duration)
+    matrix = np.frombuffer(damping).reshape(count, count)
+    if len(own) != count:
+        transition, begin, end = _exponential(own.reshape(1, count, count), matrix[None], duration)
         return transition[:, 0], begin[:, 0], end[:, 0]
-    count, size, mode = len(stiffness), len(lengths), np.arange(len(stiffness))
-    parts = _exponential(stiffness[:, None, None], np.diag(damping)[:, None, None], lengths)
+    mode = np.arange(count)
+    parts = _exponential(own[:, None, None], np.diag(matrix)[:, None, None], duration)
     whole, forces = np.zeros((size, 2, count, 2, count)), np.zeros((2, size, 2, count, count))
     whole[:, :, mode, :, mode] = parts[0].transpose(1, 0, 2, 3)
     for force, part in zip(forces, parts[1:], strict=True):

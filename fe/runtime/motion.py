@@ -5,7 +5,7 @@ copied into the FMU. The loops run as plain Python here; `discrepancy.models.com
 functions compiled, to be given as `kernel`.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import isfinite
@@ -189,10 +189,9 @@ def laws_of(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = Fal
         If a law acts on a port that the model does not have, or a value cannot be (a scale that is not
         positive), or in a window only where the model cannot follow it.
     """
-    names, numbers, values, elements, spans = [], [], [], [], []
-    for item in patch:
-        if not isinstance(item, PortForce):
-            continue
+    forces = []
+    for item in patch.of(PortForce):
+        assert isinstance(item, PortForce)
         if item.port not in ports:
             known = f"it has {', '.join(dict.fromkeys(map(place_of, ports)))}" if ports else "it has none"
             raise InvalidPatchError(
@@ -206,23 +205,27 @@ def laws_of(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = Fal
             raise InvalidPatchError(
                 f"The primitive {item.kind!r} acts in a window, which lumped models alone can follow."
             )
-        spans.append(tuple(window.span for window in item.windows))
-        names.append(item.port)
-        numbers.append(LAWS.index(type(item)))
-        values.append(np.pad(item.row, (0, PARAMETERS - len(item.row))))
-        elements.append(item.elements())
+        forces.append(item)
     rate = sum((item.rate for item in patch if isinstance(item, StiffnessDrift)), 0.0)
-    if not names:
+    if not forces:
         return NO_LAWS if rate == 0.0 else replace(NO_LAWS, rate=rate)
-    width = max(1, *(len(item) for item in elements))
+    spans = tuple(tuple(window.span for window in item.windows) for item in forces)
     return Laws(
-        tuple(names),
-        np.array(numbers, dtype=np.int64),
-        np.array(values, dtype=np.float64),
-        np.array([np.pad(item, (0, width - len(item))) for item in elements]),
+        tuple(item.port for item in forces),
+        np.array([LAWS.index(type(item)) for item in forces], dtype=np.int64),
+        _padded([item.row for item in forces], PARAMETERS),
+        _padded([item.elements() for item in forces], 1),
         rate,
-        tuple(spans) if any(spans) else (),
+        spans if any(spans) else (),
     )
+
+
+def _padded(rows: Sequence[Sequence[float] | FloatArray], least: int) -> FloatArray:
+    """Return rows as an array, zeros after shorter ones, at least so wide."""
+    found = np.zeros((len(rows), max(least, *map(len, rows))))
+    for own, row in zip(found, rows, strict=True):
+        own[: len(row)] = row
+    return found
 
 
 LEAST_FLEXIBLE = 0.1

@@ -22,7 +22,6 @@ from .laws import (
     holding_limit,
     holds,
     kick,
-    resistance,
     share,
     steady,
     strength,
@@ -263,8 +262,7 @@ def second_half(
         end = speed - before.lost[j]
         can_hold = holds(ports.numbers[j], ports.values[j])
         if can_hold and before.freed[j] == 0.0 and before.speed[j] != 0.0 and before.speed[j] * end <= 0.0:
-            slopes = slopes_at_port(linear, ports, state, before, j, time, h)
-            turn_over(ports, acting, state, before, j, now, slopes, h)
+            turn_over(linear, ports, acting, state, before, j, now, time, h)
         else:
             after = kick(ports.numbers[j], ports.values[j], speed, now, half, False)
             if after == 0.0 and can_hold and now > 0.0:
@@ -273,37 +271,35 @@ def second_half(
             add(state.v, acting.pull[j], after - speed, 1.0)
 
 
-def slopes_at_port(
-    linear: Linear, ports: Ports, state: State, before: Before, j: int, time: float, h: float
-) -> tuple[float, float]:  # fmt: skip
-    """Return the acceleration of a port at both ends of a step, as friction of the first sign has it."""
-    modes, count = len(state.q), len(ports.numbers)
-    at_begin = -2.0 * before.lost[j] / h
-    at_end = -2.0 * before.lost[j] / h
-    for m in range(modes):
-        first, last = linear.begin[m], linear.end[m]
-        first -= linear.stiffness[m] * (1.0 + linear.rate * time) * before.q[m]
-        last -= linear.stiffness[m] * (1.0 + linear.rate * (time + h)) * state.q[m]
-        for k in range(modes):
-            first -= linear.damping[m, k] * before.v[k]
-            last -= linear.damping[m, k] * state.v[k]
-        for k in range(count):
-            first -= ports.acts[k, m] * before.forces[k]
-            last -= ports.acts[k, m] * state.current[k]
-        at_begin += ports.rows[j, m] * first
-        at_end += ports.rows[j, m] * last
-    return at_begin, at_end
+def acceleration(
+    linear: Linear, ports: Ports, q: FloatArray, v: FloatArray, forces: FloatArray, push: float, time: float,
+    m: int,
+) -> float:  # fmt: skip
+    """Return the acceleration of a mode under a push and the forces of laws; those of speed have none."""
+    total = push - linear.stiffness[m] * (1.0 + linear.rate * time) * q[m]
+    for k in range(len(q)):
+        total -= linear.damping[m, k] * v[k]
+    for k in range(len(forces)):
+        total -= ports.acts[k, m] * forces[k]
+    return float(total)
 
 
 def turn_over(
-    ports: Ports, acting: Acting, state: State, before: Before, j: int, now: float,
-    slopes: tuple[float, float], h: float,
+    linear: Linear, ports: Ports, acting: Acting, state: State, before: Before, j: int, now: float,
+    time: float, h: float,
 ) -> None:  # fmt: skip
     """Correct speed and position of a port whose friction turned over within a step."""
+    at_begin = -2.0 * before.lost[j] / h  # acceleration at both ends, as friction of the first sign has it
+    at_end = at_begin
+    for m in range(len(state.q)):
+        first = acceleration(linear, ports, before.q, before.v, before.forces, linear.begin[m], time, m)
+        last = acceleration(linear, ports, state.q, state.v, state.current, linear.end[m], time + h, m)
+        at_begin += ports.rows[j, m] * first
+        at_end += ports.rows[j, m] * last
     speed = at_port(ports.rows, j, state.v)
     change, way, held = crossing(
-        ports.numbers[j], ports.values[j], before.speed[j], speed - before.lost[j], slopes, before.lost[j],
-        now, h,
+        ports.numbers[j], ports.values[j], before.speed[j], speed - before.lost[j], (at_begin, at_end),
+        before.lost[j], now, h,
     )  # fmt: skip
     if held == 1.0:
         change = -speed
@@ -329,22 +325,14 @@ def record(
         if acting.route[j] != SPEED:
             continue
         x, speed = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
-        most = acting.strength[j] * share(ports.numbers[j], ports.values[j], x) / acting.weight[j]
+        out.forces[sample, j] = steady(ports.numbers[j], ports.values[j], x, speed)
         if state.memory[j, 0] == 1.0:  # what it takes to hold the port
             need = 0.0
             for m in range(modes):
-                push = linear.end[m]
-                push -= linear.stiffness[m] * (1.0 + linear.rate * time) * state.q[m]
-                for k in range(modes):
-                    push -= linear.damping[m, k] * state.v[k]
-                for k in range(count):
-                    if acting.route[k] != SPEED:
-                        push -= ports.acts[k, m] * state.current[k]
+                push = acceleration(linear, ports, state.q, state.v, state.current, linear.end[m], time, m)
                 need += ports.rows[j, m] * push / acting.weight[j]
-            out.forces[sample, j] = (
-                min(max(need, -most), most) if dry(ports.numbers[j], ports.values[j]) else need
-            )
-        elif speed != 0.0:
-            size = resistance(ports.numbers[j], ports.values[j], most, speed)
-            out.forces[sample, j] = size if speed > 0.0 else -size
+            if dry(ports.numbers[j], ports.values[j]):
+                most = acting.strength[j] * share(ports.numbers[j], ports.values[j], x) / acting.weight[j]
+                need = min(max(need, -most), most)
+            out.forces[sample, j] = need
         out.lagged[sample, j] = out.forces[sample, j]

@@ -80,7 +80,7 @@ class PatchArrays(RegionArrays):
     """
 
     what = "a wing for patches"
-    layout: ClassVar[Mapping[str, int]] = {"patch_format": 2}
+    layout: ClassVar[Mapping[str, int]] = {"patch_format": 3}
 
     validity_box: Annotated[FloatArray, "chosen", 2]
     largest_loss: Positive

@@ -20,25 +20,17 @@ MOST_ANCHORS = 16
 """Largest number of approximate dual solutions of a reduced model."""
 
 
-def _words(key: str) -> "cached_property[tuple[str, ...]]":
-    """Declare the names that a text of a record holds, parted by spaces."""
-    return cached_property(lambda arrays: tuple(getattr(arrays, key).split()))
-
-
 @dataclass(frozen=True, repr=False)
 class RegionArrays(KeptArrays):
     """Arrays of a structure with K damage regions, 1 to 8.
 
     Attributes
     ----------
-    region_names : str
-        Names of the damage regions in the order of their stiffness terms, parted by spaces; `regions` parts
-        them.
+    regions : tuple of str
+        Names of the damage regions in the order of their stiffness terms.
     """
 
-    region_names: str
-
-    regions = _words("region_names")
+    regions: tuple[str, ...]
 
     def losses(self, stiffness_loss: Mapping[str, float] | Iterable[float]) -> Losses:
         """Return one stiffness loss for each region, in their order; see `fe.runtime.state.losses_of`."""
@@ -68,13 +60,12 @@ class ReducedArrays(RegionArrays):
     ----------
     name : str
         Of the structure.
-    parameter_names, mass_names, control_names : str
-        Parted by spaces; each may be empty. `parameters`, `masses` and `controls` part them.
-    control_units : str
-        Unit of each control, parted by spaces.
-    gauge_names, displacement_names, acceleration_names : str
-        Names of the outputs, parted by spaces; each may be empty. `gauges`, `displacements` and
-        `accelerations` part them.
+    parameters, masses, controls : tuple of str
+        Their names.
+    control_units : tuple of str
+        Unit of each control.
+    gauges, displacements, accelerations : tuple of str
+        Names of the outputs.
     nominal : (V,) ndarray
         Nominal value of all that can be chosen; zero for the losses.
     damping : (2,) ndarray
@@ -136,22 +127,16 @@ class ReducedArrays(RegionArrays):
     """
 
     what = "a reduced model"
-    layout: ClassVar[Mapping[str, int]] = {"format": 5}
-    parameters = _words("parameter_names")
-    masses = _words("mass_names")
-    controls = _words("control_names")
-    gauges = _words("gauge_names")
-    displacements = _words("displacement_names")
-    accelerations = _words("acceleration_names")
+    layout: ClassVar[Mapping[str, int]] = {"format": 6}
 
     name: str
-    parameter_names: str
-    mass_names: str
-    control_names: str
-    control_units: str
-    gauge_names: str
-    displacement_names: str
-    acceleration_names: str
+    parameters: tuple[str, ...]
+    masses: tuple[str, ...]
+    controls: tuple[str, ...]
+    control_units: tuple[str, ...]
+    gauges: tuple[str, ...]
+    displacements: tuple[str, ...]
+    accelerations: tuple[str, ...]
     nominal: Annotated[FloatArray, "chosen"]
     damping: Annotated[FloatArray, 2]
     stiffness_factors: Annotated[IntArray, "terms", 2]
@@ -205,7 +190,7 @@ class ReducedArrays(RegionArrays):
                 raise ReducedModelFileError(
                     f"The array {name} of {self.what} names what is not there; build it anew."
                 )
-        if self.stiffness_factors[-1].any() or len(self.control_units.split()) != len(self.controls):
+        if self.stiffness_factors[-1].any() or len(self.control_units) != len(self.controls):
             raise ReducedModelFileError(
                 f"The terms or units of {self.what} are not those of its names; build it anew."
             )

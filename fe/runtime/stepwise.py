@@ -1,6 +1,6 @@
 """Motion of a linear system with laws at its ports, at any time stamps: exact between them without laws.
 
-Steps are those of `fe.runtime.modal_system.exact_step`; lengths that differ by less than `ALIKE` of the
+Steps are those of `ModalSystem.exact_steps`; lengths that differ by less than `ALIKE` of the
 usual one are one. NumPy and relative imports only: this file is copied into the FMU.
 """
 
@@ -100,12 +100,12 @@ def steps_under(
     """Return steps under modal forces (K, M) at both ends of each; `feed` is that of `Steps`."""
     lengths, which = boundaries.alike
     transition, *by = system.exact_steps(lengths)
-    push = sum(
-        forces @ part[0].T if len(lengths) == 1 else np.einsum("knm,km->kn", part[which], forces)
-        for part, forces in zip(by, (begin, end), strict=True)
-    )
+    push = np.zeros((len(which), transition.shape[1]))
+    for forces, part in zip((begin, end), by, strict=True):
+        if forces.any():
+            push += forces @ part[0].T if len(lengths) == 1 else np.einsum("knm,km->kn", part[which], forces)
     moments, sample = boundaries.time, boundaries.sample
-    return Steps(transition, lengths, which, np.asarray(push), begin, end, feed, moments, sample)
+    return Steps(transition, lengths, which, push, begin, end, feed, moments, sample)
 
 
 class ModalMotion(NamedTuple):
@@ -117,8 +117,8 @@ class ModalMotion(NamedTuple):
     q: FloatArray
     v: FloatArray
     port_forces: FloatArray
-    memory: FloatArray
     lagged: FloatArray
+    memory: FloatArray
 
 
 class Begin(NamedTuple):
@@ -168,7 +168,7 @@ def advance(
         before = acting
     if laws.spans:
         out = Samples(*(item[steps.sample] for item in out))
-    return ModalMotion(out.q, out.v, out.forces, kept, out.lagged)
+    return ModalMotion(*out, kept)
 
 
 def _sections(laws: Laws, time: FloatArray) -> Iterator[tuple[int, int, BoolArray]]:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from .arrays import FloatArray
 from .errors import InvalidStateError
-from .modal_system import ModalSystem, exact_step, rayleigh_damping_ratio
+from .modal_system import ModalSystem, rayleigh_damping_ratio
 
 if TYPE_CHECKING:
     from .motion import Laws
@@ -168,7 +168,6 @@ class ModalIntegrator:
         self._rayleigh = damping_alpha, damping_beta
         self._laws = self.structure.laws
         self._loads = self.structure.loads.shape[1] - (0 if self._laws is None else len(self._laws))
-        self._cached: tuple[float, FloatArray] | None = None
 
     @property
     def modes(self) -> Any:
@@ -211,20 +210,17 @@ class ModalIntegrator:
     @cached_property
     def _system(self) -> ModalSystem:
         """The modes with the ports of the laws."""
-        assert self._laws is not None
         alpha, beta = self._rayleigh
+        damping = np.diag(alpha + beta * self._omega**2)
+        if self._laws is None:
+            return ModalSystem(self._omega, damping)
         rows, names = self._participation[:, self._loads :].T, self._laws.ports
         whole = np.diag(self._port_answers[:, self._loads :])
         left_out = whole - np.sum((rows / self._omega) ** 2, axis=1)
         flexible = np.array([name not in self.structure.on_modes for name in names], dtype=bool)
         left_out = np.where((left_out > 1e-9 * whole) & flexible, left_out, 0.0)  # less is rounding
-        return ModalSystem(
-            self._omega,
-            np.diag(alpha + beta * self._omega**2),
-            dict(zip(names, rows, strict=True)),
-            np.array(list(dict(zip(names, left_out.tolist(), strict=True)).values())),
-            beta,
-        )
+        ports, beyond = (dict(zip(names, item, strict=True)) for item in (rows, left_out.tolist()))
+        return ModalSystem(self._omega, damping, ports, np.array(list(beyond.values())), beta)
 
     def _moved(
         self, state: TransientState, acting: FloatArray, duration: float, time: float
@@ -360,7 +356,11 @@ class ModalIntegrator:
                 f"{load!r}."
             )
         if self._laws is None or self._laws.linear:
-            place, velocity = self._free_step(state, duration, acting)
+            (transition,), *_ = self._system.exact_steps(np.array([duration]))
+            static = self._modal_static[:, : self._loads] @ acting
+            free = transition @ np.concatenate((state.displacement - static, state.velocity))
+            # plus zero: a structure at rest has the velocity 0, not -0
+            place, velocity = free[: len(static)] + static, free[len(static) :] + 0.0
             forces, memory = state.forces, state.memory
         else:
             moved = self._moved(state, acting, duration, time)
@@ -370,17 +370,6 @@ class ModalIntegrator:
         if holding is not None and state.load[holding] != 0.0:
             acting[holding] = state.load[holding] * exp(-duration / beta)
         return TransientState(place, velocity, acting, forces, memory)
-
-    def _free_step(
-        self, state: TransientState, duration: float, acting: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        if self._cached is None or self._cached[0] != duration:
-            damping = np.diag(2.0 * self.damping_ratio * self._omega)
-            self._cached = duration, exact_step(self._omega**2, damping, np.array([duration]))[0][0]
-        static = self._modal_static @ acting
-        moved = self._cached[1] @ np.concatenate((state.displacement - static, state.velocity))
-        # plus zero: a structure at rest has the velocity 0, not -0
-        return moved[: len(static)] + static, moved[len(static) :] + 0.0
 
     def displacement(self, state: TransientState) -> FloatArray:
         """Return the displacement (n,) at a state, in the coordinates of the structure.

@@ -115,27 +115,15 @@ def strain_gauge(output: str) -> int:
     return -1 if strain is None else int(strain.group(1)) - 1
 
 
-class PlanformStations(NamedTuple):
-    """Stations of the integral over the planform.
+def planform_stations(semi_span: float, root_chord: float, tip_chord: float) -> tuple[FloatArray, FloatArray]:
+    """Return the stations (S,) [m from the root] of the integral over the planform, and their shares (S,).
 
-    Attributes
-    ----------
-    distance : (S,) ndarray
-        From the root [m].
-    share : (S,) ndarray
-        Share of the area; sums to one.
+    The chord is linear along the span; the shares are of the area and sum to one.
     """
-
-    distance: FloatArray
-    share: FloatArray
-
-
-def planform_stations(semi_span: float, root_chord: float, tip_chord: float) -> PlanformStations:
-    """Return the stations of a wing whose chord is linear along the span, lengths in m."""
     place, weight = np.polynomial.legendre.leggauss(STATION_COUNT)
     eta = 0.5 * (1.0 + place)
     area = weight * (root_chord + (tip_chord - root_chord) * eta)
-    return PlanformStations(semi_span * eta, area / area.sum())
+    return semi_span * eta, area / area.sum()
 
 
 class WingRows:
@@ -261,19 +249,19 @@ class WingRows:
         return parts
 
     @cached_property
-    def planform(self) -> PlanformStations:
-        """Stations of forces that are spread over the planform."""
+    def planform(self) -> tuple[FloatArray, FloatArray]:
+        """Stations of forces that are spread over the planform, and their shares."""
         return planform_stations(self.span, self.arrays.root_chord, self.arrays.tip_chord)
 
     def internal_forces(self, patch: ModelPatch) -> ModelPatch:
         """Return the internal forces of a patch by ports of `port_rows`, of the planform by station."""
-        return at_stations(patch.of(*INTERNAL_FORCES), self.planform.share)
+        return at_stations(patch.of(*INTERNAL_FORCES), self.planform[1])
 
     @cached_property
     def port_rows(self) -> dict[str, FloatArray]:
         """Rows (n,) of `PORTS`, "root" in rad and the others in m, then of the planform's stations."""
         upwards = self.arrays.line_rows[2]
-        stations = [self._along(distance) @ upwards for distance in self.planform.distance.tolist()]
+        stations = [self._along(distance) @ upwards for distance in self.planform[0].tolist()]
         places = (self.arrays.flap_row, self.arrays.load_tip, self.arrays.station_weights @ upwards)
         return dict(zip((*PORTS, *STATION_PORTS), (*places, *stations), strict=True))
 

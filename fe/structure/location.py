@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import sparse
 
-from fe.elements.cells import CellMesh, strain_weights
+from fe.elements.cells import CellMesh
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError
 
@@ -244,9 +244,11 @@ def gauge_rows(mesh: StructureMesh, gauges: tuple[Gauge, ...]) -> tuple[sparse.c
     InvalidDesignError
         If a gauge lies off the surface, reaches over its edge, or points out of it.
     """
-    rows, moved = [sparse.csr_array((0, mesh.unknowns))], []
-    for number, gauge in enumerate(gauges, start=1):
-        where = f"gauge[{number}] ({gauge.name})"
+    if not gauges:
+        return sparse.csr_array((0, mesh.unknowns)), np.empty(0)
+    strains, moved = [], []
+    for number, gauge in enumerate(gauges):
+        where = f"gauge[{number + 1}] ({gauge.name})"
         point = mesh.unit * np.asarray(gauge.point)
         found = on_surface(mesh, point, f"{where}: the point {mesh.place(point)}")
         direction = _in_surface(np.asarray(gauge.direction), found.normal, where)
@@ -263,15 +265,12 @@ def gauge_rows(mesh: StructureMesh, gauges: tuple[Gauge, ...]) -> tuple[sparse.c
                 )
                 for off in (*inside, *corners)
             ][: len(inside)]
-        row = np.zeros(mesh.unknowns)
         for spot in spots:
             along = _in_surface(direction, spot.normal, where)
-            weights = strain_weights(mesh.kind, mesh.nodes[spot.cell], spot.local, along)
             share = 1.0 / (len(spots) * len(spot.cell))  # the mean of the cells that meet there
-            np.add.at(row.reshape(-1, 3), mesh.cells[spot.cell], share * weights)
-        rows.append(sparse.csr_array(row[None]))
+            strains += [(number, share, *place, along) for place in zip(spot.cell, spot.local, strict=True)]
         moved.append(found.distance)
-    return sparse.vstack(rows).tocsr(), np.array(moved)
+    return mesh.strain_rows(*map(np.array, zip(*strains, strict=True))), np.array(moved)
 
 
 def _spots(

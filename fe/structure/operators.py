@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.elements.cells import centre_strains
 from fe.elements.kinds import meshio_with_wedges
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError, MeshError
 from reporting.files import atomic_file
 
 from .affine import AffineStructure, StiffnessTerm, designed, static_response
-from .design import Damage, Material, MatrixDesign, MeshDesign, load_structure, structure_hash
+from .design import Damage, Material, MatrixDesign, MeshDesign, load_structure, structure_hash, unit_vector
 from .location import gauge_rows, nodal_load, point_shares
 from .matrices import assemble_matrices
 from .mesh import StructureMesh
@@ -225,8 +224,7 @@ def _point_rows(design: MeshDesign, mesh: StructureMesh, key: str) -> sparse.csr
     rows = [sparse.csr_array((0, mesh.unknowns))]
     for number, part in enumerate(getattr(design, key), start=1):
         shares = point_shares(mesh, part.point, f"{key}[{number}]")
-        direction = np.asarray(part.direction) / np.linalg.norm(part.direction)
-        rows.append(sparse.csr_array(np.outer(shares, direction).reshape(1, -1)))
+        rows.append(sparse.csr_array(np.outer(shares, unit_vector(part.direction)).reshape(1, -1)))
     return sparse.vstack(rows).tocsr()
 
 
@@ -261,21 +259,19 @@ def write_structure_vtu(
     FileNotWrittenError
         If the file cannot be written.
     """
-    given = dict(values or {})
+    mesh, given = structure.mesh, dict(values or {})
     displacement = structure.full_displacement(static_response(structure, given).displacement)
-    mesh, loss = structure.mesh, np.zeros(len(structure.mesh.cells))
-    for number, name in enumerate(structure.regions):
-        loss[structure.region_of == number] = given.get(name, 0.0)
+    lost = [*(given.get(name, 0.0) for name in structure.regions), 0.0]  # the last one is that of no region
     write_vtu(
         path,
         mesh.points,
         (mesh.kind.file_type, mesh.cells),
         {"displacement": displacement},
         {
-            "strain": centre_strains(mesh, displacement),
+            "strain": mesh.strains(displacement)[:, 0],
             "material": structure.material_of + 1,
             "region": structure.region_of + 1,
-            "stiffness_loss": loss,
+            "stiffness_loss": np.array(lost)[structure.region_of],
         },
     )
 

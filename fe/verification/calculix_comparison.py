@@ -1,27 +1,21 @@
 """Structures and the wing against CalculiX on the identical mesh: statics, modes and a ring-down."""
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from fe.elements.cells import gradients, strain_matrix
 from fe.elements.kinds import gauss_points
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import TIP_FORCE, DigitalState
 from fe.structure.affine import natural_frequencies
-from fe.structure.operators import Structure
 from fe.wing.operators import AffineOperators
 
-from .calculix_deck import CalculixDeck, Step, gauge_cells, load_step, number_line, structure_deck, wing_deck
+from .calculix_deck import TEST_FORCE, CalculixDeck, Step, number_line, wing_deck
 from .calculix_job import read_frequencies, read_tables, run_calculix
 
-TEST_FORCE = 10.0
-"""Upward force of the static test and before the ring-down [N]."""
 INTEGRATION_POINTS = gauss_points(3)[0][:, ::-1]
 """Local places (27, 3) in 0..1 of the integration points of a C3D20 element, in the order of its output."""
 # Places of our strains in the order in which CalculiX prints a strain tensor: xx, yy, zz, xy, xz, yz.
@@ -61,26 +55,32 @@ class Agreement:
         return _relative_each(self.calculix, self.ours)
 
 
-def _agreement(
-    deck: CalculixDeck,
-    loads: Mapping[str, Step],
-    folder: Path,
-    modes: int,
-    relative: Callable[[FloatArray, FloatArray], float],
-    tensor: Callable[[FloatArray], FloatArray] | None = None,
-) -> Agreement:
-    """Solve loads, given by their steps, and the lowest modes by both codes.
+def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
+    """Solve each load of a model alone, and its lowest modes, by both codes.
 
-    `relative` compares strains and outputs; `tensor` gives our strains (p, 6) in the cells EGAUGES.
+    Parameters
+    ----------
+    deck : CalculixDeck
+        The model in one state; a structure is to be assembled with `mass_as_stiffness`, for frequencies that
+        can be compared.
+    folder : Path
+        Where CalculiX works.
+    modes : int
+        Number of modes.
+
+    Raises
+    ------
+    CalculixError
+        If CalculiX is not there or fails.
     """
-    structure = deck.structure
+    structure, cells = deck.structure, np.asarray(deck.gauge_cells, dtype=np.int64)
     prints = ["*NODE PRINT, NSET=NALL", "U"]
     prints += ["*NODE PRINT, NSET=NPROBES", "U"] if len(deck.probes) else []
-    prints += ["*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E"] if tensor else []
-    text = deck.text(*(step._replace(lines=[*step.lines, *prints]) for step in loads.values()))
-    printed = read_tables(run_calculix(text, folder, "static")) if loads else {}
-    if (count := len(printed.get("NALL", ()))) != len(loads):
-        raise CalculixError(f"CalculiX printed {count} static solutions instead of {len(loads)}.")
+    prints += ["*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E"] if len(cells) else []
+    text = deck.text(*(step._replace(lines=[*step.lines, *prints]) for step in deck.loads.values()))
+    printed = read_tables(run_calculix(text, folder, "static")) if deck.loads else {}
+    if (count := len(printed.get("NALL", ()))) != len(deck.loads):
+        raise CalculixError(f"CalculiX printed {count} static solutions instead of {len(deck.loads)}.")
     frequencies = natural_frequencies(structure, modes, deck.values)[0]
     text = deck.text(Step(procedure=("*FREQUENCY", f"{modes}")))
     theirs = read_frequencies(run_calculix(text, folder, "modes"))
@@ -90,78 +90,20 @@ def _agreement(
     gauges, end = len(structure.gauges), len(deck.probes)
     parts = {"gauge strains": slice(0, gauges), "displacement outputs": slice(gauges, end)}
     differences = {}
-    for number, (name, step) in enumerate(loads.items()):
+    for number, (name, step) in enumerate(deck.loads.items()):
         displacement, tables = solve(step.load), {key: rows[number] for key, rows in printed.items()}
         ours, nodes = deck.probes @ displacement, structure.full_displacement(displacement)
         found = differences[name] = {"nodal displacements": _relative(tables["NALL"][:, 1:], nodes)}
         for what, own in parts.items():
             if len(ours[own]):
+                relative = _relative_each if deck.each_alone else _relative
                 found[what] = relative(tables["NPROBES"][:, 1:].ravel()[own], ours[own])
-        if tensor:
-            strains = tensor(displacement)
-            found["strains at integration points"] = _relative(tables["EGAUGES"][:, 2:], strains)
+        if len(cells):
+            strains = deck.mesh.strains(nodes, cells, INTEGRATION_POINTS).reshape(-1, 6)
+            strains[:, 3:] *= 0.5  # engineering to tensor shear
+            printed_here = tables["EGAUGES"][:, 2:]
+            found["strains at integration points"] = _relative(printed_here, strains[:, _PRINTED])
     return Agreement(differences, frequencies, theirs[:modes])
-
-
-def structure_agreement(structure: Structure, folder: Path, modes: int = 6) -> Agreement:
-    """Solve every load and the lowest modes by both codes, undamaged and with nominal values.
-
-    Parameters
-    ----------
-    structure : Structure
-        The model; assembled with `mass_as_stiffness`, for frequencies that can be compared.
-    folder : Path
-        Where CalculiX works.
-    modes : int
-        Number of modes.
-
-    Raises
-    ------
-    CalculixError
-        If CalculiX is not there, fails, or has no such element.
-    """
-    deck = structure_deck(structure)
-    loads = {load.name: load_step(structure, load) for load in structure.design.load}
-    return _agreement(deck, loads, folder, modes, _relative)
-
-
-def wing_agreement(
-    operators: AffineOperators, folder: Path, state: DigitalState, modes: int = 6
-) -> Agreement:
-    """Solve the static test, the lift of the design and the lowest modes in one state by both codes.
-
-    Parameters
-    ----------
-    operators : AffineOperators
-        The model.
-    folder : Path
-        Where CalculiX works.
-    state : DigitalState
-        Health and masses.
-    modes : int
-        Number of modes.
-
-    Raises
-    ------
-    CalculixError
-        If CalculiX is not there or fails.
-    """
-    deck, lift = wing_deck(operators, state), operators.wing_mesh.design.lift
-    loads = {
-        "tip force": Step(operators.turn(0.0, TEST_FORCE)),
-        "lift": Step(operators.turn(lift.load_factor)),
-    }
-    return _agreement(deck, loads, folder, modes, _relative_each, partial(_strain_tensors, operators))
-
-
-def _strain_tensors(operators: AffineOperators, free: FloatArray) -> FloatArray:
-    """Strain tensors (27 cells, 6) in CalculiX's order at the integration points of the gauges' cells."""
-    mesh, cells = operators.wing_mesh, gauge_cells(operators)
-    slopes, _ = gradients(mesh.kind, mesh.nodes[cells], INTEGRATION_POINTS)
-    displacement = operators.full_displacement(free).ravel()[mesh.unknowns_of(cells)]
-    voigt = np.einsum("nqij,nj->nqi", strain_matrix(slopes), displacement).reshape(-1, 6)
-    voigt[:, 3:] *= 0.5  # engineering to tensor shear
-    return np.asarray(voigt[:, _PRINTED])
 
 
 def ring_down_agreement(

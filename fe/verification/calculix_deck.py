@@ -41,6 +41,8 @@ NOT_COMPARABLE = (WEDGES_6,)
 """Kinds that CalculiX integrates otherwise (C3D6 at two points)."""
 ORTHOTROPIC = ([0, 0, 1, 0, 1, 2, 5, 4, 3], [0, 1, 1, 2, 2, 2, 5, 4, 3])
 """Rows and columns of an elasticity in the order of CalculiX's nine orthotropic constants."""
+TEST_FORCE = 10.0
+"""Upward force of the static test of a wing, and before its ring-down [N]."""
 _BLOCK = 0.01  # side of the block that stands for a point mass [m]
 Term = tuple[int, int, float]
 """A node, its direction from 1, and what stands with it: a force or a factor."""
@@ -119,6 +121,8 @@ class CalculixDeck:
         What the cells are made of.
     masses : tuple of PointBlock
         Point masses.
+    loads : mapping of str to Step
+        Static steps of its loads, each alone.
     probed : tuple of (n,)
         Rows on the free unknowns that are read behind the gauges and the displacement outputs.
     gauge_cells : (m,)
@@ -127,6 +131,8 @@ class CalculixDeck:
         Temperatures of the nodes, where constants of materials depend on them.
     damping : (float, float)
         Rayleigh damping [1/s] and [s] of a step in time.
+    each_alone : bool
+        Whether strains and outputs are compared each over its own, and not over the largest of their kind.
     """
 
     title: str
@@ -136,10 +142,12 @@ class CalculixDeck:
     supports: SupportedUnknowns
     materials: tuple[CellMaterial, ...]
     masses: tuple[PointBlock, ...]
+    loads: Mapping[str, Step]
     probed: tuple[FloatArray, ...] = ()
     gauge_cells: IntArray | tuple[()] = ()
     temperatures: FloatArray | None = None
     damping: tuple[float, float] = (0.0, 0.0)
+    each_alone: bool = False
 
     @cached_property
     def probes(self) -> FloatArray:
@@ -266,12 +274,13 @@ def structure_deck(structure: Structure) -> CalculixDeck:
         constants = np.asarray(factor * np.linalg.inv(part.compliance)[ORTHOTROPIC], dtype=np.float64)
         cells, axes = np.flatnonzero(structure.material_of == number), np.array(part.axes or np.eye(3)[:2])
         materials.append(CellMaterial([(0.0, constants)], part.density, axes, cells))
+    loads = {load.name: _load_step(structure, load) for load in design.load}
     return CalculixDeck(
-        "structure", structure, {}, mesh, structure.unknowns_held, tuple(materials), tuple(masses)
+        "structure", structure, {}, mesh, structure.unknowns_held, tuple(materials), tuple(masses), loads
     )
 
 
-def load_step(structure: Structure, load: Load) -> Step:
+def _load_step(structure: Structure, load: Load) -> Step:
     """Return the static step of a load of a structure, its control at the nominal value."""
     factor = 1.0 if load.control is None else structure.controls[load.control]
     lines = ["*DLOAD, OP=NEW"]
@@ -293,17 +302,22 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
 
     The root is a rigid set about the straight chord line, which moves in heave, flap and yaw on its springs.
     """
-    mesh = operators.wing_mesh
+    mesh, design = operators.wing_mesh, operators.wing_mesh.design
+    plan, lift = design.planform, design.lift
     masses = (
         PointBlock(
             state.servo_mass if place.kind == "servo" else state.pitot_mass,
-            np.array([0.0, place.station * mesh.design.planform.semi_span, 0.0]),  # where it is drawn
+            np.array([0.0, place.station * plan.semi_span, 0.0]),  # where it is drawn
             point_mass_weights(mesh, place),
         )
-        for place in mesh.design.point_masses
+        for place in design.point_masses
     )
     # The station of a node stands as its temperature, on which the constants of a graded skin depend.
-    stations = mesh.points[:, 1] / mesh.design.planform.semi_span if mesh.design.skin.stations else None
+    stations = mesh.points[:, 1] / plan.semi_span if design.skin.stations else None
+    cells = [  # that hold the middle of a gauge
+        mesh.skin_point(distance, chord * plan.chord(distance / plan.semi_span)).cell
+        for distance, chord in design.gauges.positions
+    ]
     return CalculixDeck(
         "wing, design",
         operators,
@@ -312,22 +326,13 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
         root_support(mesh),
         tuple(_wing_materials(operators, state)),
         tuple(masses),
+        {"tip force": Step(operators.turn(0.0, TEST_FORCE)), "lift": Step(operators.turn(lift.load_factor))},
         (operators.load_tip,),
-        gauge_cells(operators),
+        np.unique(cells),
         stations,
         (state.damping_alpha, state.damping_beta),
+        each_alone=True,
     )
-
-
-def gauge_cells(operators: AffineOperators) -> IntArray:
-    """Numbers of the cells of a wing that hold the middle of a gauge; they are the set EGAUGES."""
-    mesh = operators.wing_mesh
-    plan = mesh.design.planform
-    cells = [
-        mesh.skin_point(distance, chord * plan.chord(distance / plan.semi_span)).cell
-        for distance, chord in mesh.design.gauges.positions
-    ]
-    return np.unique(cells)
 
 
 def _wing_materials(operators: AffineOperators, state: DigitalState) -> Iterator[CellMaterial]:

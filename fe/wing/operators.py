@@ -20,7 +20,6 @@ from fe.elements.cells import (
     orthotropic_compliance,
     point_jacobians,
     rotate_elasticity,
-    strain_weights,
 )
 from fe.elements.kinds import gauss_points
 from fe.runtime.arrays import FloatArray, IntArray
@@ -74,11 +73,7 @@ def gauge_output(mesh: WingMesh, turned: float = 0.0) -> sparse.csr_array:
         local[:, 2] = 0.5
     direction, aft = _in_skin(mesh, cells, local)
     direction = np.cos(turned) * direction + np.sin(turned) * aft
-    weights = strain_weights(mesh.kind, mesh.nodes[cells], local, direction)
-    values = -share[:, None] * weights.reshape(len(cells), -1)
-    rows = np.repeat(owner, values.shape[1])
-    places = (rows, mesh.unknowns_of(cells).ravel())
-    return sparse.coo_array((values.ravel(), places), (len(gauges.positions), mesh.unknowns)).tocsr()
+    return mesh.strain_rows(owner, -share, cells, local, direction)
 
 
 def _in_skin(mesh: WingMesh, cells: IntArray, local: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -216,8 +216,6 @@ class OpenedFmu:
         self._begin(start, with_inputs=given, renewed=renewed)
 
     def _begin(self, request: list[float], *, with_inputs: bool, renewed: bool = False) -> None:
-        if self._lines:
-            request[-self._lines :] = request[2 : 2 + self._lines]
         start = Start(self._start_time, self._settings, request, with_inputs)
         try:
             instance = self._housing.start(start, renewed=renewed)

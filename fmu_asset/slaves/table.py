@@ -91,7 +91,7 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
     table, wing = Table(start), is_wing(model)
     texts = _OF_THE_WING if wing else {}
     nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
-    control_unit = dict(zip(model.controls, model.control_units.split(), strict=True))
+    control_unit = dict(zip(model.controls, model.control_units, strict=True))
     variables: dict[str, str] = {}
 
     def add(group: str, part: slice = slice(None)) -> None:

@@ -13,9 +13,8 @@ from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.errors import FmuBuildError
 from scenarios import binding_files
 from tests.conftest import BEAM
-from tests.fmu_asset.chain import chain_arrays, chain_model
 from tests.fmu_asset.making import with_dependencies
-from tests.fmu_asset.ours import OurFmus
+from tests.fmu_asset.ours import OurFmus, chain_arrays, chain_model
 from tests.kept import FE, kept
 
 

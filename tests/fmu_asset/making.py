@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.coupling.structure import (
     Component,
     Connection,
@@ -46,6 +47,11 @@ def edited(fmu: Path, target: Path, *changes: tuple[str, str], entry: str = DESC
         assert old in text
         text = text.replace(old, new)
     return archive_of(target, contents | {entry: text.encode()})
+
+
+def parameters_of(fmu: Path) -> dict[str, float]:
+    """Return the parameters of an FMU with the start values that it declares."""
+    return {v.name: float(v.start or 0.0) for v in read_fmu(fmu).variables if v.causality == "parameter"}
 
 
 def with_dependencies(fmu: Path, target: Path, dependencies: Mapping[str, Sequence[str]]) -> Path:

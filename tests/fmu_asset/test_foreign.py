@@ -35,12 +35,9 @@ def test_an_error_is_the_end_of_an_instance_and_a_state_goes_on(foreign_fmu, iso
         asset.restore_state(saved)
         np.testing.assert_array_equal(asset.step({"u": -1.0}).values, following)
     wrong = changed(FIXED, header={"decimation": 1, "step_size": 1.0})
-    with (
-        FmiAsset(foreign_fmu("fixed2"), wrong, isolated=isolated) as asset,
-        pytest.raises(
-            errors.FmuCallError, match=r"(?s)fmi2DoStep returned Error.*the sample time is 0\.01 s"
-        ),
-    ):
+    words = r"(?s)fmi2DoStep returned Error.*the sample time is 0\.01 s"
+    asset = FmiAsset(foreign_fmu("fixed2"), wrong, isolated=isolated)
+    with asset, pytest.raises(errors.FmuCallError, match=words):
         asset.step()
 
 
@@ -116,9 +113,8 @@ def test_what_cannot_be_bound_is_named(foreign_fmu, roles, sentence) -> None:
 def test_other_kinds_are_refused_with_their_reason(foreign_fmu) -> None:
     with pytest.raises(errors.BindingError, match=r"is for FMI 2\.0, but .* is of FMI 1\.0"):
         FmiAsset(foreign_fmu("lag1"), changed(LAG, header={"fmi_version": "2.0"}))
-    with pytest.raises(
-        errors.FmuUnsupportedError, match=r"offers model-exchange only, .* asks for co-simulation"
-    ):
+    words = r"offers model-exchange only, .* asks for co-simulation"
+    with pytest.raises(errors.FmuUnsupportedError, match=words):
         FmiAsset(foreign_fmu("ball2"), changed(BALL, header={"interface": "co-simulation"}))
     scheduled = foreign_fmu.changed("swing3", "scheduled", ("<ModelExchange", "<ScheduledExecution"))
     with pytest.raises(errors.FmuUnsupportedError, match="scheduled execution is not supported"):

@@ -158,11 +158,6 @@ def steady(law: FloatArray, x: float, speed: float) -> float:
     return 0.0
 
 
-def resistance(law: FloatArray, unit: float, speed: float) -> float:
-    """Return the size of the force at a speed that is not zero, `unit` at unit speed."""
-    return 0.0
-
-
 def kick(law: FloatArray, speed: float, strength: float, duration: float, through: bool) -> float:
     """Return the speed after the law alone has acted; with `through`, dry friction does not stop at zero."""
     return speed
@@ -216,6 +211,6 @@ def held(law: FloatArray, speed: float, push: float, gain: float, strength: floa
 
 FUNCTIONS = (
     "advance", "parts", "pull",
-    "dry", "holds", "strength", "share", "steady", "resistance", "kick", "holding_limit", "crossing", "held",
+    "dry", "holds", "strength", "share", "steady", "kick", "holding_limit", "crossing", "held",
 )  # fmt: skip
 """Functions of a law."""

@@ -40,8 +40,13 @@ class MicroSlip(PortForce):
         return self.stiffness, float(self.element_count)
 
     def elements(self) -> FloatArray:
-        """Return the slip displacements (n,) of the elements."""
-        return slip_displacements(self)
+        """Return the slip displacements (n,) of the elements.
+
+        Quantile midpoints of phi ~ d^chi, scaled so that the joint as a whole slips at `slip_force` exactly.
+        """
+        part = (np.arange(self.element_count) + 0.5) / self.element_count
+        slips = part ** (1.0 / (1.0 + self.chi))
+        return np.asarray(slips * (self.slip_force / self.stiffness / slips.mean()))
 
     def check(self) -> None:
         """Raise `InvalidPatchError` where a number cannot be."""
@@ -53,17 +58,6 @@ class MicroSlip(PortForce):
                 f"element_count of {self.kind!r} must be {MOST_ELEMENTS} at most, "
                 f"but is {self.element_count}."
             )
-
-
-def slip_displacements(joint: MicroSlip) -> FloatArray:
-    """Return the slip displacements (n,) of a joint's elements.
-
-    Quantile midpoints of phi ~ d^chi (Segalman 2005, without the macro-slip impulse), scaled so that the
-    joint as a whole slips at `slip_force` exactly.
-    """
-    part = (np.arange(joint.element_count) + 0.5) / joint.element_count
-    slips = part ** (1.0 / (1.0 + joint.chi))
-    return np.asarray(slips * (joint.slip_force / joint.stiffness / slips.mean()))
 
 
 def advance(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, least: int) -> None:

@@ -47,11 +47,6 @@ def steady(law: FloatArray, x: float, speed: float) -> float:
     return float(law[0] * power(max(speed - law[2], 0.0) / law[3], law[1]))
 
 
-def resistance(law: FloatArray, unit: float, speed: float) -> float:
-    """Return the size of the flow at a level."""
-    return unit * power(max(speed - law[2], 0.0), law[1]) if speed > law[2] else 0.0
-
-
 def kick(law: FloatArray, speed: float, strength: float, duration: float, through: bool) -> float:
     """Return the level after s' = -strength (s - l)^n alone."""
     above = speed - law[2]

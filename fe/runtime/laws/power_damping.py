@@ -79,11 +79,6 @@ def steady(law: FloatArray, x: float, speed: float) -> float:
     return float(size * (power(abs(speed) / law[3], law[1]) * np.sign(speed)))
 
 
-def resistance(law: FloatArray, unit: float, speed: float) -> float:
-    """Return the size of the force at a speed."""
-    return unit * power(abs(speed), law[1])
-
-
 def kick(law: FloatArray, speed: float, strength: float, duration: float, through: bool) -> float:
     """Return the speed after s' = -strength |s|^p sgn s alone; with `through`, dry friction turns it."""
     exponent = law[1]

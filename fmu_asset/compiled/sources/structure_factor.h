@@ -110,6 +110,57 @@ TARGET static void IN_LANES(solve_upper)(const double *factor, size_t size, size
     }
 }
 
+/* Apply a reflection, row -= v[i] w + w[i] v, to rows of a symmetric matrix, of which the columns from `begin` are in use,
+   and multiply what they then are by the next one: product += next[i] row. So each row is read once. */
+TARGET static void IN_LANES(reflect_rows)(double *restrict matrix, size_t stride, size_t first, size_t last,
+                                          size_t begin, const double *restrict v, const double *restrict w,
+                                          const double *restrict next, double *restrict product) {
+    size_t i = first;
+    if ((last - i) % 2 > 0) {
+        double *p = matrix + i * stride;
+        const double vp = v[i], wp = w[i], np = next[i++];
+        for (size_t j = begin; j < stride; j += WIDTH) {
+            const VECTOR a = OF(p + j) - (vp * OF(w + j) + wp * OF(v + j));
+            AT(p + j) = a;
+            AT(product + j) += np * a;
+        }
+    }
+    for (; i < last; i += 2) {
+        double *p = matrix + i * stride, *q = p + stride;
+        const double vp = v[i], wp = w[i], np = next[i], vq = v[i + 1], wq = w[i + 1], nq = next[i + 1];
+        for (size_t j = begin; j < stride; j += WIDTH) {
+            const VECTOR x = OF(v + j), y = OF(w + j);
+            const VECTOR a = OF(p + j) - (vp * y + wp * x), b = OF(q + j) - (vq * y + wq * x);
+            AT(p + j) = a, AT(q + j) = b;
+            AT(product + j) += np * a + nq * b;
+        }
+    }
+}
+
+/* Apply the reflections of `tridiagonalise`, the last one first, to vectors side by side: z (size, LANES). */
+TARGET static void IN_LANES(reflect)(double *restrict z, const double *restrict matrix, size_t size, size_t stride,
+                                     const double *restrict factors) {
+    for (size_t lane = 0; lane < LANES; lane += WIDTH) {
+        for (size_t k = size - 1; k-- > 0;) {
+            const double *v = matrix + k * stride;
+            double *x = z + (k + 1) * LANES + lane;
+            size_t i = k + 1;
+            VECTOR even = v[i] * OF(x), odd = 0.0 * even; /* which do not wait for each other */
+            for (++i, x += LANES; i + 2 <= size; i += 2, x += 2 * LANES) {
+                even += v[i] * OF(x);
+                odd += v[i + 1] * OF(x + LANES);
+            }
+            if (i < size) {
+                even += v[i] * OF(x);
+            }
+            even = factors[k] * (even + odd);
+            for (i = k + 1, x = z + i * LANES + lane; i < size; ++i, x += LANES) {
+                AT(x) -= v[i] * even;
+            }
+        }
+    }
+}
+
 /* sum += columns times coefficients, in the registers of one or several vectors: four columns at a time */
 #define SUM(place, c) ((fa * OF(a + place) + fb * OF(b + place)) + (fc * OF(c + place) + fd * OF(d + place)))
 

@@ -17,7 +17,7 @@
 #define MOST_CORRECTIONS 10
 /* The largest correction of a value, relative to it, after which its vector is taken: one of rounding, since the next
    would be about the third power. */
-#define SETTLED 4e-14
+#define SETTLED 1e-12
 
 /* Also compiled for wider vector registers, and chosen when the library is loaded. The numbers are the same to the
    last bit, because each element is computed by the same operations in the same order. */
@@ -108,10 +108,11 @@ bool structure_cholesky(double *factor, size_t size, size_t stride, const double
 
 void structure_pad(double *padded, const double *matrix, size_t size) {
     const size_t stride = structure_padded(size);
-    for (size_t i = 0; i < stride; ++i) {
-        for (size_t j = 0; j < stride; ++j) {
-            padded[i * stride + j] = i < size && j < size ? matrix[i * size + j] : i == j ? 1.0 : 0.0;
-        }
+    for (size_t i = 0; i < stride; ++i, padded += stride) {
+        const size_t kept = i < size ? size : 0;
+        memcpy(padded, matrix + i * kept, kept * sizeof *matrix);
+        memset(padded + kept, 0, (stride - kept) * sizeof *padded);
+        padded[i] = i < size ? padded[i] : 1.0;
     }
 }
 
@@ -156,102 +157,59 @@ void structure_solve_lower_columns(const double *restrict factor, size_t size, s
     solve_lower_columns(factor, size, stride, right);
 }
 
-/* Bring a symmetric matrix to tridiagonal form by Householder reflections H = I - factor v v' (Golub & Van Loan,
-   Matrix Computations, section 8.3.1). Row k of the matrix then holds v from column k + 1 on. */
+/* Bring a symmetric matrix with padded rows to tridiagonal form by Householder reflections H = I - factor v v' (Golub &
+   Van Loan, Matrix Computations, section 8.3.1). Row k of the matrix then holds v from column k + 1 on. `work` has room
+   for three rows. */
 STRUCTURE_WIDE
 static void tridiagonalise(double *restrict matrix, size_t size, double *restrict diagonal,
                            double *restrict off_diagonal, double *restrict factors, double *restrict work) {
+    const size_t stride = structure_padded(size);
+    double *w = work, *product = w + stride;
+    const double *v = product + stride; /* none at first */
+    memset(work, 0, 3 * stride * sizeof *work);
     for (size_t k = 0; k + 1 < size; ++k) {
-        double *v = matrix + k * size + k + 1, *below = v + size;
-        const size_t length = size - k - 1;
-        const double norm = sqrt(inline_dot(v, v, length));
-        diagonal[k] = matrix[k * size + k];
-        if (length == 1 || norm == 0.0) {
-            off_diagonal[k] = v[0];
-            factors[k] = 0.0;
-            continue;
+        double *row = matrix + k * stride, *x = row + k + 1;
+        const size_t length = size - k - 1, begin = (k + 1) / 4 * 4;
+        for (size_t j = k; j < size; ++j) {
+            row[j] -= v[k] * w[j] + w[k] * v[j];
         }
-        const double reflected = v[0] > 0.0 ? -norm : norm;
-        off_diagonal[k] = reflected;
-        /* (v', v) / 2 = norm (norm + |v0|), without a difference of like numbers */
-        factors[k] = 1.0 / (norm * (norm + fabs(v[0])));
-        v[0] -= reflected;
-        memset(work, 0, length * sizeof *work);
-        size_t i = 0;
-        for (; i + 4 <= length; i += 4) { /* the matrix is symmetric: its rows are its columns */
-            const double *a = below + i * size, *b = a + size, *c = b + size, *d = c + size;
-            const double va = v[i], vb = v[i + 1], vc = v[i + 2], vd = v[i + 3];
-            for (size_t j = 0; j < length; ++j) {
-                work[j] += (va * a[j] + vb * b[j]) + (vc * c[j] + vd * d[j]);
-            }
+        diagonal[k] = row[k];
+        const double norm = sqrt(inline_dot(x, x, length));
+        off_diagonal[k] = x[0];
+        factors[k] = 0.0;
+        if (length > 1 && norm > 0.0) {
+            off_diagonal[k] = x[0] > 0.0 ? -norm : norm;
+            /* (v', v) / 2 = norm (norm + |v0|), without a difference of like numbers */
+            factors[k] = 1.0 / (norm * (norm + fabs(x[0])));
+            x[0] -= off_diagonal[k];
         }
-        for (; i < length; ++i) {
-            const double *a = below + i * size, va = v[i];
-            for (size_t j = 0; j < length; ++j) {
-                work[j] += va * a[j];
-            }
+        memset(row + begin, 0, (k + 1 - begin) * sizeof *row); /* in front of it, so that loops may begin there */
+        memset(product, 0, stride * sizeof *product);
+        CHOOSE(reflect_rows)(matrix, stride, k + 1, size, begin, v, w, row, product);
+        const double share = -0.5 * factors[k] * factors[k] * inline_dot(product + k + 1, x, length);
+        memset(w + begin, 0, (k + 1 - begin) * sizeof *w);
+        for (size_t j = k + 1; j < stride; ++j) {
+            w[j] = factors[k] * product[j] + share * row[j];
         }
-        const double share = -0.5 * factors[k] * factors[k] * inline_dot(work, v, length);
-        for (size_t j = 0; j < length; ++j) {
-            work[j] = factors[k] * work[j] + share * v[j];
-        }
-        for (i = 0; i + 2 <= length; i += 2) {
-            double *restrict row = below + i * size, *restrict next = row + size;
-            const double va = v[i], wa = work[i], vb = v[i + 1], wb = work[i + 1];
-            for (size_t j = 0; j < length; ++j) {
-                row[j] -= va * work[j] + wa * v[j];
-                next[j] -= vb * work[j] + wb * v[j];
-            }
-        }
-        for (; i < length; ++i) {
-            double *row = below + i * size;
-            const double vi = v[i], wi = work[i];
-            for (size_t j = 0; j < length; ++j) {
-                row[j] -= vi * work[j] + wi * v[j];
-            }
-        }
+        v = row;
     }
-    diagonal[size - 1] = matrix[size * size - 1];
+    diagonal[size - 1] = matrix[(size - 1) * stride + size - 1];
 }
 
-/* Apply the reflections of `tridiagonalise`, the last one first, to vectors (count, size). */
-STRUCTURE_WIDE
-static void reflect(double *restrict vectors, size_t count, const double *restrict matrix, size_t size,
-                    const double *restrict factors) {
-    for (size_t k = size - 1; k-- > 0;) {
-        const double *restrict v = matrix + k * size + k + 1;
-        const size_t length = size - k - 1;
-        size_t c = 0;
-        for (; c + 3 <= count; c += 3) { /* three at a time, so that their sums do not wait for each other */
-            double *restrict x = vectors + c * size + k + 1, *restrict y = x + size, *restrict z = y + size;
-            double a[4] = {0.0}, b[4] = {0.0}, d[4] = {0.0};
-            size_t i = 0;
-            for (; i + 4 <= length; i += 4) {
-                for (size_t q = 0; q < 4; ++q) {
-                    a[q] += v[i + q] * x[i + q];
-                    b[q] += v[i + q] * y[i + q];
-                    d[q] += v[i + q] * z[i + q];
-                }
-            }
-            for (; i < length; ++i) {
-                a[0] += v[i] * x[i];
-                b[0] += v[i] * y[i];
-                d[0] += v[i] * z[i];
-            }
-            const double of_x = factors[k] * ((a[0] + a[1]) + (a[2] + a[3]));
-            const double of_y = factors[k] * ((b[0] + b[1]) + (b[2] + b[3]));
-            const double of_z = factors[k] * ((d[0] + d[1]) + (d[2] + d[3]));
-            for (i = 0; i < length; ++i) {
-                x[i] -= of_x * v[i];
-                y[i] -= of_y * v[i];
-                z[i] -= of_z * v[i];
+/* Apply the reflections of `tridiagonalise` to vectors (count, size); `work` has room for size LANES doubles. */
+static void reflect(double *vectors, size_t count, const double *matrix, size_t size, const double *factors,
+                    double *work) {
+    for (size_t first = 0; first < count; first += LANES, vectors += LANES * size) {
+        const size_t lanes = count - first < LANES ? count - first : LANES;
+        for (size_t i = 0; i < size; ++i) {
+            for (size_t j = 0; j < LANES; ++j) {
+                work[i * LANES + j] = j < lanes ? vectors[j * size + i] : 0.0;
             }
         }
-        for (; c < count; ++c) {
-            double *restrict x = vectors + c * size + k + 1;
-            const double of_x = factors[k] * inline_dot(x, v, length);
-            for (size_t i = 0; i < length; ++i) {
-                x[i] -= of_x * v[i];
+        CHOOSE(reflect)(work, matrix, size, structure_padded(size), factors);
+        for (size_t i = 0; i < size; ++i) {
+            for (size_t j = 0; j < lanes; ++j) {
+                vectors[j * size + i] = work[i * LANES + j];
             }
         }
     }
@@ -463,9 +421,10 @@ static bool find_all(double *values, double *off_diagonal, size_t size, double *
     return true;
 }
 
-bool structure_symmetric_eigen(double *restrict matrix, size_t size, size_t count, double *restrict values,
-                          double *restrict vectors, double *restrict work) {
-    double *diagonal = work, *off_diagonal = work + size, *factors = work + 2 * size, *rest = work + 3 * size;
+bool structure_symmetric_eigen(const double *restrict matrix, size_t size, size_t count, double *restrict values,
+                               double *restrict vectors, double *restrict work) {
+    double *padded = work, *rest = padded + structure_padded(size) * structure_padded(size);
+    double *diagonal = rest + 40 * size + 12, *off_diagonal = diagonal + size, *factors = off_diagonal + size;
     for (size_t i = 0; i < size; ++i) {
         values[i] = matrix[i * size + i];
     }
@@ -476,7 +435,8 @@ bool structure_symmetric_eigen(double *restrict matrix, size_t size, size_t coun
             }
         }
     }
-    tridiagonalise(matrix, size, diagonal, off_diagonal, factors, rest);
+    structure_pad(padded, matrix, size);
+    tridiagonalise(padded, size, diagonal, off_diagonal, factors, rest);
     if (count == size || !find_apart(diagonal, off_diagonal, size, count, values, vectors, rest)) {
         memcpy(values, diagonal, size * sizeof *values);
         if (!find_all(values, off_diagonal, size, vectors)) {
@@ -484,6 +444,6 @@ bool structure_symmetric_eigen(double *restrict matrix, size_t size, size_t coun
         }
         sort_pairs(values, vectors, size, count, size);
     }
-    reflect(vectors, count, matrix, size, factors);
+    reflect(vectors, count, padded, size, factors, rest);
     return true;
 }

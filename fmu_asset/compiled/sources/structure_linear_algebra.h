@@ -49,10 +49,10 @@ void structure_solve_lower_columns(const double *restrict factor, size_t size, s
 
 /* The `count` lowest eigenvalues of a symmetric matrix, ascending, and their unit vectors as rows. Few of a positive
    definite one are found several times faster than all, where they lie apart and the least of its
-   diagonal are near them. The matrix is destroyed; `values` has room for `size`, `vectors` for (size, size), `work` for
+   diagonal are near them. `values` has room for `size`, `vectors` for (size, size), `work` for
    STRUCTURE_EIGEN_WORK(size) doubles. False if the iteration does not end, which finite numbers do not cause. */
-#define STRUCTURE_EIGEN_WORK(size) (43 * (size))
-bool structure_symmetric_eigen(double *restrict matrix, size_t size, size_t count, double *restrict values,
+#define STRUCTURE_EIGEN_WORK(size) (43 * (size) + 12 + structure_padded(size) * structure_padded(size))
+bool structure_symmetric_eigen(const double *restrict matrix, size_t size, size_t count, double *restrict values,
                           double *restrict vectors, double *restrict work);
 
 #if defined(__GNUC__) && !defined(_WIN32)

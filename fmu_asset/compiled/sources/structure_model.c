@@ -45,6 +45,8 @@ static void lay_out(structure_model *model, size_t anchors, structure_arena *are
     const size_t n = model->static_size, outputs = model->output_count, r = model->residual_size;
     model->stiffness_terms = structure_take(arena, model->terms * model->padded_size * model->stride);
     model->output_columns = structure_take(arena, n * outputs);
+    model->modal_output = structure_take(arena, model->modal_size * model->modal_outputs);
+    model->cross_mass = structure_take(arena, (model->masses + 1) * n * model->modal_size);
     model->load_residual = structure_take(arena, model->loads * r);
     model->stiffness_residual = structure_take(arena, (model->terms - 1) * n * r);
     model->correction_columns = structure_take(arena, (model->functions ? model->functions : anchors) * r * outputs);
@@ -245,7 +247,8 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
     }
     const double *static_stiffness = NULL, *static_output = NULL, *load_residual = NULL,
                  *stiffness_residual = NULL, *correction = NULL, *modes = NULL, *gauges = NULL,
-                 *residual_allowance = NULL, *rounding_allowance = NULL, *dual_residual = NULL;
+                 *residual_allowance = NULL, *rounding_allowance = NULL, *dual_residual = NULL, *modal_output = NULL,
+                 *cross_mass = NULL;
     const struct {
         const char *name;
         const double **values;
@@ -265,8 +268,8 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
         {"modal_stiffness", &model->modal_stiffness, 3, {terms, nm, nm}},
         {"modal_mass", &model->modal_mass, 3, {mass_terms, nm, nm}},
         {"modal_load", &model->modal_load, 2, {loads, nm}},
-        {"modal_output", &model->modal_output, 2, {modal_outputs, nm}},
-        {"cross_mass", &model->cross_mass, 3, {mass_terms, nm, n}},
+        {"modal_output", &modal_output, 2, {modal_outputs, nm}},
+        {"cross_mass", &cross_mass, 3, {mass_terms, nm, n}},
         {"mode_count", &modes, 0, {0}},
         {"gauge_count", &gauges, 0, {0}},
     };
@@ -298,6 +301,10 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
     structure_arena arena = structure_arena_of(model->memory);
     lay_out(model, anchors, &arena);
     transpose(model->output_columns, static_output, outputs, n, n, 1.0);
+    transpose(model->modal_output, modal_output, modal_outputs, nm, nm, 1.0);
+    for (size_t i = 0; i < mass_terms; ++i) {
+        transpose(model->cross_mass + i * nm * n, cross_mass + i * nm * n, nm, n, n, 1.0);
+    }
     transpose(model->load_residual, load_residual + n * loads, r, loads, loads, 1.0);
     for (size_t i = 0; i < terms; ++i) {
         const size_t t = model->order[i];

@@ -55,14 +55,14 @@ typedef struct {
     const double *modal_stiffness;  /* (T, Nm, Nm) */
     const double *modal_mass;       /* (1 + P, Nm, Nm) */
     const double *modal_load;       /* (L, Nm) */
-    const double *modal_output;     /* (modal_outputs, Nm) */
-    const double *cross_mass;       /* (1 + P, Nm, N) */
     double residual_allowance;
     double rounding_allowance;
     /* laid out anew: columns one after another */
     size_t padded_size, stride; /* of the static basis, and with the loads behind it */
     double *stiffness_terms;    /* (T, padded size, stride) in the order of `order`; the first with the loads */
     double *output_columns;     /* (N, O) */
+    double *modal_output;       /* (Nm, modal_outputs) */
+    double *cross_mass;         /* (1 + P, N, Nm) */
     double *load_residual;      /* (L, R) */
     double *stiffness_residual; /* (T - 1, N, R) in the order of `order`, without the first of it */
     size_t *residual_begins;    /* (damaged terms, tiles of R) columns before which a tile has only zeros */

@@ -175,8 +175,7 @@ bool structure_modes_find(structure_modes *modes, const double *chosen, structur
     }
     memcpy(modes->present, modes->stiffness, square * sizeof *modes->present);
     structure_add_columns(modes->present, square, modes->stiffness + square, square, damaged, losses);
-    memcpy(modes->matrix, modes->present, square * sizeof *modes->matrix);
-    if (!structure_symmetric_eigen(modes->matrix, size, model->mode_count, modes->values, modes->vectors,
+    if (!structure_symmetric_eigen(modes->present, size, model->mode_count, modes->values, modes->vectors,
                                    modes->work)) {
         return structure_fail(problem, "the modes under these parameters and losses were not found");
     }
@@ -190,12 +189,16 @@ bool structure_modes_find(structure_modes *modes, const double *chosen, structur
         double *shape = modes->shape + mode * size, *output = modes->output + mode * outputs;
         memset(shape, 0, size * sizeof *shape);
         structure_add_columns(shape, size, modes->basis, size, size, modes->vectors + mode * size);
-        if (structure_dot(model->modal_output + (outputs - 1) * size, shape, size) < 0.0) {
+        memset(output, 0, outputs * sizeof *output);
+        structure_add_columns(output, outputs, model->modal_output, outputs, size, shape);
+        if (output[outputs - 1] < 0.0) {
             for (size_t i = 0; i < size; ++i) {
                 shape[i] = -shape[i];
             }
+            for (size_t i = 0; i < outputs; ++i) {
+                output[i] = -output[i];
+            }
         }
-        structure_multiply(output, model->modal_output, outputs, size, shape);
         structure_multiply(modes->participation + mode * loads, model->modal_load, loads, size, shape);
     }
     memcpy(modes->key, chosen, model->key * sizeof *chosen);
@@ -234,10 +237,11 @@ double structure_modes_square_derivative(const structure_modes *modes, size_t mo
 void structure_modes_project(const structure_modes *modes, const double *modal, const double *static_part, double *result,
                         double *work) {
     const structure_model *model = modes->model;
-    const size_t size = model->modal_size, n = model->static_size;
-    structure_multiply(work, modes->mass, size, size, modal);
-    for (size_t i = 0; i < size; ++i) {
-        work[i] += structure_dot(modes->cross_mass + i * n, static_part, n);
+    const size_t size = model->modal_size;
+    memset(work, 0, size * sizeof *work);
+    structure_add_columns(work, size, modes->mass, size, size, modal); /* symmetric */
+    if (static_part != NULL) {
+        structure_add_columns(work, size, modes->cross_mass, size, model->static_size, static_part);
     }
     structure_multiply(result, modes->shape, model->mode_count, size, work);
 }

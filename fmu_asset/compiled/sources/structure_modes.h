@@ -20,7 +20,7 @@ typedef struct {
     double *output;            /* (M, O and accelerations) per unit of modal coordinate */
     double *participation;     /* (M, L) modal force per unit of load */
     double *mass;              /* (Nm, Nm) */
-    double *cross_mass;        /* (Nm, N) between the modal and the static basis */
+    double *cross_mass;        /* (N, Nm) between the static and the modal basis */
     double *factor;            /* of the stiffness without a loss, padded */
     double *basis;             /* (Nm, Nm) all modes without a loss, by which the others are found */
     double *stiffness;         /* (1 + damaged terms, Nm, Nm) in it, first what no loss changes */
@@ -39,7 +39,7 @@ bool structure_modes_find(structure_modes *modes, const double *chosen, structur
    `chosen` holds the values: x' (dK - omega^2 dM) x. */
 double structure_modes_square_derivative(const structure_modes *modes, size_t mode, const double *chosen, size_t which);
 
-/* result (M) = shape' M u for displacements u = modal (Nm) in the modal plus static (N) in the static basis;
+/* result (M) = shape' M u for displacements u = modal (Nm) in the modal plus static (N), if not NULL, in the static basis;
    `work` has room for Nm doubles. */
 void structure_modes_project(const structure_modes *modes, const double *modal, const double *static_part, double *result,
                         double *work);

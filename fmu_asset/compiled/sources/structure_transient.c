@@ -147,8 +147,7 @@ void structure_integrator_take_over(structure_integrator *integrator, structure_
     structure_modes_project(&integrator->modes, modal, steady, after->displacement, scratch);
     memset(modal, 0, size * sizeof *modal);
     structure_add_columns(modal, size, former->modes.shape, size, count, before->velocity);
-    memset(steady, 0, n * sizeof *steady);
-    structure_modes_project(&integrator->modes, modal, steady, after->velocity, scratch);
+    structure_modes_project(&integrator->modes, modal, NULL, after->velocity, scratch);
     memcpy(after->load, before->load, model->loads * sizeof *after->load);
 }
 

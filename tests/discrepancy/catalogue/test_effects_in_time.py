@@ -17,19 +17,10 @@ from discrepancy.errors import CampaignDataError, CampaignFileError, CatalogueEr
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe
 from tests.discrepancy.rigs import one_mass
+from tests.refusals import Inputs
 
 PAGE = Path(__file__).parents[3] / "docs" / "when.md"
-TRIALS = """
-format = 1
-name = "A mass beside a pump"
-channel = [
-  { name = "x", quantity = "displacement", unit = "m", output = "x", noise = { standard_deviation = 1e-4 } },
-]
-trial = [
-  { name = "quiet", kind = "driven", file = "a.csv", begins = "still" },
-  { name = "pumping", kind = "driven", file = "b.csv", begins = "still" },
-]
-"""
+TRIALS = Inputs(__file__).text("trials.toml")
 EVENT = '{ name = "pump_on", trial = "pumping", time = 2.5, until = 8.0 }'
 TOML = f"{TRIALS}event = [{EVENT}]\n"
 MODEL = one_mass(free=True)

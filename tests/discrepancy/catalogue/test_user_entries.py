@@ -14,96 +14,12 @@ from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import PointMass
+from tests.refusals import Inputs
 
-PYLON = """
-id = "store_pylon"
-name = "store on a pylon"
-family = "mass at a free place"
-equation = "M += m delta(y - y_p)"
-signature = "f1 falls, the static response stays"
-reference = "drawing 12-003"
-acts_on = ["ringdown", "forced"]
-confusable = ["point_mass"]
+INPUTS = Inputs(__file__)
+PYLON = INPUTS.text("pylon.toml")
 
-[[parameters]]
-name = "mass_ratio"
-symbol = "mu"
-unit = "1"
-description = "mass over the first modal mass"
-prior = { shape = "log_normal", low = 0.01, high = 0.3 }
-magnitude = true
-
-[[primitives]]
-kind = "point_mass"
-mass = "0.1 * mass_ratio * modal_mass"
-station = "length / 2"
-"""
-
-BUFFER = """
-[[effect]]
-id = "rubber_buffer"
-name = "rubber buffer"
-family = "stiffness |x|^n, one- or two-sided"
-equation = "F = s k |x / A|^n on one side, and a loss"
-signature = "stiffer upwards"
-reference = "none"
-acts_on = ["static", "ringdown"]
-places = "ports"
-
-[[effect.parameters]]
-name = "share"
-symbol = "s"
-unit = "1"
-description = "of the force at the largest motion"
-prior = { shape = "log_normal", low = 0.01, high = 0.1 }
-magnitude = true
-
-[[effect.shape]]
-name = "power"
-symbol = "n"
-description = "exponent"
-canonical = 2.0
-prior = { shape = "uniform", low = 1.0, high = 4.0 }
-
-[[effect.primitives]]
-kind = "power_stiffness"
-port = "place"
-coefficient = "share * port_stiffness * port_displacement"
-exponent = "power"
-side = "2 - 1"
-reference_displacement = "port_displacement"
-
-[[effect.primitives]]
-kind = "power_damping"
-port = "place"
-coefficient = "0.1 * share * port_stiffness * port_displacement"
-velocity_exponent = 1.0
-displacement_exponent = 0
-reference_velocity = "port_displacement * port_angular_frequency"
-reference_displacement = "port_displacement"
-
-[[effect]]
-id = "first_gauge"
-name = "gauge g0"
-family = "sensor gain"
-equation = "eps -> (1 + g) eps"
-signature = "one channel"
-reference = "none"
-acts_on = ["static", "ringdown", "forced", "flight"]
-
-[[effect.parameters]]
-name = "g"
-symbol = "g"
-unit = "1"
-description = "gain error"
-prior = { shape = "normal", low = -0.1, high = 0.1 }
-magnitude = true
-
-[[effect.primitives]]
-kind = "sensor_gain"
-channel = "g0"
-gain = "min(max(g, -0.5), sqrt(0.25))"
-"""
+BUFFER = INPUTS.text("buffer.toml")
 
 
 @pytest.fixture
@@ -152,41 +68,7 @@ def test_an_effect_whose_place_is_no_port(write, setting: Setting) -> None:
         buffer.patch(setting, {"share": 0.05}, "flap")
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "sentence"),
-    [
-        ('id = "store_pylon"', 'id = "Store Pylon"', "lower-case letters"),
-        ('id = "store_pylon"', 'id = "point_mass"', "2 effects with the identifier 'point_mass'"),
-        ('id = "store_pylon"', "", "'id' is missing"),
-        ('name = "store on a pylon"', "name = 3", "name: a text in quotes is expected, but 3 came"),
-        ('"ringdown", "forced"', '"ringing"', "acts_on[1]: input should be 'static', 'ringdown'"),
-        ('acts_on = ["ringdown", "forced"]', "acts_on = []", "does not say which trials it acts on"),
-        ('confusable = ["point_mass"]', 'confusable = ["mass"]', "names 'mass' as confusable"),
-        ('confusable = ["point_mass"]', "colour = 1", "'colour' is not a key of an effect"),
-        ('confusable = ["point_mass"]', 'places = "wings"', "'places' must be a list or one of ports"),
-        ('confusable = ["point_mass"]', 'places = ["ports"]', 'write places = "ports", without brackets'),
-        ('shape = "log_normal", low = 0.01', 'shape = "gamma", low = 0.01',
-         "parameters[1].prior.shape: input should be 'log_normal'"),
-        ('confusable = ["point_mass"]', 'needs = ["luck"]', "'needs' has 'luck', but known are trial, event"),
-        ("low = 0.01", "low = 0.0", "must have low > 0"),
-        ("magnitude = true", "height = 2", "'parameters[1].height' is not a key of an effect"),
-        ("mass_ratio * modal", "mean_power * modal", "unknown name 'mean_power'"),  # of a shape `exponent`
-        ("low = 0.01", "low = 0.5", "must have low < high"),
-        ("low = 0.01", "low = nan", "parameters[1].prior.low: a finite number is expected, but nan came"),
-        ("magnitude = true", 'magnitude = "yes"',
-         "parameters[1].magnitude: true or false is expected, but 'yes' came"),
-        ('name = "mass_ratio"', 'name = "length"', "must not be called 'length'"),
-        ('kind = "point_mass"', 'kind = "mass"', "'kind' is 'mass', but known are point_mass"),
-        ('station = "length / 2"', "", "lacks station"),
-        ('station = "length / 2"', 'station = "length / 2"\nplace = 1.0', "unknown key 'place'"),
-        ('station = "length / 2"', 'station = "length / b"', "unknown name 'b'"),
-        ('station = "length / 2"', "station = \"__import__('os')\"", "may hold numbers, names"),
-        ('station = "length / 2"', "station = [1.0]",
-         "primitives[1].station: a text in quotes is expected, but [1.0] came"),
-        ("[[primitives]]", "[[primitive]]", "'primitive' is not a key of an effect"),
-        ('id = "store_pylon"', "id = store", "is not valid TOML"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("effect"))
 def test_a_bad_entry_is_refused_with_one_sentence(write, old: str, new: str, sentence: str) -> None:
     assert old in PYLON
     with pytest.raises(CatalogueError) as caught:

@@ -30,6 +30,7 @@ from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, Window
 from tests.discrepancy.rigs import one_mass
+from tests.refusals import Inputs
 
 NOISE = 2e-4
 COULOMB = effect_by_identifier("coulomb_friction", library())
@@ -41,38 +42,7 @@ MODEL = one_mass(
     ],
 )  # fmt: skip
 BEGIN = {"first": 4.137, "second": 2.221}
-OWN = """
-id = "late_friction"
-name = "friction from some moment on"
-family = "friction"
-equation = "F = F_c sgn v, t > t_0"
-signature = "the response is smaller from then on"
-reference = "none"
-acts_on = ["forced"]
-places = "ports"
-[[parameters]]
-name = "size"
-symbol = "F_c"
-unit = "N"
-description = "friction"
-prior = { shape = "log_normal", low = 0.1, high = 1.0 }
-magnitude = true
-[[parameters]]
-name = "moment"
-symbol = "t_0"
-unit = "s"
-description = "since when"
-prior = { shape = "normal", low = 3.0, high = 5.0 }
-[[primitives]]
-kind = "power_damping"
-port = "place"
-coefficient = "size"
-velocity_exponent = 0.0
-displacement_exponent = 0.0
-reference_velocity = 1.0
-reference_displacement = 1.0
-begin = "moment"
-"""
+OWN = Inputs(__file__).text("late_friction.toml")
 
 
 @pytest.fixture(scope="module")

@@ -24,24 +24,9 @@ from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PowerStiffness
 from tests.discrepancy.rigs import FEW, measured
+from tests.refusals import Inputs
 
-EXPLOSIVE = """
-id = "explosive"
-name = "explosive law"
-family = "mine"
-equation = "x += a exp(1000 t)"
-signature = "none"
-reference = "none"
-acts_on = ["ringdown"]
-primitives = [{ kind = "channel_offset", channel = "displacement", offset = "a * exp(1000 * time)" }]
-[[parameters]]
-name = "a"
-symbol = "a"
-unit = "1"
-description = "size"
-prior = { shape = "normal", low = -1.0, high = 1.0 }
-magnitude = true
-"""
+EXPLOSIVE = Inputs(__file__).text("explosive.toml")
 
 
 def softening(coefficient: float, reference: float) -> Effect:

@@ -15,20 +15,9 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.judgement.separability import CONFUSED, Separability, _groups, as_predicted, separability
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.report.check_tables import group_lines
+from tests.refusals import Inputs
 
-ONE_MODE = """
-format = 1
-name = "One mass on a beam"
-mass = [2.0]
-stiffness = [1974.0]
-characteristic_length = 0.4
-damping = { ratios = [0.01] }
-root = { lever = [0.4] }
-input = [{ name = "mass", vector = [1.0] }]
-output = [{ name = "displacement", vector = [1.0] }]
-place = [{ name = "mass", vector = [1.0], station = 0.4 }]
-parameter = [{ name = "stiffness_factor", terms = "stiffness", deviation = 0.02, low = 0.7, high = 1.3 }]
-"""
+ONE_MODE = Inputs(__file__).text("one_mode.toml")
 
 
 def group_of(found: Separability, identifier: str) -> tuple[str, ...]:

@@ -1,7 +1,8 @@
-"""The whole way on simulated campaigns of the chain."""
+"""The whole way on simulated campaigns of the chain; responses are remembered of the trial asked for."""
 
 from __future__ import annotations
 
+import gc
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +13,12 @@ from discrepancy.catalogue.library import library
 from discrepancy.errors import CampaignDataError
 from discrepancy.fits.candidate import Candidate
 from discrepancy.judgement.separability import as_predicted
+from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate, open_hypotheses, patch_draws, solver_share, without_port
+from fe.runtime.patch import ModelPatch
 
 
 @pytest.fixture(scope="module")
@@ -181,3 +184,23 @@ def test_effects_that_lack_a_port_are_remarked_on_with_the_port_to_declare() -> 
     static = example_campaign(chain, "static", 1, plan)
     (remark,) = without_port(Setting(static, bare, bare.scales(static)), library())
     assert "Coulomb" not in remark  # a port would not help: there is no motion
+
+
+# ---------------------------------------------------------------- remembered responses
+
+
+def test_trials_that_came_and_went_are_not_mistaken_for_each_other(kit) -> None:  # type: ignore[no-untyped-def]
+    """Trials of proposals live briefly; their addresses are used again."""
+    problem = kit.closed_problem()
+    template = problem.campaign.trials[0]
+    channels = problem.campaign.channels
+    outputs = tuple((channels[name].output, channels[name].quantity) for name in template.channels)
+    memo = problem.model
+    plain = memo.patched(ModelPatch())
+    conditions = Conditions(np.array([1.0, 0.5]), health=np.zeros((9, 2)))
+    for number in range(200):
+        trial = replace(template, force=float(number) * template.force)
+        got = memo.respond(trial, outputs, ModelPatch(), conditions).values
+        np.testing.assert_array_equal(got, plain.respond(trial, outputs, ModelPatch(), conditions).values)
+        del trial
+        gc.collect(0)

@@ -29,53 +29,10 @@ from discrepancy.campaign.sampling import is_even
 from discrepancy.campaign.schema import INPUT_COLUMNS
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
+from tests.refusals import Inputs
 
-TOML = """
-format = 1
-name = "A mass in the laboratory"
-reference_temperature = 20.0
-[parameters.young_modulus_factor]
-mean = 1.0073
-deviation = 0.0103
-[noise]
-file = "noise.csv"
-[[channel]]
-name = "g17"
-quantity = "strain"
-unit = "microstrain"
-output = "strain[17]"
-station = 0.35
-chord = 0.3
-gain_deviation = 0.005
-offset_deviation = 2.0
-[[channel]]
-name = "tip"
-quantity = "displacement"
-unit = "mm"
-output = "tip_displacement"
-column = "w [mm]"
-offset_deviation = "free"
-noise = { standard_deviation = 0.05, degrees_of_freedom = 200 }
-[[trial]]
-name = "tip load up"
-kind = "static"
-file = "tip_up.csv"
-run = "A"
-start = 30.0
-load_place = [1.0, 0.35]
-health = { z1 = 0.2, flange = 0.1, deviation = 0.05 }
-[[trial]]
-name = "release"
-kind = "ringdown"
-file = "release.csv"
-temperature = 23.5
-release = { displacement = 50, unit = "mm" }
-[[trial]]
-name = "turn"
-kind = "flight"
-file = "turn.csv"
-held_out = true
-"""
+INPUTS = Inputs(__file__)
+TOML = INPUTS.text("campaign.toml")
 TABLES = {
     "noise.csv": "time,g17\n" + "".join(f"{k * 0.01:.2f},{(-1) ** k * 1.5 + 0.5}\n" for k in range(40)),
     "tip_up.csv": "# by hand\nforce,g17,w [mm]\n0,0.5,0.1\n# pause\n5,120.25,7.3\n10,,14.6\n",
@@ -314,39 +271,6 @@ def test_noise_from_repeats_is_the_pooled_deviation(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- what is wrong
 
 RELEASE = TABLES["release.csv"]
-WRONG_TOML = [
-    ("format = 1", "format = 2", r"`format` is 2; this version reads campaigns with `format = 1`\."),
-    ("format = 1", "", "'format' is missing"),
-    ("name = ", "nam = ", "'nam' is not a key of a campaign"),
-    ('unit = "microstrain"', 'unit = "mm"', "a unit such as 1, microstrain or percent, and 'mm' came"),
-    ('quantity = "strain"', 'quantity = "stress"', r"channel\[1\].quantity: input should be 'strain'"),
-    ('column = "w [mm]"', 'column = "force"', "the column 'force' holds an input"),
-    ('column = "w [mm]"', 'column = "g17"', "more than one channel reads the column 'g17'"),
-    ('column = "w [mm]"', "", "release.csv of the trial 'release' holds no channel"),
-    ('column = "w [mm]"', 'column = "g"\n[[channel]]\nname="w [mm]"\nquantity="signal"\nunit="1"\noutput="x"',
-     "channel 'tip' is in no trial: no table has a column 'g'"),
-    ('name = "tip"', 'name = "g17"', "more than one channel called 'g17'"),
-    ('name = "tip"', 'name = "*"', r"cannot be called '\*'"),
-    ('kind = "flight"', 'kind = "fly"', r"trial\[3\].kind: input should be 'static'"),
-    ('file = "turn.csv"', 'file = "turns.csv"', "There is no file turns.csv .* noise.csv, release.csv"),
-    ('file = "turn.csv"', 'file = "../turn.csv"', "must lie in the campaign's folder"),
-    ("held_out = true", 'held_out = "yes"', "true or false is expected, but 'yes' came"),
-    ("held_out = true", "left_out = { g17 = [3] }", "leaves out row 3 of 'g17', and turn.csv has 2 rows"),
-    ("held_out = true", "left_out = { g18 = [1] }", "names the channel 'g18'"),
-    ("held_out = true", 'channels = ["tip"]', r"turn.csv has no column 'w \[mm\]', which the chan"),
-    ("held_out = true", "temperature = 21", "gives its temperature twice"),
-    ("held_out = true", 'hold = "smooth"', r"and its `hold` is for the force of a forced one: say that"),
-    ("held_out = true", 'hold = "held"', r"hold: input should be 'zero_order', 'linear' or 'smooth', but 'h"),
-    ("held_out = true", "health = { z1 = 0.1 }", "gives z1 twice"),
-    ("load_place = [1.0, 0.35]", "load_place = [1.0]", r"must be a name or \[y, x\]"),
-    ("release = {", "releases = {", r"'trial\[2\].releases' is not a key of a campaign"),
-    ('release = { displacement = 50, unit = "mm" }', "", r"'trial\[2\].release.displacement' is missing"),
-    ("displacement = 50", "displacement = 0", "must not be zero: its sign is the side"),
-    ("reference_temperature = 20.0", "", "the campaign has no `reference_temperature`"),
-    ("standard_deviation = 0.05", "standard_deviation = 0", "should be greater than 0"),
-    ("z1 = 0.2", "z1 = 20", "less than or equal to 1, but 20 came"),
-    ("[noise]", "[noise", "is not valid TOML"),
-]  # fmt: skip
 WRONG_TABLES = [
     ("tip_up", "load,g17\n1,2\n", CampaignFileError, "tip_up.csv has no column 'force', .*are load, g17"),
     ("tip_up", "force,strain\n1,2\n", CampaignFileError, "holds no channel: its columns are force, strain"),
@@ -380,7 +304,7 @@ def check_sentence(text: str) -> None:
     assert "\n" not in text
 
 
-@pytest.mark.parametrize(("old", "new", "sentence"), WRONG_TOML)
+@pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("campaign"))
 def test_a_wrong_key_is_named_in_one_sentence(tmp_path: Path, old: str, new: str, sentence: str) -> None:
     assert old in TOML
     with pytest.raises(CampaignFileError, match=sentence) as caught:

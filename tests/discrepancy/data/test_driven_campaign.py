@@ -10,24 +10,9 @@ from discrepancy.campaign.records import Hold, Quantity, Start
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.errors import CampaignFileError
 from tests.discrepancy.data.test_campaign_file import same
+from tests.refusals import Inputs
 
-TOML = """
-format = 1
-name = "A heated plate on a shaker"
-channel = [
-{ name = "plate", quantity = "temperature", unit = "degC", output = "plate", noise.standard_deviation = 0.1 },
-{ name = "turned", quantity = "angle", unit = "deg", output = "turned", noise.standard_deviation = 0.5 },
-]
-input = [
-  { name = "heater", quantity = "heat", unit = "kW", hold = "zero_order", offset_deviation = 0.01 },
-  { name = "table", quantity = "displacement", unit = "mm", column = "x" },
-  { name = "fan", quantity = "torque", unit = "mN m" },
-]
-trial = [
-  { name = "first", kind = "driven", file = "first.csv", begins = "unknown" },
-  { name = "second", kind = "driven", file = "second.csv" },
-]
-"""
+TOML = Inputs(__file__).text("heated_plate.toml")
 HEAD = "time,heater,x,fan,plate,turned\n"
 ROWS = [f"{0.1 * k + 0.01 * (k % 3):.3f},{1 + k},{k},{2 * k},{20 + k},{90 * k}" for k in range(10)]
 FIRST = HEAD + "\n".join(ROWS)

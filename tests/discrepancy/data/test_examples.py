@@ -1,7 +1,8 @@
-"""Examples as a user makes them: written, read and checked, with and without a hidden effect."""
+"""Examples as a user makes them, and that of docs/campaign.md: written, read and checked."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from discrepancy.campaign.held_out import choose_held_out
+from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import TrialKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers
@@ -72,3 +74,36 @@ def test_plan_of_the_wing_names_its_outputs() -> None:
     assert [channel.output for channel in plan.channels][-1] == "tip_displacement"
     assert plan.names(TrialKind.FLIGHT) == plan.names(TrialKind.STATIC)[:-1]
     assert np.isfinite([channel.noise.standard_deviation for channel in plan.channels if channel.noise]).all()
+
+
+# ---------------------------------------------------------------- the example of docs/campaign
+
+
+PAGE = Path(__file__).parents[3] / "docs" / "campaign.md"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    text = PAGE.read_text(encoding="utf-8")
+    toml = re.search(r"```toml\n(.*?)```", text, re.DOTALL)
+    tables = re.search(r"begin with\n\n```\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "campaign.toml").write_text(toml.group(1), encoding="utf-8")
+    columns = [re.split(r"\s{3,}", line) for line in tables.group(1).splitlines()]
+    for number, name in enumerate(("noise", "tip_up", "release_1", "turns")):
+        rows = [row[number] for row in columns]
+        if name in ("noise", "release_1"):  # the page shows how they begin; a record is longer
+            rows += [f"{0.002 * sample:.3f},{(-1) ** sample}" for sample in range(3, 50)]
+        (tmp_path / f"{name}.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return tmp_path
+
+
+def test_the_documented_campaign_is_read(folder: Path) -> None:
+    campaign = read_campaign(folder)
+    kinds = [TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FLIGHT]
+    assert [trial.kind for trial in campaign.trials] == kinds
+    assert campaign.trials[0].values[1].tolist() == [54.1e-6, 2.98e-3]
+    assert campaign.trials[0].temperature.tolist() == [1.5] * 3
+    assert campaign.trials[1].release.displacement == 0.015
+    assert campaign.trials[2].health[2].tolist() == [0.2, 0.0]
+    assert campaign.channels["g17"].noise.source == "pre-trigger"
+    assert campaign.remarks == ()

@@ -20,25 +20,11 @@ from discrepancy.checks.unit_slips import slip_between
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.sources.examples import example_campaign, plan_for
 from tests.discrepancy.rigs import model_of
+from tests.refusals import Inputs
 
 FloatArray = NDArray[np.float64]
 
-MODEL = """
-format = 1
-name = "a mass on a spring"
-mass = 2.0
-stiffness = 800.0
-damping = { matrix = 0.8 }
-input = [{ name = "motor", vector = 1.0 }]
-output = [
-  { name = "x", vector = 1.0, quantity = "displacement" },
-  { name = "y", vector = -0.5, quantity = "displacement" },
-]
-parameter = [
-  { name = "spring", terms = "stiffness", deviation = 0.1, low = 0.3, high = 3.0 },
-  { name = "oil", terms = "damping", deviation = 0.3, low = 0.1, high = 3.0 },
-]
-"""
+MODEL = Inputs(__file__).text("mass_on_a_spring.toml")
 CHANNEL = """
 [[channel]]
 name = "{0}"

@@ -33,59 +33,15 @@ from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
 from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness
 from tests.discrepancy.rigs import fmu_rig
+from tests.refusals import Inputs
 
 FloatArray = NDArray[np.float64]
 
 CART, CART_IN_AIR, SHAKEN, SERVO, STORES = 0, 5, 8, 12, 14
 """Campaigns of seed 1: friction on a rail, drag, one on a support, a cubic spring in a loop, an outflow."""
-DRIVE = """format = 1
-name = "positioning drive"
-mass = 95.0
-free = true
-damping = { matrix = 200.0 }
-[[input]]
-name = "force"
-vector = 1.0
-quantity = "force"
-[[output]]
-name = "position"
-vector = 1.0
-[[port]]
-name = "carriage"
-vector = 1.0
-[[parameter]]
-name = "mass"
-terms = "mass"
-deviation = 0.1
-low = 0.3
-high = 3.0
-[[parameter]]
-name = "viscous friction"
-terms = "damping"
-deviation = 0.2
-low = 0.3
-high = 3.0
-"""
-DRIVEN = """format = 1
-name = "drive"
-[[channel]]
-name = "position"
-quantity = "displacement"
-unit = "m"
-output = "position"
-noise = { standard_deviation = 2e-6 }
-[[input]]
-name = "force"
-quantity = "force"
-unit = "N"
-hold = "zero_order"
-offset_deviation = 5.0
-[[trial]]
-name = "there and back"
-kind = "driven"
-file = "run.csv"
-begins = "still"
-"""
+INPUTS = Inputs(__file__)
+DRIVE = INPUTS.text("drive.toml")
+DRIVEN = INPUTS.text("driven.toml")
 
 
 def share_of(missing: MissingForce) -> float:

@@ -116,7 +116,7 @@ def test_each_row_has_its_own_health_and_temperature(wing: Wing) -> None:
 
 def test_a_cubic_spring_over_the_planform_solves_the_equations_of_all_unknowns(wing: Wing) -> None:
     stiffness, *_ = wing.matrices()
-    rows, share = np.stack([wing.wing.port_rows[port] for port in STATION_PORTS]), wing.wing.planform.share
+    rows, share = np.stack([wing.wing.port_rows[port] for port in STATION_PORTS]), wing.wing.planform[1]
     values = wing.seen(STATIC, PowerStiffness("planform", 60.0, 3.0, 0, 0.02))
     for level, force in enumerate(STATIC.force):
         u = np.linalg.solve(stiffness, force * wing.tip)

@@ -280,7 +280,7 @@ def test_powers_of_the_distance_have_the_mean_over_the_area(root: float, tip: fl
 @pytest.mark.parametrize("kind", AT_EACH)
 def test_where_all_places_move_alike_the_forces_add_up_to_the_law(kind: str) -> None:
     """What is elsewhere in a patch stays as it is."""
-    share, item = planform_stations(SPAN, ROOT, TIP).share, AT_EACH[kind]
+    share, item = planform_stations(SPAN, ROOT, TIP)[1], AT_EACH[kind]
     before, after = patch.PointMass(0.1, 1.0), FreePlay("root", 2.0, 1e-3)
     first, *spread, last = at_stations(ModelPatch((before, item, after)), share)
     assert (first, last) == (before, after)
@@ -297,9 +297,9 @@ def test_rows_of_the_stations_are_displacements_of_the_elastic_line(coarse_patch
     bent = np.linalg.solve(wing.structure(1.0, (0.0, 0.0), 0.17, 0.13).stiffness, wing.arrays.load_tip)
     along = wing.arrays.line_rows[2] @ bent
     seen = np.array([wing.port_rows[port] @ bent for port in STATION_PORTS])
-    between = CubicSpline(wing.arrays.stations, along)(wing.planform.distance)
+    between = CubicSpline(wing.arrays.stations, along)(wing.planform[0])
     assert seen == pytest.approx(between, rel=1e-2)
     # the mean over the area is that of the port "span"
-    assert float(wing.planform.share @ seen) == pytest.approx(float(wing.port_rows["span"] @ bent), rel=1e-2)
+    assert float(wing.planform[1] @ seen) == pytest.approx(float(wing.port_rows["span"] @ bent), rel=1e-2)
     with pytest.raises(InvalidPatchError, match="it has root, tip, span, planform"):
         laws_of(wing.internal_forces(ModelPatch((FreePlay("flap", 1.0, 1e-3),))), wing.port_rows)

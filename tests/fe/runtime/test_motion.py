@@ -10,7 +10,6 @@ from scipy.special import ellipk
 
 from discrepancy.models.compiled_motion import compiled_kernel
 from fe.runtime import patch
-from fe.runtime.laws.micro_slip import slip_displacements
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
@@ -225,7 +224,7 @@ def test_an_iwan_joint_loses_the_energy_of_its_density_and_obeys_masing(chi: flo
 @pytest.mark.parametrize("chi", [0.0, -0.4, -0.9])
 def test_elements_of_a_joint_slip_together_at_the_slip_force(chi: float) -> None:
     law = MicroSlip("mass", slip_force=2.0, stiffness=8.0, chi=chi)
-    assert slip_displacements(law).mean() == pytest.approx(0.25)
+    assert law.elements().mean() == pytest.approx(0.25)
     assert whole_force(law, np.array([50.0]))[0] == pytest.approx(2.0)
 
 

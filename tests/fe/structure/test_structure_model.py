@@ -20,7 +20,7 @@ from fe.runtime.errors import (
 from fe.structure.affine import natural_frequencies, static_responses
 from fe.structure.mesh_file import check_memory, memory_estimate, read_mesh
 from fe.structure.operators import Structure, load_and_assemble, weighed, write_structure_vtu
-from fe.verification.calculix_comparison import structure_agreement
+from fe.verification.calculix_comparison import agreement
 from fe.verification.calculix_deck import structure_deck
 from tests.calculix_decks import needs_calculix
 from tests.refusals import Inputs, refused
@@ -269,13 +269,14 @@ def test_memory_is_estimated_before_it_is_taken(beam) -> None:
 )
 def test_both_codes_agree(kind: str, changes: tuple[tuple[str, str], ...], body, tmp_path: Path) -> None:
     """The last one stands on a rigid flange, which the push and two gauges near it load, on springs."""
-    agreement = structure_agreement(body(kind, *changes, mass_as_stiffness=True), tmp_path / "ccx", 5)
-    assert list(agreement.loads) == ["weight", "suction", "push"]
-    for differences in agreement.loads.values():
+    deck = structure_deck(body(kind, *changes, mass_as_stiffness=True))
+    found = agreement(deck, tmp_path / "ccx", 5)
+    assert list(found.loads) == ["weight", "suction", "push"]
+    for differences in found.loads.values():
         assert list(differences) == ["nodal displacements", "gauge strains", "displacement outputs"]
         assert max(differences.values()) < 1e-5
-    assert len(agreement.ours) == 5
-    assert agreement.modal < 1e-6
+    assert len(found.ours) == 5
+    assert found.modal < 1e-6
 
 
 def test_wedges_cannot_be_compared(body) -> None:

@@ -124,9 +124,8 @@ def test_what_is_seen_when_it_is_loaded_is_one_sentence(foreign_fmu, fmu, bindin
     library = bytearray(contents["binaries/linux64/hostile2.so"])
     struct.pack_into("<H", library, 18, 183)  # ELF e_machine: AArch64
     arm = archive_of(tmp_path / "arm.fmu", contents | {"binaries/linux64/hostile2.so": bytes(library)})
-    with pytest.raises(
-        errors.FmuCallError, match=r"binary cannot be loaded on this machine .*another processor"
-    ):
+    words = r"binary cannot be loaded on this machine .*another processor"
+    with pytest.raises(errors.FmuCallError, match=words):
         FmiAsset(arm, HOSTILE).reset()
     needing = ("<CoSimulation ", '<CoSimulation needsExecutionTool="true" ')
     tool = edited(foreign_fmu("hostile2", "NO_INSTANCE"), tmp_path / "tool.fmu", needing)

@@ -70,10 +70,7 @@ def test_step_sizes_and_units_that_contradict(foreign_fmu) -> None:
 
 def test_a_binding_of_ones_own(foreign_fmu) -> None:
     def own(unit: str) -> Any:
-        load = {
-            "outside": ("ambient.T", "degC", -40.0, 50.0),
-            "power": ("heater.u[1].P", "kW", 0.0, 3.0),
-        }
+        load = {"outside": ("ambient.T", "degC", -40.0, 50.0), "power": ("heater.u[1].P", "kW", 0.0, 3.0)}
         return bound(30.0, {"room": ("room.T", unit)}, load=load, header={"name": "own"})
 
     check = check_fmu(foreign_fmu("room2"), own("degC"))

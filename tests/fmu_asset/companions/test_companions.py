@@ -4,50 +4,32 @@ import math
 import random
 from collections.abc import Callable
 from contextlib import closing
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.companions.damage_growth import DamageGrowth
 from fmu_asset.companions.strain_gauges import StrainGauges, normal
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError
-from tests.fmu_asset.making import bound
+from tests.fmu_asset.making import bound, parameters_of
 from tests.fmu_asset.ours import OurFmus
 from tests.fmu_asset.slaves.slave import DISCARD, OK, Slave
-
-
-@pytest.fixture(scope="module")
-def parameters(ours: OurFmus) -> Callable[..., dict[str, float]]:
-    """Parameters of a companion, with the start values that the packed FMU declares."""
-    starts = {
-        name: {
-            v.name: float(v.start or 0.0)
-            for v in read_fmu(ours(name)).variables
-            if v.causality == "parameter"
-        }
-        for name in ("damage_growth", "strain_gauges")
-    }
-
-    def changed(name: str, **changes: float) -> dict[str, float]:
-        assert not set(changes) - set(starts[name])
-        return starts[name] | changes
-
-    return changed
-
 
 # ---------------------------------------------------------------------- damage growth
 
 
 @pytest.fixture(scope="module")
-def damage(parameters: Any) -> Callable[..., DamageGrowth]:
+def damage(ours: OurFmus) -> Callable[..., DamageGrowth]:
+    """Return what begins with the start values that the packed FMU declares."""
+    declared = parameters_of(ours("damage_growth"))
+
     def begun(**changes: float) -> DamageGrowth:
+        assert not set(changes) - set(declared)
         behaviour = DamageGrowth()
-        behaviour.start(parameters("damage_growth", **changes), 0.0, [1.0])
+        behaviour.start(declared | changes, 0.0, [1.0])
         return behaviour
 
     return begun
@@ -137,14 +119,15 @@ def test_refusals_leave_the_state(ours) -> None:
 
 
 @pytest.fixture(scope="module")
-def gauges(parameters: Any) -> Callable[..., Callable[[float], list[float]]]:
+def gauges(ours: OurFmus) -> Callable[..., Callable[[float], list[float]]]:
     """Return what begins with gauges at equal strains: the readings of a step, and then what is received."""
+    declared = parameters_of(ours("strain_gauges"))
 
     def begun(strains: list[float], **changes: float) -> Callable[[float], list[float]]:
+        assert not set(changes) - set(declared)
         outside = tuple(f"[{gauge}]" for gauge in range(len(strains) + 1, 25))
-        values = parameters("strain_gauges", **changes)
+        mine = {name: v for name, v in (declared | changes).items() if not name.endswith(outside)}
         behaviour = StrainGauges()
-        mine = {name: value for name, value in values.items() if not name.endswith(outside)}
         started = behaviour.start(mine, 0.0, strains)
         return lambda time: started if time < 0.0 else behaviour.advance(float(time), 1.0, strains)
 

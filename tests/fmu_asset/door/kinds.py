@@ -15,7 +15,6 @@ from scipy.linalg import expm
 from fe.runtime.state import TIP_FORCE
 from fe.runtime.transient import ModalIntegrator
 from fe.structure.design import parse_structure
-from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.companions.damage_growth import DamageGrowth
 from fmu_asset.coupling.structure import Component, Setting, SystemStructure
 from fmu_asset.door.binding import Binding, load_binding
@@ -23,7 +22,7 @@ from fmu_asset.slaves.effects import output_channels
 from fmu_asset.structures.binding import structure_binding
 from scenarios import binding_files
 from tests.conftest import BEAM
-from tests.fmu_asset.making import bound, changed, linear, system, watch
+from tests.fmu_asset.making import bound, changed, linear, parameters_of, system, watch
 from tests.fmu_asset.ours import REGIONS, OurFmus
 
 Floats = npt.NDArray[np.float64]
@@ -383,8 +382,7 @@ def integral(kind: Kind, _: OurFmus) -> Shown:
 
 def damage(kind: Kind, ours: OurFmus) -> Shown:
     """The behaviour that is packed, in this process."""
-    declared = read_fmu(ours(kind.file)).variables
-    values = {v.name: float(v.start or 0.0) for v in declared if v.causality == "parameter"}
+    values = parameters_of(ours(kind.file))
     values |= {kind.binding.parameter[name].variable: value for name, value in kind.parameters.items()}
     behaviour = DamageGrowth()
     behaviour.start(values, 0.0, [1.0])

@@ -19,7 +19,7 @@ from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.placement import limits_of
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.units import Meaning, contradictions, conversion, meaning_of, same_dimension
+from fmu_asset.door.units import Conversion, Meaning, contradictions, conversion, meaning_of, same_dimension
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
 from tests.fmu_asset.foreign.workshop import MODELS
@@ -183,6 +183,10 @@ def test_units_convert_both_ways(units) -> None:
     scale = conversion(unit, variable("v", "input", unit=of_fmu), DEFINED, where="here")
     assert scale.to_fmu(value) == pytest.approx(in_fmu, rel=1e-12)
     assert scale.from_fmu(in_fmu) == pytest.approx(value, rel=1e-12)
+    for first, second in ((scale, Conversion(2.0, 0.5)), (Conversion(2.0, 0.5), scale)):
+        assert first.then(second).to_fmu(value) == pytest.approx(
+            second.to_fmu(first.to_fmu(value)), rel=1e-12
+        )
 
 
 @pytest.mark.parametrize(("unit", "of_fmu"), [("N", "1"), ("m", "K"), ("bushel", "1"), ("1", "bushel")])
@@ -265,7 +269,8 @@ def test_numbered_outputs_are_one_observation(first, count, form) -> None:
 def test_other_units_and_shapes_are_another_observation_and_none_is_none() -> None:
     metres, kelvins = variable("s1", "output", unit="m"), variable("s2", "output", unit="K")
     array = dataclasses.replace(variable("s1", "output"), shape=(3,))
-    for first, second in ((metres, kelvins), (array, variable("s2", "output"))):
+    padded = variable("s01", "output"), variable("s2", "output")
+    for first, second in ((metres, kelvins), (array, variable("s2", "output")), padded):
         assert len(drafted(description(first, second)).observation) == 2
     with pytest.raises(BindingError, match="no number that could be observed"):
         draft_binding(description(variable("u", "input")))

@@ -93,17 +93,12 @@ def watched(step: float, kind: str) -> Any:
     return watch("first.x", "second.x", step_size=step, interpolation=kind, tolerance=1e-10)
 
 
-@pytest.mark.parametrize(
-    ("system_options", "asset_options"),
-    [
-        ({}, {}),
-        ({"exchange": True}, {}),
-        ({"substeps": 3}, {}),
-        ({"exchange": True, "substeps": 3}, {"algorithm": "jacobi"}),
-        ({"delayed": True}, {}),
-        ({}, {"algorithm": "jacobi"}),
-    ],
-)
+JACOBI = {"algorithm": "jacobi"}
+COUPLED = [({}, {}), ({"exchange": True}, {}), ({"substeps": 3}, {}), ({"delayed": True}, {}), ({}, JACOBI),
+           ({"exchange": True, "substeps": 3}, JACOBI)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("system_options", "asset_options"), COUPLED)
 def test_the_error_of_a_system_falls_with_the_square_of_the_step(
     foreign_fmu, system_options, asset_options
 ) -> None:

@@ -7,6 +7,7 @@ import json
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fmpy import read_model_description
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
@@ -39,6 +40,7 @@ from reporting.provenance import collect_provenance
 from tests.command_line import command, refused, said
 from tests.fmu_asset.door.kinds import CHANNELS, INTERVAL, OUTPUTS, SENDING, WARM, on, playing, watching
 from tests.fmu_asset.ours import OurFmus
+from tests.fmu_asset.slaves.slave import OK, Slave
 
 HERE = Path(__file__).parent
 SENSORS, WING = (
@@ -170,18 +172,6 @@ def test_what_is_on_and_how_much_show_in_the_guid(model, sensing, tmp_path) -> N
 
 # ---------------------------------------------------------------------- sensors
 
-ROW = st.tuples(
-    st.floats(-1.0, 4.0), st.sampled_from([0.0, 0.3, 0.8]), st.floats(0.0, 0.8), st.floats(-20.0, 20.0)
-)
-
-
-@settings(max_examples=12, deadline=None)
-@given(rows=st.lists(ROW, min_size=1, max_size=6), response=st.sampled_from([1.0, 2.0]))
-@pytest.mark.long
-def test_off_is_the_plain_wing_to_the_bit(fmu, sensing, rows, response) -> None:
-    given = {"response": response, "release": 0.02 if response == 2.0 else 0.0}
-    assert flown(fmu, rows, **given).tobytes() == flown(sensing, rows, **given).tobytes()
-
 
 @pytest.mark.parametrize("response", [1.0, 2.0], ids=["quasi-static", "transient"])
 def test_effects_of_sensors_are_those_of_whole_records(fmu, sensing, response) -> None:
@@ -190,10 +180,11 @@ def test_effects_of_sensors_are_those_of_whole_records(fmu, sensing, response) -
     rows = [(0.0, 0.0, 0.0, 0.0)] * 80 if moving else [(n, 0.1, 0.0, 0.0) for n in (1.0, 2.0, -1.0, 3.0)]
     given = {"response": response, "release": 0.03 * moving, "start": 2.0 * moving}
     first = 0 if moving else 1
-    plain, shown = (
+    plain, off, shown = (
         flown(path, rows, **given, **switched)[first:, :26]
-        for path, switched in ((fmu, {}), (sensing, on(*SENSORS)))
+        for path, switched in ((fmu, {}), (sensing, {}), (sensing, on(*SENSORS)))
     )
+    assert off.tobytes() == plain.tobytes()
     whole = ModelPatch(
         tuple(item for effect in parse_patch(content()).for_gauges(24).effects for item in effect.patch)
     )
@@ -229,6 +220,22 @@ def test_switches_and_values_change_between_steps(sensing, fmu) -> None:
         warm = asset.step(load={"temperature": 4.0}).values
     np.testing.assert_allclose(warm[:24] - cold[:24], 4.8e-5, rtol=1e-9)
     np.testing.assert_array_equal(warm[24:], cold[24:])
+
+
+@pytest.mark.parametrize("response", [1, 2])
+def test_what_is_read_while_initialising_leaves_no_trace(sensing, response) -> None:
+    seen = []
+    for factors in ((3.0, 1.0), (1.0,)):
+        with closing(Slave(sensing)) as slave:
+            slave.initialising()
+            slave.fmu.setInteger([slave.reference["response"]], [response])
+            for factor in factors:
+                slave.set(on("coupling") | {"load_factor": factor})
+                slave.everything()
+            assert slave.status_of(slave.fmu.exitInitializationMode) == OK
+            assert slave.status_of(slave.fmu.doStep, 0.0, 0.05) == OK
+            seen.append(slave.everything())
+    assert seen[0] == seen[1]
 
 
 IMPOSSIBLE = {

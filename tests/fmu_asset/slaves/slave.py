@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -54,25 +55,25 @@ class Slave:
 
     # ------------------------------------------------------------------ values
 
+    def _whole(self, places: Sequence[int]) -> tuple[list[int], list[int]]:
+        """Return the value references of the arrays that places lie in, and all places in these."""
+        arrays = list(dict.fromkeys(self._arrays[place] for place in places))
+        return [array.start for array in arrays], [place for array in arrays for place in array]
+
     def read(self, places: Sequence[int]) -> list[float]:
         """Return real values by value references."""
-        if not self.three:
-            return [float(value) for value in self.fmu.getReal(places)]
-        arrays = list(dict.fromkeys(self._arrays[place] for place in places))
-        order = [place for array in arrays for place in array]
-        values = self.fmu.getFloat64([array.start for array in arrays], len(order))
-        return [values[order.index(place)] for place in places]
+        starts, order = self._whole(places)
+        get = partial(self.fmu.getFloat64, nValues=len(order)) if self.three else self.fmu.getReal
+        values = dict(zip(order, map(float, get(starts)), strict=True))
+        return [values[place] for place in places]
 
     def write(self, places: Sequence[int], values: Sequence[float]) -> None:
         """Set real values by value references; of an array the others stay."""
-        if not self.three:
-            self.fmu.setReal(places, values)
-            return
         given = dict(zip(places, values, strict=True))
-        arrays = list(dict.fromkeys(self._arrays[place] for place in places))
-        order = [place for array in arrays for place in array]
+        starts, order = self._whole(places)
         kept = {} if len(order) == len(given) else dict(zip(order, self.read(order), strict=True))
-        self.fmu.setFloat64([array.start for array in arrays], [(kept | given)[place] for place in order])
+        set_real = self.fmu.setFloat64 if self.three else self.fmu.setReal
+        set_real(starts, [(kept | given)[place] for place in order])
 
     def set(self, values: Mapping[str, float]) -> None:
         """Set real variables by name."""
@@ -97,15 +98,12 @@ class Slave:
 
     def derivative(self, unknowns: Sequence[str], seed: Mapping[str, float]) -> np.ndarray:
         """Return the directional derivative of variables."""
-        of, by = ([self.reference[name] for name in names] for names in (unknowns, seed))
-        if not self.three:
-            return np.array(self.fmu.getDirectionalDerivative(of, by, list(seed.values())))
-        results, knowns = ([*dict.fromkeys(self._arrays[place] for place in places)] for places in (of, by))
-        order, given = [p for array in results for p in array], dict(zip(by, seed.values(), strict=True))
-        seeds = [given.get(place, 0.0) for array in knowns for place in array]
-        starts = ([array.start for array in arrays] for arrays in (results, knowns))
-        found = self.fmu.getDirectionalDerivative(*starts, seeds, len(order))
-        return np.array([found[order.index(place)] for place in of])
+        places, given = [self.reference[n] for n in unknowns], {self.reference[n]: v for n, v in seed.items()}
+        (results, order), (knowns, sown) = self._whole(places), self._whole(list(given))
+        count = [len(order)] if self.three else []
+        seeds = [given.get(place, 0.0) for place in sown]
+        found = self.fmu.getDirectionalDerivative(results, knowns, seeds, *count)
+        return np.array([found[order.index(place)] for place in places])
 
     # ------------------------------------------------------------------ life
 

@@ -206,6 +206,12 @@ def joined(theirs: Pack, tmp_path: Path) -> Callable[..., Wiring]:
     )
 
 
+DELAYED = (
+    '<ssd:Annotations><ssc:Annotation type="uav-twin"><own:Coupling xmlns:own="urn:uav-twin:coupling" '
+    'delayed="true"/></ssc:Annotation></ssd:Annotations>'
+)
+
+
 def test_nested_systems_parameters_and_mappings(theirs, joined) -> None:
     wiring = joined()
     assert [c.name for c in wiring.structure.components] == ["structure.wing", "damage"]
@@ -218,7 +224,10 @@ def test_nested_systems_parameters_and_mappings(theirs, joined) -> None:
     }  # fmt: skip
     ((target, feed),) = wiring.feeds.items()
     assert (str(feed.end), str(target)) == ("damage.z1", "structure.wing.health.z1")
-    assert feed.conversion == (0.5, 0.0)
+    assert (feed.conversion, feed.delayed) == ((0.5, 0.0), False)
+    inner = 'startConnector="z" endElement="wing" endConnector="health.z1"'
+    late = joined((f"{inner}/>", f"{inner}>{DELAYED}</ssd:Connection>"))
+    assert [feed.delayed for feed in late.feeds.values()] == [True]
     assert wiring.ends["loss"][0].conversion == (pytest.approx(100.0), 0.0)
     assert {str(port.end): port.conversion for port in wiring.ends["n"]} == {
         "structure.wing.load_factor": (1.0, 0.0), "damage.load_factor": (0.5, 0.25),

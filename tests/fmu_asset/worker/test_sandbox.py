@@ -220,17 +220,20 @@ def test_what_is_granted_can_be_had(attempting, targets, what, attempt, limit) -
     assert happened()
 
 
-def test_a_port_beside_the_granted_one_and_another_protocol_stay_closed(attempting, targets) -> None:
-    for what, attempt in (
-        ("call", STREAM),
-        ("call", "call(SOCK_STREAM,262,TARGET)"),
-        ("service", "call_service(TARGET)"),
-    ):
-        target, happened = targets(what)
-        refused(
-            attempting(attempt, target, ports=[int(target) if "262" in attempt else 9]), "Permission denied"
-        )
-        assert not happened()
+CLOSED = [
+    ("call", STREAM, 9),
+    ("call", "call(SOCK_STREAM,262,TARGET)", 0),
+    ("service", "call_service(TARGET)", 9),
+]
+
+
+@pytest.mark.parametrize(("what", "attempt", "port"), CLOSED)
+def test_a_port_beside_the_granted_one_and_another_protocol_stay_closed(
+    attempting, targets, what, attempt, port
+) -> None:
+    target, happened = targets(what)
+    refused(attempting(attempt, target, ports=[port or int(target)]), "Permission denied")
+    assert not happened()
 
 
 def test_a_program_that_is_granted_is_as_confined_as_the_fmu(attempting, tmp_path) -> None:
