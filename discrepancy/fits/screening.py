@@ -28,6 +28,7 @@ from .candidate import Candidate, Term
 from .elimination import Cholesky, eliminated, finite
 from .fitting import LARGEST_EFFECT, CandidateFit
 from .problem import Problem
+from .trial_data import EVERY
 
 
 @dataclass(frozen=True)
@@ -137,13 +138,13 @@ class Screen:
         changes: dict[int, FloatArray] = {}
         for number, data in enumerate(problem.trials):
             names = data.trial.channels
-            touched = [column for column, name in enumerate(names) if not channels or name in channels]
+            touched = [column for column, name in enumerate(names) if name in channels] if channels else EVERY
             if data.trial.kind in acting and touched:
                 response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
                 gains = 1.0 + problem.shared.gains(fit.point.shared, names)
-                change = changes[number] = np.zeros(response.shape)
                 moved = gains[touched] * (response - fit.responses[number])[:, touched]
-                change[:, touched] = data.standardised(moved, touched)
+                changes[number] = np.zeros(response.shape)
+                changes[number][:, touched] = data.standardised(moved, touched)
         return self.projected(changes)
 
     def projected(self, changes: Mapping[int, FloatArray]) -> tuple[FloatArray, float, float]:
@@ -151,19 +152,19 @@ class Screen:
         total = np.zeros(self._size)
         parts, tail, fits, square = [], [], 0.0, 0.0
         for number, block in enumerate(self._blocks):
-            whole, z = np.zeros(self.fit.residuals[number].T.shape), np.zeros(len(block.local))
+            d, z = np.zeros(self.fit.residuals[number].T.shape), np.zeros(len(block.local))
             if number in changes:
-                touched = np.flatnonzero(changes[number].any(axis=0)).tolist()
-                root = np.sqrt(block.precision[touched])[:, np.newaxis]
-                d = whole[touched] = changes[number].T[touched] * root
-                onto = block.derivatives.onto(d * root, touched)
+                d = changes[number].T * block.root
+                moved = d.any(axis=1)
+                at = EVERY if moved.all() else np.flatnonzero(moved).tolist()
+                onto = block.derivatives.onto(d[at] * block.root[at], at)
                 local = onto[: len(z)]
-                z = block.factor.half(local)
+                z = block.half @ local
                 total[block.index] += onto[len(z) :] - block.followed.T @ local
-                fits += float(np.vdot(self.fit.residuals[number].T[touched] * root, d))
-                fits -= float(block.factor.half(block.local_gradient) @ z)
+                fits += float(np.vdot(self.fit.residuals[number].T * block.root, d))
+                fits -= float(block.half_gradient @ z)
                 square += float(np.vdot(d, d)) - float(z @ z)
-            parts.append(whole.reshape(-1))
+            parts.append(d.reshape(-1))
             tail.append(z)
         y = self._inverse @ total
         fits -= float(self._gradient @ y)

@@ -6,18 +6,20 @@ to a trial: zeros of its channels, initial state and time zero of a ring-down, a
 constants of inputs of a driven trial, health where it is uncertain.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import isinf
 
 import numpy as np
 
-from discrepancy.campaign.noise import NoiseModel, noise_model
+from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.campaign.sampling import IntArray
 from discrepancy.models.interface import Conditions, Model
 
+EVERY = slice(None)
+"""All channels of a trial."""
 FREE_MOTION = 3.0
 """Prior deviation of a free initial state, in units of the release displacement."""
 LEAST_LOSS, LARGEST_LOSS = -0.5, 0.95
@@ -278,13 +280,11 @@ class TrialDerivatives:
         total = np.bincount(at.ravel(), weighted.ravel(), minlength=count * count)
         return np.asarray(total.reshape(count, count)[:-1, :-1])
 
-    def onto(self, columns: FloatArray, channels: Sequence[int] | None = None) -> FloatArray:
+    def onto(self, columns: FloatArray, channels: list[int] | slice = EVERY) -> FloatArray:
         """Return J d (L + K,) of readings d (C, N), or of some channels' only."""
-        rows, owners = self.rows, self.owners
-        if channels is not None:
-            rows, owners = rows[list(channels)], owners[list(channels)]
-        found = np.matmul(rows, columns[:, :, np.newaxis])[:, :, 0]
-        return np.asarray(np.bincount(owners.ravel(), found.ravel(), minlength=self.size + 1)[:-1])
+        found = np.matmul(self.rows[channels], columns[:, :, np.newaxis])[:, :, 0]
+        owners = self.owners[channels].ravel()
+        return np.asarray(np.bincount(owners, found.ravel(), minlength=self.size + 1)[:-1])
 
     def spread(self, products: FloatArray, weights: FloatArray, covariance: FloatArray) -> FloatArray:
         """Return for each channel (C,) the trace of W J^T covariance J, of all L + K unknowns."""
@@ -345,21 +345,19 @@ class TrialData:
         found = even if np.all(np.abs(given[1:] - even[1:]) < 1e-3 * even[1:]) else given
         return np.concatenate((np.zeros(1), found[1:]))
 
-    def standardised(self, columns: FloatArray, channels: Sequence[int] | None = None) -> FloatArray:
+    def standardised(self, columns: FloatArray, channels: list[int] | slice = EVERY) -> FloatArray:
         """Return columns (..., N, C) over s0, whitened in time, zero where a sample does not count.
 
         With `channels`, the columns are theirs only.
         """
-        chosen = range(len(self.deviation)) if channels is None else channels
-        at = slice(None) if channels is None else list(channels)
-        scaled = columns / self.deviation[at]
+        scaled = columns / self.deviation[channels]
         interval = self.trial.whitened_at
         if interval is not None:
-            for number, channel in enumerate(chosen):
+            for number, channel in enumerate(np.arange(len(self.deviation))[channels]):
                 noise = self.noise[channel]
                 if noise.applies(interval):
                     scaled[..., number] = noise.whiten(scaled[..., number], interval)
-        return np.asarray(scaled * self.weight[:, at])
+        return np.asarray(scaled * self.weight[:, channels])
 
     @classmethod
     def of(
@@ -385,13 +383,6 @@ class TrialData:
                     for row in np.flatnonzero(~trial.used[:, number]):
                         weight[row : row + len(item.autoregression) + 1, number] = 0.0
         return cls(trial, deviation, groups, local_unknowns(campaign, trial, deviation, model), weight, noise)
-
-
-def noise_models(campaign: Campaign) -> dict[str, NoiseModel]:
-    """Return the noise of every channel of a campaign."""
-    return {
-        name: noise_model(channel, stand_in(campaign, name)) for name, channel in campaign.channels.items()
-    }
 
 
 def stand_in(campaign: Campaign, name: str) -> float:
