@@ -10,20 +10,8 @@ from typing import Any
 from calibration.result.file import load_calibration
 from calibration.result.plain import tailoring
 from discrepancy.errors import DiscrepancyError, ModelError
+from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
-from discrepancy.files.verdict import (
-    APPLIED,
-    PATCH_NAME,
-    PATCHED,
-    VERDICT_NAME,
-    StoredPatch,
-    StoredVerdict,
-    fmu_outputs,
-    patch_effects,
-    read_patch,
-    read_verdict_file,
-    write_patch,
-)
 from discrepancy.model_choice import ModelChoice, ModelKind, model_of
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
 from discrepancy.sentences import SENTENCES, said
@@ -33,7 +21,7 @@ from fe.runtime.state import DigitalState
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
 from fmu_asset.packing.wing_packing import pack_wing
 from reporting.errors import FileNotWrittenError
-from reporting.files import atomic_write_text
+from reporting.files import atomic_write_text, refuse_existing
 from reporting.folders import restore_folder
 from reporting.progress import Progress
 from reporting.toml_file import read_toml, toml_text
@@ -103,8 +91,8 @@ def apply_verdict(
     file = Path(verdict)
     if file.suffix != ".json":
         restore_folder(file)
-        file = file / VERDICT_NAME
-    stored = read_verdict_file(file)
+        file = file / files.VERDICT_NAME
+    stored = files.read_verdict_file(file)
     found = _found(stored, file, member)
     choice = model_of(stored.origin, file, progress)
     patch = changed(found, origin=stored.origin).upon(choice.built_in)
@@ -115,11 +103,10 @@ def apply_verdict(
     path = Path(f"{stem}_patched{'.toml' if plain else '.json'}" if out is None else out)
     if path.suffix not in ENDINGS:
         raise FileNotWrittenError(f"{path} must end in one of {', '.join(ENDINGS)}: choose another --out.")
-    made_of = (choice.file, *choice.beneath, choice.path or "", file, file.parent / PATCH_NAME)
+    made_of = (choice.file, *choice.beneath, choice.path or "", file, file.parent / files.PATCH_NAME)
     if path.exists() and path.resolve() in (Path(item).resolve() for item in made_of):
         raise FileNotWrittenError(f"{path} is what the patched model is made of: choose another --out.")
-    if path.exists() and not replace:
-        raise FileNotWrittenError(f"{path} exists: choose another --out or give --replace.")
+    refuse_existing(path, replace=replace)
     what = " and ".join(f"{item.name}{item.place and f' at {item.place}'}" for item in found.effects)
     sure = said(f"applied.{found.verdict.name.lower()}", group=", ".join(stored.verdict.group))
     sentence = f"{capital(what)}, {sure}."
@@ -135,34 +122,34 @@ def apply_verdict(
         pack_patched(choice, patch, path, activate=True, replace=replace, progress=progress)
         return Applied(path, sentence, "")
     else:
-        write_patch(path, patch)
+        files.write_patch(path, patch)
     return Applied(path, sentence, _again(stored.origin.command, path))
 
 
 def gives(verdict: Verdict) -> bool:
     """Return whether a verdict gives something to apply."""
     open_gap = verdict.kind is VerdictKind.UNEXPLAINED
-    return verdict.kind in PATCHED or (open_gap and _hypothesis(verdict, None) is not None)
+    return verdict.kind in files.PATCHED or (open_gap and _hypothesis(verdict, None) is not None)
 
 
-def _found(stored: StoredVerdict, file: Path, member: str | None) -> StoredPatch:
+def _found(stored: files.StoredVerdict, file: Path, member: str | None) -> files.StoredPatch:
     """Return the effects that are applied."""
     verdict = stored.verdict
     if member is not None and (verdict.kind is not VerdictKind.GROUP or member not in verdict.group):
         known = ", ".join(map(repr, verdict.group)) if verdict.kind is VerdictKind.GROUP else "no group"
         raise DiscrepancyError(f"--member {member!r} is none of {file}, which has {known}: leave it out.")
-    beside = file.parent / PATCH_NAME
-    if member is None and verdict.kind in PATCHED and beside.is_file():
-        return read_patch(beside)
-    best = _hypothesis(verdict, member) if verdict.kind in APPLIED else None
+    beside = file.parent / files.PATCH_NAME
+    if member is None and verdict.kind in files.PATCHED and beside.is_file():
+        return files.read_patch(beside)
+    best = _hypothesis(verdict, member) if verdict.kind in files.APPLIED else None
     if best is None:
         key = f"nothing_as_{verdict.kind.name.lower()}"
         why = said(f"applied.{key}" if key in SENTENCES["applied"] else "applied.nothing_there")
         raise DiscrepancyError(f"{file} gives nothing to apply: {why}.")
     residuals = file.parent / RESIDUALS_NAME
-    channels = fmu_outputs(read_residuals(residuals).channels) if residuals.is_file() else {}
-    effects = patch_effects(best.effects)
-    return StoredPatch(verdict.kind, "", effects, channels, best.parameters, stored.origin)
+    channels = files.fmu_outputs(read_residuals(residuals).channels) if residuals.is_file() else {}
+    effects = files.patch_effects(best.effects)
+    return files.StoredPatch(verdict.kind, "", effects, channels, best.parameters, stored.origin)
 
 
 def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
@@ -179,7 +166,7 @@ def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
     return next(iter((*told, *better)), None)
 
 
-def _lumped_text(choice: ModelChoice, patch: StoredPatch) -> str:
+def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
     """Return the file of a lumped model with laws at its ports and calibrated parameters."""
     file = choice.path or SHIPPED_MODELS / f"{patch.origin.model_file}.toml"
     content: dict[str, Any] = read_toml(file, ModelError, what="lumped model")
@@ -199,7 +186,7 @@ def _lumped_text(choice: ModelChoice, patch: StoredPatch) -> str:
 
 def pack_patched(
     choice: ModelChoice,
-    patch: StoredPatch,
+    patch: files.StoredPatch,
     path: Path,
     *,
     activate: bool = False,

@@ -14,13 +14,7 @@ from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.reduced_structure import StructureModel
 from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
-from discrepancy.sources.from_run import (
-    CALIBRATION_FILE,
-    DESIGN_FILE,
-    is_calibrated_wing,
-    patch_of_run,
-    run_model,
-)
+from discrepancy.sources import from_run
 from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import is_structure
@@ -209,10 +203,10 @@ def choice_of_run(folder: Path) -> ModelChoice:
     CampaignFileError, ModelError
         As `run_model`.
     """
-    model, tailored = run_model(folder), is_calibrated_wing(folder)
+    model, tailored = from_run.run_model(folder), from_run.is_calibrated_wing(folder)
     kind = ModelKind.CALIBRATION if tailored else ModelKind.WING
-    choice = _wing(model, kind, folder / (CALIBRATION_FILE if tailored else DESIGN_FILE))
-    patch = patch_of_run(folder)
+    choice = _wing(model, kind, folder / (from_run.CALIBRATION_FILE if tailored else from_run.DESIGN_FILE))
+    patch = from_run.patch_of_run(folder)
     if patch is None:
         return choice
     return replace(choice, source_hash=hash_record({"model": choice.source_hash, "patch": hash_file(patch)}))

@@ -4,9 +4,11 @@ import glob
 import os
 import shutil
 import tempfile
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from reporting.errors import FileNotWrittenError
 from reporting.files import write_error
 
 _OLD, _REPLACED = "old", "replaced"
@@ -42,6 +44,43 @@ def fresh_folder(folder: Path) -> Path:
     os.umask(mask)
     fresh.chmod(0o777 & ~mask)
     return fresh
+
+
+def _taken(folder: Path) -> int:
+    descriptor = lock_folder(folder)
+    if descriptor is None:
+        raise FileNotWrittenError(f"another process is replacing {folder}: look at what it leaves.")
+    return descriptor
+
+
+@contextmanager
+def whole_folder(folder: Path, take: Callable[[Path], int] = _taken) -> Iterator[Path]:
+    """Give an empty folder to be filled, and put it in the place of `folder` when the block ends.
+
+    An exception in the block leaves `folder` as it was. `take` holds a folder that is to be replaced for this
+    process, as `lock_folder` does, or says why not.
+
+    Raises
+    ------
+    FileNotWrittenError
+        The disk is full, the place is not writable, or another process holds the folder.
+    """
+    try:
+        fresh = fresh_folder(folder)
+        try:
+            yield fresh
+            if not folder.is_dir():
+                fresh.rename(folder)
+                return
+            held = take(folder)
+            try:
+                replace_folder(fresh, folder)
+            finally:
+                os.close(held)
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
+    except OSError as error:
+        raise write_error(error, folder) from error
 
 
 def replace_folder(fresh: Path, folder: Path) -> None:

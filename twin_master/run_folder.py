@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from reporting.files import atomic_write_bytes, atomic_write_text, remove_leftovers, write_error
-from reporting.folders import fresh_folder, lock_folder, replace_folder
+from reporting.files import atomic_write_bytes, atomic_write_text, remove_leftovers
+from reporting.folders import lock_folder, whole_folder
 from reporting.json_file import read_json
 from reporting.provenance import collect_provenance
 from twin_master.errors import NotResumableError, RunFolderError, RunFolderExistsError
@@ -89,27 +89,17 @@ def create_run_folder(
             f"{folder} holds a run already: choose another --out, go on with it by --resume, or give "
             "--replace."
         )
-    held = lock_run_folder(folder) if occupied else None
+    lock = None
     try:
-        fresh = fresh_folder(folder)
-        lock = lock_run_folder(fresh)
-        try:
+        with whole_folder(folder, lock_run_folder) as fresh:
+            lock = lock_run_folder(fresh)
             for name, content in (files or {}).items():
                 atomic_write_bytes(fresh / name, content)
             atomic_write_text(fresh / CONFIG_NAME, to_json(config))
-            if occupied:
-                replace_folder(fresh, folder)
-            else:
-                fresh.rename(folder)
-        except BaseException:
+    except BaseException:
+        if lock is not None:
             os.close(lock)
-            shutil.rmtree(fresh, ignore_errors=True)
-            raise
-    except OSError as error:
-        raise write_error(error, folder) from error
-    finally:
-        if held is not None:
-            os.close(held)
+        raise
     return lock
 
 

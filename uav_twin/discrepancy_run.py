@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
     from discrepancy.document import Origin
     from discrepancy.model_choice import ModelChoice
+    from discrepancy.report.figures import Pack
     from discrepancy.self_calibration import SelfCalibration
     from discrepancy.verdict import ExplainedShare, Proof
-    from discrepancy.verdict_folder import Pack
     from discrepancy.workflow import Investigation
     from reporting.progress import Progress
 
@@ -70,7 +70,8 @@ def run(
     from discrepancy.catalogue.library import load_catalogue
     from discrepancy.errors import CampaignFileError
     from discrepancy.judgement.separability import separability
-    from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
+    from discrepancy.report.figures import ReportInput
+    from discrepancy.verdict_folder import check_folder, write_verdict_folder
     from discrepancy.workflow import investigate
 
     one_thread()
@@ -106,7 +107,7 @@ def run(
     )
     pack = None if choice.design is None else _packing(choice, progress)
     origin = _origin(data, choice, command, seed, effects or [])
-    content = VerdictContent(found, origin, able, tried, choice.design, pack=pack)
+    content = ReportInput(found, origin, able, tried, choice.design, pack=pack)
     with progress.stage("Writing the verdict"):
         place = write_verdict_folder(folder, content, replace_it=replace, report=not no_report)
     if json:

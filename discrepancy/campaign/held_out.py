@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from discrepancy.campaign.records import Campaign, Trial, TrialKind
+from discrepancy.sentences import said
 
 SHARE = 0.25
 """Share of the trials of a kind that is held out."""
@@ -55,12 +56,8 @@ def choose_held_out(campaign: Campaign) -> Campaign:
             trials.append(replace(trial, held_out=True) if trial.name in chosen else trial)
     held = [trial.name for trial in trials if trial.held_out]
     if not held:
-        remark = (
-            "Nothing is held out for proof: there are too few trials to spare one. Mark a trial with "
-            "`held_out = true`, or measure one more at another level."
-        )
-        return replace(campaign, remarks=(*campaign.remarks, remark))
-    remark = f"Held out for proof by the rule of the workflow: {', '.join(held)}."
+        return replace(campaign, remarks=(*campaign.remarks, said("remarks.nothing_held_out")))
+    remark = said("remarks.held_out", names=", ".join(held))
     return replace(campaign, trials=tuple(trials), remarks=(*campaign.remarks, remark))
 
 

@@ -18,6 +18,7 @@ from scipy.stats import chi2
 from discrepancy.campaign.noise_tests import ljung_box
 from discrepancy.campaign.records import Channel, FloatArray, NoiseRecord, Trial
 from discrepancy.errors import CampaignDataError
+from discrepancy.sentences import said
 from reporting.words import counted
 
 MAINS = (50.0, 60.0, 400.0)
@@ -339,8 +340,5 @@ def with_noise(
         return stated, ""
     found = repeat_record(channel, trials)
     if found is not None:
-        return found, (
-            f"The noise of the channel {channel.name!r} is taken from repeated trials "
-            f"({found.degrees_of_freedom:.0f} degrees of freedom): what changes from trial to trial is in it."
-        )
+        return found, said("remarks.repeats", channel=channel, found=found)
     return None, ""  # said by the checks

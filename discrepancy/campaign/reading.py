@@ -7,6 +7,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from discrepancy.campaign import schema
 from discrepancy.campaign.noise import pre_trigger_record, with_noise
 from discrepancy.campaign.records import (
     USUAL_REGIONS,
@@ -25,18 +26,9 @@ from discrepancy.campaign.records import (
 )
 from discrepancy.campaign.remarks import remarks_on
 from discrepancy.campaign.sampling import check_sampling, nearly_even
-from discrepancy.campaign.schema import (
-    INPUT_COLUMNS,
-    OF_REGION,
-    CampaignSection,
-    ChannelSection,
-    ColumnSection,
-    ReleaseSection,
-    TrialSection,
-    parse_campaign,
-)
 from discrepancy.campaign.units import conversion_of
 from discrepancy.errors import CampaignDataError, CampaignFileError
+from discrepancy.sentences import said
 from reporting.provenance import hash_file, hash_record
 from reporting.table_file import TableErrors, TextTable, read_table
 from reporting.toml_file import read_toml
@@ -90,7 +82,7 @@ def read_campaign(folder: str | Path) -> Campaign:
     return assemble(section, tables, data_hash)
 
 
-def assemble(section: CampaignSection, tables: Mapping[str, TextTable], data_hash: str) -> Campaign:
+def assemble(section: schema.CampaignSection, tables: Mapping[str, TextTable], data_hash: str) -> Campaign:
     """Return the campaign that a description and its tables make; errors as `read_campaign`.
 
     Parameters
@@ -126,22 +118,22 @@ def assemble(section: CampaignSection, tables: Mapping[str, TextTable], data_has
     )
 
 
-def _unused(section: CampaignSection, tables: Mapping[str, TextTable]) -> list[str]:
+def _unused(section: schema.CampaignSection, tables: Mapping[str, TextTable]) -> list[str]:
     """Return a remark on each column that no channel and no input has."""
-    known = {*INPUT_COLUMNS, *(item.table_column for item in (*section.channel, *section.input))}
+    known = {*schema.INPUT_COLUMNS, *(item.table_column for item in (*section.channel, *section.input))}
     files: dict[str, list[str]] = {}
     for name in dict.fromkeys(trial.file for trial in section.trial):
         for column in tables[name].columns:
-            if column not in known and not column.startswith(OF_REGION):
+            if column not in known and not column.startswith(schema.OF_REGION):
                 files.setdefault(column, []).append(name)
+    more = {column: f" and {len(where) - 1} more" if where[1:] else "" for column, where in files.items()}
     return [
-        f"{where[0]}{f' and {len(where) - 1} more' if where[1:] else ''}: no channel has the column "
-        f"{column!r}, which is left out; if that is not meant, check its spelling."
+        said("remarks.no_channel", file=where[0], more=more[column], column=column)
         for column, where in files.items()
     ]
 
 
-def _events(section: CampaignSection, trials: tuple[Trial, ...]) -> Iterator[Event]:
+def _events(section: schema.CampaignSection, trials: tuple[Trial, ...]) -> Iterator[Event]:
     """Yield the events; each must lie within the records of its trials."""
     records = {trial.name: trial.time for trial in trials}
     for event in section.event:
@@ -167,18 +159,20 @@ def _read_table(folder: Path, name: str) -> TextTable:
     return read_table(folder / name, TABLE_ERRORS, name=name)
 
 
-def _read_section(folder: Path) -> CampaignSection:
+def _read_section(folder: Path) -> schema.CampaignSection:
     path = folder / CAMPAIGN_FILE
     if not path.exists():
         missing = f"{CAMPAIGN_FILE} in {folder}" if folder.is_dir() else f"folder {folder}"
         raise CampaignFileError(f"There is no {missing}: give the folder of a campaign.")
-    return parse_campaign(read_toml(path, CampaignFileError, what="campaign"), str(path))
+    return schema.parse_campaign(read_toml(path, CampaignFileError, what="campaign"), str(path))
 
 
 # ---------------------------------------------------------------- trials
 
 
-def _trial(section: TrialSection, table: TextTable, campaign: CampaignSection, remarks: list[str]) -> Trial:
+def _trial(
+    section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, remarks: list[str]
+) -> Trial:
     user = f"the trial {section.name!r}"
     time, start = _times(section, table, user)
     zeros = np.zeros(len(table))
@@ -190,9 +184,9 @@ def _trial(section: TrialSection, table: TextTable, campaign: CampaignSection, r
     held = section.kind is TrialKind.STATIC and inputs and "force" not in table.columns
     forced = section.kind in (TrialKind.STATIC, TrialKind.FORCED) and not held
     pushing = (item.values for item in inputs if item.quantity in (Quantity.FORCE, Quantity.TORQUE))
-    said = section.model_dump(include={*SAID})
+    given = section.model_dump(include={*SAID})
     return Trial(
-        **said,
+        **given,
         channels=tuple(channel.name for channel in chosen),
         values=np.stack(columns, axis=1),
         used=np.stack(used, axis=1),
@@ -212,7 +206,7 @@ def _trial(section: TrialSection, table: TextTable, campaign: CampaignSection, r
 
 
 def _inputs(
-    section: TrialSection, table: TextTable, campaign: CampaignSection, user: str
+    section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
 ) -> tuple[RecordedInput, ...]:
     """Return the recorded inputs of a driven or static trial: those whose columns are there."""
     if section.kind not in (TrialKind.DRIVEN, TrialKind.STATIC):
@@ -227,12 +221,14 @@ def _inputs(
     )  # fmt: skip
 
 
-def _numbers(table: TextTable, item: ColumnSection, user: str, *, empty_allowed: bool = False) -> FloatArray:
+def _numbers(
+    table: TextTable, item: schema.ColumnSection, user: str, *, empty_allowed: bool = False
+) -> FloatArray:
     numbers = table.numbers(item.table_column, user, empty_allowed=empty_allowed)
     return conversion_of(item.quantity, item.unit).to_si(numbers)
 
 
-def _times(section: TrialSection, table: TextTable, user: str) -> tuple[FloatArray, float]:
+def _times(section: schema.TrialSection, table: TextTable, user: str) -> tuple[FloatArray, float]:
     """Return the times of a trial's rows and its start [s]."""
     start = section.start or 0.0
     if section.kind not in (TrialKind.STATIC, TrialKind.FLIGHT):
@@ -248,8 +244,8 @@ def _times(section: TrialSection, table: TextTable, user: str) -> tuple[FloatArr
 
 
 def _measured(
-    section: TrialSection, table: TextTable, campaign: CampaignSection
-) -> tuple[ChannelSection, ...]:
+    section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection
+) -> tuple[schema.ChannelSection, ...]:
     """Return the channels of a trial: those that it names, or all whose columns are there."""
     channels = {channel.name: channel for channel in campaign.channel}
     if section.channels is not None:
@@ -268,7 +264,7 @@ def _measured(
 
 
 def _readings(
-    channel: ChannelSection, section: TrialSection, table: TextTable, remarks: list[str]
+    channel: schema.ChannelSection, section: schema.TrialSection, table: TextTable, remarks: list[str]
 ) -> tuple[FloatArray, BoolArray]:
     """Return a channel's readings and which of them are used; an empty cell is bridged and left out."""
     values = _numbers(table, channel, f"the channel {channel.name!r}", empty_allowed=True)
@@ -281,10 +277,9 @@ def _readings(
     if not used.all():
         rows = np.arange(len(values))
         values[~used] = np.interp(rows[~used], rows[used], values[used])
-        remarks.append(
-            f"{int((~used).sum())} of {len(values)} readings of {channel.name!r} in the trial "
-            f"{section.name!r} {be(int((~used).sum()))} empty and left out."
-        )
+        count, told = int((~used).sum()), {"channel": channel.name, "trial": section.name}
+        are = f"{be(count)} empty"
+        remarks.append(said("remarks.left_out", count=count, total=len(values), are=are, **told))
     for row in section.left_out.get(channel.name, ()):
         if row > len(values):
             raise CampaignFileError(
@@ -295,7 +290,9 @@ def _readings(
     return values, used
 
 
-def _temperature(section: TrialSection, table: TextTable, campaign: CampaignSection, user: str) -> FloatArray:
+def _temperature(
+    section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
+) -> FloatArray:
     reference = campaign.reference_temperature
     column = "temperature" in table.columns
     if column and section.temperature is not None:
@@ -316,17 +313,19 @@ def _temperature(section: TrialSection, table: TextTable, campaign: CampaignSect
 
 
 def _health(
-    section: TrialSection, table: TextTable, user: str
+    section: schema.TrialSection, table: TextTable, user: str
 ) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
     """Return damage regions, and their losses and deviations (N, K), from columns, keys, or healthy."""
     stated = {} if section.health is None else section.health.losses
     usual = None if section.health is None else section.health.deviation
-    columns = [name.removeprefix(OF_REGION) for name in table.columns if name.startswith(OF_REGION)]
+    columns = [
+        name.removeprefix(schema.OF_REGION) for name in table.columns if name.startswith(schema.OF_REGION)
+    ]
     losses = (name for name in columns if name.removesuffix("_deviation") not in {*columns, *stated} - {name})
     regions = tuple(dict.fromkeys((*USUAL_REGIONS, *stated, *losses)))
     health, deviation = np.zeros((2, len(table), len(regions)))
     for index, name in enumerate(regions):
-        column = name if name in USUAL_REGIONS else f"{OF_REGION}{name}"
+        column = name if name in USUAL_REGIONS else f"{schema.OF_REGION}{name}"
         if column in table.columns and name in stated:
             raise CampaignFileError(
                 f"{user.capitalize()} gives {name} twice: remove it from `health` or from {table.name}."
@@ -354,7 +353,7 @@ def _within(
     return values
 
 
-def _release(section: ReleaseSection) -> Release:
+def _release(section: schema.ReleaseSection) -> Release:
     quantity = Quantity.DISPLACEMENT if section.unit in ("m", "mm", "um") else Quantity.SIGNAL
     given = section.model_dump(exclude={"displacement", "unit"})
     return Release(conversion_of(quantity, section.unit).to_si(section.displacement), **given)
@@ -364,7 +363,7 @@ def _release(section: ReleaseSection) -> Release:
 
 
 def _channels(
-    section: CampaignSection,
+    section: schema.CampaignSection,
     tables: Mapping[str, TextTable],
     trials: tuple[Trial, ...],
     remarks: list[str],
@@ -386,7 +385,9 @@ def _channels(
     return channels
 
 
-def _recorded_noise(section: CampaignSection, tables: Mapping[str, TextTable]) -> dict[str, NoiseRecord]:
+def _recorded_noise(
+    section: schema.CampaignSection, tables: Mapping[str, TextTable]
+) -> dict[str, NoiseRecord]:
     """Return the records of the samples at rest; a shorter record has empty cells at its end."""
     if section.noise is None:
         return {}

@@ -56,7 +56,7 @@ class Quantity(StrEnum):
 
     def shows(self, output: "Quantity") -> bool:
         """Whether a channel of this quantity can measure what an output of a model is."""
-        return self in (output, Quantity.SIGNAL) or self.derivatives_of(output) > 0
+        return self is output or self is Quantity.SIGNAL or self.derivatives_of(output) > 0
 
     @property
     def is_rate(self) -> bool:

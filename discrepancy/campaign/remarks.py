@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from discrepancy.campaign.noise import noise_model
 from discrepancy.campaign.records import Channel, Start, Trial, TrialKind
 from discrepancy.campaign.sampling import spacing_sentence
+from discrepancy.sentences import said
 from reporting.words import counted
 
 
@@ -20,6 +21,7 @@ _BEGINS = {
     Start.STILL: "taken to begin at rest under nothing",
     Start.UNKNOWN: "begun in a state that is fitted",
 }
+_ASSUMED = ' (assumed: say `begins`, "settled", "still" or "unknown")'
 
 
 def _begins(trials: tuple[Trial, ...]) -> list[str]:
@@ -31,11 +33,9 @@ def _begins(trials: tuple[Trial, ...]) -> list[str]:
             groups.setdefault((trial.begins, trial.begin_assumed), []).append(repr(trial.name))
     found = []
     for (begins, assumed), names in groups.items():
-        what = "The trial {} is {}" if len(names) == 1 else "The trials {} are {}"
-        text = what.format(", ".join(names), _BEGINS[begins])
-        found.append(
-            text + (' (assumed: say `begins`, "settled", "still" or "unknown").' if assumed else ".")
-        )
+        several, are = ("", "is") if len(names) == 1 else ("s", "are")
+        how = _BEGINS[begins] + (_ASSUMED if assumed else "")
+        found.append(f"The trial{several} {', '.join(names)} {are} {how}.")
     return found
 
 
@@ -54,9 +54,6 @@ def _not_whitened(channels: Mapping[str, Channel], trials: tuple[Trial, ...]) ->
             and (trial.whitened_at is None or not noise.applies(trial.whitened_at))
         ]
         if where:
-            found.append(
-                f"The noise of the channel {name!r} is coloured, and its record is not sampled like the "
-                f"{counted(len(where), 'trial')} {', '.join(map(repr, where))}: there its samples count as "
-                "independent, so that probabilities are too sharp; record the noise at the trials' sampling."
-            )
+            trials_there = f"{counted(len(where), 'trial')} {', '.join(map(repr, where))}"
+            found.append(said("remarks.not_whitened", channel=name, trials=trials_there))
     return found

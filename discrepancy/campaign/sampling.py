@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from discrepancy.errors import CampaignDataError
+from discrepancy.sentences import said
 from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
@@ -93,16 +94,12 @@ def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:
         return None
     steps = np.concatenate([np.diff(time) for time in uneven.values()])
     usual = float(np.median(steps))
-    names = ", ".join(map(repr, uneven))
-    text = (
-        f"The samples of the {'trial' if len(uneven) == 1 else 'trials'} {names} are not evenly spaced "
-        f"(steps of {steps.min():.4g} to {steps.max():.4g} s, usually {usual:.4g} s): they are taken as "
-        "stamped, and spectra are approximate."
-    )
+    names = f"trial{'s' * (len(uneven) > 1)} {', '.join(map(repr, uneven))}"
+    text = said("remarks.uneven", trials=names, least=steps.min(), most=steps.max(), usual=usual)
     if steps.max() > 1.5 * usual:
         name, time = max(uneven.items(), key=lambda item: float(np.diff(item[1]).max()))
         at = float(time[int(np.argmax(np.diff(time)))])
-        text += f" The widest gap, {steps.max():.4g} s, begins at {at:.6g} s of {name!r}."
+        text += said("remarks.widest_gap", most=steps.max(), at=at, trial=name)
     return text
 
 

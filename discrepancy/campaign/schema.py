@@ -1,6 +1,6 @@
 """The schema of `campaign.toml`: what it may say, checked strictly; units are still those of the file."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from keyword import iskeyword
 from math import inf, isinf
 from typing import Annotated, Any, Literal, Self
@@ -62,15 +62,6 @@ class StatedNoise(Section):
     standard_deviation: Positive
     degrees_of_freedom: Positive = inf
     source: Literal["stated", "repeats", "pre-trigger"] = "stated"
-
-
-def input_columns(kinds: Iterable[TrialKind]) -> tuple[str, ...]:
-    """Return the columns that no channel may have beside trials of these kinds.
-
-    The force is a column of static and forced trials only: a load cell may be called so in a driven one.
-    """
-    forced = any(kind in (TrialKind.STATIC, TrialKind.FORCED) for kind in kinds)
-    return tuple(name for name in INPUT_COLUMNS if name != "force" or forced)
 
 
 class ColumnSection(Section):
@@ -303,7 +294,9 @@ class CampaignSection(Section):
             raise ValueError(
                 f"more than one {what} reads the column {twice[0]!r}: give each its own `column`"
             )
-        taken = input_columns(item.kind for item in self.trial)
+        # the force is one of static and forced trials only: a load cell may be called so in a driven one
+        forced = any(item.kind in (TrialKind.STATIC, TrialKind.FORCED) for item in self.trial)
+        taken = {name for name in INPUT_COLUMNS if name != "force" or forced}
         for channel in self.channel:
             if channel.table_column in taken:
                 raise ValueError(

@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 from math import inf, pi
+from operator import attrgetter
 
 from scipy.special import beta
 
@@ -103,13 +104,9 @@ def _station(end: int, here: Here) -> float:
     return (here.setting.model.stations() or (0.0, 0.0))[end]
 
 
-def _scale(name: str, here: Here) -> float:
-    return float(getattr(here.setting.scales, name))
-
-
 SCALES: dict[str, Callable[[Here], float]] = {
     **{
-        name: partial(_scale, name)
+        name: attrgetter(f"setting.scales.{name}")
         for name in (
             "length", "tip_stiffness", "modal_mass", "angular_frequency", "force", "load_factor", "duration",
             "campaign_time",

@@ -11,6 +11,7 @@ from scipy.ndimage import maximum_filter1d
 
 from discrepancy.campaign.noise import repeated
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
+from discrepancy.sentences import said
 
 LARGEST_SHARE = 0.03
 """Largest share of a record in time that may be left out; above it the record is at fault."""
@@ -51,9 +52,9 @@ def mark_outliers(campaign: Campaign) -> Campaign:
         used = trial.used.copy()
         used[found, trial.channels.index(channel)] = False
         trials[name] = replace(trial, used=used)
-        said = "is an outlier" if count == 1 else "are outliers"
+        are = "is an outlier" if count == 1 else "are outliers"
         remarks.append(
-            f"{count} of {total} readings of {channel!r} in the trial {name!r} {said} and left out."
+            said("remarks.left_out", count=count, total=total, channel=channel, trial=name, are=are)
         )
     return replace(campaign, trials=tuple(trials.values()), remarks=tuple(remarks))
 

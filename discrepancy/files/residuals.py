@@ -35,6 +35,9 @@ RESIDUALS_NAME = "residuals.nc"
 SCHEMA = "uav-twin residuals 1"
 """Value of the attribute `schema` of the root."""
 
+_DAMAGED = (
+    DamagedFileError, KeyError, TypeError, ValueError, AttributeError, RecursionError, DiscrepancyError,
+)  # fmt: skip
 _PLAIN = ("name", "output", "gain_deviation", "offset_deviation", "station", "chord")
 """What the file has of a channel as it is."""
 _BY_CHANNEL = {
@@ -97,19 +100,15 @@ def read_residuals(path: Path) -> ResidualSet:
         raise VerdictFileError(f"There is no file {path}; give the one that the discrepancy workflow left.")
     try:
         tree = read_groups(path)
-    except DamagedFileError as error:
+        schema = tree.attrs.get("schema")
+        if schema == SCHEMA:
+            return _residuals(tree)
+    except _DAMAGED as error:
         raise VerdictFileError(
-            f"{path} is damaged or no file of residuals: it cannot be read as NetCDF; write it again."
+            f"{path} is damaged or no file of residuals ({type(error).__name__}: {one_line(error)}); write "
+            "it again."
         ) from error
-    schema = tree.attrs.get("schema")
-    if not isinstance(schema, str) or schema != SCHEMA:
-        raise VerdictFileError(f"{path} has the schema {schema!r}, but {SCHEMA!r} is needed.")
-    try:
-        return _residuals(tree)
-    except (KeyError, TypeError, ValueError, AttributeError, RecursionError, DiscrepancyError) as error:
-        raise VerdictFileError(
-            f"{path} is damaged ({type(error).__name__}: {one_line(error)}); write it again."
-        ) from error
+    raise VerdictFileError(f"{path} has the schema {schema!r}, but {SCHEMA!r} is needed.")
 
 
 def _residuals(tree: xr.DataTree) -> ResidualSet:

@@ -3,7 +3,7 @@
 import re
 from collections import ChainMap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from math import nan
 from pathlib import Path
@@ -257,18 +257,11 @@ def patch_effects(
     Raises
     ------
     VerdictFileError
-        As `primitive_intervals`, or if there are not draws of each effect.
+        As `primitive_intervals`.
     """
-    if draws and len(draws) != len(effects):
-        raise VerdictFileError(
-            f"Draws are needed for each of {len(effects)} effects, or none, but came for {len(draws)}."
-        )
+    rows = zip(effects, draws or [()] * len(effects), strict=True)
     return tuple(
-        PatchEffect(
-            **{item.name: getattr(effect, item.name) for item in fields(NamedEffect)},
-            intervals=primitive_intervals(effect.patch, draws[place] if draws else ()),
-        )
-        for place, effect in enumerate(effects)
+        PatchEffect(**vars(effect), intervals=primitive_intervals(effect.patch, own)) for effect, own in rows
     )
 
 

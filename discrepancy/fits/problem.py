@@ -12,7 +12,7 @@ from math import inf
 
 import numpy as np
 
-from discrepancy.campaign.noise import NoiseModel
+from discrepancy.campaign.noise import NoiseModel, noise_model
 from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
@@ -22,7 +22,7 @@ from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
 from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Candidate, Linearisation, Point, State, moved
-from .trial_data import GlobalUnknowns, TrialData, TrialDerivatives, global_unknowns, noise_models
+from .trial_data import GlobalUnknowns, TrialData, TrialDerivatives, global_unknowns, stand_in
 
 KEPT = 2000
 """Responses that a problem keeps."""
@@ -81,7 +81,10 @@ class Problem:
             )
         self.channel_names = tuple(campaign.channels)
         self.refinement: int = 1 if like is None else like.refinement
-        self.noise: dict[str, NoiseModel] = like.noise if like is not None else noise_models(campaign)
+        self.noise: dict[str, NoiseModel] = {
+            name: noise_model(channel, stand_in(campaign, name)) if like is None else like.noise[name]
+            for name, channel in campaign.channels.items()
+        }
         self.trials = tuple(TrialData.of(campaign, trial, self.noise, model) for trial in chosen)
         counts = np.zeros(len(self.channel_names))
         for data in self.trials:
@@ -114,12 +117,10 @@ class Problem:
                 if channel.gain_deviation != inf or name in found:
                     continue
                 measured = data.trial.values[:, column] - np.median(data.trial.values[:, column])
+                local = point.local[number]
                 if data.trial.release is not None and not data.trial.release.at_rest:
-                    unit = np.zeros_like(point.local[number])
-                    unit[data.unknowns.zeros] = 1.0 / data.unknowns.initial_scale
-                    response, _ = self.response(number, point.shared, unit, ModelPatch())
-                else:
-                    response, _ = self.response(number, point.shared, point.local[number], ModelPatch())
+                    local[data.unknowns.zeros] = 1.0 / data.unknowns.initial_scale
+                response, _ = self.response(number, point.shared, local, ModelPatch())
                 size = float(np.abs(response[:, column]).max())
                 if size > 0.0:
                     same = data.trial.release is not None or measured @ response[:, column] > 0.0
@@ -212,23 +213,20 @@ class Problem:
         data = self.trials[number]
         kind = data.trial.kind
         patch = candidate.patch(self.setting, point.effect) if kind in candidate.acts_on else ModelPatch()
+        where = point if base is None else base.point
+        shared, local = where.shared, where.local[number]
+        at_base, _ = self.response(number, shared, local, patch)
+        response = at_base
         if base is not None:
-            shared, local = base.point.shared, base.point.local[number]
             there = base.linearisations[number]
-            response, _ = self.response(number, shared, local, patch)
-            at_base = response
             move = (point.shared - shared)[: len(there.parameters)]
             response = response + np.tensordot(move, there.parameters, 1)
             response += np.tensordot((point.local[number] - local)[data.unknowns.zeros :], there.local, 1)
-            parameters, by_local = there.parameters, there.local
-        else:
-            shared, local = point.shared, point.local[number]
-            response, _ = self.response(number, shared, local, patch)
-            at_base = response
-            if known is not None:
-                parameters, by_local = known.parameters, known.local
-            elif derivatives:
-                parameters, by_local = self._by_nuisances(number, shared, local, patch)
+            known = there
+        if known is not None:
+            parameters, by_local = known.parameters, known.local
+        elif derivatives:
+            parameters, by_local = self._by_nuisances(number, shared, local, patch)
         if not derivatives:
             return Linearisation(response, _NOTHING, _NOTHING, _NOTHING)
         effect = np.zeros((candidate.size, *response.shape))

@@ -13,7 +13,7 @@ from math import isinf
 
 import numpy as np
 
-from discrepancy.campaign.noise import NoiseModel, noise_model
+from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.campaign.sampling import IntArray
 from discrepancy.models.interface import Conditions, Model
@@ -383,13 +383,6 @@ class TrialData:
                     for row in np.flatnonzero(~trial.used[:, number]):
                         weight[row : row + len(item.autoregression) + 1, number] = 0.0
         return cls(trial, deviation, groups, local_unknowns(campaign, trial, deviation, model), weight, noise)
-
-
-def noise_models(campaign: Campaign) -> dict[str, NoiseModel]:
-    """Return the noise of every channel of a campaign."""
-    return {
-        name: noise_model(channel, stand_in(campaign, name)) for name, channel in campaign.channels.items()
-    }
 
 
 def stand_in(campaign: Campaign, name: str) -> float:

@@ -17,16 +17,8 @@ from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.location.residuals import ResidualSet
+from discrepancy.missing_force import shares
 from discrepancy.missing_force.naming import Explained, ForceSearch
-from discrepancy.missing_force.shares import (
-    OF_READINGS,
-    SHORTEST,
-    WINDOWS,
-    ForceShares,
-    Share,
-    missing_force,
-    told_force,
-)
 from discrepancy.search.honest_evidence import noise_levels, refitted
 from discrepancy.search.hypotheses import are_related
 from discrepancy.search.strategy import Search
@@ -47,7 +39,7 @@ class ByForce(Court[Explained]):
 
     def __init__(self, problem: Problem, found: Search, force: ForceSearch) -> None:
         super().__init__(problem, found)
-        self.force, self._of_force = force, ForceShares(force)
+        self.force, self._of_force = force, shares.ForceShares(force)
         self.has_held_out = self._of_force.has_held_out
 
     @property
@@ -67,7 +59,7 @@ class ByForce(Court[Explained]):
         """Return the log evidence over missing forces alone [nat]."""
         return item.evidence - self.force.whole.evidence
 
-    def share_of(self, item: Explained, *, held_out: bool) -> Share:
+    def share_of(self, item: Explained, *, held_out: bool) -> shares.Share:
         """Return the share that a hypothesis is of the missing force."""
         return self._of_force.of(item, held_out=held_out)
 
@@ -93,7 +85,7 @@ class ByForce(Court[Explained]):
             return self.found.none
         return replace(shown, covariance=item.covariance)
 
-    def left(self, item: Explained, share: Share) -> str:
+    def left(self, item: Explained, share: shares.Share) -> str:
         """Return in words what is left beside a hypothesis."""
         return said("verdict.left_of_force", share=share, unit=self._unit(item))
 
@@ -105,10 +97,10 @@ class ByForce(Court[Explained]):
 
     def gap(self) -> str:
         """Return size and port of the missing force, and the variable that orders it."""
-        missing = missing_force(self.force, self.force.best())
+        missing = shares.missing_force(self.force, self.force.best())
         if missing is None:
             return ""
-        told = told_force(missing, self.problem.model)
+        told = shares.told_force(missing, self.problem.model)
         order = said("verdict.not_ordered")
         if told.ordered_by:
             most = 100.0 * max(told.orders.values())
@@ -155,7 +147,7 @@ class ByReadings(Court[CandidateFit]):
         levels = noise_levels(self.problem, self.found.best())
         return dict(zip(self.problem.channel_names, levels.tolist(), strict=True))
 
-    def share_of(self, item: CandidateFit, *, held_out: bool) -> Share:
+    def share_of(self, item: CandidateFit, *, held_out: bool) -> shares.Share:
         """Return the share of the gap that a hypothesis closes; sizes are over the noise."""
         sets = [self.residuals(one) for one in (self.found.none, item)]
         pairs = zip(*([i for i in one.trials if i.trial.held_out is held_out] for one in sets), strict=True)
@@ -163,14 +155,16 @@ class ByReadings(Court[CandidateFit]):
         for first, second in pairs:
             scale = np.array([self._noise[name] for name in first.trial.channels])
             count, trials = len(first.used), trials + 1
-            blocks = min(WINDOWS, max(1, count // SHORTEST)) if first.trial.is_dynamic else 1
+            blocks = min(shares.WINDOWS, max(1, count // shares.SHORTEST)) if first.trial.is_dynamic else 1
             squares = [np.where(one.used, one.standardised, 0.0) ** 2 for one in (first, second)]
             for part in np.array_split(np.arange(count), blocks):
                 level = float((first.used[part] * scale).sum())
                 rows.append((float(squares[0][part].sum()), float(squares[1][part].sum()), level))
         before, after, noise = np.array(rows).T
         left, whole = (float(np.sqrt(max(one.sum() / noise.sum() - 1.0, 0.0))) for one in (after, before))
-        return Share(before, after, noise, held_out, trials, left, whole, OF_READINGS, tested=True)
+        return shares.Share(
+            before, after, noise, held_out, trials, left, whole, shares.OF_READINGS, tested=True
+        )
 
     def followed(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:
         """Return a further hypothesis, begun at values (E,) of its unknowns; None: it cannot be."""
@@ -224,6 +218,6 @@ class ByReadings(Court[CandidateFit]):
         """Return the simulation that stands for a hypothesis: itself."""
         return item
 
-    def left(self, item: CandidateFit, share: Share) -> str:
+    def left(self, item: CandidateFit, share: shares.Share) -> str:
         """Return in words what is left beside a hypothesis."""
         return said("verdict.left_of_readings" if share.left > 0.0 else "verdict.nothing_left", share=share)

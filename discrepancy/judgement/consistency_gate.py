@@ -88,7 +88,7 @@ def consistency_gate(problem: Problem, fit: CandidateFit) -> Gate:
         `passed` is None where there is no static trial, no flight, and no effect of a single channel, or too
         few readings.
     """
-    tests = consistency_tests(problem, fit)
+    tests = score_tests(problem, fit, directions(problem, fit))
     if not tests:
         return Gate("consistency", None, np.nan, CONSISTENCY_LEVEL, said("consistency.not_judged"))
     worst = min(tests, key=lambda test: test.p_value)
@@ -97,17 +97,6 @@ def consistency_gate(problem: Problem, fit: CandidateFit) -> Gate:
     along = counted(worst.count, "direction")
     reason = said(f"consistency.{'passed' if passed else 'failed'}", worst=worst, along=along)
     return Gate("consistency", passed, statistic, CONSISTENCY_LEVEL, reason)
-
-
-def consistency_tests(problem: Problem, fit: CandidateFit) -> list[ScoreTest]:
-    """Return the tests of the gate that can be made.
-
-    Static trials: size, zero and slope over the span of the response, for each load place. Flights: size and
-    slope over the span. Runs of static trials: a zero for each quantity. Effects of single channels: size of
-    each such channel's response by load place and kind of trial, and a zero that moves in time.
-    """
-    groups = directions(problem, fit)
-    return score_tests(problem, fit, {name: group for name, group in groups.items() if group})
 
 
 def score_tests(

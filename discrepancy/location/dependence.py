@@ -92,31 +92,37 @@ _HATS = 9  # knots of a dependence on time or amplitude
 
 
 @dataclass(frozen=True)
-class Explanation:
-    """What a dependence of the residual explains.
+class Disagreement:
+    """One finding.
 
     Attributes
     ----------
     trials : str
-        Kind of the trials.
+        Kind of the trials where it shows.
     subject : str
-        "mode 1", or "" for all channels alike.
+        "mode 1", "channel g17", "all channels", ...; of a pattern over channels what it means.
     dependence : str
-        "amplitude", "time", "load (proportional)", "x and v", ...
+        What it goes with: "amplitude", "time", "load (not proportional)", "channels", ...
     share : float
-        Of the excess variance of these trials, after subtracting one for each coefficient.
-    coefficients : int
-        Number fitted.
+        Of the excess variance of these trials.
     p_value : float
-        Of the explained sum of squares against chi^2.
+        Of the finding.
+    coefficients : int
+        Number fitted to tell it.
+    sentence : str
+        In words.
+    channel : str
+        Where a pattern over channels is strongest.
     """
 
     trials: str
     subject: str
     dependence: str
     share: float
-    coefficients: int
     p_value: float
+    coefficients: int = 0
+    sentence: str = ""
+    channel: str = ""
 
 
 def kinds(residuals: ResidualSet) -> dict[str, tuple[int, ...]]:
@@ -144,7 +150,7 @@ def _hats(values: FloatArray, low: float, high: float) -> FloatArray:
     return np.column_stack([np.interp(values, centres, hat) for hat in np.eye(_HATS)])
 
 
-def explanations(residuals: ResidualSet) -> tuple[Explanation, ...]:
+def explanations(residuals: ResidualSet) -> tuple[Disagreement, ...]:
     """Return what single dependences explain of the excess variance, by kind of trial, largest share first.
 
     Every dependence is fitted to each channel by itself with one set of coefficients for all trials of the
@@ -177,7 +183,7 @@ def explanations(residuals: ResidualSet) -> tuple[Explanation, ...]:
             p = float(stats.chi2.sf(statistic, count)) if count else 1.0
             if line is not None and dependence == line.name:
                 p = min(1.0, p * line.choices)
-            found.append(Explanation(name, subject, dependence, share, count, p))
+            found.append(Disagreement(name, subject, dependence, share, p, count))
     return tuple(sorted(found, key=lambda item: -item.share))
 
 

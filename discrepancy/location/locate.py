@@ -14,7 +14,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
 from discrepancy.sentences import said
 
-from .dependence import Explanation, excess, explanations, kinds, mode_shares, predicted_frequencies
+from .dependence import Disagreement, excess, explanations, kinds, mode_shares, predicted_frequencies
 from .map import Cell, residual_map
 from .omnibus_tests import OmnibusTest, coloured_noise, mean_square, noise_groups, serial_tests, variance_test
 from .residuals import FittedTrial, ResidualSet, at_own_scale
@@ -26,37 +26,6 @@ PATTERN_LEVEL = 0.01
 """Largest p-value of a pattern that is told."""
 
 _SIMULATIONS = 999
-
-
-@dataclass(frozen=True)
-class Disagreement:
-    """One finding.
-
-    Attributes
-    ----------
-    trials : str
-        Kind of the trials where it shows.
-    subject : str
-        "mode 1", "channel g17", "all channels", ...; of a pattern over channels what it means.
-    dependence : str
-        What it goes with: "amplitude", "time", "load (not proportional)", "channels", ...
-    share : float
-        Of the excess variance of these trials.
-    p_value : float
-        Of the finding.
-    sentence : str
-        In words.
-    channel : str
-        Where a pattern over channels is strongest.
-    """
-
-    trials: str
-    subject: str
-    dependence: str
-    share: float
-    p_value: float
-    sentence: str
-    channel: str = ""
 
 
 def singular_patterns(
@@ -98,7 +67,7 @@ def singular_patterns(
             told = f"p {'<=' if p <= 1.0 / _SIMULATIONS else '='} {p:.1g}"
             sentence = said("location.explains", what=words, trials=name, percent=100.0 * share, p=told)
             channel = channels[int(np.argmax(np.abs(weights)))]
-            found.append(Disagreement(name, meaning, "channels", share, p, sentence, channel))
+            found.append(Disagreement(name, meaning, "channels", share, p, 0, sentence, channel))
             if number >= 2:
                 break
     return tuple(found)
@@ -290,7 +259,7 @@ def _disagreements(
         whose = f"{subject[0].upper()}{subject[1:]}, {words},"
         p = "p < 1e-6" if told.p_value < 1e-6 else f"p = {told.p_value:.1g}"
         sentence = said("location.explains", what=whose, trials=name, percent=100.0 * told.share, p=p)
-        found.append(Disagreement(name, subject, told.dependence, told.share, told.p_value, sentence))
+        found.append(replace(told, subject=subject, sentence=sentence))
     # Shares are of one kind of trial; what explains most of the whole gap is told first.
     return tuple(sorted((*found, *patterns), key=lambda item: -item.share * gap[item.trials]))
 
@@ -316,7 +285,7 @@ def _subject(
     return "all channels"
 
 
-def _smallest_sufficient(rows: Sequence[Explanation]) -> Explanation | None:
+def _smallest_sufficient(rows: Sequence[Disagreement]) -> Disagreement | None:
     """Return the dependence with fewest coefficients among those within 2 % of the largest share."""
     rows = [row for row in rows if row.share >= _WORTH_TELLING and row.p_value < 1e-3]
     if not rows:
@@ -327,7 +296,7 @@ def _smallest_sufficient(rows: Sequence[Explanation]) -> Explanation | None:
     )
 
 
-def _dependence_words(told: Explanation, rows: Sequence[Explanation]) -> str:
+def _dependence_words(told: Disagreement, rows: Sequence[Disagreement]) -> str:
     """Return the dependence, and its rival where one release amplitude cannot tell the two apart."""
     rivals = {"amplitude": "time", "time": "amplitude"}
     if told.dependence not in rivals:

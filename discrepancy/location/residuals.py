@@ -60,24 +60,15 @@ class FittedTrial:
     sensitivity: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        shape, used, of_all = self.trial.values.shape, self.trial.used, self.sensitivity
-        where = f"The fit of the trial {self.trial.name!r}"
-        for name in ("prediction", "residual", "predictive_deviation", "leverage", "rates"):
-            array = getattr(self, name)
-            if array is not None and array.shape != shape:
-                raise FitError(f"{where} has {name} of the shape {array.shape}, but the data have {shape}.")
-            if array is not None and not np.all(np.isfinite(array[used])):
-                raise FitError(f"{where} has a value of {name} that is not finite at a used sample.")
-        if self.noise_deviation.shape != shape[1:] or not np.all(self.noise_deviation > 0.0):
-            raise FitError(f"{where} needs one positive noise deviation for each of {shape[1]} channels.")
-        if not np.all(self.predictive_deviation[used] > 0.0):
-            raise FitError(f"{where} has a predictive deviation that is not positive.")
-        if of_all is not None and (of_all.ndim != 3 or of_all.shape[:2] != shape):
+        used = self.trial.used
+        parts = (self.prediction, self.residual, self.predictive_deviation, self.leverage, self.rates)
+        finite = all(np.all(np.isfinite(part[used])) for part in parts if part is not None)
+        positive = np.all(self.noise_deviation > 0.0) and np.all(self.predictive_deviation[used] > 0.0)
+        if not (finite and positive and np.all(self.expected_variance[used] > -1e-9)):
             raise FitError(
-                f"{where} has a sensitivity of the shape {of_all.shape}; {(*shape, 'P')} is expected."
+                f"The fit of the trial {self.trial.name!r} has values that are not finite, deviations "
+                "that are not positive, or a leverage above one."
             )
-        if not np.all(self.expected_variance[used] > -1e-9):
-            raise FitError(f"{where} has a leverage above one, so that the expected variance is negative.")
 
     @property
     def used(self) -> BoolArray:
@@ -120,18 +111,9 @@ class ResidualSet:
     trials: tuple[FittedTrial, ...]
 
     def __post_init__(self) -> None:
-        if not self.trials:
-            raise FitError("A set of residuals needs at least one trial, but there is none.")
-        for item in self.trials:
-            unknown = [name for name in item.trial.channels if name not in self.channels]
-            if unknown:
-                raise FitError(f"The trial {item.trial.name!r} has the unknown channel {unknown[0]!r}.")
-        counts = {item.sensitivity.shape[2] for item in self.trials if item.sensitivity is not None}
-        if len(counts) > 1:
-            raise FitError(
-                "Sensitivities of all trials must have the columns of the same parameters, but there are "
-                f"{' and '.join(str(count) for count in sorted(counts))}."
-            )
+        names = {name for item in self.trials for name in item.trial.channels}
+        if not names or not names <= self.channels.keys():
+            raise FitError("A set of residuals needs at least one trial, and the channels of all its trials.")
 
     @property
     def fitted(self) -> "ResidualSet | None":
@@ -152,11 +134,6 @@ class ResidualSet:
         noise = self.channels[channel].noise
         return 0.0 if noise is None else noise.degrees_of_freedom
 
-    @property
-    def parameter_count(self) -> int:
-        """Number of fitted parameters P as far as sensitivities tell; zero without."""
-        return next((i.sensitivity.shape[2] for i in self.trials if i.sensitivity is not None), 0)
-
     def white(self, generator: np.random.Generator) -> tuple[FloatArray, ...]:
         """Return residuals that are white with unit variance if the model is right, (N, C) by trial.
 
@@ -166,7 +143,8 @@ class ResidualSet:
         residuals are divided by their expected deviation. Samples that are not used are drawn from the noise,
         so that series keep their even spacing.
         """
-        draw = generator.standard_normal(self.parameter_count)
+        columns = (item.sensitivity.shape[2] for item in self.trials if item.sensitivity is not None)
+        draw = generator.standard_normal(next(columns, 0))
         outside = self._held_out_draw(draw)
         white = []
         for item in self.trials:

@@ -165,7 +165,9 @@ class Columns:
         added = np.zeros_like(motion.added)
         readings = np.zeros_like(trial.residual)
         forces: dict[int, FloatArray] = {}
-        for port, law in self._at_ports(trial, laws):
+        at_ports = self.problem.model.at_ports(laws)
+        for law in (item for item in at_ports if isinstance(item, PortForce)):
+            port = trial.system.ports.index(law.port)
             position, speed = motion.positions[:, port], motion.speeds[:, port]
             doubt, holding = motion.speed_deviations.get(port, 0.0), motion.forces.get(port, 0.0)
             course = law_course(law, trial.fine_time, position, speed, doubt, holding)
@@ -174,11 +176,6 @@ class Columns:
             readings += trial.readings(state, {port: course})
             forces[port] = forces.get(port, 0.0) + course
         return Part(readings, added, forces)
-
-    def _at_ports(self, trial: SeenTrial, laws: ModelPatch) -> list[tuple[int, PortForce]]:
-        names, model = trial.system.ports, self.problem.model
-        forces = model.at_ports(laws)
-        return [(names.index(law.port), law) for law in forces if isinstance(law, PortForce)]
 
     def _changed(self, number: int, patch: ModelPatch, trial: SeenTrial) -> FloatArray:
         """Return what a patch changes in the model's own response."""

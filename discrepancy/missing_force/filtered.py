@@ -191,8 +191,8 @@ class Filtered:
         moves, slot, gains, sizes, predicted, _ = self._passed
         which, used = self.trial.steps[1][at], self.trial.used[at]
         rows = self.system[2]
-        found = kernels.variances(moves, which, rows, used, slot[at], gains, sizes, predicted, shown[None])
-        return np.asarray(np.sqrt(found[:, 0]))
+        found = kernels.variances(moves, which, rows, used, slot[at], gains, sizes, predicted, shown)
+        return np.asarray(np.sqrt(found))
 
 
 ROUNDING = 1e-12

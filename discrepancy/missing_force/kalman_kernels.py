@@ -22,11 +22,8 @@ STEADY = 1e-9
 @callable_when_compiled
 def is_steady(one: FloatArray, other: FloatArray) -> bool:
     """Return whether two covariances (n, n) are the same within `STEADY`."""
-    for i in range(len(one)):
-        for j in range(len(one)):
-            if abs(one[i, j] - other[i, j]) > STEADY * np.sqrt(one[i, i] * one[j, j]):
-                return False
-    return True
+    squares = np.diag(one)
+    return not np.any(np.abs(one - other) > STEADY * np.sqrt(np.outer(squares, squares)))
 
 
 @compiled
@@ -39,9 +36,7 @@ def discretised(
     numbers in an exponential of both signs.
     """
     n = len(generator)
-    largest = 0.0
-    for i in range(n):
-        largest = max(largest, np.sum(np.abs(generator[i])))
+    largest = np.max(np.sum(np.abs(generator), axis=1)) if n else 0.0
     moves, noises = np.empty((len(lengths), n, n)), np.empty((len(lengths), n, n))
     for k in range(len(lengths)):
         doublings, part = 0, lengths[k]
@@ -232,9 +227,9 @@ def variances(
     transitions: FloatArray, which: IntArray, rows: FloatArray, used: BoolArray, slot: IntArray,
     gains: FloatArray, sizes: FloatArray, predicted: FloatArray, shown: FloatArray,
 ) -> FloatArray:  # fmt: skip
-    """Return the smoothed variance (N, r) of rows `shown` (r, n) of the state."""
+    """Return the smoothed variance (N,) of a row `shown` (n,) of the state."""
     count, channels, n = len(which), len(rows), rows.shape[1]
-    found = np.zeros((count, len(shown)))
+    found = np.zeros(count)
     know = np.zeros((n, n))
     for k in range(count - 1, -1, -1):
         at = slot[k]
@@ -245,8 +240,7 @@ def variances(
                 know = know - np.outer(rows[c], along) - np.outer(along, rows[c])
                 know = know + size * np.outer(rows[c], rows[c])
         cover = predicted[at] - predicted[at] @ know @ predicted[at]
-        for r in range(len(shown)):
-            found[k, r] = max(shown[r] @ cover @ shown[r], 0.0)
+        found[k] = max(shown @ cover @ shown, 0.0)
         if k > 0:
             know = transitions[which[k]].T @ know @ transitions[which[k]]
     return found

@@ -64,7 +64,8 @@ def _of_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
     """Return when a force is missing at the port, or the reading, that tells most."""
     search = ForceSearch(problem)
     port = max(search.at, key=lambda name: search.at[name].evidence)
-    law = _law_at(search, fit, port)
+    laws = [number for number, term in enumerate(fit.candidate.terms) if term.place == port]
+    law = search.followed(search.at[port], *fit.candidate.some(laws, fit.effect)) if laws else None
     number, found = _most_telling(search.ports.index(port), search.rough(port))
     if found.evidence < of_nothing(found) + GROUND:
         return ()
@@ -74,14 +75,6 @@ def _of_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
         force = motion.forces[number]
         shown.append(trial.readings(trial.pushed(number, force), {number: force}))
     return _windows(best, [data.trial.channels for data in problem.trials], shown, with_effect=False)
-
-
-def _law_at(search: ForceSearch, fit: CandidateFit, port: str) -> Explained | None:
-    """Return the hypothesis of the laws that a verdict has at a port; None where it has none."""
-    laws = [number for number, term in enumerate(fit.candidate.terms) if term.place == port]
-    if not laws:
-        return None
-    return search.followed(search.at[port], *fit.candidate.some(laws, fit.effect))
 
 
 def residual_windows(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +92,7 @@ class WingModel(SystemModel):
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
         self.name, self.parameters = name, wing_priors(box, **prior)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
-        self.port_names = tuple(PORTS)
+        self.port_names, self._row = tuple(PORTS), cache(wing.output_row)
         self._stiffnesses, self._systems, self._rows, self._answers = (Memory() for _ in range(4))
 
     @classmethod
@@ -141,15 +142,13 @@ class WingModel(SystemModel):
 
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
         """Return what outputs show; `component` 1 and 2: transverse and shear strain."""
-        rows = np.array([self._row(output, component) for output, _ in outputs]).reshape(-1, self.wing.size)
+        known = (self._row(output, component) for output, _ in outputs)
+        rows = self._rows.get((outputs, component), lambda: np.array([*known]).reshape(-1, self.wing.size))
         factors = self.wing.strain_factors(case.patch.of(LocalStiffnessLoss))
         if factors is not None:
             gauges = np.array([strain_gauge(output) for output, _ in outputs])
             rows = rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
         return shown_rows(rows if acting is None or acting.basis is None else rows @ acting.basis, outputs)
-
-    def _row(self, output: str, component: int = 0) -> FloatArray | None:
-        return self._rows.get((output, component), lambda: self.wing.output_row(output, component))
 
     @property
     def shown_outputs(self) -> tuple[str, ...]:

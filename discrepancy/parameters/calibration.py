@@ -1,15 +1,16 @@
 """The whole way from a campaign to the calibration of a model's parameters."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import truncnorm
 
 from calibration.result.record import Calibration, ChannelFit, ParameterPrior, correlation, prior_samples
-from discrepancy.campaign.records import Campaign
+from discrepancy.campaign.records import Campaign, FloatArray
 from discrepancy.catalogue.entry import Setting
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.model_check import LEFT
@@ -18,11 +19,12 @@ from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import ModelChoice
 from discrepancy.parameters.posterior import ParameterPosterior, parameter_posterior
+from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 from discrepancy.workflow import checked, without_wrong_ends
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance
-from reporting.words import counted
+from reporting.words import counted, small
 
 SAMPLES = 1000
 
@@ -174,78 +176,51 @@ def findings(
     remarks: tuple[str, ...],
 ) -> tuple[str, ...]:
     """Return all sentences: what disagrees first, then what the campaign does not tell, then remarks."""
-    said: list[str] = []
+    found: list[str] = []
     if gate.passed is False:
-        said.append(
-            f"The campaign is not explained by these parameters: {gate.reason[0].lower()}{gate.reason[1:]} "
-            "The posterior is too narrow, and may be of the wrong thing; `uav-twin discrepancy run` on the "
-            "same campaign and model looks for what is missing."
-        )
+        found.append(said("parameters.not_explained", reason=small(gate.reason)))
     elif gate.passed is None:
-        said.append(gate.reason)
-    said += _disagreements(priors, posterior)
-    said += _untold(priors, posterior)
-    said += [fault.sentence for fault in faults if fault.kind is not FaultKind.UNOBSERVABLE]
-    said += [text for text in remarks if text not in said]
-    return tuple(said)
+        found.append(gate.reason)
+    found += [*_disagreements(priors, posterior), *_untold(priors, posterior)]
+    found += [fault.sentence for fault in faults if fault.kind is not FaultKind.UNOBSERVABLE]
+    return (*found, *(text for text in remarks if text not in found))
 
 
-def _disagreements(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -> list[str]:
-    said = []
-    draws, marginal = posterior.draws, posterior.marginal
-    means = draws.mean(axis=0)
-    for at, prior in enumerate(priors):
-        if abs(means[at]) > FAR:
-            side = "above" if means[at] > 0.0 else "below"
-            said.append(
-                f"{prior.name} comes out {abs(means[at]):.1f} prior deviations {side} what {prior.stated_by} "
-                "states: the prior is wrong, or the parameter stands for something that the model lacks."
-            )
-    best = posterior.optima[0].point.shared[marginal.free]
-    deviation = np.maximum(np.sqrt(np.diag(posterior.optima[0].covariance)[marginal.free]), 1e-12)
+def _disagreements(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -> Iterator[str]:
+    marginal, optima = posterior.marginal, posterior.optima
+
+    def listed(values: FloatArray) -> str:
+        pairs = zip(priors, values.tolist(), strict=True)
+        return ", ".join(f"{prior.name} = {value:.4g}" for prior, value in pairs if np.isfinite(value))
+
+    for prior, mean in zip(priors, posterior.draws.mean(axis=0).tolist(), strict=True):
+        if abs(mean) > FAR:
+            side = "above" if mean > 0.0 else "below"
+            yield said("parameters.off_prior", prior=prior, off=abs(mean), side=side)
+    best = optima[0].point.shared[marginal.free]
+    deviation = np.maximum(np.sqrt(np.diag(optima[0].covariance)[marginal.free]), 1e-12)
     beyond = ndtr((marginal.low - best) / deviation) + ndtr((best - marginal.high) / deviation)
     told = kept_shares(posterior) <= LEFT
-    said += [
-        f"The posterior of {prior.name} reaches the end of its range, {prior.low:g} to {prior.high:g}, and "
-        "is cut off there: widen the range if the model holds beyond it."
-        for prior, share, known in zip(priors, beyond.tolist(), told.tolist(), strict=True)
-        if known and share > EDGE
-    ]
+    for prior, share, known in zip(priors, beyond.tolist(), told.tolist(), strict=True):
+        if known and share > EDGE:
+            yield said("parameters.cut_off", prior=prior)
     missing = [item for item in marginal.refused if _told_apart(posterior, item[0]) < REFUSED]
     if missing:
         place, reason = missing[0]
-        values = zip(priors, marginal.values(place).tolist(), strict=True)
-        places = ", ".join(f"{prior.name} = {value:.4g}" for prior, value in values if np.isfinite(value))
-        said.append(
-            f"At {counted(len(missing), 'place')} near the optimum, and within its range, the model cannot "
-            f"be had, first at {places} ({reason.rstrip('.')}): the posterior has nothing there; correct "
-            "the range in the model's file."
-        )
-    if len(posterior.optima) > 1:
-        evidence = np.array([item.log_evidence for item in posterior.optima])
+        where = {"count": counted(len(missing), "place"), "places": listed(marginal.values(place))}
+        yield said("parameters.refused", reason=reason.rstrip("."), **where)
+    if len(optima) > 1:
+        evidence = np.array([item.log_evidence for item in optima])
         weight = np.exp(evidence - evidence.max())
-        names = [prior.name for prior in priors]
-        places = " and ".join(
-            f"{', '.join(f'{name} = {value:.4g}' for name, value in zip(names, values, strict=True))} "
-            f"({share:.0%})"
-            for values, share in zip(
-                [marginal.values(item.point.shared[marginal.free]) for item in posterior.optima],
-                (weight / weight.sum()).tolist(),
-                strict=True,
-            )
-        )
-        said.append(
-            f"The posterior has {len(posterior.optima)} maxima: {places}; the campaign does not tell which, "
-            "and the mean lies between them."
-        )
-    if not posterior.optima[0].converged:
-        said.append(
-            "The fit had not settled when it ended: the samples may be off; state the priors narrower."
-        )
-    return said
+        values = [listed(marginal.values(item.point.shared[marginal.free])) for item in optima]
+        shares = zip(values, (weight / weight.sum()).tolist(), strict=True)
+        places = " and ".join(f"{there} ({share:.0%})" for there, share in shares)
+        yield said("parameters.maxima", count=len(optima), places=places)
+    if not optima[0].converged:
+        yield said("parameters.not_settled")
 
 
-def _told_apart(posterior: ParameterPosterior, u: NDArray[np.float64]) -> float:
+def _told_apart(posterior: ParameterPosterior, u: FloatArray) -> float:
     """Return how far from the best optimum scaled parameters (P,) are [standard deviations]; NaN: any."""
     known = np.flatnonzero(np.isfinite(u))
     index, best = posterior.marginal.free[known], posterior.optima[0]
@@ -253,30 +228,18 @@ def _told_apart(posterior: ParameterPosterior, u: NDArray[np.float64]) -> float:
     return float(np.sqrt(shift @ np.linalg.solve(best.covariance[np.ix_(index, index)], shift)))
 
 
-def kept_shares(posterior: ParameterPosterior) -> NDArray[np.float64]:
+def kept_shares(posterior: ParameterPosterior) -> FloatArray:
     """Return the deviation of each parameter (P,) over that of its prior, cut off at its range [1]."""
     marginal = posterior.marginal
     return np.asarray(posterior.draws.std(axis=0, ddof=1) / truncnorm.std(marginal.low, marginal.high))
 
 
-def _untold(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -> list[str]:
-    said = []
-    draws = posterior.draws
+def _untold(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -> Iterator[str]:
     for prior, share in zip(priors, kept_shares(posterior).tolist(), strict=True):
         if share > LEFT:
             left = "all" if share > 0.995 else f"{100.0 * share:.0f} %"
-            said.append(
-                f"The campaign does not tell {prior.name}: {left} of its prior deviation is left, "
-                "and what is believed of it is the prior."
-            )
-    if len(priors) > 1:
-        matrix = correlation(draws)
-        for first in range(len(priors)):
-            for second in range(first + 1, len(priors)):
-                if abs(matrix[first, second]) > TIED:
-                    said.append(
-                        f"{priors[first].name} and {priors[second].name} are told together and hardly apart "
-                        f"(correlation {matrix[first, second]:+.3f}): fly with samples of both, or measure "
-                        "where they act differently."
-                    )
-    return said
+            yield said("parameters.not_told", prior=prior, left=left)
+    matrix = correlation(posterior.draws)
+    for (at, first), (beside, second) in combinations(enumerate(priors), 2):
+        if abs(matrix[at, beside]) > TIED:
+            yield said("parameters.tied", first=first, second=second, value=matrix[at, beside])

@@ -1,7 +1,8 @@
 """What the report shows, and its figures with their captions, as far as the data allow them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -177,9 +178,13 @@ def _draw_in_time(axes: Axes, missing: MissingForce, name: str) -> None:
     axes.set_xlabel(f"time in {item.trial}, s")
 
 
+Pack = Callable[[Path, Path], str]
+"""(patch.json, FMU to be written) -> what to say about it."""
+
+
 @dataclass(frozen=True)
 class ReportInput:
-    """All that the report shows.
+    """All that the report shows, and what is written beside it.
 
     Attributes
     ----------
@@ -197,6 +202,9 @@ class ReportInput:
         Of the patch, by effect; empty without a patch.
     fmu : str
         Name of the patched FMU, or why there is none; empty if none is due.
+    pack : callable, optional
+        Makes the patched FMU, of patch.json and its own file, and says what of it; called where an effect is
+        named.
     """
 
     investigation: Investigation
@@ -206,6 +214,7 @@ class ReportInput:
     design: WingDesign | None = None
     intervals: Sequence[Sequence[PrimitiveInterval]] = ()
     fmu: str = ""
+    pack: Pack | None = None
 
 
 def report_figures(content: ReportInput) -> dict[str, ReportFigure]:

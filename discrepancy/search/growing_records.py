@@ -150,15 +150,14 @@ class Beginnings:
             places = tuple(effect.places(self.problem.setting))
             if term.place in places:
                 places = (term.place,)
-            best = None
-            for place in places if len(places) <= SEARCH.few_places else ():
-                candidate = Candidate((Term(effect, place),))
-                for start in self._tried(found, candidate):
-                    item = self._fitted(candidate, start)
-                    if item is not None and (best is None or item.objective < best.objective):
-                        best = item
-            if best is not None:
-                begun.append(best)
+            candidates = [Candidate((Term(effect, place),)) for place in places]
+            fits = (
+                self._fitted(candidate, start)
+                for candidate in (candidates if len(places) <= SEARCH.few_places else ())
+                for start in self._tried(found, candidate)
+            )
+            able = [item for item in fits if item is not None]
+            begun += [min(able, key=lambda item: item.objective)] if able else []
         return self.whole(begun, found.objective)
 
     def _tried(self, found: CandidateFit, candidate: Candidate) -> list[Point]:

@@ -14,13 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from discrepancy.campaign.noise_tests import (
-    SHORTEST_SERIES,
-    combine,
-    lag_products,
-    ljung_box,
-    variance_p_value,
-)
+from discrepancy.campaign import noise_tests
 from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.fits.candidate import Key, Remainder
 from discrepancy.fits.fitting import CandidateFit, attempt
@@ -57,10 +51,13 @@ def left_by(problem: Problem, found: CandidateFit) -> Remainder:
             continue
         freedom, known = max(counted - found.spent[channel], 1.0), problem.freedom[channel]
         left = sum(float(item @ item) for item in series) / freedom
-        larger = bool(known > 0.0 and variance_p_value(left, freedom, known) < LEVEL)
+        larger = bool(known > 0.0 and noise_tests.variance_p_value(left, freedom, known) < LEVEL)
         if (
             not larger
-            and combine([ljung_box(x, used=u)[1] for x, u in zip(series, used, strict=True)]) > LEVEL
+            and noise_tests.combine(
+                [noise_tests.ljung_box(x, used=u)[1] for x, u in zip(series, used, strict=True)]
+            )
+            > LEVEL
         ):
             continue
         rho, chance = _autocorrelation(series)
@@ -128,7 +125,7 @@ def _records(
     series, used, intervals = [], [], [0.0]
     for data, residual in zip(problem.trials, found.residuals, strict=True):
         for column in np.flatnonzero(data.groups == channel) if data.trial.is_dynamic else ():
-            if len(residual) >= SHORTEST_SERIES:
+            if len(residual) >= noise_tests.SHORTEST_SERIES:
                 series.append(np.ascontiguousarray(residual[:, column]))
                 used.append(data.weight[:, column] > 0.0)
                 intervals.append(float(np.median(data.steps[1:])))
@@ -140,7 +137,7 @@ def _autocorrelation(series: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
     lags = max(int(LAGS * max(len(item) for item in series)), 2)
     products, pairs = np.zeros(lags + 1), np.zeros(lags + 1)
     for item in series:
-        own = lag_products(item, min(lags, len(item) - 1))[0]
+        own = noise_tests.lag_products(item, min(lags, len(item) - 1))[0]
         products[: len(own)] += own
         pairs[: len(own)] += len(item) - np.arange(len(own))
     return products[1:] / max(products[0], 1e-300), pairs[1:] / pairs[0] ** 2

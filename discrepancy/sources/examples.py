@@ -120,37 +120,26 @@ def plan_for(
     ModelError
         If the model lacks an output.
     """
-    quantities = {output: model.output_quantity(output) for output in outputs}
-    for output, quantity in quantities.items():
+    channels: dict[str, Channel] = {}
+    for output in outputs:
+        quantity = model.output_quantity(output)
         if quantity is None:
             raise ModelError(f"{model.name} has no output {output!r}: an example cannot measure it.")
-    scales = model.scales(Campaign("", {}, (), None, {}, ""))
-    channels = tuple(
-        Channel(name, quantity, name, NoiseRecord(1.0, 200.0))
-        for name, quantity in quantities.items()
-        if quantity is not None
-    )
+        channels[output] = Channel(output, quantity, output, None, 0.005)
+    bare = Campaign("", {}, (), None, {}, "")
+    scales = model.scales(bare)
+    bare = replace(bare, channels=channels)
     period = 2.0 * np.pi / scales.angular_frequency
     motion = min(0.02 * scales.length, largest_force / scales.tip_stiffness)
-    plan = ExamplePlan(
-        channels,
-        force=motion * scales.tip_stiffness,
-        release=motion,
-        duration=20.0 * period,
-        interval=period / 50.0,
-        load_place=load_place,
-    )
-    trial = _blank("", TrialKind.STATIC, plan, np.array([plan.force]), 0.0)
-    bare = Campaign("", {channel.name: channel for channel in channels}, (), None, {}, "")
+    force, plan = motion * scales.tip_stiffness, ExamplePlan(tuple(channels.values()), load_place=load_place)
+    plan = replace(plan, force=force, release=motion, duration=20.0 * period, interval=period / 50.0)
+    trial = _blank("", TrialKind.STATIC, plan, np.array([force]), 0.0)
     seen = np.abs(observe(model, bare, trial, ModelPatch(), prior_mean(bare, model, trial)).values[0])
-    sized = []
-    for channel, size in zip(channels, seen.tolist(), strict=True):
-        noise = 1e-3 * (size or float(seen.max()) or 1.0)
-        sized.append(
-            replace(
-                channel, noise=NoiseRecord(noise, 200.0), gain_deviation=0.005, offset_deviation=2.0 * noise
-            )
-        )
+    noises = 1e-3 * np.where(seen > 0.0, seen, seen.max() or 1.0)
+    sized = (
+        replace(channel, noise=NoiseRecord(noise, 200.0), offset_deviation=2.0 * noise)
+        for channel, noise in zip(plan.channels, noises.tolist(), strict=True)
+    )
     return replace(plan, channels=tuple(sized))
 
 

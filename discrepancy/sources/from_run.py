@@ -13,15 +13,8 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.result.file import load_calibration
-from discrepancy.campaign.records import (
-    Campaign,
-    Channel,
-    FloatArray,
-    NoiseRecord,
-    Quantity,
-    Trial,
-    TrialKind,
-)
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.campaign.sampling import FloatArray
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
 from discrepancy.models.wing import WingModel
 from fmu_asset.door.binding import load_binding

@@ -100,12 +100,12 @@ def steps_under(
     """Return steps under modal forces (K, M) at both ends of each; `feed` is that of `Steps`."""
     lengths, which = boundaries.alike
     transition, *by = system.exact_steps(lengths)
-    push = sum(
-        forces @ part[0].T if len(lengths) == 1 else np.einsum("knm,km->kn", part[which], forces)
-        for part, forces in zip(by, (begin, end), strict=True)
-    )
+    push = np.zeros((len(which), transition.shape[1]))
+    for forces, part in zip((begin, end), by, strict=True):
+        if forces.any():
+            push += forces @ part[0].T if len(lengths) == 1 else np.einsum("knm,km->kn", part[which], forces)
     moments, sample = boundaries.time, boundaries.sample
-    return Steps(transition, lengths, which, np.asarray(push), begin, end, feed, moments, sample)
+    return Steps(transition, lengths, which, push, begin, end, feed, moments, sample)
 
 
 class ModalMotion(NamedTuple):

@@ -56,14 +56,14 @@ def data_file_bytes(model: ReducedArrays) -> bytes:
         Magic, version, arrays, CRC-32.
     """
     values: dict[str, Any] = {item.name: getattr(model, item.name) for item in fields(ReducedArrays)}
-    values["chosen_counts"] = tuple(
+    values["chosen_counts"] = [
         len(names) for names in (model.parameters, model.regions, model.masses, model.controls)
-    )
+    ]
     values["gauge_count"] = len(model.gauges)
     arrays = {
         name: np.asarray(value, dtype=np.float64)
         for name, value in values.items()
-        if name not in _UNUSED and not isinstance(value, str) and np.size(value)
+        if name not in _UNUSED and not isinstance(value, str | tuple) and np.size(value)
     }
     return pack_arrays(arrays)
 

@@ -29,10 +29,11 @@ from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
 from discrepancy.models.sensing import observe
+from discrepancy.report.figures import ReportInput
 from discrepancy.search.strategy import search
 from discrepancy.sources.examples import example_campaign, plan_of, write_example
 from discrepancy.verdict import VerdictKind
-from discrepancy.verdict_folder import VerdictContent, write_verdict_folder
+from discrepancy.verdict_folder import write_verdict_folder
 from discrepancy.workflow import Investigation, investigate
 from fe.runtime.patch import LoadGain, ModelPatch, PowerDamping, PowerStiffness, SensorGain
 from fmu_asset.archive.fmu_file import read_fmu
@@ -71,7 +72,7 @@ def verdict_of(
         campaign.name, choice.model.name, campaign.data_hash, choice.source_hash,
         "uav-twin discrepancy run 'a campaign' --model rig.toml --seed 0", collect_provenance(0), choice.file,
     )  # fmt: skip
-    write_verdict_folder(folder, VerdictContent(found, origin), report=False, replace_it=replace_it)
+    write_verdict_folder(folder, ReportInput(found, origin), report=False, replace_it=replace_it)
     return found
 
 

@@ -18,7 +18,6 @@ from discrepancy.fits.problem import Problem
 from discrepancy.judgement.consistency_gate import (
     CONSISTENCY_LEVEL,
     consistency_gate,
-    consistency_tests,
     directions,
     score_tests,
 )
@@ -56,6 +55,10 @@ def changed(problem, *, record=None, size=None, shift=0.0, place="middle", fligh
 def fitted(problem, effect, place):  # type: ignore[no-untyped-def]
     candidate = Candidate((Term(effect, place),))
     return fit(problem, candidate, problem.start(candidate), iterations=40)
+
+
+def _tests_of(problem, found):  # type: ignore[no-untyped-def]
+    return score_tests(problem, found, directions(problem, found))
 
 
 def test_statistic_is_the_fall_of_the_penalised_sum_of_squares(kit) -> None:  # type: ignore[no-untyped-def]
@@ -99,7 +102,7 @@ def test_p_values_are_uniform_where_the_name_is_right(kit, freedom: float) -> No
             seed=seed, effect=0.3 * generator.standard_normal(), samples=20, noise=NoiseRecord(0.02, inf)
         )
         problem = changed(drawn, record=NoiseRecord(0.02 * scale, freedom))
-        for test in consistency_tests(problem, fitted(problem, effect, "y1")):
+        for test in _tests_of(problem, fitted(problem, effect, "y1")):
             found[test.name].append(test.p_value)
     for values in found.values():
         assert len(values) == 100
@@ -141,7 +144,7 @@ def test_what_the_sum_of_squares_does_not_show_is_seen(kit, made, place, change,
     assert gate.statistic < CONSISTENCY_LEVEL
     assert all(word in gate.reason for word in words)
     flights = ["loads of flight"] * flight
-    names = [test.name for test in consistency_tests(wrong, found)]
+    names = [test.name for test in _tests_of(wrong, found)]
     assert names == ["static loads", *flights, "zeros of the static runs", f"channel {place}"]
 
 
@@ -149,7 +152,7 @@ def test_runs_without_a_label_have_one_zero(kit) -> None:  # type: ignore[no-unt
     problem = changed(kit.closed_problem(seed=4, effect=0.5))
     trials = tuple(replace(trial, run="") for trial in problem.campaign.trials)
     whole = Problem(replace(problem.campaign, trials=trials), problem.model, problem.setting)
-    tests = consistency_tests(whole, fitted(whole, kit.offset_effect(), "y1"))
+    tests = _tests_of(whole, fitted(whole, kit.offset_effect(), "y1"))
     (zeros,) = (test for test in tests if test.name == "zeros of the static runs")
     assert zeros.strongest.startswith("the zero of displacement in the runs without a label (")
 

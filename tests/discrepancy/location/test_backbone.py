@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from discrepancy.errors import FitError
-from discrepancy.location.backbone import Backbone, backbones
+from discrepancy.location.backbone import Backbone, at_amplitude, backbones
 
 REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 TIME = 0.005 * np.arange(2000)
@@ -120,21 +120,27 @@ def test_pure_noise_gives_no_points() -> None:
     assert backbones(TIME[:600], signal, (5.0,), noise_deviation=1.0)[0].time.size == 0
 
 
+def test_value_at_an_amplitude_is_the_mean_over_trials() -> None:
+    def line(shift: float) -> Backbone:
+        amplitude = np.geomspace(1.0, 0.1, 12)
+        one = np.ones(12)
+        return Backbone(1, one, amplitude, 0.01 * one, 5.0 + shift - 0.1 * np.log(amplitude), 0.02 * one,
+                        0.01 + 0.002 * np.log(amplitude) + shift, 0.001 * one)  # fmt: skip
+
+    found = at_amplitude([line(0.01), line(-0.01), line(0.03)], 0.4)
+    assert found.frequency == pytest.approx(5.01 - 0.1 * np.log(0.4))
+    assert found.frequency_error == pytest.approx(np.std([0.01, -0.01, 0.03], ddof=1) / np.sqrt(3))
+    assert found.damping_ratio == pytest.approx(0.02 + 0.002 * np.log(0.4))
+    assert found.trial_count == 3
+    single = at_amplitude([line(0.0)], 0.4)
+    assert 0.02 / np.sqrt(12) < single.frequency_error < 0.02
+    assert at_amplitude([line(0.0)], 50.0).trial_count == 0
+
+
 def test_records_shorter_than_a_window_are_refused() -> None:
     for periods, words in ((0.1, "at least 12"), (500.0, "the record's length")):
         with pytest.raises(FitError, match=words):
             backbones(TIME, _viscous(), (5.0,), periods=periods)
-
-
-def _near(curve: Backbone, amplitude: float) -> NDArray[np.float64]:
-    """Return frequency and damping ratio at an amplitude, on a line through what is near."""
-    x = np.log(curve.amplitude / amplitude)
-    near = np.abs(x) <= np.log(2.0)
-    fits = [
-        np.polyfit(x[near], getattr(curve, name)[near], 1, w=1.0 / getattr(curve, f"{name}_error")[near])
-        for name in ("frequency", "damping_ratio")
-    ]
-    return np.array([fit[1] for fit in fits])
 
 
 def test_the_real_wing_stiffens_and_its_damping_falls_as_it_comes_to_rest() -> None:
@@ -147,8 +153,13 @@ def test_the_real_wing_stiffens_and_its_damping_falls_as_it_comes_to_rest() -> N
         found = backbones(record.time, record.signal, (5.65, 29.97), averaging_width=record.averaging_width)
         curves.append(found[0])
     assert len(curves) == 5
-    large, small = (np.array([_near(curve, size) for curve in curves]) for size in (6e-3, 0.6e-3))
-    change = (small - large) * np.array([1.0, -1.0])
-    assert np.all(change > 0.0)
-    errors = [np.std(item, axis=0, ddof=1) / np.sqrt(5.0) for item in (large, small)]
-    assert np.all(change.mean(axis=0) > 5.0 * np.hypot(*errors))
+    large, small = at_amplitude(curves, 6e-3), at_amplitude(curves, 0.6e-3)
+    assert large.trial_count == small.trial_count == 5
+    assert small.frequency - large.frequency > 5.0 * np.hypot(small.frequency_error, large.frequency_error)
+    assert large.damping_ratio - small.damping_ratio > 5.0 * np.hypot(
+        small.damping_ratio_error, large.damping_ratio_error
+    )
+    for curve in curves:
+        own = [at_amplitude([curve], a) for a in (6e-3, 0.6e-3)]
+        assert own[0].frequency < own[1].frequency
+        assert own[0].damping_ratio > own[1].damping_ratio

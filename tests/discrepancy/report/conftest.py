@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from discrepancy.judgement.separability import Separability, separability
-from discrepancy.verdict_folder import VerdictContent, write_verdict_folder
+from discrepancy.report.figures import ReportInput
+from discrepancy.verdict_folder import write_verdict_folder
 from discrepancy.workflow import Investigation, investigate
 from tests.discrepancy.rigs import FEW, ORIGIN, measured
 
@@ -29,5 +30,5 @@ def able(drag: Investigation) -> Separability:
 def written(drag: Investigation, able: Separability, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of that verdict."""
     folder = tmp_path_factory.mktemp("named") / "verdict"
-    write_verdict_folder(folder, VerdictContent(drag, ORIGIN, able))
+    write_verdict_folder(folder, ReportInput(drag, ORIGIN, able))
     return folder

@@ -25,7 +25,7 @@ from discrepancy.judgement.separability import Separability
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.verdict import VerdictKind
-from discrepancy.verdict_folder import VerdictContent, check_folder, write_verdict_folder
+from discrepancy.verdict_folder import check_folder, write_verdict_folder
 from discrepancy.workflow import Investigation, investigate
 from reporting.errors import FileNotWrittenError
 from reporting.figures import to_svg
@@ -188,7 +188,7 @@ def test_a_null_has_no_patch_and_no_model_after(tmp_path: Path) -> None:
     campaign, model = measured(kind="static")
     found = investigate(campaign, model, library())
     assert found.verdict.kind is VerdictKind.NOTHING_MISSING
-    report = write_verdict_folder(tmp_path / "v", VerdictContent(found, ORIGIN))
+    report = write_verdict_folder(tmp_path / "v", ReportInput(found, ORIGIN))
     assert not (tmp_path / "v" / "patch.json").exists()
     page = report.read_text(encoding="utf-8")
     assert "with the effect" not in page
@@ -200,7 +200,7 @@ def test_faults_of_the_data_are_reported_and_nothing_else(tmp_path: Path) -> Non
     wrong = tuple(replace(trial, values=1e6 * trial.values) for trial in campaign.trials)
     found = investigate(replace(campaign, trials=wrong), model, library())
     assert found.verdict.kind is VerdictKind.DATA_ERROR
-    report = write_verdict_folder(tmp_path / "v", VerdictContent(found, ORIGIN))
+    report = write_verdict_folder(tmp_path / "v", ReportInput(found, ORIGIN))
     page = report.read_text(encoding="utf-8")
     assert found.verdict.sentence.split(",")[0] in unescape(page)
     assert "Proof" not in page
@@ -209,7 +209,7 @@ def test_faults_of_the_data_are_reported_and_nothing_else(tmp_path: Path) -> Non
 
 def test_a_folder_is_replaced_on_demand_only_and_only_if_it_is_a_verdict(tmp_path: Path) -> None:
     campaign, model = measured(kind="static")
-    content = VerdictContent(investigate(campaign, model, library()), ORIGIN)
+    content = ReportInput(investigate(campaign, model, library()), ORIGIN)
     folder = tmp_path / "v"
     write_verdict_folder(folder, content)
     (folder / "stray.txt").write_text("x", encoding="utf-8")
@@ -237,6 +237,6 @@ def test_a_failure_while_writing_leaves_the_old_folder(
         raise OSError(28, "No space left on device")
 
     with pytest.raises(FileNotWrittenError, match="No space"):
-        write_verdict_folder(folder, VerdictContent(drag, ORIGIN, pack=refuse), replace_it=True)
+        write_verdict_folder(folder, ReportInput(drag, ORIGIN, pack=refuse), replace_it=True)
     assert (folder / "verdict.json").read_text(encoding="utf-8") == "old"
     assert [path.name for path in tmp_path.iterdir()] == ["v"]

@@ -25,9 +25,10 @@ from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import choice_of_run, choose_model
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
+from discrepancy.report.figures import ReportInput
 from discrepancy.sources.from_run import held_out_turns, run_campaign, run_model
 from discrepancy.verdict import VerdictKind
-from discrepancy.verdict_folder import VerdictContent, write_verdict_folder
+from discrepancy.verdict_folder import write_verdict_folder
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PointMass, SensorDrift, SensorGain, SensorRotation
 from tests.discrepancy.rigs import ORIGIN
@@ -193,7 +194,7 @@ def test_a_drifting_gauge_is_found_in_the_run_and_applied(
     assert found.proof.held_out_after is not None
     assert found.proof.held_out_after.chi_square_per_dof < found.proof.held_out_before.chi_square_per_dof
     origin = replace(ORIGIN, model_hash=choice.source_hash, model_file=choice.file)
-    write_verdict_folder(tmp_path / "verdict", VerdictContent(found, origin), report=False)
+    write_verdict_folder(tmp_path / "verdict", ReportInput(found, origin), report=False)
     applied = apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
     again = investigate(campaign, applied.path, RIVALS, thorough=False).verdict
     assert again.kind is VerdictKind.NOTHING_MISSING, again.sentence

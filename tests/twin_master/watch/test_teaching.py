@@ -17,9 +17,10 @@ from typer.testing import CliRunner
 
 from discrepancy.catalogue.library import library
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.report.figures import ReportInput
 from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.verdict import VerdictKind
-from discrepancy.verdict_folder import VerdictContent, write_verdict_folder
+from discrepancy.verdict_folder import write_verdict_folder
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PowerStiffness, SensorGain
 from fmu_asset.packing.patch_file import SCHEMA
@@ -138,7 +139,7 @@ def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(
     few = [item for item in library() if item.identifier in ("cubic_stiffness", "coulomb_friction")]
     found = investigate(campaign, rig, few)
     assert found.verdict.kind is VerdictKind.NAMED
-    write_verdict_folder(tmp_path / "verdict", VerdictContent(found, ORIGIN))
+    write_verdict_folder(tmp_path / "verdict", ReportInput(found, ORIGIN))
     watch = watchful(base, tmp_path / "watch")
     watch.run(CsvFeed(recorded, watch.scenario), lambda _d: None, turns=20)
     assert seen(watch).pictures == []  # turns are no motion
