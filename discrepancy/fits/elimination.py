@@ -103,16 +103,6 @@ class TrialBlock:
         return self.factor.half(np.eye(len(self.local)))
 
     @cached_property
-    def half_gradient(self) -> FloatArray:
-        """The same times the gradient (L,)."""
-        return self.half @ self.local_gradient
-
-    @cached_property
-    def root(self) -> FloatArray:
-        """Square roots (C, 1) of the precisions."""
-        return np.sqrt(self.precision)[:, np.newaxis]
-
-    @cached_property
     def followed(self) -> FloatArray:
         """What the trial's own unknowns (L, K) do less of where the shared ones do more."""
         return self.factor.solve(self.cross)

@@ -154,15 +154,16 @@ class Screen:
         for number, block in enumerate(self._blocks):
             d, z = np.zeros(self.fit.residuals[number].T.shape), np.zeros(len(block.local))
             if number in changes:
-                d = changes[number].T * block.root
+                root = np.sqrt(block.precision)[:, np.newaxis]
+                d = changes[number].T * root
                 moved = d.any(axis=1)
                 at = EVERY if moved.all() else np.flatnonzero(moved).tolist()
-                onto = block.derivatives.onto(d[at] * block.root[at], at)
+                onto = block.derivatives.onto(d[at] * root[at], at)
                 local = onto[: len(z)]
                 z = block.half @ local
                 total[block.index] += onto[len(z) :] - block.followed.T @ local
-                fits += float(np.vdot(self.fit.residuals[number].T * block.root, d))
-                fits -= float(block.half_gradient @ z)
+                fits += float(np.vdot(self.fit.residuals[number].T * root, d))
+                fits -= float(block.half @ block.local_gradient @ z)
                 square += float(np.vdot(d, d)) - float(z @ z)
             parts.append(d.reshape(-1))
             tail.append(z)
