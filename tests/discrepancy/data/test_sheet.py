@@ -210,7 +210,8 @@ def test_a_table_comes_back_from_any_dialect(
     )
     folder = tmp_path_factory.mktemp("sheet")
     sheet = sheet_of(folder, stream.getvalue().encode(encoding))
-    assert sheet.decimal in (mark, None)
+    told = any(mark in written(value) for row in table for value in row)  # not by 6e-06
+    assert sheet.decimal in (mark, None) or not told
     assert sheet.heads == tuple(f"c{at}" for at in range(len(heads)))
     read = [[float(cell) for cell in sheet.numbers(head, mark)] for head in sheet.heads]
     assert read == [list(column) for column in zip(*table, strict=True)]
