@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 from scipy.linalg import eigh
-from scipy.stats import qmc
 
 from fe.full.subspace import Norm
 from fe.runtime.arrays import FloatArray
@@ -152,8 +151,9 @@ OUTBOARD = (0.75, 1.0)
 TURNED_WEIGHT = 0.4
 """How much representatives of strain across a gauge and of shear count."""
 MODE_WEIGHTS = np.array([3.0, 3.0, 6.0, 3.0, 1.5, 1.0, 0.5, 0.3])
-CHANGED = 6
-"""Numbers of the changes: start, length, amount of a local loss, root compliance, point mass, its station."""
+CHANGED, TAKEN = 6, (0.5, 0.75, 0.4, 0.6)
+"""Numbers of the changes: start, length, amount of a local loss, root compliance, point mass, its station;
+and the shares of the states that have losses of their regions, and each of the three changes."""
 PLAIN_WEIGHT = 10.0
 """How much more the wing as it was counts than one of the patched states."""
 
@@ -173,9 +173,10 @@ def _directions(arrays: PatchArrays, settings: PatchSettings) -> FloatArray:
     columns = np.concatenate(groups).T
     weights = np.repeat((LOAD_WEIGHT, 1.0, TURNED_WEIGHT), [len(rows) for rows in groups])
     all_snapshots = np.zeros((wing.size, wing.size))
-    places = qmc.Halton(len(arrays.validity_box) - 2 + CHANGED, scramble=False).random(settings.states)
+    numbers = len(TAKEN) + CHANGED + len(arrays.validity_box) - 2
+    places = np.random.default_rng(settings.seed).random((settings.states, numbers))
     for number, shares in enumerate(places):
-        structure = _patched_state(wing, shares, number)
+        structure = _patched_state(wing, shares, plain=number == 0)
         solutions, modes = _unit(structure.static(columns)), _unit(structure.lowest(MODES).shapes)
         shapes = np.concatenate((solutions * weights, modes * MODE_WEIGHTS), axis=1)
         all_snapshots += shapes @ shapes.T * (1.0 if number else PLAIN_WEIGHT**2)
@@ -187,17 +188,17 @@ def _unit(vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=0))
 
 
-def _patched_state(wing: PatchedWing, shares: FloatArray, number: int) -> PatchedState:
-    """Return a state at shares of all ranges; its number says what is changed, 0 is the wing as it was."""
+def _patched_state(wing: PatchedWing, shares: FloatArray, *, plain: bool) -> PatchedState:
+    """Return a state at shares of all ranges; `plain`: the wing as it was, in the middle of them."""
     arrays, span = wing.arrays, wing.span
-    start, length, loss, compliance, mass, station = shares[:CHANGED].tolist()
+    damaged, *changed = (shares[: len(TAKEN)] < TAKEN) & (not plain)
+    start, length, loss, compliance, mass, station, *shares = shares[len(TAKEN) :].tolist()
     low, high = arrays.validity_box[:-2].T  # all but the loads
-    e, *losses, servo, pitot = (low + (high - low) * (shares[CHANGED:] if number else 0.5)).tolist()
+    e, *losses, servo, pitot = (low + (high - low) * (0.5 if plain else np.array(shares))).tolist()
     changes = (
         LocalStiffnessLoss(loss**0.5 * arrays.largest_loss, start * span, (0.02 + 0.28 * length) * span),
         RootCompliance(compliance * arrays.largest_compliance),
         PointMass(mass * arrays.largest_mass, (0.1 + 0.9 * station) * span),
     )
-    taken = zip(changes, (number, number & 2, number & 4), strict=True)
-    patch = ModelPatch(tuple(change for change, wanted in taken if wanted))
-    return wing.structure(e, tuple(losses) if number & 1 else (), servo, pitot, patch)
+    patch = ModelPatch(tuple(change for change, taken in zip(changes, changed, strict=True) if taken))
+    return wing.structure(e, tuple(losses) if damaged else (), servo, pitot, patch)

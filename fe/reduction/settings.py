@@ -81,6 +81,8 @@ class PatchSettings:
         Root compliance, as a share of the tip's compliance.
     largest_mass : float
         Point mass [kg].
+    seed : int
+        Of the states.
     """
 
     strip_count: int = 64
@@ -89,6 +91,7 @@ class PatchSettings:
     largest_loss: float = 0.7
     compliance_share: float = 0.4
     largest_mass: float = 0.25
+    seed: int = 1
 
 
 def default_anchors(regions: int) -> tuple[int, ...]:
