@@ -18,8 +18,9 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate, Key, Point, Term
 from discrepancy.fits.problem import Problem
 
-from .columns import Columns, both_signs, log_prior, scaled, sized, stepped, variants
+from .columns import Columns
 from .filtered import Process, Solution
+from .hypotheses import both_signs, log_prior, scaled, sized, stepped, variants
 from .trial import seen_trial
 from .view import SHARES, Column, Motion, Processes, View, combined
 

@@ -17,7 +17,8 @@ from discrepancy.fits.problem import Problem
 from discrepancy.models.interface import Model
 from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
 
-from .columns import Columns, scaled, sees_forces
+from .columns import Columns
+from .hypotheses import scaled, sees_forces
 from .naming import Explained, ForceSearch
 from .trial import SeenTrial, seen_trial
 from .view import Motion, View

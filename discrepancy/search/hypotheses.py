@@ -18,7 +18,7 @@ from discrepancy.fits.candidate import Candidate, Key, Term
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
-from discrepancy.missing_force.columns import log_prior
+from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import SENSORS, MicroSlip
 
