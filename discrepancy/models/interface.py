@@ -37,7 +37,7 @@ class Memory:
         self, size: int = 256, weight: Callable[[Any], int] = lambda _: 1,
         end: Callable[[Any], None] = lambda _: None,
     ) -> None:  # fmt: skip
-        self._size, self._weight, self._end = size, weight, end
+        self._room, self._weight, self._end = size, weight, end
         self._values: OrderedDict[Hashable, Any] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
@@ -46,8 +46,8 @@ class Memory:
             self._values.move_to_end(key)
             return self._values[key]  # type: ignore[no-any-return]
         value = self._values[key] = make()
-        self._size -= self._weight(value)
-        while self._size < 0 and len(self._values) > 1:
+        self._room -= self._weight(value)
+        while self._room < 0 and len(self._values) > 1:
             self._forget()
         return value
 
@@ -58,7 +58,7 @@ class Memory:
 
     def _forget(self) -> None:
         value = self._values.popitem(last=False)[1]
-        self._size += self._weight(value)
+        self._room += self._weight(value)
         self._end(value)
 
 

@@ -22,7 +22,13 @@ from discrepancy.models.acting import (
     place_among,
 )
 from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
-from discrepancy.models.lumped_file import GAINS, ControllerSection, InputSection, LumpedDescription
+from discrepancy.models.lumped_file import (
+    GAINS,
+    ControllerSection,
+    InputSection,
+    LoadSection,
+    LumpedDescription,
+)
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
@@ -110,11 +116,10 @@ class Rig(NamedTuple):
     constant: FloatArray
     loops: Mapping[str, Loop]
 
-    def along(self, row: FloatArray, through: str | None, name: str) -> FloatArray:
-        """Return a load (N,), through a matrix where it says so, times its own factor."""
-        return np.asarray(
-            self.factors.get(name, 1.0) * (row if through is None else self.terms[through] @ row)
-        )
+    def along(self, item: LoadSection, row: FloatArray) -> FloatArray:
+        """Return a load (N,) along a row, through a matrix where it says so, times its own factor."""
+        acting = row if item.through is None else self.terms[item.through] @ row
+        return np.asarray(self.factors.get(item.name, 1.0) * acting)
 
 
 class LumpedModel(DescribedModel, SystemModel):
@@ -275,7 +280,7 @@ class LumpedModel(DescribedModel, SystemModel):
             row = row + change.along_span * np.array(item.station_derivative)
             if item.chord_derivative is not None:
                 row = row + change.along_chord * np.array(item.chord_derivative)
-        return rig.along(self.description.padded(row), item.through, item.name)
+        return rig.along(item, self.description.padded(row))
 
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
         """Return what each output shows under what acts; None: at rest."""
@@ -416,7 +421,7 @@ class LumpedModel(DescribedModel, SystemModel):
 
     def system(self, state: State) -> SecondOrderSystem:
         """Return what moves, with prescribed motions and controllers as the state says."""
-        rig = self.rig(state)  # which lives while it is kept below
+        rig = self.rig(state)
 
         def made() -> tuple[Rig, SecondOrderSystem]:
             description, terms, n = self.description, rig.terms, self.description.size
@@ -441,7 +446,7 @@ class LumpedModel(DescribedModel, SystemModel):
                         matrix[loop.state] += seen
             beta = description.damping.beta if description.damping is not None else None
             drives = [description.padded(self._inputs[name].vector) for name in state.drives]
-            return rig, SecondOrderSystem(
+            return rig, SecondOrderSystem(  # the rig lives as long, so that its id stays its own
                 mass, damping, stiffness, self.port_rows,
                 mode_count=MOST_MODES if description.is_plain else None,
                 relaxation=rig.factors.get("damping", 1.0) * (beta or 0.0),
