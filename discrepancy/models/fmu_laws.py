@@ -275,7 +275,7 @@ class FmuLaws(FmuMotion):
                 forces[: len(part.series), at] += value * part.series[: run.steps]
                 first[at] += value * part.begin
         if any(part.kind == "input" for part, _ in run.loads):
-            start = np.linalg.solve(system.generator, system.push @ -first)
+            start = np.asarray(np.linalg.solve(system.generator, system.push @ -first))
         else:
             key = (run.state, run.step, run.steps)
             inverse = self._starts.get(key, lambda: system.starting(count, run.step, run.steps))

@@ -22,13 +22,7 @@ from discrepancy.models.acting import (
     place_among,
 )
 from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
-from discrepancy.models.lumped_file import (
-    GAINS,
-    ControllerSection,
-    InputSection,
-    LoadSection,
-    LumpedDescription,
-)
+from discrepancy.models.lumped_file import GAINS, ControllerSection, InputSection, LumpedDescription
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
@@ -114,12 +108,12 @@ class Rig(NamedTuple):
     factors: Mapping[str, float]
     terms: Mapping[str, FloatArray]
     constant: FloatArray
-    loops: Mapping[str, Loop]
+    loops: dict[str, Loop]
 
-    def along(self, item: LoadSection, row: FloatArray) -> FloatArray:
-        """Return a load (N,) along a row, through a matrix where it says so, times its own factor."""
-        acting = row if item.through is None else self.terms[item.through] @ row
-        return np.asarray(self.factors.get(item.name, 1.0) * acting)
+    def along(self, row: FloatArray, through: str | None, name: str) -> FloatArray:
+        """Return a load (N,), through a matrix where it says so, times its own factor."""
+        acting = row if through is None else self.terms[through] @ row
+        return np.asarray(self.factors.get(name, 1.0) * acting)
 
 
 class LumpedModel(DescribedModel, SystemModel):
@@ -280,7 +274,7 @@ class LumpedModel(DescribedModel, SystemModel):
             row = row + change.along_span * np.array(item.station_derivative)
             if item.chord_derivative is not None:
                 row = row + change.along_chord * np.array(item.chord_derivative)
-        return rig.along(item, self.description.padded(row))
+        return rig.along(self.description.padded(row), item.through, item.name)
 
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
         """Return what each output shows under what acts; None: at rest."""
@@ -346,9 +340,8 @@ class LumpedModel(DescribedModel, SystemModel):
         vector = self.port_rows.get(port)
         if vector is None or not np.all(np.isin(vector, (-1.0, 0.0, 1.0))):
             return None
-        told: dict[int, set[bool]] = {}
-        for item in (*self.description.output, *self.description.input):
-            row, moving = item.vector, item.quantity.moving
+        told, known = dict[int, set[bool]](), (*self._outputs.values(), *self._inputs.values())
+        for row, moving in ((item.vector, item.quantity.moving) for item in known):
             if row is not None and moving and np.count_nonzero(row) == 1 and max(row) == 1.0:
                 told.setdefault(int(np.argmax(row)), set()).add(Quantity.ANGLE in moving)
         kinds = set().union(*(told.get(int(at), {True, False}) for at in np.flatnonzero(vector)))
@@ -402,22 +395,17 @@ class LumpedModel(DescribedModel, SystemModel):
                 own = (weighted * (2.0 * np.array(given.ratios) * w)) @ weighted.T
             damping += factors.get("damping", 1.0) * own
         rig = Rig(factors, terms, np.zeros(description.width), {})
-        constant = sum(
-            (
-                rig.along(description.padded(item.vector), item.through, item.name)
-                for item in description.load
-            ),
-            rig.constant,
-        )
-        loops, state = dict[str, Loop](), n + description.states
+        for load in description.load:
+            rig.constant[:] += rig.along(description.padded(load.vector), load.through, load.name)
+        state = n + description.states
         for item in description.controller:
             named = (factors.get(f"{item.name}.{gain}", 1.0) * getattr(item, gain) for gain in GAINS)
             gains = [factors.get(item.name, 1.0) * gain for gain in named]
             row, acts = description.padded(item.vector), description.padded(item.acts)
             sees = Shown.of(row, order_of(item.quantity), states=description.width - n).rows
-            loops[item.name] = Loop(item, gains, sees, acts, state if item.integral else None)
+            rig.loops[item.name] = Loop(item, gains, sees, acts, state if item.integral else None)
             state += item.integral != 0.0
-        return rig._replace(constant=constant, loops=loops)
+        return rig
 
     def system(self, state: State) -> SecondOrderSystem:
         """Return what moves, with prescribed motions and controllers as the state says."""
