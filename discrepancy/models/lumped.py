@@ -340,8 +340,10 @@ class LumpedModel(DescribedModel, SystemModel):
         vector = self.port_rows.get(port)
         if vector is None or not np.all(np.isin(vector, (-1.0, 0.0, 1.0))):
             return None
-        told, known = dict[int, set[bool]](), (*self._outputs.values(), *self._inputs.values())
-        for row, moving in ((item.vector, item.quantity.moving) for item in known):
+        told: dict[int, set[bool]] = {}
+        known = [(item.vector, item.quantity.moving) for item in self.description.output]
+        known += [(item.vector, item.quantity.moving) for item in self.description.input]
+        for row, moving in known:
             if row is not None and moving and np.count_nonzero(row) == 1 and max(row) == 1.0:
                 told.setdefault(int(np.argmax(row)), set()).add(Quantity.ANGLE in moving)
         kinds = set().union(*(told.get(int(at), {True, False}) for at in np.flatnonzero(vector)))
