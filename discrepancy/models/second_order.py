@@ -5,7 +5,7 @@ it for a `Motion`, which says what outputs show. Between the stamps the linear p
 (`fe.runtime.stepwise`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,6 +17,7 @@ from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Response
 from discrepancy.models.linear_system import LinearSystem, solved
+from discrepancy.models.scales import PortScale
 from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.motion_arrays import Steps
 from fe.runtime.stepwise import Begin, Boundaries, ModalMotion, advance, steps_under, substeps
@@ -323,3 +324,91 @@ class SecondOrderSystem(LinearSystem):
                 steps.transition[:, coordinate] = 0.0
                 steps.push[:, coordinate] = heaviness * drive.at(time[1:], order)
         return steps
+
+
+FORCES = 5.0
+"""Force scale of a port that no stiffness holds over the rms of the forces there: friction of 1 to 25 % of
+what acts is in the middle of its prior, and drag of as much at the largest speed."""
+TURNS = 1e-3
+"""Share of the largest speed of a port that both directions must reach, for a motion that turns."""
+Rested = tuple[FloatArray, bool]
+"""Where the ports were (N, P) in a trial at rest or after a release, and whether it is fitted."""
+Moved = tuple[Motion, float, bool]
+"""Motion in a trial under recorded inputs, the largest force measured in it [N], and whether it is fitted."""
+
+
+def port_scales(
+    bare: LinearSystem, still: Mapping[str, float], rests: Sequence[Rested], motions: Sequence[Moved]
+) -> dict[str, PortScale]:
+    """Return natural scales of ports under a campaign: what acts and moves where the structure has none.
+
+    Where no stiffness of the structure holds a port (that of a controller is none), its force scale is
+    `FORCES` times the rms of inertia, damping, own laws and loads there, its displacement and speed the
+    largest: effects are measured by what acts and moves. At a port of a state likewise, of flows. Where
+    drives alone move a port, no frequency of the structure says how fast: its force scale is the largest
+    measured force.
+
+    Parameters
+    ----------
+    bare : LinearSystem
+        The system at the prior mean, without controllers.
+    still : mapping of str to float
+        The ports, and the stiffness of each at rest; zero where the modes tell it.
+    rests, motions : sequences of Rested and Moved
+        What the campaign shows. Where all trials are followed in time from known inputs, what was not seen to
+        turn does not.
+    """
+    names, driven_only = list(still), not rests
+    sizes, squares, count = np.zeros((3, len(names))), np.zeros(len(names)), 0
+    turned, follows = np.zeros(len(names), bool), np.ones(len(names), bool)
+    rows = np.array([bare.ports[name] for name in names]).reshape(len(names), len(bare.mass))
+    for position, fitted in rests:
+        x = np.max(np.abs(position), axis=0, initial=0.0)
+        sizes = np.maximum(sizes, (x * fitted, x, 0.0 * x))
+    for motion, measured, fitted in motions:
+        system = motion.system
+        at = [list(system.ports).index(name) for name in names]
+        position, speed = (item[:, at] for item in motion.at_ports)
+        x, v = (np.max(np.abs(item), axis=0, initial=0.0) for item in (position, speed))
+        sizes = np.maximum(sizes, (x * fitted, x, v))
+        least = TURNS * np.max(np.abs(speed), axis=0)
+        turned |= (np.min(speed, axis=0) < -least) & (np.max(speed, axis=0) > least)
+        if system.mode_count is not None:
+            follows[:] = False
+            continue
+        shapes = system.shapes
+        pushed = (
+            motion.acceleration[:, : shapes.shape[1]] @ (system.mass @ shapes).T,
+            motion.velocity[:, : shapes.shape[1]] @ (bare.damping @ shapes).T,
+            motion.acting.load_at(motion.time, np.eye(len(system.mass))),
+        )
+        # modal force along the port, over what a unit force there gives
+        lent = np.sum((rows @ shapes) ** 2, axis=1)
+        along = shapes @ (shapes.T @ rows.T) / np.where(lent > 0.0, lent, 1.0)
+        largest = np.max([np.mean((item @ along) ** 2, axis=0) for item in pushed], axis=0)
+        squares += len(motion.time) * np.where(lent > 0.0, largest, (measured / FORCES) ** 2)
+        count += len(motion.time)
+        follows &= lent == 0.0
+    found, frequency = dict[str, PortScale](), bare.angular_frequency[: bare.moving]
+    for number, (name, row, stiff) in enumerate(zip(names, rows, still.values(), strict=True)):
+        usual, most, pace = sizes[:, number].tolist()
+        weight = (row @ bare.shapes)[: bare.moving] ** 2
+        holds = weight > 1e-6 * float(weight.sum())
+        amount, free = usual or most or 1.0, not np.any(frequency[holds] > 0.0)
+        force = FORCES * float(np.sqrt(squares[number] / max(count, 1)))
+        if np.any(holds) and np.all(frequency[holds] > 0.0):
+            stiff = stiff or 1.0 / float(np.sum(weight[holds] / frequency[holds] ** 2))
+            w, of_mode = float(frequency[holds][0]), float(weight[holds][0])
+            if driven_only and follows[number] and force > 0.0 < pace:
+                found[name] = PortScale(
+                    amount, force / amount, pace / amount, stiff, most or amount, driven=True
+                )
+            else:
+                found[name] = PortScale(amount, w**2 / of_mode, w, stiff, most or 1.0)
+            continue
+        found[name] = PortScale(
+            amount, (force or 1.0) / amount, (pace or 1.0) / amount, None, most or amount, free=free,
+            turns=bool(turned[number]) or not (free and driven_only and np.any(holds)),
+            of_state=not np.any(row[: bare.displacements]),
+        )  # fmt: skip
+    return found

@@ -13,20 +13,12 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, release_of
 from discrepancy.models.interface import NO_PATCH, Conditions, Model, Outputs, Place, PortedSystem, Response
 from discrepancy.models.linear_system import Resting, at_rest
-from discrepancy.models.natural_scales import PortSizes
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
-from discrepancy.models.second_order import Motion, SecondOrderSystem
+from discrepancy.models.second_order import Motion, Moved, Rested, SecondOrderSystem, port_scales
+from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws
-from fe.runtime.patch import (
-    INTERNAL_FORCES,
-    LOADS,
-    STRUCTURE,
-    ModelPatch,
-    ModulusTemperature,
-    PointMass,
-    PortLoad,
-)
+from fe.runtime.patch import INTERNAL_FORCES, LOADS, STRUCTURE, ModelPatch, PortLoad
 from fe.runtime.state import Losses
 
 
@@ -126,7 +118,7 @@ class SystemModel(Model):
         loads = patch.of(*LOADS)
         if trial.kind is TrialKind.FLIGHT:
             # where a mass has weight; other zeros are read with it in place
-            rows = self.lift(state, patch.of(*LOADS, PointMass))
+            rows = self.lift(state, patch.of(*LOADS, changes.PointMass))
             amounts = [trial.load_factor, trial.load_factor**2]
         else:
             rows = self.force_row(trial.load_place, state, loads)[None]
@@ -230,7 +222,7 @@ class SystemModel(Model):
             )
         count, losses = len(trial.force), self.losses(trial, conditions.health)
         losses = losses * count if len(losses) == 1 else losses
-        warmer = trial.temperature.tolist() if len(patch.of(ModulusTemperature)) else [0.0] * count
+        warmer = trial.temperature.tolist() if len(patch.of(changes.ModulusTemperature)) else [0.0] * count
         values = np.empty((count, len(components) * len(outputs)))
         memory, before, start = None, None, 0
         for (lost, warm), group in groupby(zip(losses, warmer, strict=True)):
@@ -320,16 +312,17 @@ class SystemModel(Model):
         held = system.mode_count is not None and all(
             trial.kind is not TrialKind.DRIVEN and trial.begins is Start.SETTLED for trial in trials
         )
-        driven_only = all(trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN for trial in trials)
-        ports = PortSizes(names, self.system(state._replace(closed=False)), driven_only=driven_only)
-        rows = np.array([self.port_rows[name] for name in names])
+        rows, bare = (
+            np.array([self.port_rows[name] for name in names]),
+            self.system(state._replace(closed=False)),
+        )
+        rests, motions = list[Rested](), list[Moved]()
         conditions, largest = Conditions(parameters), [0.0, 0.0, 0.0]
         for trial in trials:
             case, fitted = self.case(trial, conditions), trial.is_dynamic and not trial.held_out
             if not trial.is_dynamic or trial.kind is TrialKind.RINGDOWN:
-                if held and names:
-                    position = self._held(case) @ rows.T
-                    ports.see(position, 0.0 * position, fitted)
+                known = held and names
+                rests.append((self._held(case) @ rows.T if known else np.zeros((0, len(names))), fitted))
                 continue
             try:
                 motion = self.moved(case, laws)
@@ -343,7 +336,7 @@ class SystemModel(Model):
                 for column, name in enumerate(trial.channels)
                 if campaign.channels[name].quantity in (Quantity.FORCE, Quantity.TORQUE)
             ]
-            ports.add(motion, max(pushes, default=0.0), fitted)
+            motions.append((motion, max(pushes, default=0.0), fitted))
             shapes = motion.system.all_shapes[: self.displacements].T
             loads = motion.acting.load_at(motion.time, np.eye(len(motion.acting.constant)))
             for number, item in enumerate((motion.q @ shapes, motion.velocity @ shapes, loads)):
@@ -364,7 +357,7 @@ class SystemModel(Model):
             frequency = float(elastic[0]) if len(elastic) else usual
             mass = float(np.trace(system.mass)) / max(len(system.mass), 1)
             stiffness = weight / peak if peak > 0.0 < weight else mass * frequency**2
-        found = {name: ports.scale(number, still[number]) for number, name in enumerate(names)}
+        found = port_scales(bare, dict(zip(names, still, strict=True)), rests, motions)
         return Scales(
             **{**sizes, "force": sizes["force"] or weight},
             length=self.length or max(map(abs, self.stations() or (0.0,))) or 1.0,

@@ -13,7 +13,7 @@ from discrepancy.campaign.records import Campaign, Release, TrialKind
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import library
 from discrepancy.catalogue.scales import loss_integral
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from fe.runtime.patch_arrays import PatchArrays
 from tests.discrepancy.models.test_wing import RING
 
