@@ -16,9 +16,9 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Response
-from discrepancy.models.linear_system import LinearSystem, solved
+from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.scales import PortScale
-from fe.runtime.motion import NO_LAWS, Laws
+from fe.runtime.motion import NO_LAWS, Laws, static_solution
 from fe.runtime.motion_arrays import Steps
 from fe.runtime.stepwise import Begin, Boundaries, ModalMotion, advance, steps_under, substeps
 
@@ -67,23 +67,16 @@ class Motion:
         pull = self.q @ modal.whole.T
         if self.laws.rate != 0.0:
             pull *= 1.0 + self.laws.rate * self.time[:, None]
-        found = system.forces_at(self.acting, self.time) - pull - self.velocity @ modal.damping.T
+        found = self.acting.load_at(self.time, system.all_shapes) - pull - self.velocity @ modal.damping.T
         if len(self.laws):
             found -= self.port_forces @ self.laws.rows(modal.actions or modal.ports, self.q.shape[1])
-        for number, drive in enumerate(self.acting.drives.values(), len(system.angular_frequency)):
-            found[:, number] = system.heaviness * drive.at(self.time, 2)
+        for number, drive in enumerate(self.acting.drives.values()):
+            moved = [drive.at(self.time, order) for order in range(3)]
+            for amount, part in zip(moved, system.driven(number), strict=True):
+                found -= np.outer(amount, part)
+            found[:, len(system.angular_frequency) + number] = system.heaviness * moved[2]
         found[: self.held] = 0.0
         return found
-
-    def derivative(self, order: int) -> FloatArray:
-        """Return a derivative (N, M + P) of the modal coordinates, up to the third."""
-        if order < 2:
-            return (self.q, self.velocity)[order]
-        if order == 2:
-            return self.acceleration
-        if len(self.time) < 2:
-            return np.zeros_like(self.q)
-        return np.asarray(np.gradient(self.acceleration, self.time, axis=0))
 
     @property
     def at_ports(self) -> tuple[FloatArray, FloatArray]:
@@ -116,11 +109,17 @@ class Motion:
         """Return what outputs show, and the rates; omitted modes are in what is not derived only."""
         system = self.system
         values, rates = np.zeros((2, len(self.time), len(shown)))
-        for order, rows in enumerate(system.by_order(shown, system.all_shapes)):
-            if np.any(rows):
-                values += self.derivative(order) @ rows.T
-                if order < 3:
-                    rates += self.derivative(order + 1) @ rows.T
+        by_order = system.by_order(shown, system.all_shapes)
+        moved, asked = [self.q, self.velocity], np.any(by_order, axis=(1, 2))
+        if asked[1:].any():
+            moved.append(self.acceleration)
+        if asked[2:].any():
+            still = len(self.time) < 2
+            moved.append(0.0 * self.q if still else np.gradient(self.acceleration, self.time, axis=0))
+        for order in np.flatnonzero(asked):
+            values += moved[order] @ by_order[order].T
+            if order < 3:
+                rates += moved[order + 1] @ by_order[order].T
         if system.truncated:
             values += self._left_out(np.array([item.rows[0] for item in shown]))
         for number, item in enumerate(shown):
@@ -131,7 +130,7 @@ class Motion:
                 values[:, number] -= self.acting.load_at(self.time, along[:, None])[:, 0]
                 if len(self.laws):
                     values[:, number] += self.port_forces @ (
-                        self.laws.rows(system.acting_rows, len(along)) @ along
+                        self.laws.rows({**system.ports, **system.actions}, len(along)) @ along
                     )
             for factor, course in item.courses or ():
                 values[:, number] += factor * course.at(self.time)
@@ -176,8 +175,12 @@ class SecondOrderSystem(LinearSystem):
         times, first = acting.sampled, float(acting.time[0])
         begin = self._first(acting, laws)
         found = self._followed(acting, laws, first, times, begin, refinement)
-        if acting.begins is not Start.UNKNOWN and times[0] <= first:
-            self._rest_on_drives(found, begin.v, laws)
+        if acting.begins is not Start.UNKNOWN and times[0] <= first and len(laws) and len(self.drives):
+            # Laws of speed at ports that only drives move are nothing where they begin at rest: the force by
+            # which a drive would be held there, were it a mass, is none that a reading shows.
+            rows = laws.rows(self.modal.ports, len(begin.v))
+            driven = ~np.any(rows[:, : len(self.angular_frequency)], axis=1)
+            found.port_forces[0, driven & (rows @ begin.v == 0.0) & (laws.of_speed == 1)] = 0.0
         return Motion(self, acting, laws, times, *found[:4])
 
     def _let_go(
@@ -231,17 +234,6 @@ class SecondOrderSystem(LinearSystem):
             q[count:], v[count:] = self.heaviness * drive, self.heaviness * np.array(speeds)
         return Begin(q, v, memory)
 
-    def _rest_on_drives(self, found: ModalMotion, v: FloatArray, laws: Laws) -> None:
-        """Take laws of speed at ports that only drives move as nothing where they begin at rest.
-
-        The force by which a drive would be held there, were it a mass, is none that a reading shows.
-        """
-        if not (len(laws) and len(self.drives)):
-            return
-        rows = laws.rows(self.modal.ports, len(v))
-        driven = ~np.any(rows[:, : len(self.angular_frequency)], axis=1)
-        found.port_forces[0, driven & (rows @ v == 0.0) & (laws.of_speed == 1)] = 0.0
-
     def _released(
         self, row: FloatArray, release: Release, initial: FloatArray, laws: Laws
     ) -> tuple[Begin, FloatArray | None]:
@@ -265,7 +257,7 @@ class SecondOrderSystem(LinearSystem):
             rows = self.port_rows(laws)
             along = rows @ self.flexibility(row)
             held = rows @ self.flexibility(rows.T) - np.outer(along, along) / compliance
-            solution = solved(laws, (holding * along)[None], held)
+            solution = static_solution(laws, (holding * along)[None], held, kernel=compiled_kernel())
             holding += float(along @ solution.forces[0]) / compliance
             acts, memory = holding * row - solution.forces[0] @ rows, solution.memory
             if self.truncated:  # of the port's position, fades after the release

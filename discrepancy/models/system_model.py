@@ -17,7 +17,7 @@ from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from discrepancy.models.second_order import Motion, Moved, Rested, SecondOrderSystem, port_scales
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
-from fe.runtime.motion import NO_LAWS, Laws
+from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import INTERNAL_FORCES, LOADS, STRUCTURE, ModelPatch, PortLoad
 from fe.runtime.state import Losses
 
@@ -146,7 +146,7 @@ class SystemModel(Model):
     def laws(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> Laws:
         """Return the laws at its ports, its own and those of a patch."""
         forces = self.at_ports(self.own_laws(parameters) + patch.of(*INTERNAL_FORCES))
-        return self.laws_at(forces, self.port_rows)
+        return laws_of(forces, self.port_rows, in_windows=self.follows_windows)
 
     def case(self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH) -> Case:
         """Return a trial as it is at its begin."""
@@ -192,7 +192,7 @@ class SystemModel(Model):
             acting = replace(acting, begins=Start.STILL)
         try:
             return system.motion(acting, laws, case.conditions.refinement)
-        except ModelError as cause:
+        except (ModelError, FiniteElementError) as cause:
             raise ModelError(f"The trial {case.trial.name!r} of {self.name!r}: {cause}") from cause
 
     def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
@@ -202,16 +202,13 @@ class SystemModel(Model):
         dynamic trial the structure is that at its first temperature.
         """
         components = range(self.components if conditions.components else 1)
-        try:
-            laws, case = self.laws(conditions.parameters, patch), self.case(trial, conditions, patch)
-            if not trial.is_dynamic:
-                return self._at_rest(case, outputs, laws, components)
-            motion = self.moved(case, laws)
-            shown = (self.shown(case, outputs, motion.acting, number) for number in components)
-            found, *further = map(motion.seen, shown)
-            return Response(found.values, found.rates, *(part.values for part in further))
-        except FiniteElementError as cause:
-            raise ModelError(str(cause)) from cause
+        laws, case = self.laws(conditions.parameters, patch), self.case(trial, conditions, patch)
+        if not trial.is_dynamic:
+            return self._at_rest(case, outputs, laws, components)
+        motion = self.moved(case, laws)
+        shown = (self.shown(case, outputs, motion.acting, number) for number in components)
+        found, *further = map(motion.seen, shown)
+        return Response(found.values, found.rates, *(part.values for part in further))
 
     def _at_rest(self, case: Case, outputs: Outputs, laws: Laws, components: range) -> Response:
         """Return what is shown at rest; rows of one structure that follow one another go together."""
@@ -243,7 +240,7 @@ class SystemModel(Model):
             rest, given = self.rest(case.state), amounts[rows]
             try:
                 values[rows], memory = at_rest(rest, units, given, laws, ports, memory, before, seen=seen)
-            except ModelError as cause:
+            except (ModelError, FiniteElementError) as cause:
                 raise ModelError(f"The trial {trial.name!r} is at rest, but {cause}") from cause
             values[rows] += [item.constant for item in shown]
             before, start = amounts[rows.stop - 1], rows.stop
