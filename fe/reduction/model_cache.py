@@ -58,12 +58,8 @@ def _once(
             raise ReducedModelFileError(f"{path} holds {kind.what} of another design; delete it.")
         return arrays
 
-    return built_once(
-        path,
-        load,
-        threadpool_limits.wrap(limits=1)(build),
-        lambda made: atomic_write_bytes(path, made.to_bytes()),
-    )
+    built = threadpool_limits.wrap(limits=1)(build)
+    return built_once(path, load, built, lambda made: atomic_write_bytes(path, made.to_bytes()))
 
 
 def reduced_model(
