@@ -43,8 +43,8 @@ def compiled_kernel() -> Kernel:
     The functions of `fe` stay plain; they can be called from compiled ones from then on.
     """
     functions = list(law_functions())
-    own = (item for module in (motion_arrays, motion_kernel) for item in _functions(module))
-    for function in (static_path.pull_of, static_path.settle_port, *own):
+    of_static: tuple[Callable[..., Any], ...] = (static_path.pull_of, static_path.settle_port)
+    for function in (*of_static, *_functions(motion_arrays), *_functions(motion_kernel)):
         functions.append(function)
         if function is not motion_kernel.integrate:
             callable_when_compiled(function, makes_arrays=False, inline=function not in SELDOM)

@@ -27,7 +27,7 @@ def cache_folder() -> Path:
 
 
 def built_once(
-    path: Path, load: Callable[[], _Kept], build: Callable[[], _Kept], keep: Callable[[_Kept], None]
+    path: Path, load: Callable[[], _Kept], build: Callable[[], _Kept], keep: Callable[[_Kept], object]
 ) -> _Kept:
     """Return what is kept, or build and keep it; of several builders one builds, and the others wait for it.
 

@@ -58,7 +58,7 @@ def _once(
             raise ReducedModelFileError(f"{path} holds {kind.what} of another design; delete it.")
         return arrays
 
-    built = threadpool_limits.wrap(limits=1)(build)
+    built: Callable[[], _Kept] = threadpool_limits.wrap(limits=1)(build)
     return built_once(path, load, built, lambda made: atomic_write_bytes(path, made.to_bytes()))
 
 
