@@ -313,7 +313,7 @@ def test_residuals_come_back_to_the_last_bit(tmp_path):
 def test_residual_file_carries_units_and_refuses_damage(tmp_path):
     import xarray as xr
 
-    path = write_residuals(tmp_path / "residuals.nc"().fit(np.random.default_rng(1)))
+    path = write_residuals(tmp_path / "residuals.nc", Bench().fit(np.random.default_rng(1)))
     with xr.open_datatree(path, engine="h5netcdf") as tree:
         group = tree["trial_001"].to_dataset()
         assert group["time"].attrs["units"] == "s"
