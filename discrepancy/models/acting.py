@@ -11,8 +11,7 @@ from scipy.interpolate import CubicSpline, PPoly
 
 from discrepancy.campaign.records import FloatArray, Hold, Quantity, Release, Start, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Place
-from discrepancy.models.memory import Memory
+from discrepancy.models.interface import Memory, Place
 from fe.runtime.expression import Expression
 from fe.runtime.patch import LoadGain, LoadPlace, Primitive
 

@@ -9,8 +9,7 @@ from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown, place_among, shown_rows
-from discrepancy.models.interface import NO_PATCH, Outputs, Place
-from discrepancy.models.memory import Memory
+from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, ModelPatch, Primitive

@@ -14,9 +14,8 @@ from calibration.result.record import STATE
 from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown, shown_rows
-from discrepancy.models.interface import NO_PATCH, Outputs, Place
+from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
 from discrepancy.models.linear_system import Resting, springs
-from discrepancy.models.memory import Memory
 from discrepancy.models.scales import PortScale
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel

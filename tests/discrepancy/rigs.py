@@ -14,7 +14,7 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.document import Origin
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import parse_lumped
+from discrepancy.models.lumped_file import LumpedDescription
 from discrepancy.sources.examples import example_campaign, plan_for
 from fe.runtime.patch import (
     ModelPatch,
@@ -54,7 +54,7 @@ ORIGIN = Origin("Rig", MODEL, "ab" * 32, "cd" * 32, "uav-twin discrepancy run ri
 
 def model_of(text: str) -> LumpedModel:
     """Return the lumped model that a text says."""
-    return LumpedModel(parse_lumped(tomllib.loads(text)))
+    return LumpedModel(LumpedDescription.parse(tomllib.loads(text)))
 
 
 def fmu_rig(folder: Path, fmu: object, *changes: tuple[str, str]) -> Path:
@@ -68,7 +68,9 @@ def one_mass(**terms: Any) -> LumpedModel:
     """Return a mass of 2 kg and what holds it; the force on it is `push`, its place `x`, its port `slide`."""
     ends = {"input": "push", "output": "x", "port": "slide"}
     rows = {key: [{"name": name, "vector": 1.0}] for key, name in ends.items()}
-    return LumpedModel(parse_lumped({"format": 1, "name": "One mass", "mass": 2.0, **rows, **terms}, "here"))
+    return LumpedModel(
+        LumpedDescription.parse({"format": 1, "name": "One mass", "mass": 2.0, **rows, **terms}, "here")
+    )
 
 
 def measured(hidden: str = "", value: float = 0.0, kind: str = "laboratory") -> tuple[Campaign, LumpedModel]:

@@ -27,7 +27,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import ModelChoice, choose_model
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
+from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
 from discrepancy.models.sensing import observe
 from discrepancy.report.figures import ReportInput
 from discrepancy.search.strategy import search
@@ -389,7 +389,10 @@ def test_a_law_in_the_file_is_the_law_of_a_patch() -> None:
     law = PowerStiffness("slide", 3.0, 3.0, 0, 0.008)
     factor = {"name": "law", "terms": "spring", "deviation": 0.1, "low": 0.5, "high": 4.0}
     more = {"law": [{"name": "spring", **law.to_mapping()}], "parameter": [*content["parameter"], factor]}
-    own, plain = LumpedModel(parse_lumped(content | more)), LumpedModel(parse_lumped(content))
+    own, plain = (
+        LumpedModel(LumpedDescription.parse(content | more)),
+        LumpedModel(LumpedDescription.parse(content)),
+    )
     plan = plan_of(plain)
     campaign = example_campaign(plain, "laboratory", 3, plan)
     for trial in campaign.trials:

@@ -14,8 +14,8 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.model_choice import ModelKind, choose_model
-from discrepancy.models.fmu_file import load_fmu_model
-from discrepancy.models.lumped_file import SHIPPED_MODELS, load_lumped
+from discrepancy.models.fmu_file import FmuModelDescription
+from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
 from tests.discrepancy.rigs import MODEL
 from tests.refusals import Inputs
 
@@ -91,11 +91,17 @@ def test_a_campaign_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
     assert marked.channels == plain.channels
     text = (SHIPPED_MODELS / "three_mass_chain.toml").read_text(encoding="utf-8")
     (tmp_path / "model.toml").write_text("\ufeff" + text, encoding="utf-8")
-    assert load_lumped(tmp_path / "model.toml") == load_lumped("three_mass_chain")
+    assert LumpedDescription.read(tmp_path / "model.toml") == LumpedDescription.read("three_mass_chain")
 
 
 @pytest.mark.parametrize(
-    "read", [lambda path: read_campaign(path.parent), load_lumped, load_fmu_model, effects_of_file]
+    "read",
+    [
+        lambda path: read_campaign(path.parent),
+        LumpedDescription.read,
+        FmuModelDescription.read,
+        effects_of_file,
+    ],
 )
 @pytest.mark.parametrize("depth", [40, 3000])
 def test_what_is_nested_too_deeply_is_refused(

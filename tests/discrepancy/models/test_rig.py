@@ -375,7 +375,7 @@ def test_states_may_be_given_by_parts_alone() -> None:
         for name, matrix in (("first", [[0.1, 0.0], [-0.1, 0.0]]), ("second", [[0.0, 0.0], [0.0, 0.08]]))
     )
     other = model_of(INPUTS.text("tanks.toml", (whole, "")) + parts)
-    one, other = (item.description.whole("conductance") for item in (rig("tanks"), other))
+    one, other = (item.description.terms()["conductance"] for item in (rig("tanks"), other))
     np.testing.assert_array_equal(one, other)
     with pytest.raises(ModelError, match="conductance must be a 2 x 2 matrix"):
         rig("tanks", (whole, ""))

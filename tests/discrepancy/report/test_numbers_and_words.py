@@ -16,7 +16,7 @@ from discrepancy.files.verdict import primitive_intervals
 from discrepancy.judgement.conclusion import named_effects, probability_text
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import parse_lumped
+from discrepancy.models.lumped_file import LumpedDescription
 from discrepancy.models.wing import WingModel
 from discrepancy.report.residual_figures import (
     gauge_places,
@@ -152,7 +152,7 @@ conductance_part = [{ name = "outlet", matrix = 0.1 }]
 output = [{ name = "level", vector = 1.0, quantity = "level" }]
 port = [{ name = "outlet", vector = 1.0 }]
 """
-    model = LumpedModel(parse_lumped(tomllib.loads(tank)))
+    model = LumpedModel(LumpedDescription.parse(tomllib.loads(tank)))
     for law, text in (
         (PowerDamping("outlet", 0.5, 0.5, 0.0, 2.0, 1.0), "flow 0.500 m/s times capacity at 2 m"),
         (Overflow("outlet", 0.5, 1.5, 3.0, 2.0), "flow 0.500 m/s times capacity, level 3.000 m"),
@@ -191,7 +191,7 @@ port = [
   {{ name = "between", vector = [1.0, -1.0] }},
 ]
 """
-    model = LumpedModel(parse_lumped(tomllib.loads(text)))
+    model = LumpedModel(LumpedDescription.parse(tomllib.loads(text)))
     assert [model.port_unit(name) for name in ("one", "other", "between")] == units
 
 
