@@ -62,10 +62,8 @@ def held_forces(
     for j in range(count):
         if ports.of_speed[j] == 0:
             middle = x[j] + 0.5 * h * v[j] + h * h / 6.0 * (push[j] - taken[j] / h)
-            laws.advance(ports.numbers[j], ports.values[j], ports.elements[j], memory[j], middle, 1)
-            forces[j] = laws.pull(
-                ports.numbers[j], ports.values[j], ports.elements[j], memory[j], middle, 1.0, 1
-            )[0]
+            laws.advance(ports.numbers[j], ports.values[j], memory[j], middle, 1)
+            forces[j] = laws.pull(ports.numbers[j], ports.values[j], memory[j], middle, 1.0, 1)[0]
     for j in range(count):
         if ports.of_speed[j] == 1:
             left = push[j]
@@ -117,9 +115,7 @@ def couple(
 def begin(positions: FloatArray, ports: Ports, memory: FloatArray) -> None:
     """Load the laws from zero to positions (J,) without turning."""
     for j in range(len(positions)):
-        laws.advance(
-            ports.numbers[j], ports.values[j], ports.elements[j], memory[j], positions[j], FIRST_PARTS
-        )
+        laws.advance(ports.numbers[j], ports.values[j], memory[j], positions[j], FIRST_PARTS)
 
 
 @cache
