@@ -309,17 +309,15 @@ class SystemModel(Model):
         held = system.mode_count is not None and all(
             trial.kind is not TrialKind.DRIVEN and trial.begins is Start.SETTLED for trial in trials
         )
-        rows, bare = (
-            np.array([self.port_rows[name] for name in names]),
-            self.system(state._replace(closed=False)),
-        )
+        rows = np.array([self.port_rows[name] for name in names])
+        bare = self.system(state._replace(closed=False))
         rests, motions = list[Rested](), list[Moved]()
         conditions, largest = Conditions(parameters), [0.0, 0.0, 0.0]
         for trial in trials:
             case, fitted = self.case(trial, conditions), trial.is_dynamic and not trial.held_out
             if not trial.is_dynamic or trial.kind is TrialKind.RINGDOWN:
-                known = held and names
-                rests.append((self._held(case) @ rows.T if known else np.zeros((0, len(names))), fitted))
+                still = self._held(case) @ rows.T if held and names else np.zeros((0, len(names)))
+                rests.append((still, fitted))
                 continue
             try:
                 motion = self.moved(case, laws)
@@ -339,12 +337,12 @@ class SystemModel(Model):
             for number, item in enumerate((motion.q @ shapes, motion.velocity @ shapes, loads)):
                 largest[number] = max(largest[number], float(np.max(np.abs(item), initial=0.0)))
         (peak, speed, weight), sizes = largest, campaign_sizes(campaign)
-        shape, still = np.zeros(0), [0.0] * len(names)
+        shape, stiff = np.zeros(0), [0.0] * len(names)
         if held:
             known = [*(trial.load_place for trial in trials), *(self.load_places or ())]
             row, shape = self.force_row(self.reference or known[0], state), system.shapes[:, 0]
             shape = shape if system.basis is None else system.basis @ shape
-            still = [1.0 / float(own @ rest(own[None])[0]) for own in rows]
+            stiff = [1.0 / float(own @ rest(own[None])[0]) for own in rows]
             frequency, participation = float(system.angular_frequency[0]), float(row @ shape) ** 2
             mass = 1.0 / participation if participation else float(np.trace(system.mass))
             stiffness = 1.0 / float(row @ rest(row[None])[0])
@@ -354,7 +352,7 @@ class SystemModel(Model):
             frequency = float(elastic[0]) if len(elastic) else usual
             mass = float(np.trace(system.mass)) / max(len(system.mass), 1)
             stiffness = weight / peak if peak > 0.0 < weight else mass * frequency**2
-        found = port_scales(bare, dict(zip(names, still, strict=True)), rests, motions)
+        found = port_scales(bare, dict(zip(names, stiff, strict=True)), rests, motions)
         return Scales(
             **{**sizes, "force": sizes["force"] or weight},
             length=self.length or max(map(abs, self.stations() or (0.0,))) or 1.0,
