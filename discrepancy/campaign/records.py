@@ -49,7 +49,7 @@ class Quantity(StrEnum):
 
     @property
     def order(self) -> int:
-        """How often a displacement is derived to be this; zero of what is of no motion."""
+        """How often a displacement is derived to be this; if it is, it is nought at rest."""
         return self.moving.index(self) if self.moving else 0
 
     def derivatives_of(self, output: "Quantity") -> int:
@@ -59,11 +59,6 @@ class Quantity(StrEnum):
     def shows(self, output: "Quantity") -> bool:
         """Whether a channel of this quantity can measure what an output of a model is."""
         return self is output or self is Quantity.SIGNAL or self.derivatives_of(output) > 0
-
-    @property
-    def is_rate(self) -> bool:
-        """Whether it is nought at rest."""
-        return self.order > 0
 
 
 _MOVING = (

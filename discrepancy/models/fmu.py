@@ -173,7 +173,7 @@ class FmuModel(DescribedModel):
         """
         asked, (columns, orders) = self._asked(trial, conditions, patch), self._read(outputs)
         if not trial.is_dynamic:
-            if any(quantity.is_rate for _, quantity in outputs):
+            if any(quantity.order > 0 for _, quantity in outputs):
                 raise ModelError(
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )

@@ -229,7 +229,7 @@ class SystemModel(Model):
             units, amounts = self.acting(case).levels
             n = units.shape[1] if self.displacements is None else self.displacements
             for (_, quantity), item in zip(outputs, shown, strict=False):
-                if np.any(item.rows[2:, n:]) or (quantity.is_rate and np.any(item.rows[1:, :n])):
+                if np.any(item.rows[2:, n:]) or (quantity.order > 0 and np.any(item.rows[1:, :n])):
                     raise ModelError(
                         f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
                         "acceleration."
