@@ -37,8 +37,8 @@ def test_every_command_takes_quiet_and_verbose() -> None:
 
 def test_a_scenario_is_described() -> None:
     text = said("scenario", "check", "level_turns")
-    assert "Flown: FMU of the reduced model of the design." in text
-    assert "Believed: reduced model of the design." in text
+    assert "Flown: FMU of the reduced model of the design UAV wing." in text
+    assert "Believed: reduced model of the design UAV wing." in text
     assert "25 states, z1 (5 levels), z2 (5 levels)" in text
     assert "50 turns, 10 ahead" in text
     record = json.loads(said("scenario", "check", "level_turns", "--json", "-q"))
