@@ -91,8 +91,9 @@ def expect_shape(
 
 def expect_controls(index: ArrayLike, count: int) -> None:
     """Refuse indices of controls, an array of any shape, that are none of `count`."""
-    found = np.asarray(index)
-    if found.size and (found.min() < 0 or found.max() >= count):
-        raise InvalidModelError(
-            f"expected control indices between 0 and {count - 1}, got {found.min()} to {found.max()}"
-        )
+    if isinstance(index, int):
+        low = high = index
+    else:
+        low, high = np.min(index, initial=0), np.max(index, initial=0)
+    if low < 0 or high >= count:
+        raise InvalidModelError(f"expected control indices between 0 and {count - 1}, got {low} to {high}")
