@@ -1,4 +1,4 @@
-"""A structure, or the wing, as input for CalculiX; `fe.verification.calculix_job` runs it and reads results.
+"""A structure, or the wing, as input for CalculiX, which `calculix_comparison` runs.
 
 CalculiX (`ccx`, Debian package calculix-ccx) is an independent finite element code. It gets nodes, cells,
 local material constants with their orientations, supports and springs, rigid sets as equations on two
@@ -25,8 +25,8 @@ from fe.runtime.state import DigitalState
 from fe.structure.affine import AffineStructure
 from fe.structure.design import Load
 from fe.structure.location import point_shares
+from fe.structure.mesh import SupportedUnknowns
 from fe.structure.operators import Structure
-from fe.structure.supports import SupportedUnknowns
 from fe.wing.operators import (
     AffineOperators,
     cell_axes,

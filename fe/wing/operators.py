@@ -24,7 +24,7 @@ from fe.elements.cells import (
 from fe.elements.kinds import gauss_points
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.structure.affine import AffineStructure, StiffnessTerm, designed
-from fe.structure.supports import RigidSet, SupportedUnknowns, rigid_motions
+from fe.structure.mesh import RigidSet, SupportedUnknowns, rigid_motions
 
 from .design import WingDesign, wing_structure
 from .mesh import WingMesh, build_mesh

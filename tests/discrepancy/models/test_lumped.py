@@ -15,7 +15,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Shown
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
+from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
 from discrepancy.models.second_order import SecondOrderSystem
 from fe.runtime import patch as patches
 from fe.runtime.motion import NO_LAWS
@@ -261,7 +261,7 @@ def test_closed_form_and_stepped_ringdown_agree_for_any_damping(
     ratios: tuple[float, ...], clock: float
 ) -> None:
     content = tomllib.loads((SHIPPED_MODELS / "three_mass_chain.toml").read_text())
-    closed = LumpedModel(parse_lumped(content | {"damping": {"ratios": list(ratios)}}))
+    closed = LumpedModel(LumpedDescription.parse(content | {"damping": {"ratios": list(ratios)}}))
     # a drift of nothing that counts makes the kernel step
     values, stepped = (
         shown(closed, ringdown(200), *items, clock=(0.0, clock))

@@ -24,7 +24,7 @@ from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.natural_scales import FORCES
+from discrepancy.models.second_order import FORCES
 from fe.runtime.patch import ModulusTemperature, Overflow, PowerDamping, PowerStiffness
 from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
 from tests.discrepancy.asking import trial as asked
@@ -375,7 +375,7 @@ def test_states_may_be_given_by_parts_alone() -> None:
         for name, matrix in (("first", [[0.1, 0.0], [-0.1, 0.0]]), ("second", [[0.0, 0.0], [0.0, 0.08]]))
     )
     other = model_of(INPUTS.text("tanks.toml", (whole, "")) + parts)
-    one, other = (item.description.whole("conductance") for item in (rig("tanks"), other))
+    one, other = (item.description.terms()["conductance"] for item in (rig("tanks"), other))
     np.testing.assert_array_equal(one, other)
     with pytest.raises(ModelError, match="conductance must be a 2 x 2 matrix"):
         rig("tanks", (whole, ""))

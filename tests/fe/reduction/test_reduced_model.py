@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fe.reduction.certified_basis import compressed
-from fe.reduction.reduced_basis import reduce_structure
-from fe.reduction.structure_errors import measured_errors
+from fe.reduction.reduced_basis import measured_errors, reduce_structure
 from fe.runtime.errors import OutsideModelError
 from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure, natural_frequencies, static_response
