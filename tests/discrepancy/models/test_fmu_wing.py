@@ -13,7 +13,7 @@ import pytest
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, RootCompliance
 from fmu_asset.packing.patch_file import parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
