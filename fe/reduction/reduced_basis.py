@@ -2,8 +2,8 @@
 
 First a small basis in which the first eigenmodes are accurate for every stiffness and mass: a working basis
 is grown by Davidson corrections until the modes of sampled states have small residuals in it; then the modes
-of many states, computed in the working basis, are compressed by singular values. The method and what it reaches
-are in `docs/reduced_model.md`.
+of many states, computed in the working basis, are compressed by singular values. The method and what it
+reaches are in `docs/reduced_model.md`.
 """
 
 from bisect import bisect_left
