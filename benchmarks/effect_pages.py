@@ -74,8 +74,6 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         *free,
         "",
         *([text["unit"], ""] if text["unit"] else []),
-        f"**Signature.** {effect.signature}",
-        "",
         f"![{effect.name}](images/{effect.identifier}.png)",
         "",
         f"{what}: {shown}" + (f", place `{place}`." if place else "."),

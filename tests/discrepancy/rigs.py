@@ -7,43 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from discrepancy.campaign.records import Campaign, FloatArray
+from discrepancy.campaign.records import Campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.document import Origin
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import LumpedDescription
 from discrepancy.sources.examples import example_campaign, plan_for
-from fe.runtime.patch import (
-    ModelPatch,
-)
+from fe.runtime.patch import ModelPatch
 from reporting.provenance import collect_provenance
 from tests.refusals import Inputs
-
-
-def sensitivity(jacobian: FloatArray, covariance: FloatArray, noise_deviation: FloatArray) -> FloatArray:
-    """Return S = J L / s0 with L L^T the posterior covariance, so that S S^T holds the leverages.
-
-    Parameters
-    ----------
-    jacobian : (N, C, P) ndarray
-        Derivatives of the predictions of one trial by all fitted parameters [channel's unit].
-    covariance : (P, P) ndarray
-        Posterior covariance of the parameters at the scale of the noise records.
-    noise_deviation : (C,) ndarray
-        s0 [channel's unit].
-
-    Returns
-    -------
-    (N, C, P) ndarray
-        Dimensionless.
-    """
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    root = vectors * np.sqrt(np.clip(values, 0.0, None))
-    return np.asarray((jacobian @ root) / noise_deviation[:, np.newaxis])
-
 
 MODEL = "single_mass_rig"
 INPUTS = Inputs(Path(__file__).with_name("models"))
