@@ -111,7 +111,7 @@ def assemble_patch_operators(operators: full.AffineOperators, strip_count: int =
     found, part_of = np.unique(
         np.stack((strips, mesh.stiffness_term), axis=1)[skin], axis=0, return_inverse=True
     )
-    parts = (skin[part_of == number] for number in range(len(found)))
+    parts = full.stiffness_parts(mesh, (skin[part_of == number] for number in range(len(found))))
     flap = np.zeros(operators.unknowns)
     flap[-2] = 1.0
     return PatchOperators(
@@ -142,8 +142,5 @@ def assemble_patch_operators(operators: full.AffineOperators, strip_count: int =
             "gauge_stations": np.array([place for place, _ in design.gauges.positions]),
             "gauge_length": design.gauges.averaging_spanwise,
         },
-        strips=tuple(
-            sparse.csr_array(restriction @ (matrix @ expansion))
-            for matrix in full.stiffness_parts(mesh, parts)
-        ),
+        strips=tuple(sparse.csr_array(restriction @ (part @ expansion)) for part in parts),
     )
