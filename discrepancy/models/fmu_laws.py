@@ -14,17 +14,16 @@ from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.compiled_motion import law_functions
+from discrepancy.models.compiled_motion import compiled_kernel, law_functions
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_runs import Run, State
 from discrepancy.models.interface import Memory
-from discrepancy.models.linear_system import solved
 from discrepancy.models.port_system import PortSystem
 from fe.compilation import callable_when_compiled, compiled
 from fe.runtime import laws
 from fe.runtime.arrays import IntArray
-from fe.runtime.motion import Laws
+from fe.runtime.motion import Laws, static_solution
 from fe.runtime.motion_arrays import FIRST_PARTS, Ports
 
 CONVERGED = 1e-4
@@ -209,7 +208,9 @@ class FmuLaws(FmuMotion):
             compliance = self.flexibility(state)[np.ix_(index, index)]
             linear = self.rest(state, load)[columns]
             for _ in range(STATIC_ITERATIONS):
-                solution = solved(internal, linear[None], compliance, memory, before)
+                solution = static_solution(
+                    internal, linear[None], compliance, memory=memory, start=before, kernel=compiled_kernel()
+                )
                 forces, given = solution.forces[0], dict(load)
                 for at, force in zip(inputs, forces.tolist(), strict=True):
                     given[at] = given.get(at, 0.0) - force

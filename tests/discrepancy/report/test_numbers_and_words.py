@@ -14,7 +14,7 @@ from discrepancy.judgement.conclusion import named_effects, probability_text
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import LumpedDescription
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from discrepancy.report.residual_figures import (
     gauge_places,
     planform_figure,

@@ -14,7 +14,7 @@ from fmu_asset.packing.script import build_script_fmu
 from reporting.progress import SilentProgress
 from scenarios import asset_scripts, binding_files
 from tests.twin_master.runs import check_same, cut_off_after
-from twin_master.assets.observation_library import ObservationLibrary, load_observation_library
+from twin_master.assets.library_source import ObservationLibrary, load_observation_library
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import InvalidObservationLibraryError, ScenarioError, TwinMasterError
 from twin_master.library.grid import SamplingGrid

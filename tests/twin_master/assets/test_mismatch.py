@@ -22,13 +22,11 @@ from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
-from twin_master.assets.asset_source import PairedSource
-from twin_master.assets.interface import AssetReading, StatelessAsset
+from twin_master.assets.asset_source import AssetReading, PairedSource, StatelessAsset
 from twin_master.assets.mismatch import find_misfit
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.errors import MissingObservationModelError, MissionInputError, ScenarioError
 from twin_master.fleet.reading import Outcomes
 from twin_master.fleet.store import in_credible_set

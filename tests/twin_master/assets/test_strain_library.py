@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin_master.assets.strain_library import load_strain_library
+from twin_master.assets.strain_library_source import load_strain_library
 from twin_master.errors import InvalidStrainLibraryError
 
 LIBRARY = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_digital_twin"

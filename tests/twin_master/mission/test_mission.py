@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.seeds import fly_seeds
-from twin_master.assets.interface import AssetReading, StatelessAsset
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.assets.asset_source import AssetReading, StatelessAsset
+from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.errors import AssetOutputError, NotResumableError
 from twin_master.mission.loop import Checkpoint, fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from fmu_asset.errors import FmuEndedError
-from twin_master.assets.interface import AssetReading, StatelessAsset
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.assets.asset_source import AssetReading, StatelessAsset
+from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.errors import AssetOutputError
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import ENDED, FLOWN, in_credible_set, outcomes_of

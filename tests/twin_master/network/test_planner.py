@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from twin_master.assets.strain_library import load_strain_library
+from twin_master.assets.strain_library_source import load_strain_library
 from twin_master.errors import InvalidDistributionError, PlanningError
 from twin_master.network.graphical_model import worsening_table
 from twin_master.network.planner import evaluate_policy, value_iteration

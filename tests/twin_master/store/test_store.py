@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from reporting.errors import DamagedFileError, FileNotWrittenError
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.twin import build_graphical_model

@@ -15,8 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.mission.loop import operate
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.network.twin import Twin
