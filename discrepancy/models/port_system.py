@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from warnings import catch_warnings, simplefilter
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.linalg import logm
 from scipy.signal import cont2discrete
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.models.memory import Memory
+from discrepancy.models.interface import Memory
 
 KEPT_STEPS = 16
 MOST_STATES = 40
@@ -84,12 +85,13 @@ class PortSystem:
         rows, at_once = self.rows([*((column, 0) for column in x), *speeds])
         return replace(self, outputs=rows, direct=at_once)
 
-    def motion(self, forces: FloatArray, step: float) -> FloatArray:
-        """Return the outputs (N + 1, C) under forces (N, P) that are held over steps [s], from rest."""
-        states = np.zeros((len(forces) + 1, len(self.generator)))
+    def motion(self, forces: FloatArray, step: float, start: FloatArray | float = 0.0) -> FloatArray:
+        """Return the outputs (N + 1, C) under forces (N, P) held over steps [s], from a state (n,)."""
         transition, drive = self.over(step)
-        for k, force in enumerate(forces):
-            states[k + 1] = transition @ states[k] + drive @ force
+        states = np.zeros((len(forces) + 1, len(transition)))
+        states[0], states[1:] = start, forces @ drive.T
+        for before, after in pairwise(states):
+            after += transition @ before
         return self.seen(states, forces)
 
     def seen(

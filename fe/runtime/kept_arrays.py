@@ -1,13 +1,11 @@
 """Records of arrays that live in one `.npz` file: checked where they are made, read back to the last bit.
 
-The file has reproducible bytes, is written whole or not at all, and nothing in it is pickled.
+The file has reproducible bytes, and nothing in it is pickled.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
 import io
-import os
-import tempfile
 import zipfile
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
@@ -111,34 +109,6 @@ def require_arrays(arrays: Mapping[str, npt.NDArray[Any]], where: str, wanted: I
         raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it anew.")
 
 
-def write_bytes_atomically(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all: a reader never sees half of it, whatever happens meanwhile.
-
-    Parameters
-    ----------
-    path : Path
-        The file; its folder must exist.
-    content : bytes
-        What it is to hold.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written; an older file of that name is then untouched.
-    """
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
 @dataclass(frozen=True, repr=False)
 class KeptArrays:
     """Arrays and plain numbers that were made of one design; a kind of record is a subclass with its fields.
@@ -238,11 +208,7 @@ class KeptArrays:
                 f"{where} does not hold the arrays of {cls.what} ({cause}); build it anew."
             ) from cause
 
-    def save(self, path: str | Path) -> None:
-        """Write one `.npz` file, whole or not at all; `OSError` if that fails."""
-        write_bytes_atomically(Path(path), self.to_bytes())
-
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what `save` wrote; raises `FileNotFoundError` or `ReducedModelFileError`."""
+        """Read a file of `to_bytes`; raises `FileNotFoundError` or `ReducedModelFileError`."""
         return cls.from_bytes(Path(path).read_bytes(), str(path))

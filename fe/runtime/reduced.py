@@ -15,8 +15,7 @@ from numpy.linalg import solve
 
 from .arrays import FloatArray
 from .errors import OutsideModelError
-from .online import OnlineArrays
-from .reduced_arrays import ReducedArrays
+from .reduced_arrays import OnlineArrays, ReducedArrays
 
 Values = Mapping[str, float] | FloatArray
 """What is chosen: by name, or all of it (V,) in the order of `ReducedArrays.chosen`."""

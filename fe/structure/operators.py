@@ -18,9 +18,8 @@ from .affine import AffineStructure, StiffnessTerm, designed, static_response
 from .design import Damage, Material, MatrixDesign, MeshDesign, load_structure, structure_hash, unit_vector
 from .location import gauge_rows, nodal_load, point_shares
 from .matrices import assemble_matrices
-from .mesh import StructureMesh
+from .mesh import StructureMesh, SupportedUnknowns, supported
 from .mesh_file import check_memory, read_mesh
-from .supports import SupportedUnknowns, supported
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,6 @@
 """Calibration step 1: conjugate posterior, published lengths, bad files."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +11,7 @@ from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import READING_UNCERTAINTY, MeasuredLength, published_lengths, read_lengths
 
 
-def test_the_published_lengths() -> None:
+def test_the_published_lengths():
     result = published_lengths()
     for length, measured in zip(result, (1.828, 0.433, 0.260), strict=True):
         assert length.prior.deviation == pytest.approx(2.54e-3 / 1.96)
@@ -24,7 +21,7 @@ def test_the_published_lengths() -> None:
     assert result.semi_span.posterior.mean == pytest.approx(1.828005, abs=1e-6)
 
 
-def test_posterior_by_quadrature() -> None:
+def test_posterior_by_quadrature():
     length = published_lengths().root_chord
     grid = np.linspace(0.432, 0.436, 40001)
     density = np.exp(
@@ -38,7 +35,7 @@ def test_posterior_by_quadrature() -> None:
 
 
 @given(designed=st.floats(0.1, 5.0), shift=st.floats(-0.05, 0.05))
-def test_posterior_lies_between_and_is_narrower(designed: float, shift: float) -> None:
+def test_posterior_lies_between_and_is_narrower(designed, shift):
     length = MeasuredLength("semi_span", designed, designed * (1.0 + shift))
     low, high = sorted((length.designed, length.measured))
     assert low - 1e-12 <= length.posterior.mean <= high + 1e-12
@@ -46,7 +43,7 @@ def test_posterior_lies_between_and_is_narrower(designed: float, shift: float) -
     assert length.posterior.standard_deviation <= length.prior.deviation
 
 
-def test_the_published_file_gives_the_published_figures(reference: Path) -> None:
+def test_the_published_file_gives_the_published_figures(reference):
     for read, published in zip(read_lengths(reference), published_lengths(), strict=True):
         assert read.designed == pytest.approx(published.designed, rel=1e-12)
         assert read.measured == pytest.approx(published.measured, rel=1e-12)
@@ -59,7 +56,7 @@ chord_{tip},261.112,260.0
 """
 
 
-def test_a_file_of_its_own(tmp_path: Path) -> None:
+def test_a_file_of_its_own(tmp_path):
     file = tmp_path / "lengths.csv"
     file.write_text(GOOD, encoding="utf-8")
     for read, published in zip(read_lengths(file), published_lengths(), strict=True):
@@ -81,16 +78,14 @@ def test_a_file_of_its_own(tmp_path: Path) -> None:
         (GOOD.replace("1828.0", "182.8"), ExperimentDataError, "more than 10 % apart"),
     ],
 )
-def test_bad_files_are_told_in_one_sentence(
-    tmp_path: Path, text: str, error: type[Exception], words: str
-) -> None:
+def test_bad_files_are_told_in_one_sentence(tmp_path, text, error, words):
     file = tmp_path / "lengths.csv"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(error, match=words):
         read_lengths(file)
 
 
-def test_missing_files(tmp_path: Path) -> None:
+def test_missing_files(tmp_path):
     with pytest.raises(ExperimentFileError, match="does not hold"):
         read_lengths(tmp_path)
     with pytest.raises(ExperimentFileError, match="does not exist"):

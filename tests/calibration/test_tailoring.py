@@ -1,36 +1,29 @@
 """The measured planform in the design, and what a wing cannot be."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
 
 from calibration.errors import ExperimentDataError
-from calibration.geometry import (
-    Lengths,
-    published_lengths,
-    tailored_design,
-    tailored_geometry,
-)
+from calibration.geometry import published_lengths, tailored_design, tailored_geometry
 from fe.runtime.errors import InvalidDesignError
-from fe.wing.design import WingDesign, load_design
+from fe.wing.design import load_design
 from fe.wing.mesh import build_mesh
 
 
-def lengths(**measured: float) -> Lengths:
+def lengths(**measured):
     """The published lengths, some measured otherwise [m]."""
     published = published_lengths()
     changes = {name: replace(getattr(published, name), measured=value) for name, value in measured.items()}
-    return published._replace(**changes)  # type: ignore[arg-type]
+    return published._replace(**changes)
 
 
-def test_the_published_lengths_are_the_shipped_design() -> None:
+def test_the_published_lengths_are_the_shipped_design():
     """So nothing is built anew for the wing of the paper."""
     assert tailored_design(load_design(), published_lengths()).hash == load_design().hash
 
 
-def test_the_planform_is_the_posterior_mean_to_a_tenth_of_a_millimetre() -> None:
+def test_the_planform_is_the_posterior_mean_to_a_tenth_of_a_millimetre():
     measured = lengths(semi_span=1.83517, root_chord=0.4401, tip_chord=0.25541)
     found = tailored_geometry(measured)
     # precision-weighted means by hand: tolerances of 2.54 and 0.2 mm
@@ -41,7 +34,7 @@ def test_the_planform_is_the_posterior_mean_to_a_tenth_of_a_millimetre() -> None
         assert getattr(found, name) * 1e4 == pytest.approx(round(mean * 1e4), abs=1e-9)
 
 
-def test_what_moves_with_the_planform_and_what_stays() -> None:
+def test_what_moves_with_the_planform_and_what_stays():
     drawn = load_design()
     tailored = tailored_design(drawn, lengths(semi_span=1.9, root_chord=0.44, tip_chord=0.255))
     before, after = drawn.model_dump(), tailored.model_dump()
@@ -57,13 +50,13 @@ def test_what_moves_with_the_planform_and_what_stays() -> None:
     assert tailored.gauges.positions == drawn.gauges.positions
 
 
-def test_another_wing_than_the_design_is_refused() -> None:
+def test_another_wing_than_the_design_is_refused():
     other = load_design().changed(planform={"semi_span": 2.4})
     with pytest.raises(ExperimentDataError, match=r"semi_span measures 1828\.0 mm.*2400\.0 mm.*--design"):
         tailored_design(other, published_lengths())
 
 
-def crowded(**sections: object) -> WingDesign:
+def crowded(**sections):
     """The shipped design with something at the end of its wing."""
     return load_design().changed(**sections)
 
@@ -83,14 +76,14 @@ def crowded(**sections: object) -> WingDesign:
         ),
     ],
 )
-def test_what_no_longer_fits_is_refused_with_its_place(design: WingDesign, place: str) -> None:
+def test_what_no_longer_fits_is_refused_with_its_place(design, place):
     with pytest.raises(InvalidDesignError, match=rf"does not fit the measured planform .*{place}") as caught:
         tailored_design(design, lengths(semi_span=1.8))
     assert "the changed design" not in str(caught.value)
     assert str(caught.value).endswith(".")
 
 
-def test_a_skin_too_thick_for_the_measured_chord_is_refused() -> None:
+def test_a_skin_too_thick_for_the_measured_chord_is_refused():
     thick = crowded(skin={"thickness": 0.0023})
     with pytest.raises(InvalidDesignError, match=r"the skin of 0\.0023 m does not fit"):
         tailored_design(thick, lengths(tip_chord=0.24))

@@ -1,9 +1,6 @@
 """The virtual wing: its physics against the integrator, its experiments, its laboratory folder."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +16,6 @@ from calibration.static.experiments import published_measurements, read_measurem
 from calibration.virtual_wing import (
     RECORDED_GAUGE,
     SENSITIVITY,
-    RingDownSignal,
     VirtualWing,
     check_recorded,
     measure_lengths,
@@ -29,7 +25,6 @@ from calibration.virtual_wing import (
 )
 from calibration.wing.lab_data import WEIGHED_MASS_FILE, read_weighed_mass, write_lab_folder
 from fe.runtime.errors import OutsideModelError
-from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE, DigitalState, Geometry
 from tests.wings import wing_integrator
 
@@ -39,10 +34,10 @@ TRUTH = DigitalState(young_modulus_factor=1.0073, damping_alpha=1.03, damping_be
 class Beam:
     """A test bench of closed formulas: k = 680 N/m, two modes."""
 
-    def tip_displacement(self, load: float) -> float:
+    def tip_displacement(self, load):
         return load / 680.0
 
-    def ring_down(self, initial_tip_displacement: float, duration: float, rate: float) -> RingDownSignal:
+    def ring_down(self, initial_tip_displacement, duration, rate):
         time = virtual_wing.sampling_times(duration, rate)
         signal = np.zeros_like(time)
         for frequency, ratio, share in ((5.65, 0.028, 0.8), (29.0, 0.05, 0.5)):
@@ -53,14 +48,14 @@ class Beam:
 
 
 @pytest.fixture(scope="module")
-def wing() -> ReducedModel:
+def wing():
     from fe.reduction.model_cache import reduced_model
 
     return reduced_model()
 
 
 @pytest.mark.slow
-def test_the_release_is_the_integrators(wing: ReducedModel) -> None:
+def test_the_release_is_the_integrators(wing):
     bench = VirtualWing(wing, TRUTH)
     time, signal = bench.ring_down(0.03, 0.4, 1000.0)
     integrator = wing_integrator(
@@ -87,7 +82,7 @@ def test_the_release_is_the_integrators(wing: ReducedModel) -> None:
 
 
 @pytest.mark.slow
-def test_overdamped_and_critical_modes(wing: ReducedModel) -> None:
+def test_overdamped_and_critical_modes(wing):
     modes = wing.modes(
         young_modulus_factor=1.0, stiffness_loss=(0.0, 0.0), servo_mass=0.169, pitot_mass=0.134
     )
@@ -99,7 +94,7 @@ def test_overdamped_and_critical_modes(wing: ReducedModel) -> None:
 
 
 @pytest.mark.slow
-def test_records_give_back_the_truth(wing: ReducedModel) -> None:
+def test_records_give_back_the_truth(wing):
     bench = VirtualWing(wing, TRUTH, frequency_error=(-0.01, 0.045))
     modes = wing.modes(
         young_modulus_factor=1.0073, stiffness_loss=(0.0, 0.0), servo_mass=0.169, pitot_mass=0.134
@@ -121,7 +116,7 @@ def test_records_give_back_the_truth(wing: ReducedModel) -> None:
         VirtualWing(wing, DigitalState(servo_mass=0.9))
 
 
-def test_reading_errors_are_as_stated() -> None:
+def test_reading_errors_are_as_stated():
     published = published_measurements()
     tests = [measure_load_test(Beam(), seed) for seed in range(500)]
     load = np.array([test.load for test in tests]) - published.load
@@ -134,7 +129,7 @@ def test_reading_errors_are_as_stated() -> None:
     np.testing.assert_array_equal(tests[0].run, published.run)
 
 
-def test_experiments_repeat_with_the_seed() -> None:
+def test_experiments_repeat_with_the_seed():
     one, two, other = (measure_ring_down(Beam(), seed, trials=2, duration=2.0) for seed in (4, 4, 5))
     assert one[1].signal.tobytes() == two[1].signal.tobytes()
     assert one[1].signal.tobytes() != other[1].signal.tobytes()
@@ -148,7 +143,7 @@ def test_experiments_repeat_with_the_seed() -> None:
     assert np.std(lengths) == pytest.approx(0.2e-3 / 1.96, rel=0.15)
 
 
-def test_quantisation_and_bad_settings() -> None:
+def test_quantisation_and_bad_settings():
     record = measure_ring_down(Beam(), 1, trials=1, quantisation=5e-5)[0]
     np.testing.assert_allclose(record.signal / 5e-5, np.round(record.signal / 5e-5), atol=1e-9)
     with pytest.raises(ExperimentDataError, match="at least one trial"):
@@ -164,7 +159,7 @@ def test_quantisation_and_bad_settings() -> None:
 
 
 @pytest.mark.parametrize("rate", [500.0, 100_000.0])
-def test_the_laboratory_folder_is_read_back(tmp_path: Path, rate: float) -> None:
+def test_the_laboratory_folder_is_read_back(tmp_path, rate):
     load_test = measure_load_test(Beam(), 2)
     records = measure_ring_down(Beam(), 2, trials=2, duration=1.0, sampling_rate=rate)
     lengths = measure_lengths(Geometry(), 2)
@@ -187,7 +182,7 @@ def test_the_laboratory_folder_is_read_back(tmp_path: Path, rate: float) -> None
     assert (scale.value, scale.deviation) == pytest.approx((0.4711, 2e-3))
 
 
-def test_the_weighed_mass_file(tmp_path: Path) -> None:
+def test_the_weighed_mass_file(tmp_path):
     file = tmp_path / WEIGHED_MASS_FILE
     file.parent.mkdir()
     for text, error, words in (

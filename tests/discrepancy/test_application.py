@@ -1,12 +1,9 @@
 """The way back: a campaign, its verdict, the model patched by it, and the campaign once more."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import shutil
 import tomllib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +12,8 @@ import pytest
 
 import uav_twin
 from discrepancy.application import _again, apply_verdict, gives
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity
-from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
+from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
 from discrepancy.document import Origin
 from discrepancy.errors import ModelError, VerdictFileError
@@ -24,17 +21,17 @@ from discrepancy.files.verdict import read_patch
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
-from discrepancy.model_choice import ModelChoice, choose_model
-from discrepancy.models.interface import Conditions, Model
+from discrepancy.model_choice import choose_model
+from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
+from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
 from discrepancy.models.sensing import observe
 from discrepancy.report.figures import ReportInput
 from discrepancy.search.strategy import search
 from discrepancy.sources.examples import example_campaign, plan_of, write_example
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
-from discrepancy.workflow import Investigation, investigate
+from discrepancy.workflow import investigate
 from fe.runtime.patch import LoadGain, ModelPatch, PowerDamping, PowerStiffness, SensorGain
 from fmu_asset.archive.fmu_file import read_fmu
 from reporting.errors import FileNotWrittenError
@@ -47,25 +44,16 @@ SPRING = ("cubic_stiffness", "seating_offset", "load_cell")
 CUBIC = {"stiffening": 0.15}
 
 
-def named(*identifiers: str) -> tuple[Effect, ...]:
+def named(*identifiers):
     return tuple(effect_by_identifier(name, CATALOGUE) for name in identifiers)
 
 
-def hidden(
-    model: Model, campaign: Campaign, identifier: str, values: dict[str, float], place: str
-) -> ModelPatch:
+def hidden(model, campaign, identifier, values, place):
     setting = Setting(campaign, model, model.scales(campaign))
     return effect_by_identifier(identifier, CATALOGUE).patch(setting, values, place)
 
 
-def verdict_of(
-    choice: ModelChoice,
-    campaign: Campaign,
-    effects: tuple[Effect, ...],
-    folder: Path,
-    *,
-    replace_it: bool = False,
-) -> Investigation:
+def verdict_of(choice, campaign, effects, folder, *, replace_it=False):
     """Investigate, and write the folder of the verdict without its report."""
     found = investigate(campaign, choice.model, effects, thorough=False)
     origin = Origin(
@@ -80,7 +68,7 @@ def verdict_of(
 
 
 @pytest.fixture(scope="module")
-def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def laboratory(tmp_path_factory):
     """A folder with a lumped model, a campaign with a cubic spring hidden in it, and its verdict."""
     folder = tmp_path_factory.mktemp("laboratory")
     shutil.copy(SHIPPED_MODELS / "single_mass_rig.toml", folder / "rig.toml")
@@ -106,9 +94,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_there_and_back_by_the_command_line(
-    laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_there_and_back_by_the_command_line(laboratory, tmp_path, monkeypatch):
     """Run, apply, run again, each in another folder: nothing is missing any more."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(laboratory / "verdict", "verdicts/lab")
@@ -138,9 +124,7 @@ def test_there_and_back_by_the_command_line(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rig_patched.toml", "verdicts"]
 
 
-def test_the_command_repeats_the_run_in_any_folder(
-    laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_repeats_the_run_in_any_folder(laboratory, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     command = uav_twin.read_verdict(laboratory / "verdict").origin.command
     done = command_line.command(*shlex.split(command)[1:], "--no-report")
@@ -152,7 +136,7 @@ def test_the_command_repeats_the_run_in_any_folder(
     assert once == again
 
 
-def test_the_next_command_of_a_mission_has_a_folder_of_its_own() -> None:
+def test_the_next_command_of_a_mission_has_a_folder_of_its_own():
     command = "uav-twin discrepancy run --from-run /flights/m1 --to-turn 3 --model own.toml --seed 0"
     assert _again(command, Path("two/one.json")) == (
         "uav-twin discrepancy run --from-run /flights/m1 --to-turn 3 --seed 0 --model two/one.json "
@@ -160,7 +144,7 @@ def test_the_next_command_of_a_mission_has_a_folder_of_its_own() -> None:
     )
 
 
-def static_campaign(choice: ModelChoice, folder: Path) -> Campaign:
+def static_campaign(choice, folder):
     """Write a static campaign with a cubic spring hidden at the port of the load."""
     model, plan = choice.model, plan_of(choice.model)
     bare = example_campaign(model, "static", 3, plan)
@@ -171,9 +155,7 @@ def static_campaign(choice: ModelChoice, folder: Path) -> Campaign:
 
 
 @pytest.mark.parametrize("kind", ["FMU", "structure", "wing"])
-def test_there_and_back_from_python(
-    kind: str, foreign_fmu: Callable[[str], Path], write_beam: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_there_and_back_from_python(kind, foreign_fmu, write_beam, tmp_path):
     """A patch beside the model's own file is a model itself, refused once that file has changed."""
     file = tmp_path / "rig.toml"
     if kind == "FMU":
@@ -210,7 +192,6 @@ def test_there_and_back_from_python(
             ("damping.alpha", calibrated["damping_alpha"]),
         ):
             variable = packed.variable(name)
-            assert variable is not None
             assert float(str(variable.start)) == wanted
         return
     old, new = ("density = 2700", "density = 2710") if kind == "structure" else ("high = 1.3", "high = 1.4")
@@ -224,7 +205,7 @@ def test_there_and_back_from_python(
 
 
 @pytest.fixture(scope="module")
-def group(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def group(tmp_path_factory):
     """The verdict of a static campaign that cannot tell a compliant root from a crack."""
     folder = tmp_path_factory.mktemp("group")
     choice = choose_model("three_mass_chain")
@@ -239,9 +220,7 @@ def group(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_of_a_group_one_member_is_applied(
-    group: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_a_group_one_member_is_applied(group, tmp_path, monkeypatch):
     """The leading one unless another is asked for; both say that they are no name, and close the gap."""
     monkeypatch.chdir(tmp_path)
     verdict = uav_twin.read_verdict(group / "verdict").verdict
@@ -266,7 +245,7 @@ def test_of_a_group_one_member_is_applied(
     assert f"which has '{leading}', '{other}'" in done.stderr
 
 
-def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path: Path) -> None:
+def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path):
     """A hardening spring with nothing but a stiffness that drifts to explain it."""
     choice = choose_model("single_mass_rig")
     plan = plan_of(choice.model)
@@ -292,9 +271,7 @@ def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path: Path) ->
 # ---------------------------------------------------------------- files
 
 
-def test_files_are_not_taken_from_their_owner(
-    laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_are_not_taken_from_their_owner(laboratory, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     verdict = laboratory / "verdict"
     (tmp_path / "there.toml").write_text("mine", encoding="utf-8")
@@ -316,7 +293,7 @@ def test_files_are_not_taken_from_their_owner(
     assert uav_twin.load_model("there.toml").name.endswith("with geometric (cubic) stiffness")
 
 
-def test_a_model_is_found_beside_its_patch(laboratory: Path, tmp_path: Path) -> None:
+def test_a_model_is_found_beside_its_patch(laboratory, tmp_path):
     """Files that moved together are a model still; one without its base is not."""
     moved = tmp_path / "moved"
     shutil.copytree(laboratory, tmp_path / "there")
@@ -331,7 +308,7 @@ def test_a_model_is_found_beside_its_patch(laboratory: Path, tmp_path: Path) -> 
         uav_twin.load_model(moved / "patched.json")
 
 
-def test_a_verdict_of_an_earlier_version_asks_for_another_run(laboratory: Path, tmp_path: Path) -> None:
+def test_a_verdict_of_an_earlier_version_asks_for_another_run(laboratory, tmp_path):
     """It is read, but does not say where its model is."""
     folder = tmp_path / "verdict"
     shutil.copytree(laboratory / "verdict", folder)
@@ -357,7 +334,7 @@ def test_a_verdict_of_an_earlier_version_asks_for_another_run(laboratory: Path, 
             call()
 
 
-def test_effects_are_applied_upon_each_other(laboratory: Path, tmp_path: Path) -> None:
+def test_effects_are_applied_upon_each_other(laboratory, tmp_path):
     """What a patched model lacks goes into one file with what it had."""
     first = choose_model(apply_verdict(laboratory / "verdict", tmp_path / "first.json").path)
     assert len(first.model.patch)
@@ -383,13 +360,16 @@ def test_effects_are_applied_upon_each_other(laboratory: Path, tmp_path: Path) -
 # ---------------------------------------------------------------- models
 
 
-def test_a_law_in_the_file_is_the_law_of_a_patch() -> None:
+def test_a_law_in_the_file_is_the_law_of_a_patch():
     """To the last bit, in motion and at rest, with the law times the factor of a parameter."""
     content = tomllib.loads((SHIPPED_MODELS / "single_mass_rig.toml").read_text(encoding="utf-8"))
     law = PowerStiffness("slide", 3.0, 3.0, 0, 0.008)
     factor = {"name": "law", "terms": "spring", "deviation": 0.1, "low": 0.5, "high": 4.0}
     more = {"law": [{"name": "spring", **law.to_mapping()}], "parameter": [*content["parameter"], factor]}
-    own, plain = LumpedModel(parse_lumped(content | more)), LumpedModel(parse_lumped(content))
+    own, plain = (
+        LumpedModel(LumpedDescription.parse(content | more)),
+        LumpedModel(LumpedDescription.parse(content)),
+    )
     plan = plan_of(plain)
     campaign = example_campaign(plain, "laboratory", 3, plan)
     for trial in campaign.trials:
@@ -404,7 +384,7 @@ def test_a_law_in_the_file_is_the_law_of_a_patch() -> None:
             np.testing.assert_array_equal(one, other)
 
 
-def test_a_built_in_sensor_is_that_of_its_channel() -> None:
+def test_a_built_in_sensor_is_that_of_its_channel():
     """Of two channels that measure one output, the one that the effect was found on."""
     model = uav_twin.load_model("single_mass_rig")
     noise = NoiseRecord(1e-5, 50.0)
@@ -421,7 +401,7 @@ def test_a_built_in_sensor_is_that_of_its_channel() -> None:
     assert np.abs(seen[:, 1]).max() > 0.0
 
 
-def test_friction_in_the_model_is_fitted_from_the_beginnings() -> None:
+def test_friction_in_the_model_is_fitted_from_the_beginnings():
     """A motion that friction ends has many optima; from the prior means the fit ends far off in one."""
     model = uav_twin.load_model("single_mass_rig")
     plan = plan_of(model)
@@ -436,9 +416,7 @@ def test_friction_in_the_model_is_fitted_from_the_beginnings() -> None:
 
 
 @pytest.mark.parametrize("kind", ["lumped", "FMU"])
-def test_gains_of_a_load_act_one_upon_the_other(
-    kind: str, foreign_fmu: Callable[[str], Path], tmp_path: Path
-) -> None:
+def test_gains_of_a_load_act_one_upon_the_other(kind, foreign_fmu, tmp_path):
     """A tare of 0.5 N that a second gain of 10 % doubles up on is 0.55 N."""
     shutil.copy(foreign_fmu("rig2"), tmp_path / "rig.fmu")
     fmu_rig(tmp_path, "rig.fmu")

@@ -1,7 +1,5 @@
 """The rigs of the notebook and of the page of the cart are made, read and understood as these say."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -24,7 +22,7 @@ DRIVEN_RIVALS = ("coulomb_friction", "quadratic_damping", "load_cell")
 RIVALS = ("coulomb_friction", "structural_damping", "quadratic_damping", "clock_error")
 
 
-def write_rig(text: str, folder: Path, campaign_folder: str) -> Path:
+def write_rig(text, folder, campaign_folder):
     """Write what a page gives into a folder and run its script; return the folder."""
     (folder / campaign_folder).mkdir()
     (script,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
@@ -36,7 +34,7 @@ def write_rig(text: str, folder: Path, campaign_folder: str) -> Path:
     return folder
 
 
-def write_notebook_rig(text: str, folder: Path) -> Path:
+def write_notebook_rig(text, folder):
     """Make the tables of the notebook and write its files into a folder, which is returned."""
     tables, *cells = re.findall(r"```{code-cell} python\n(.*?)```", text, re.DOTALL)
     (folder / "make_tables.py").write_text(tables, encoding="utf-8")
@@ -48,7 +46,7 @@ def write_notebook_rig(text: str, folder: Path) -> Path:
     return folder
 
 
-def check_tables(text: str, folder: Path, names: tuple[str, ...]) -> None:
+def check_tables(text, folder, names):
     """Compare the beginnings of tables with those that a page shows side by side."""
     shown = re.search(
         rf"{' +'.join(f'{folder.name}/{name}.csv' for name in names)}\n(.*?)```", text, re.DOTALL
@@ -60,23 +58,23 @@ def check_tables(text: str, folder: Path, names: tuple[str, ...]) -> None:
         assert tuple(made[: len(lines)]) == lines
 
 
-def check_force(text: str, verdict: Verdict) -> None:
+def check_force(text, verdict):
     """Compare the force of the only effect with the one that a page shows."""
     shown = re.search(r"force ([\d.]+) N \(([\d.]+) to ([\d.]+)\)", text)
     assert shown
     value, low, high = (float(number) for number in shown.groups())
     (law,) = verdict.effects[0].patch
-    assert law.coefficient == pytest.approx(value, abs=0.2 * (high - low))  # type: ignore[attr-defined]
+    assert law.coefficient == pytest.approx(value, abs=0.2 * (high - low))
 
 
 @pytest.fixture(scope="module")
-def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def rig(tmp_path_factory):
     """A folder with what the notebook gives, its tables made."""
     text = (DOCS / "tutorials" / "name_an_effect.md").read_text(encoding="utf-8")
     return write_notebook_rig(text, tmp_path_factory.mktemp("rig"))
 
 
-def test_without_a_port_friction_cannot_be_tested_and_that_is_said(rig: Path) -> None:
+def test_without_a_port_friction_cannot_be_tested_and_that_is_said(rig):
     with_port = (rig / "model.toml").read_text(encoding="utf-8")
     (rig / "no_port.toml").write_text(with_port[: with_port.index("[[port]]")], encoding="utf-8")
     model = LumpedModel.load(rig / "no_port.toml")
@@ -87,7 +85,7 @@ def test_without_a_port_friction_cannot_be_tested_and_that_is_said(rig: Path) ->
     assert "declare a [[port]] in the model's file, such as vector = [1]" in remark
 
 
-def test_with_the_port_look_alikes_are_remarked_on(rig: Path) -> None:
+def test_with_the_port_look_alikes_are_remarked_on(rig):
     model = LumpedModel.load(rig / "model.toml")
     campaign, _ = checked(read_campaign(rig / "my_rig"), model)
     setting = Setting(campaign, model, model.scales(campaign))
@@ -99,7 +97,7 @@ def test_with_the_port_look_alikes_are_remarked_on(rig: Path) -> None:
     assert "bouc_wen_hysteresis, free_play, joint_micro_slip, structural_damping were compared" in remark
 
 
-def test_with_the_port_friction_is_named_in_the_size_that_was_hidden(rig: Path) -> None:
+def test_with_the_port_friction_is_named_in_the_size_that_was_hidden(rig):
     effects = tuple(effect for effect in library() if effect.identifier in RIVALS)
     model = LumpedModel.load(rig / "model.toml")
     found = investigate(read_campaign(rig / "my_rig"), model, effects, thorough=False)
@@ -108,29 +106,27 @@ def test_with_the_port_friction_is_named_in_the_size_that_was_hidden(rig: Path) 
     assert (effect.identifier, effect.place) == ("coulomb_friction", "slide")
     (law,) = effect.patch
     # The corner of the script's friction is rounded off, that of the law is not.
-    assert law.coefficient == pytest.approx(0.16, rel=3e-3)  # type: ignore[attr-defined]
+    assert law.coefficient == pytest.approx(0.16, rel=3e-3)
 
 
 @pytest.fixture(scope="module")
-def cart_text() -> str:
+def cart_text():
     return (DOCS / "cart_in_ten_minutes.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
-def cart(cart_text: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cart(cart_text, tmp_path_factory):
     return write_rig(cart_text, tmp_path_factory.mktemp("cart"), "my_cart")
 
 
-def test_the_tables_of_the_cart_begin_as_they_are_shown_and_jitter(cart_text: str, cart: Path) -> None:
+def test_the_tables_of_the_cart_begin_as_they_are_shown_and_jitter(cart_text, cart):
     check_tables(cart_text, cart / "my_cart", ("rest", "ride_1"))
     for trial in read_campaign(cart / "my_cart").trials:
         steps = np.diff(trial.time)
         assert 0.015 < np.std(steps) / np.mean(steps) / np.sqrt(2.0) < 0.025
 
 
-def test_friction_of_the_cart_is_named_in_the_size_shown_and_not_the_offset(
-    cart_text: str, cart: Path
-) -> None:
+def test_friction_of_the_cart_is_named_in_the_size_shown_and_not_the_offset(cart_text, cart):
     effects = tuple(effect for effect in library() if effect.identifier in DRIVEN_RIVALS)
     found = investigate(
         read_campaign(cart / "my_cart"), LumpedModel.load(cart / "model.toml"), effects, thorough=False

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from scenarios import scenario_files
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.mission.loop import CheckpointFile
 from twin_master.mission.preparation import Knowledge, prepare_knowledge

@@ -158,8 +158,8 @@ def test_the_page_of_commands_is_that_of_the_commands() -> None:
 def test_a_scenario_is_described() -> None:
     text = said("scenario", "check", "level_turns")
     for part in (
-        "Flown: FMU of the reduced model of the design.",
-        "Believed: reduced model of the design.",
+        "Flown: FMU of the reduced model of the design UAV wing.",
+        "Believed: reduced model of the design UAV wing.",
         "25 states, z1 (5 levels), z2 (5 levels)",
         "50 turns, 10 ahead",
     ):

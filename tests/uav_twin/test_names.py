@@ -102,7 +102,7 @@ def test_records_show_themselves_in_a_few_words(library_file: Path) -> None:
     from calibration.wing.calibrate import WingCalibration
     from discrepancy.models.fmu import FmuModel
     from discrepancy.models.interface import Model
-    from discrepancy.models.wing import WingModel
+    from discrepancy.models.structures import WingModel
     from discrepancy.verdict import Verdict, VerdictKind
     from discrepancy.workflow import Investigation
 

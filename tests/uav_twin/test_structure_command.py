@@ -9,7 +9,7 @@ from pathlib import Path
 import meshio
 import pytest
 
-from fe.verification.calculix_job import calculix_program
+from fe.verification.calculix_comparison import calculix_program
 from tests.command_line import command, refused, said
 
 DECK = """*NODE

@@ -11,7 +11,7 @@ import xarray as xr
 from fmpy.validation import validate_fmu
 
 from calibration.result.file import load_calibration
-from fe.reduction.structure_errors import measured_errors
+from fe.reduction.reduced_basis import measured_errors
 from reporting.toml_file import parse_toml
 from tests.calculix_decks import needs_calculix, solved, stiffened_skin, write_structure
 from tests.command_line import refused, said

@@ -18,7 +18,7 @@ from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance
 from twin_master.assets.asset_source import AssetSource
-from twin_master.assets.resolution import asset_source, believed_source, located_scenario, portable_scenario
+from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine, Piece, flown
 from twin_master.fleet.plan import Fleet, Group, load_fleet
@@ -298,7 +298,7 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
 
 def prepared(scenario: Scenario, folder: Path, progress: Progress, *, real: bool = False) -> bytes:
     """Return the packed `Kit` of a scenario, what belongs to it made in a folder."""
-    located = located_scenario(portable_scenario(scenario), folder)
+    located = scenario.portable().moved(folder)
     for name, content in source_of(scenario, real=real).files().items():
         if not (folder / name).exists():
             atomic_write_bytes(folder / name, content)
@@ -312,7 +312,7 @@ def prepared(scenario: Scenario, folder: Path, progress: Progress, *, real: bool
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
-    return Kit(portable_scenario(scenario).to_dict(), files, wing).packed()
+    return Kit(scenario.portable().to_dict(), files, wing).packed()
 
 
 def group_folder(folder: Path, group: Group, place: int) -> Path:

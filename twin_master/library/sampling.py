@@ -27,7 +27,7 @@ from reporting.files import TEMPORARY_SUFFIX, atomic_write_text, remove_leftover
 from reporting.json_file import parse_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_file
-from twin_master.assets.observation_library import (
+from twin_master.assets.library_source import (
     FORMAT,
     KIND,
     RESERVED,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmu_asset.errors import FmuEndedError
-from twin_master.assets.interface import Asset, AssetReading
+from twin_master.assets.asset_source import Asset, AssetReading
 from twin_master.errors import AssetOutputError, MissionError, TwinMasterError
 from twin_master.mission.turns import Happened, Reading
 from twin_master.network.graphical_model import GraphicalModel

@@ -1,41 +1,34 @@
 """What the ring-down is made to say: a linear wing, one that softens, the published records."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from calibration.dynamics.damped_cosine import RingDownMode
 from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.dynamics.ringdown import Frequencies
-from calibration.dynamics.trials import RingDownTrials, fit_trials
+from calibration.dynamics.trials import fit_trials
 from calibration.joint.measurement import PUBLISHED_MODES, _mean_of, measured_modes
-from calibration.result.record import Reading
 
 TIME = np.arange(0.0, 6.4, 1.0 / 250.0)
 F1, F2, ZETA1, ZETA2 = 5.65, 29.0, 0.028, 0.05
 
 
-def by_name(trials: RingDownTrials) -> dict[str, Reading]:
+def by_name(trials):
     """What `measured_modes` reads, by name."""
     return {item.name: item for item in measured_modes(trials)}
 
 
-def second_mode(time: NDArray[np.float64]) -> NDArray[np.float64]:
+def second_mode(time):
     omega = 2.0 * math.pi * F2
     damped = omega * math.sqrt(1.0 - ZETA2**2)
     return np.asarray(0.008 * np.exp(-ZETA2 * omega * time) * np.cos(damped * time))
 
 
-def trials(
-    softening: float, seed: int, noise: float = 1e-4, scatter: float = 0.0
-) -> tuple[RingDownRecord, ...]:
+def trials(softening, seed, noise=1e-4, scatter=0.0):
     """Records whose first frequency falls by `softening` [Hz] with every factor e of the amplitude."""
     generator = np.random.default_rng(seed)
     records = []
@@ -50,7 +43,7 @@ def trials(
     return tuple(records)
 
 
-def test_a_linear_wing_is_given_its_statistical_error_alone() -> None:
+def test_a_linear_wing_is_given_its_statistical_error_alone():
     scores = []
     for seed in range(3):
         fitted = fit_trials(trials(0.0, seed), Frequencies.FITTED, start=None)
@@ -70,7 +63,7 @@ def test_a_linear_wing_is_given_its_statistical_error_alone() -> None:
     assert 0.4 < math.sqrt(float(np.mean(np.square(scores)))) < 1.6
 
 
-def test_a_wing_that_softens_is_given_its_spread() -> None:
+def test_a_wing_that_softens_is_given_its_spread():
     slope = 0.07
     found = by_name(fit_trials(trials(slope, 1), Frequencies.FITTED, start=None))
     # Windows of 0.8 s from 0.4 s on, as far as the mode stands above the noise; spread of the log amplitude.
@@ -80,7 +73,7 @@ def test_a_wing_that_softens_is_given_its_spread() -> None:
     assert found["frequency_1"].deviation == pytest.approx(slope * decay * middles.std(), rel=0.25)
 
 
-def test_frequencies_of_spectral_peaks_carry_their_bias() -> None:
+def test_frequencies_of_spectral_peaks_carry_their_bias():
     """Skirts of the first mode move the second peak: the authors' procedure is off, and says so."""
     found = by_name(fit_trials(trials(0.0, 2), Frequencies.PEAKS, start=None))
     fitted = by_name(fit_trials(trials(0.0, 2), Frequencies.FITTED, start=None))
@@ -90,14 +83,14 @@ def test_frequencies_of_spectral_peaks_carry_their_bias() -> None:
     assert found["frequency_2"].deviation < 2.0 * bias
 
 
-def _mean_of_values(values: list[float], errors: list[float]) -> tuple[float, float]:
+def _mean_of_values(values, errors):
     """Return mean and standard error of trials whose fits give these frequencies and standard errors."""
     pairs = zip(values, errors, strict=True)
     modes = [SimpleNamespace(frequency=value, standard_error={"frequency": error}) for value, error in pairs]
     return _mean_of(cast(list[RingDownMode], modes), "frequency")
 
 
-def test_mean_over_trials() -> None:
+def test_mean_over_trials():
     mean, error = _mean_of_values([1.0, 1.1, 0.9, 1.05, 0.95], [0.1] * 5)  # scatter as expected
     assert (mean, error) == (pytest.approx(1.0), pytest.approx(0.1 / math.sqrt(5.0)))
     _, error = _mean_of_values([1.0, 1.1, 0.9, 1.05, 0.95], [1e-3] * 5)  # scatter beyond the fits' errors
@@ -106,7 +99,7 @@ def test_mean_over_trials() -> None:
     assert _mean_of_values([1.0, 2.0], [1e-3, 1e-3])[1] == pytest.approx(1.0)
 
 
-def test_the_published_records(reference: Path) -> None:
+def test_the_published_records(reference):
     found = measured_modes(fit_trials(read_records(reference)))
     for read, published in zip(found, PUBLISHED_MODES, strict=True):
         assert read.deviation == pytest.approx(published.deviation, rel=0.02), read.name

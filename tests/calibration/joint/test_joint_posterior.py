@@ -1,11 +1,7 @@
 """The joint posterior: enumeration and an independent sampler as oracles, limits, calibration, bad input."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,19 +10,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from calibration.errors import (
-    CalibrationError,
-    ExperimentDataError,
-    OutsideValidityError,
-    PosteriorError,
-)
-from calibration.joint.inference import Draws, infer
+from calibration.errors import CalibrationError, ExperimentDataError, OutsideValidityError, PosteriorError
+from calibration.joint.inference import infer
 from calibration.joint.measurement import PUBLISHED_MODES, modal_readings
 from calibration.joint.posterior import joint_posterior as joint_posterior_of
 from calibration.joint.wing_table import MODEL_ERROR, WingTable, tabulate_wing, weighed, wing_priors
-from calibration.result.record import STATE, ParameterPrior, Reading, prior_samples
+from calibration.result.record import STATE, ParameterPrior, prior_samples
 from calibration.static.errors_in_variables import exact_posterior
-from calibration.static.experiments import LoadDisplacementData, published_measurements
+from calibration.static.experiments import published_measurements
 from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of, stiffness_line
 from fe.runtime.modal_system import rayleigh_damping_ratio
 
@@ -44,9 +35,7 @@ MODAL = PUBLISHED_MODES
 TOTAL = weighed()
 
 
-def modes(
-    value: Mapping[str, float] | None = None, deviation: Mapping[str, float] | None = None
-) -> tuple[Reading, ...]:
+def modes(value=None, deviation=None):
     """The published modes, some of their values and deviations changed."""
     value, deviation = value or {}, deviation or {}
     return modal_readings(
@@ -55,23 +44,16 @@ def modes(
     )
 
 
-def joint_posterior(
-    wing: WingTable,
-    static: LoadDisplacementData,
-    modal: tuple[Reading, ...],
-    *,
-    total_mass: Reading = TOTAL,
-    **given: Any,
-) -> Draws:
+def joint_posterior(wing, static, modal, *, total_mass=TOTAL, **given):
     return joint_posterior_of(wing, static, (total_mass, *modal), **given)
 
 
-def line_frequency(quantities: FloatArray) -> FloatArray:
+def line_frequency(quantities):
     """Frequencies (N, 2) [Hz] of a wing whose logarithms are linear."""
     return np.exp(AT_CENTRE + (quantities - CENTRE) @ SLOPE)
 
 
-def line_table() -> WingTable:
+def line_table():
     """The same wing as tables; the polynomial is exact."""
     half = 0.5 * np.diff(LIMITS, axis=1)[:, 0]
     middle = LIMITS.mean(axis=1)
@@ -83,11 +65,11 @@ def line_table() -> WingTable:
 
 
 @pytest.fixture(scope="module")
-def tables() -> WingTable:
+def tables():
     return line_table()
 
 
-def log_posterior(unknown: FloatArray, prior: Priors, modal: tuple[Reading, ...]) -> FloatArray:
+def log_posterior(unknown, prior, modal):
     """Log of the joint density of e, masses, alpha, beta and both model errors, written with scipy.stats."""
     e, servo, pitot, alpha, beta, *errors = unknown.T
     inside = np.all((unknown[:, :3] >= LIMITS[:, 0]) & (unknown[:, :3] <= LIMITS[:, 1]), axis=1)
@@ -114,7 +96,7 @@ def log_posterior(unknown: FloatArray, prior: Priors, modal: tuple[Reading, ...]
     return np.asarray(total)
 
 
-def stretch_sampler(prior: Priors, modal: tuple[Reading, ...], steps: int) -> FloatArray:
+def stretch_sampler(prior, modal, steps):
     """Sample all seven unknowns by the affine-invariant stretch move (Goodman and Weare 2010)."""
     generator = np.random.default_rng(7)
     half, size = 120, 7
@@ -147,7 +129,7 @@ def stretch_sampler(prior: Priors, modal: tuple[Reading, ...], steps: int) -> Fl
 
 
 @pytest.mark.long
-def test_an_independent_sampler_finds_the_same(tables: WingTable) -> None:
+def test_an_independent_sampler_finds_the_same(tables):
     # Ratios that leave little for alpha: the cut at zero matters.
     modal = modal_readings(
         (MODAL[0].value, MODAL[1].value, 0.02, 0.08), (MODAL[0].deviation, MODAL[1].deviation, 0.004, 0.008)
@@ -170,7 +152,7 @@ def test_an_independent_sampler_finds_the_same(tables: WingTable) -> None:
     )
 
 
-def test_enumeration_finds_mean_deviation_and_evidence(tables: WingTable) -> None:
+def test_enumeration_finds_mean_deviation_and_evidence(tables):
     # Damping priors far from zero, so that alpha and beta integrate in closed form.
     prior = wing_priors(VALIDITY, damping_alpha=(2.0, 0.3), damping_beta=(8e-4, 1e-4))
     result = joint_posterior(tables, STATIC, MODAL, priors=prior, count=2000)
@@ -218,7 +200,7 @@ def test_enumeration_finds_mean_deviation_and_evidence(tables: WingTable) -> Non
     np.testing.assert_allclose(result.standard_deviation[:3], deviation, rtol=0.02)
 
 
-def test_the_papers_posterior_is_the_limit_without_uncertainty(tables: WingTable) -> None:
+def test_the_papers_posterior_is_the_limit_without_uncertainty(tables):
     """With f1, the ratios and the total exact, and f2 left out, masses follow e as in the paper."""
     exact = modal_readings([item.value for item in MODAL], (1e-5, 1.0, 1e-6, 1e-6))
     result = joint_posterior(
@@ -243,7 +225,7 @@ def test_the_papers_posterior_is_the_limit_without_uncertainty(tables: WingTable
         np.testing.assert_allclose(ratio, [item.value for item in MODAL[2:]], atol=1e-5)
 
 
-def test_samples_repeat_and_follow_the_seed(tables: WingTable) -> None:
+def test_samples_repeat_and_follow_the_seed(tables):
     one, two = (joint_posterior(tables, STATIC, MODAL, seed=3, count=200) for _ in range(2))
     other = joint_posterior(tables, STATIC, MODAL, seed=4, count=200)
     assert one.samples.tobytes() == two.samples.tobytes()
@@ -251,7 +233,7 @@ def test_samples_repeat_and_follow_the_seed(tables: WingTable) -> None:
     assert one.samples.shape == (200, 5)
 
 
-def test_prior_samples_are_the_prior() -> None:
+def test_prior_samples_are_the_prior():
     drawn = prior_samples(PRIORS, 20_000, 1)
     assert drawn[:, 0].mean() == pytest.approx(1.0, abs=1e-3)
     assert drawn[:, 0].std() == pytest.approx(0.05 / 1.96, rel=0.02)
@@ -260,9 +242,7 @@ def test_prior_samples_are_the_prior() -> None:
     assert np.all((drawn[:, :3] >= LIMITS[:, 0]) & (drawn[:, :3] <= LIMITS[:, 1]))
 
 
-def simulate(
-    generator: np.random.Generator, prior: Priors, model_error: tuple[float, float]
-) -> tuple[FloatArray, tuple[Reading, ...], Reading, FloatArray]:
+def simulate(generator, prior, model_error):
     """Draw a wing from the prior and measure it with Gaussian errors; the last are its displacements [m]."""
     truth = prior_samples(prior, 1, int(generator.integers(2**32)))[0]
     frequency = line_frequency(truth[None, :3])[0]
@@ -277,7 +257,7 @@ def simulate(
 
 
 @pytest.mark.long
-def test_the_truth_has_a_uniform_rank_among_the_samples(tables: WingTable) -> None:
+def test_the_truth_has_a_uniform_rank_among_the_samples(tables):
     """Simulation-based calibration: wings from the prior, with the assumed model error."""
     generator = np.random.default_rng(2021)
     prior = wing_priors(VALIDITY, damping_alpha=(1.0, 0.5), damping_beta=(7e-4, 3e-4))
@@ -305,7 +285,7 @@ def test_the_truth_has_a_uniform_rank_among_the_samples(tables: WingTable) -> No
         assert stats.chisquare(counted).pvalue > 1e-3, STATE[place]
 
 
-def test_model_error_is_what_it_says(tables: WingTable) -> None:
+def test_model_error_is_what_it_says(tables):
     """Without model error f2 drags the masses along; with it, f2 is left to miss by 4.5 %."""
     sharp = modes(deviation={"frequency_1": 0.001, "frequency_2": 0.03})
     allowed = joint_posterior(tables, STATIC, sharp)
@@ -326,9 +306,7 @@ def test_model_error_is_what_it_says(tables: WingTable) -> None:
     error=st.floats(1e-4, 0.2),
     total=st.floats(0.2, 0.7),
 )
-def test_every_measurement_gives_a_posterior_or_a_clear_refusal(
-    first: float, ratio: float, zeta: float, error: float, total: float
-) -> None:
+def test_every_measurement_gives_a_posterior_or_a_clear_refusal(first, ratio, zeta, error, total):
     modal = modal_readings(
         (first, first * ratio, zeta, 0.05), (error * first, error * first * ratio, 0.2 * zeta, 0.01)
     )
@@ -366,9 +344,7 @@ def test_every_measurement_gives_a_posterior_or_a_clear_refusal(
         ),
     ],
 )
-def test_refusals(
-    tables: WingTable, changed: dict[str, Any], kind: type[CalibrationError], sentence: str
-) -> None:
+def test_refusals(tables, changed, kind, sentence):
     with pytest.raises(kind, match=sentence):
         joint_posterior(tables, **{"static": STATIC, "modal": MODAL, **changed})
 
@@ -382,17 +358,17 @@ def test_refusals(
         ({}, {"damping_ratio_1": 0.0}, "damping_ratio_1 and its standard deviation"),
     ],
 )
-def test_readings_that_cannot_be(value: dict[str, float], deviation: dict[str, float], sentence: str) -> None:
+def test_readings_that_cannot_be(value, deviation, sentence):
     with pytest.raises(ExperimentDataError, match=sentence):
         modes(value, deviation)
 
 
-def test_a_table_is_asked_within_its_limits_alone(tables: WingTable) -> None:
+def test_a_table_is_asked_within_its_limits_alone(tables):
     with pytest.raises(OutsideValidityError, match=r"mass of each servo is 0\.4 kg, .* 0\.05 to 0\.3 kg"):
         tables.frequency([[1.0, 0.4, 0.1]])
 
 
-def test_any_model_is_inferred() -> None:
+def test_any_model_is_inferred():
     """Two lines through one point: the posterior of a linear model is the Gaussian of its closed form."""
     priors = tuple(ParameterPrior(name, "1", 1.0, 2.0, -50.0, 50.0, "here") for name in "ab")
     design, read, spread = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-4]]), np.array([3.0, 3.0002]), 1e-5
@@ -409,7 +385,7 @@ def test_any_model_is_inferred() -> None:
 
 
 @pytest.mark.slow
-def test_our_wing() -> None:
+def test_our_wing():
     from fe.reduction.model_cache import reduced_model
 
     model = reduced_model()

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from calibration.paper.figures import calibration_figure
-from calibration.paper.load_test import StaticCalibration, calibrate_static
+from calibration.paper.load_test import calibrate_static
 from calibration.static.errors_in_variables import assess_fit
 from calibration.static.experiments import published_measurements
 from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of, stiffness_line
@@ -16,11 +16,11 @@ COUNT = 40_000
 
 
 @pytest.fixture(scope="module")
-def result() -> StaticCalibration:
+def result():
     return calibrate_static(seed=3, particle_count=COUNT)
 
 
-def model(young_modulus_factor: float) -> float:
+def model(young_modulus_factor):
     """A structural model near the published line."""
     return 1.0 / (1.0 / (640.0 * young_modulus_factor + 100.0) + 1.0 / 8500.0)
 

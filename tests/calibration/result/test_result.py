@@ -1,10 +1,7 @@
 """The record of a whole calibration and its file: what it gives back, and what is no such file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +16,7 @@ from calibration.result.record import Calibration
 MakeCalibration = Callable[..., Calibration]
 
 
-def test_what_it_gives(make_calibration: MakeCalibration) -> None:
+def test_what_it_gives(make_calibration):
     result = make_calibration()
     assert result.draws_of("servo_mass").tolist() == result.samples[:, 1].tolist()
     assert result.draws_of("tip_stiffness").tolist() == result.samples[:, 5].tolist()
@@ -41,9 +38,7 @@ def test_what_it_gives(make_calibration: MakeCalibration) -> None:
 
 
 @given(count=st.integers(1, 60), seed=st.integers(0, 5))
-def test_stratified_draws_take_one_sample_from_each_stratum(
-    make_calibration: MakeCalibration, count: int, seed: int
-) -> None:
+def test_stratified_draws_take_one_sample_from_each_stratum(make_calibration, count, seed):
     """As many draws as samples are all samples, shuffled; fewer are one of each group of neighbours."""
     result = make_calibration(count=60)
     draws = result.stratified_draws("young_modulus_factor", count, seed)
@@ -57,14 +52,14 @@ def test_stratified_draws_take_one_sample_from_each_stratum(
     np.testing.assert_array_equal(draws, result.stratified_draws("young_modulus_factor", count, seed))
 
 
-def test_more_draws_than_samples_keep_their_shares(make_calibration: MakeCalibration) -> None:
+def test_more_draws_than_samples_keep_their_shares(make_calibration):
     result = make_calibration(count=4)
     values, times = np.unique(result.stratified_draws("servo_mass", 400, 0), return_counts=True)
     np.testing.assert_array_equal(values, np.sort(result.samples[:, 1]))
     assert times.tolist() == [100, 100, 100, 100]
 
 
-def test_readings_are_judged_by_the_deviations_of_both(make_calibration: MakeCalibration) -> None:
+def test_readings_are_judged_by_the_deviations_of_both(make_calibration):
     """And the error of an experiment is in half-widths of its readings, as the paper's reward has it."""
     result = make_calibration()
     (reading,) = result.readings
@@ -76,7 +71,7 @@ def test_readings_are_judged_by_the_deviations_of_both(make_calibration: MakeCal
     assert result.error("load test", prior=True) == pytest.approx(-abs(before) / (1.96 * 6.5))
 
 
-def test_figures_that_follow_one_another_have_no_information(make_calibration: MakeCalibration) -> None:
+def test_figures_that_follow_one_another_have_no_information(make_calibration):
     """Else it is that of Gaussians: KL(N(m, s^2) | N(0, 1)) = (s^2 + m^2 - 1) / 2 - ln s for each of them."""
     made = make_calibration(count=4000)
     result = replace(made, priors=made.priors[:2], quantities=(), samples=made.samples[:, :2],
@@ -86,7 +81,7 @@ def test_figures_that_follow_one_another_have_no_information(make_calibration: M
     assert replace(result, samples=line).information is None
 
 
-def test_the_file_gives_back_everything(tmp_path: Path, make_calibration: MakeCalibration) -> None:
+def test_the_file_gives_back_everything(tmp_path, make_calibration):
     result = make_calibration()
     path = save_calibration(result, tmp_path / "deep" / "calibration.nc")
     found = load_calibration(path)
@@ -102,7 +97,7 @@ def test_the_file_gives_back_everything(tmp_path: Path, make_calibration: MakeCa
     assert result_bytes(replace(result, seed=6)) != result_bytes(result)
 
 
-def test_the_file_has_the_layout_of_arviz(tmp_path: Path, make_calibration: MakeCalibration) -> None:
+def test_the_file_has_the_layout_of_arviz(tmp_path, make_calibration):
     result = make_calibration()
     path = save_calibration(result, tmp_path / "c.nc")
     with xr.open_datatree(path, engine="h5netcdf") as tree:
@@ -121,9 +116,7 @@ def test_the_file_has_the_layout_of_arviz(tmp_path: Path, make_calibration: Make
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.9, 0.999])
-def test_a_file_cut_off_is_one_sentence(
-    tmp_path: Path, share: float, make_calibration: MakeCalibration
-) -> None:
+def test_a_file_cut_off_is_one_sentence(tmp_path, share, make_calibration):
     content = result_bytes(make_calibration())
     path = tmp_path / "c.nc"
     path.write_bytes(content[: int(share * len(content))])
@@ -131,7 +124,7 @@ def test_a_file_cut_off_is_one_sentence(
         load_calibration(path)
 
 
-def test_a_flipped_bit_never_passes(tmp_path: Path, make_calibration: MakeCalibration) -> None:
+def test_a_flipped_bit_never_passes(tmp_path, make_calibration):
     """A flip is refused, or lies in bytes that mean nothing; it never gives another calibration."""
     content = result_bytes(make_calibration())
     refused = 0
@@ -149,7 +142,7 @@ def test_a_flipped_bit_never_passes(tmp_path: Path, make_calibration: MakeCalibr
     assert refused > 5
 
 
-def test_other_files_are_told(tmp_path: Path) -> None:
+def test_other_files_are_told(tmp_path):
     with pytest.raises(CalibrationRecordError, match="is not there; give the calibration"):
         load_calibration(tmp_path / "no.nc")
     with pytest.raises(CalibrationRecordError, match="is no file"):
@@ -168,7 +161,7 @@ def test_other_files_are_told(tmp_path: Path) -> None:
         load_calibration(older)
 
 
-def test_a_changed_design_does_not_pass(tmp_path: Path, make_calibration: MakeCalibration) -> None:
+def test_a_changed_design_does_not_pass(tmp_path, make_calibration):
     path = save_calibration(make_calibration(), tmp_path / "c.nc")
     with xr.open_datatree(path, engine="h5netcdf") as tree:
         tree.load()
@@ -191,8 +184,6 @@ def test_a_changed_design_does_not_pass(tmp_path: Path, make_calibration: MakeCa
         ({"samples": np.ones((0, 11))}, "shape"),
     ],
 )
-def test_what_is_no_calibration(
-    change: dict[str, object], message: str, make_calibration: MakeCalibration
-) -> None:
+def test_what_is_no_calibration(change, message, make_calibration):
     with pytest.raises(CalibrationRecordError, match=message):
-        replace(make_calibration(), **change)  # type: ignore[arg-type]
+        replace(make_calibration(), **change)

@@ -9,11 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal, norm
 
 from calibration.errors import OutsideValidityError, PosteriorError
-from calibration.static.errors_in_variables import (
-    exact_posterior,
-    log_likelihood,
-    pair_log_likelihoods,
-)
+from calibration.static.errors_in_variables import exact_posterior, log_likelihood, pair_log_likelihoods
 from calibration.static.experiments import LoadDisplacementData, published_measurements
 from calibration.static.posterior import GaussianPrior
 from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_line

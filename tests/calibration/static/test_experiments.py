@@ -1,7 +1,6 @@
 """Reading load-displacement measurements, and one clear sentence for each thing wrong with them."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,14 +16,14 @@ from calibration.static.experiments import (
 PAIRS = np.array([[2.4525, 3.937], [4.905, 7.6962], [7.3575, 10.8712], [2.4525, 3.3528], [4.905, 7.2898]])
 
 
-def write(folder: Path, text: str) -> Path:
+def write(folder, text):
     file = folder / "step2" / "load_displacement_measurements.csv"
     file.parent.mkdir(exist_ok=True, parents=True)
     file.write_text(text, encoding="utf-8")
     return folder
 
 
-def table(pairs: np.ndarray, header: str = "load,displacement") -> str:
+def table(pairs, header="load,displacement"):
     return "\n".join([header, *(f"{load:.10g},{displacement:.10g}" for load, displacement in pairs)]) + "\n"
 
 

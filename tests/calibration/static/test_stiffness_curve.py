@@ -21,10 +21,10 @@ RANGE = (0.9, 1.1)
 class Springs:
     """A skin spring in parallel with another, both on a root spring: a smooth curve that is no line."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.calls = 0
 
-    def tip_stiffness(self, young_modulus_factor: float) -> float:
+    def tip_stiffness(self, young_modulus_factor):
         self.calls += 1
         return 1.0 / (1.0 / (640.0 * young_modulus_factor + 100.0) + 1.0 / 8000.0)
 
@@ -71,7 +71,7 @@ def test_bad_curves_are_refused():
 
 
 def test_a_model_too_rough_to_tabulate_is_refused():
-    def stairs(young_modulus_factor: float) -> float:
+    def stairs(young_modulus_factor):
         return 600.0 + 100.0 * young_modulus_factor + 5.0 * math.floor(70.0 * young_modulus_factor)
 
     with pytest.raises(PosteriorError, match="too rough"):

@@ -1,7 +1,5 @@
 """Statistics of residuals against oracles: exact sums, levels under white noise, power of the weights."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -19,7 +17,7 @@ from discrepancy.campaign.noise_tests import (
 )
 
 
-def test_periodogram_of_a_cosine_and_of_white_noise() -> None:
+def test_periodogram_of_a_cosine_and_of_white_noise():
     count = 101
     series = np.cos(2.0 * np.pi * 7 * np.arange(count) / count)
     ordinates = periodogram(series)
@@ -32,7 +30,7 @@ def test_periodogram_of_a_cosine_and_of_white_noise() -> None:
 
 
 @pytest.mark.parametrize("count", [64, 301])
-def test_p_values_of_serial_tests_are_uniform_under_white_noise(count: int) -> None:
+def test_p_values_of_serial_tests_are_uniform_under_white_noise(count):
     noise = np.random.default_rng(count).standard_normal((1500, count))
     for test in (ljung_box, cumulative_periodogram, fisher_g):
         p = np.array([test(row)[1] for row in noise])
@@ -41,7 +39,7 @@ def test_p_values_of_serial_tests_are_uniform_under_white_noise(count: int) -> N
             assert np.mean(p <= level) == pytest.approx(level, abs=4.0 * error), (test.__name__, level)
 
 
-def test_fisher_g_against_his_exact_sum() -> None:
+def test_fisher_g_against_his_exact_sum():
     from math import comb
 
     series = np.random.default_rng(2).standard_normal(41) + 1.1 * np.cos(0.9 * np.arange(41))
@@ -53,7 +51,7 @@ def test_fisher_g_against_his_exact_sum() -> None:
     assert p == pytest.approx(exact, rel=0.02)
 
 
-def test_serial_tests_see_what_they_are_for() -> None:
+def test_serial_tests_see_what_they_are_for():
     generator = np.random.default_rng(4)
     noise = generator.standard_normal(400)
     correlated = np.empty(400)
@@ -68,7 +66,7 @@ def test_serial_tests_see_what_they_are_for() -> None:
     assert share == pytest.approx(0.18 / 1.18, rel=0.5)
 
 
-def test_holm_and_benjamini_yekutieli_by_hand() -> None:
+def test_holm_and_benjamini_yekutieli_by_hand():
     assert holm([0.004, 0.011, 0.03, np.nan], 0.03) == (True, True, True, False)
     assert holm([0.011, 0.02, 0.03], 0.03) == (False, False, False)
     assert holm([], 0.01) == ()
@@ -80,7 +78,7 @@ def test_holm_and_benjamini_yekutieli_by_hand() -> None:
     assert benjamini_yekutieli(np.zeros(0), 0.05).size == 0
 
 
-def test_combined_p_values_are_valid() -> None:
+def test_combined_p_values_are_valid():
     p = np.random.default_rng(8).uniform(size=(4000, 7))
     combined = np.array([combine(row) for row in p])
     for level in (0.1, 0.01):
@@ -88,7 +86,7 @@ def test_combined_p_values_are_valid() -> None:
     assert combine([0.3]) == 0.3
 
 
-def test_ljung_box_allows_for_samples_that_do_not_count() -> None:
+def test_ljung_box_allows_for_samples_that_do_not_count():
     """A third is left out, in blocks and singly: levels hold, and its value there does not matter."""
     generator = np.random.default_rng(12)
     used = np.ones(150, dtype=bool)
@@ -106,7 +104,7 @@ def test_ljung_box_allows_for_samples_that_do_not_count() -> None:
     assert ljung_box(again, used=every)[0] == pytest.approx(ljung_box(again)[0], rel=1e-12)
 
 
-def test_weights_of_the_pooled_variance_have_the_most_power() -> None:
+def test_weights_of_the_pooled_variance_have_the_most_power():
     """A gap that raises all channels alike is found more often than with any simpler weights.
 
     Channels of a short record, of few readings and of many: what tells most is neither the most readings
@@ -118,7 +116,7 @@ def test_weights_of_the_pooled_variance_have_the_most_power() -> None:
     draws, gap, level = 2000, 0.35, 1e-3
     noise = np.where(np.isinf(record), 1.0, generator.chisquare(np.minimum(record, 1e6), (draws, 7)) / record)
 
-    def p_values(size: float) -> np.ndarray:
+    def p_values(size):
         squares = size * generator.chisquare(freedom, (draws, 7)) / freedom / noise
         return np.array(
             [
@@ -127,7 +125,7 @@ def test_weights_of_the_pooled_variance_have_the_most_power() -> None:
             ]
         )
 
-    def share(p: np.ndarray, weights: np.ndarray) -> float:
+    def share(p, weights):
         scores = stats.norm.isf(np.clip(p, 1e-300, 1.0 - 1e-16)) @ weights / np.sqrt(weights @ weights)
         return float(np.mean(stats.norm.sf(scores) < level))
 

@@ -1,10 +1,7 @@
 """Every effect on a real model: what it changes, what it does not, over its whole prior."""
 
-from __future__ import annotations
-
 import json
 import pickle
-from collections.abc import Mapping
 from dataclasses import replace
 from math import pi
 
@@ -15,8 +12,8 @@ from hypothesis import strategies as st
 
 from benchmarks.cantilever import LENGTH, Cantilever
 from benchmarks.effect_pictures import FLOWS
-from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
-from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Effect, Prior, Setting
+from discrepancy.campaign.records import Quantity, TrialKind
+from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
 from discrepancy.catalogue.library import library
 from discrepancy.catalogue.needs import mains_lines
 from discrepancy.catalogue.scales import loss_integral
@@ -30,7 +27,6 @@ from fe.runtime.patch import (
     ModelPatch,
     PointMass,
     PowerStiffness,
-    Primitive,
     RunOffset,
     SensorDrift,
     StiffnessDrift,
@@ -46,22 +42,22 @@ VANISHING = pytest.mark.parametrize(
 EFFECTS = pytest.mark.parametrize("effect", BEAM, ids=lambda effect: effect.identifier)
 
 
-def medians(effect: Effect) -> dict[str, float]:
+def medians(effect):
     """Prior medians; one deviation above zero where the median is no effect."""
     return {item.name: item.prior.value(0.0) or item.prior.value(1.0) for item in effect.parameters}
 
 
-def shown(setting: Setting, trial: Trial, patch: ModelPatch, campaign: Campaign | None = None) -> np.ndarray:
+def shown(setting, trial, patch, campaign=None):
     return observe(setting.model, campaign or setting.campaign, trial, patch, Conditions(np.ones(1))).values
 
 
-def only(setting: Setting, effect: Effect, values: Mapping[str, float], place: str) -> Primitive:
+def only(setting, effect, values, place):
     (primitive,) = effect.patch(setting, values, place)
     return primitive
 
 
 @EFFECTS
-def test_it_changes_the_trials_that_it_acts_on_and_no_other(effect: Effect, setting: Setting) -> None:
+def test_it_changes_the_trials_that_it_acts_on_and_no_other(effect, setting):
     assert effect.unavailable(setting) is None
     touched, places = set(), effect.places(setting)
     assert len(set(places)) == len(places) > 0
@@ -83,7 +79,7 @@ def test_it_changes_the_trials_that_it_acts_on_and_no_other(effect: Effect, sett
 
 
 @VANISHING
-def test_without_magnitude_nothing_changes(effect: Effect, setting: Setting) -> None:
+def test_without_magnitude_nothing_changes(effect, setting):
     values = {item.name: 0.0 if item.magnitude else medians(effect)[item.name] for item in effect.parameters}
     for place in effect.places(setting):
         patch = effect.patch(setting, values, place)
@@ -93,7 +89,7 @@ def test_without_magnitude_nothing_changes(effect: Effect, setting: Setting) -> 
 
 
 @VANISHING
-def test_a_small_magnitude_changes_little(effect: Effect, setting: Setting) -> None:
+def test_a_small_magnitude_changes_little(effect, setting):
     """Continuous at zero: no step between no effect and a small one."""
     middle = medians(effect)
     small = {item.name: middle[item.name] * (1e-7 if item.magnitude else 1.0) for item in effect.parameters}
@@ -107,7 +103,7 @@ def test_a_small_magnitude_changes_little(effect: Effect, setting: Setting) -> N
 @EFFECTS
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_it_builds_over_its_whole_prior(effect: Effect, setting: Setting, data: st.DataObject) -> None:
+def test_it_builds_over_its_whole_prior(effect, setting, data):
     items = (*effect.parameters, *effect.shape)
     values = {item.name: item.prior.value(data.draw(st.floats(-6.0, 6.0))) for item in items}
     place = data.draw(st.sampled_from(effect.places(setting)))
@@ -125,7 +121,7 @@ def test_it_builds_over_its_whole_prior(effect: Effect, setting: Setting, data: 
 
 
 @EFFECTS
-def test_its_shape_is_free_around_the_canonical_one(effect: Effect, setting: Setting) -> None:
+def test_its_shape_is_free_around_the_canonical_one(effect, setting):
     place = effect.places(setting)[0]
     named = effect.patch(setting, medians(effect), place)
     assert effect.patch(setting, {**medians(effect), **effect.canonical_shape()}, place) == named
@@ -136,20 +132,20 @@ def test_its_shape_is_free_around_the_canonical_one(effect: Effect, setting: Set
 
 
 @EFFECTS
-def test_priors_are_inverted(effect: Effect) -> None:
+def test_priors_are_inverted(effect):
     for item in (*effect.parameters, *effect.shape):
         for u in (-2.0, -0.3, 0.0, 1.5):
             assert item.prior.normal(item.prior.value(u)) == pytest.approx(u, abs=1e-9)
 
 
 @EFFECTS
-def test_it_can_be_sent_to_another_process(effect: Effect, setting: Setting) -> None:
+def test_it_can_be_sent_to_another_process(effect, setting):
     copy = pickle.loads(pickle.dumps(effect))
     place = effect.places(setting)[-1]
     assert copy.patch(setting, medians(effect), place) == effect.patch(setting, medians(effect), place)
 
 
-def test_all_but_the_filter_vanish_with_a_magnitude(setting: Setting) -> None:
+def test_all_but_the_filter_vanish_with_a_magnitude(setting):
     """However low its corner is, a filter that had settled takes off the value before a release."""
     (other,) = [effect for effect in library() if not any(item.magnitude for item in effect.parameters)]
     assert other.identifier == "high_pass"
@@ -162,18 +158,18 @@ def test_all_but_the_filter_vanish_with_a_magnitude(setting: Setting) -> None:
 # ---------------------------------------------------------------- the numbers mean what they say
 
 
-def by_name(identifier: str) -> Effect:
+def by_name(identifier):
     return next(effect for effect in library() if effect.identifier == identifier)
 
 
 @pytest.mark.parametrize(("p", "a"), [(0.0, 0.0), (0.0, 1.0), (2.0, 0.0), (1.3, 0.7)])
-def test_the_loss_of_a_cycle(p: float, a: float) -> None:
+def test_the_loss_of_a_cycle(p, a):
     angle = (np.arange(400_000) + 0.5) * 2.0 * pi / 400_000
     loss = np.mean(np.abs(np.cos(angle)) ** (p + 1.0) * np.abs(np.sin(angle)) ** a) * 2.0 * pi
     assert loss == pytest.approx(2.0 * loss_integral(p, a), rel=1e-5)
 
 
-def test_sizes_in_closed_form(setting: Setting) -> None:
+def test_sizes_in_closed_form(setting):
     scales, root, span = setting.scales, setting.scales.ports["root"], setting.scales.ports["span"]
     k, A, w = span.stiffness, span.displacement, span.angular_frequency
     drag = only(setting, by_name("quadratic_damping"), {"equivalent_damping_ratio": 0.01}, "span")
@@ -220,9 +216,7 @@ def test_sizes_in_closed_form(setting: Setting) -> None:
         ("structural_damping", {"loss_factor": 0.01}, "tip", lambda share: 0.01 / pi),
     ],
 )
-def test_a_ringdown_is_damped_as_the_equivalent_ratio_says(
-    setting: Setting, identifier: str, values: dict[str, float], port: str, ratio: object
-) -> None:
+def test_a_ringdown_is_damped_as_the_equivalent_ratio_says(setting, identifier, values, port, ratio):
     """The logarithmic decrement of the first cycles, less that of the model itself."""
     trial = next(item for item in setting.campaign.trials if item.name == "half")
     column = trial.channels.index("tip")
@@ -237,10 +231,10 @@ def test_a_ringdown_is_damped_as_the_equivalent_ratio_says(
         decrement.append((np.log(peaks[1] / peaks[5]) / (4 * 2.0 * pi), np.sqrt(peaks[1] * peaks[5])))
     (plain, _), (damped, size) = decrement
     share = size / setting.scales.ports[port].displacement
-    assert damped - plain == pytest.approx(ratio(share), rel=0.08)  # type: ignore[operator]
+    assert damped - plain == pytest.approx(ratio(share), rel=0.08)
 
 
-def test_the_root_adds_its_share_to_the_tip_compliance(setting: Setting) -> None:
+def test_the_root_adds_its_share_to_the_tip_compliance(setting):
     spring = only(setting, by_name("root_compliance"), {"compliance_share": 0.1}, "")
     assert spring.compliance * LENGTH**2 * setting.scales.tip_stiffness == pytest.approx(0.1)
     trial = replace(setting.campaign.trials[0], load_place=(LENGTH, 0.25))
@@ -250,7 +244,7 @@ def test_the_root_adds_its_share_to_the_tip_compliance(setting: Setting) -> None
     np.testing.assert_allclose(np.delete(ratio, column, axis=1), 1.0, rtol=1e-9)  # strain as before
 
 
-def test_a_mass_lowers_the_frequency_as_rayleigh_says(setting: Setting) -> None:
+def test_a_mass_lowers_the_frequency_as_rayleigh_says(setting):
     model = Cantilever()
     mass = only(setting, by_name("point_mass"), {"mass_ratio": 0.01, "station_ratio": 1.0}, "")
     trial = setting.campaign.trials[3]
@@ -264,7 +258,7 @@ def test_a_mass_lowers_the_frequency_as_rayleigh_says(setting: Setting) -> None:
     assert peaks[1] / peaks[0] == pytest.approx(1.0 - 0.005, abs=2e-4)
 
 
-def test_a_crack_opens_on_one_side_only(setting: Setting) -> None:
+def test_a_crack_opens_on_one_side_only(setting):
     up, down = setting.campaign.trials[:2]
     for skin, open_in, closed_in in (("lower", up, down), ("upper", down, up)):
         patch = by_name("breathing_crack").patch(setting, {"stiffness_loss": 0.3}, f"root, {skin} skin")
@@ -286,7 +280,7 @@ def test_a_crack_opens_on_one_side_only(setting: Setting) -> None:
         (10.0, ()),
     ],
 )
-def test_lines_that_a_sampling_rate_can_show(setting: Setting, rate: float, lines: tuple[str, ...]) -> None:
+def test_lines_that_a_sampling_rate_can_show(setting, rate, lines):
     trial = next(item for item in setting.campaign.trials if item.name == "release")
     resampled = replace(trial, time=np.arange(len(trial.time)) / rate)
     given = replace(setting, campaign=replace(setting.campaign, trials=(resampled,)))
@@ -295,7 +289,7 @@ def test_lines_that_a_sampling_rate_can_show(setting: Setting, rate: float, line
     assert (hum.unavailable(given) is None) == bool(lines)
 
 
-def test_hum_on_all_channels_of_a_quantity(setting: Setting) -> None:
+def test_hum_on_all_channels_of_a_quantity(setting):
     values = {"cosine_ratio": 0.01, "sine_ratio": 0.0, "frequency_error": 0.0}
     line = only(setting, by_name("mains_hum"), values, "50 Hz, all strain")
     assert (line.channel, line.quantity, line.frequency) == (EVERY_CHANNEL, "strain", 50.0)
@@ -307,19 +301,17 @@ def test_hum_on_all_channels_of_a_quantity(setting: Setting) -> None:
 class OutputsOnly(Cantilever):
     """The cantilever behind a door that shows neither its inside nor its ports."""
 
-    def supports(self, primitive: type[Primitive]) -> bool:
+    def supports(self, primitive):
         return False
 
-    def ports(self) -> tuple[str, ...]:
+    def ports(self):
         return ()
 
-    def stations(self) -> None:  # type: ignore[override]
+    def stations(self):
         return None
 
 
-def names_available(
-    setting: Setting, *kinds: TrialKind, model: Cantilever | None = None, **changes
-) -> set[str]:
+def names_available(setting, *kinds, model=None, **changes):
     """Return the effects that are offered without the trials of some kinds."""
     trials = tuple(trial for trial in setting.campaign.trials if trial.kind not in kinds)
     campaign = replace(setting.campaign, **{"trials": trials, **changes})
@@ -338,7 +330,7 @@ MOVING = {
 }  # fmt: skip
 
 
-def test_what_a_campaign_cannot_carry_is_not_offered(setting: Setting) -> None:
+def test_what_a_campaign_cannot_carry_is_not_offered(setting):
     static, released = TrialKind.STATIC, TrialKind.RINGDOWN
     given, forced, flight = setting.campaign, TrialKind.FORCED, TrialKind.FLIGHT
     assert (FORCED | FLOWN | MOVING | WARM | {"gauge_gain"}) <= names_available(setting)
@@ -358,7 +350,7 @@ def test_what_a_campaign_cannot_carry_is_not_offered(setting: Setting) -> None:
 
 
 @given(st.floats(-3.0, 3.0), st.floats(-2.0, 2.0))
-def test_steps_of_sizes_are_straight_in_the_value(u: float, step: float) -> None:
+def test_steps_of_sizes_are_straight_in_the_value(u, step):
     """What grows with a value is followed exactly; no step passes zero; other priors are straight already."""
     prior = Prior("log_normal", 0.01, 1.0)
     slope = (prior.value(u + 1e-6) - prior.value(u - 1e-6)) / 2e-6

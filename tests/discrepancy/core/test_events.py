@@ -1,9 +1,6 @@
 """What begins with an event of the campaign is named with it; a moment that is not known is fitted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,7 +43,7 @@ OWN = Inputs(__file__).text("late_friction.toml")
 
 
 @pytest.fixture(scope="module")
-def campaign() -> Campaign:
+def campaign():
     rng = np.random.default_rng(7)
     time = np.linspace(0.0, 8.0, 201)
     friction = PowerDamping("slide", 0.4, 0.0, 0.0, 1.0, 1.0)
@@ -75,7 +72,7 @@ def campaign() -> Campaign:
     return replace(base, trials=tuple(measured))
 
 
-def test_friction_that_begins_with_an_event_is_named_with_it(campaign: Campaign) -> None:
+def test_friction_that_begins_with_an_event_is_named_with_it(campaign):
     found = investigate(campaign, MODEL, [COULOMB], thorough=False).verdict
     assert found.kind is VerdictKind.NAMED
     (effect,) = found.effects
@@ -86,7 +83,7 @@ def test_friction_that_begins_with_an_event_is_named_with_it(campaign: Campaign)
     assert found.sentence.endswith("acts from 4.137 s on in 'first'; from 2.221 s on in 'second'.")
 
 
-def test_effects_that_cannot_be_switched_and_campaigns_without_events_give_none(campaign: Campaign) -> None:
+def test_effects_that_cannot_be_switched_and_campaigns_without_events_give_none(campaign):
     setting = Setting(campaign, MODEL, MODEL.scales(campaign))
     assert in_events(library(), replace(setting, campaign=replace(campaign, events=()))) == ()
     held_out = replace(campaign, events=campaign.events[1:])
@@ -96,7 +93,7 @@ def test_effects_that_cannot_be_switched_and_campaigns_without_events_give_none(
     assert not any(name.startswith(("clock_error", "point_mass", "high_pass")) for name in names)
 
 
-def test_a_moment_that_is_a_parameter_is_found_within_one_percent(campaign: Campaign, tmp_path: Path) -> None:
+def test_a_moment_that_is_a_parameter_is_found_within_one_percent(campaign, tmp_path):
     (tmp_path / "own.toml").write_text(OWN, encoding="utf-8")
     (effect,) = effects_of_file(tmp_path / "own.toml")
     fitted = replace(campaign, trials=campaign.trials[:1], events=())

@@ -1,7 +1,5 @@
 """What is read from noise records, against processes with known parameters."""
 
-from __future__ import annotations
-
 from math import inf
 
 import numpy as np
@@ -26,18 +24,18 @@ from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
 INTERVAL = 0.002
 
 
-def coloured(generator, coefficients, count, burn=2000):  # type: ignore[no-untyped-def]
+def coloured(generator, coefficients, count, burn=2000):
     white = generator.standard_normal(count + burn)
     return lfilter([1.0], np.r_[1.0, -np.asarray(coefficients)], white)[burn:]
 
 
-def channel(samples, interval=INTERVAL):  # type: ignore[no-untyped-def]
+def channel(samples, interval=INTERVAL):
     record = NoiseRecord(float(samples.std()), len(samples) - 1.0, samples, interval, "pre-trigger")
     return Channel("g", Quantity.STRAIN, "g", record)
 
 
 @pytest.mark.parametrize("coefficients", [(0.8,), (1.2, -0.6), (0.5, 0.0, 0.3)])
-def test_autoregression_is_recovered(coefficients: tuple[float, ...]) -> None:
+def test_autoregression_is_recovered(coefficients):
     """Yule-Walker estimates have standard errors of about 1/sqrt(N)."""
     found, innovation = autoregression(coloured(np.random.default_rng(1), coefficients, 8000))
     padded = np.zeros(max(len(found), len(coefficients)))
@@ -47,7 +45,7 @@ def test_autoregression_is_recovered(coefficients: tuple[float, ...]) -> None:
     assert innovation == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / 8000))
 
 
-def test_model_of_a_coloured_record() -> None:
+def test_model_of_a_coloured_record():
     samples = 3.0 * coloured(np.random.default_rng(2), (0.8,), 4000)
     noise = noise_model(channel(samples), 1.0)
     assert noise.standard_deviation == pytest.approx(3.0, rel=0.05)  # of the innovation
@@ -58,7 +56,7 @@ def test_model_of_a_coloured_record() -> None:
     np.testing.assert_array_equal(noise.whiten(samples, 2.0 * INTERVAL), samples)
 
 
-def test_white_records_stay_white() -> None:
+def test_white_records_stay_white():
     generator = np.random.default_rng(3)
     orders = [
         len(noise_model(channel(generator.standard_normal(400)), 1.0).autoregression) for _ in range(300)
@@ -67,7 +65,7 @@ def test_white_records_stay_white() -> None:
     assert np.count_nonzero(orders) <= binom.isf(1e-4, 300, 1e-3)
 
 
-def test_lines_are_found_where_they_are_and_taken_out() -> None:
+def test_lines_are_found_where_they_are_and_taken_out():
     generator = np.random.default_rng(6)
     time = INTERVAL * np.arange(1000)
     for frequency in (50.0, 60.0):
@@ -81,7 +79,7 @@ def test_lines_are_found_where_they_are_and_taken_out() -> None:
 
 
 @pytest.mark.parametrize("coefficients", [pytest.param((), marks=pytest.mark.long), (0.9,)])
-def test_lines_are_not_found_in_noise(coefficients: tuple[float, ...]) -> None:
+def test_lines_are_not_found_in_noise(coefficients):
     """Level 1e-4 a line against a level known from 20 neighbours: (1 + 9.2 / 20)^-20 = 5e-4, three lines."""
     generator = np.random.default_rng(7)
     found = sum(
@@ -91,7 +89,7 @@ def test_lines_are_not_found_in_noise(coefficients: tuple[float, ...]) -> None:
 
 
 @given(st.floats(0.0, 1e3), st.floats(1e-4, 1e-1))
-def test_aliases_agree_at_the_samples(frequency: float, interval: float) -> None:
+def test_aliases_agree_at_the_samples(frequency, interval):
     shown = aliased(frequency, interval)
     assert 0.0 <= shown <= 0.5 / interval * (1.0 + 1e-9)
     time = interval * np.arange(6)
@@ -100,7 +98,7 @@ def test_aliases_agree_at_the_samples(frequency: float, interval: float) -> None
     )
 
 
-def test_records_that_say_little() -> None:
+def test_records_that_say_little():
     """No record, a stated deviation, and a record too short for a spectrum."""
     none = noise_model(Channel("g", Quantity.STRAIN, "g", None), 0.7)
     assert none.degrees_of_freedom == 0.0
@@ -112,7 +110,7 @@ def test_records_that_say_little() -> None:
 
 
 @pytest.mark.parametrize("coefficients", [(0.9,), (1.2, -0.6), (0.5, 0.0, 0.3)])
-def test_whitening_is_that_of_the_whole_covariance(coefficients: tuple[float, ...]) -> None:
+def test_whitening_is_that_of_the_whole_covariance(coefficients):
     """Sum of squares of whitened samples = x' C^-1 x with the Toeplitz covariance of the process."""
     pulse = np.r_[1.0, np.zeros(3000)]
     impulse = lfilter([1.0], np.r_[1.0, -np.asarray(coefficients)], pulse)
@@ -125,7 +123,7 @@ def test_whitening_is_that_of_the_whole_covariance(coefficients: tuple[float, ..
 
 
 @pytest.mark.parametrize("share", [-0.8, -0.2, 0.5, 1.0])
-def test_lines_are_found_where_the_mains_are_off(share: float) -> None:
+def test_lines_are_found_where_the_mains_are_off(share):
     """A record of 8 s resolves 0.125 Hz, and 400 Hz may be off by 0.4 Hz."""
     generator = np.random.default_rng(9)
     time = 1e-3 * np.arange(8000)

@@ -1,10 +1,7 @@
 """Campaign folders: round trip to the last bit, units, noise records, and one sentence for what is wrong."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,7 +39,7 @@ TABLES = {
 }
 
 
-def folder_of(path: Path, toml: str = TOML, **tables: str) -> Path:
+def folder_of(path, toml=TOML, **tables):
     path.mkdir(exist_ok=True)
     (path / "campaign.toml").write_text(toml, encoding="utf-8")
     for name, text in (TABLES | {f"{key}.csv": text for key, text in tables.items()}).items():
@@ -50,7 +47,7 @@ def folder_of(path: Path, toml: str = TOML, **tables: str) -> Path:
     return path
 
 
-def test_everything_comes_out_in_si(tmp_path: Path) -> None:
+def test_everything_comes_out_in_si(tmp_path):
     campaign = read_campaign(folder_of(tmp_path))
     gauge, tip = campaign.channels["g17"], campaign.channels["tip"]
     assert (gauge.quantity, gauge.output, gauge.station, gauge.chord, gauge.gain_deviation) == (
@@ -86,7 +83,7 @@ def test_everything_comes_out_in_si(tmp_path: Path) -> None:
     assert [trial.name for trial in campaign.fitted] == ["tip load up", "release"]
 
 
-def test_a_column_of_no_channel_is_one_remark(tmp_path: Path) -> None:
+def test_a_column_of_no_channel_is_one_remark(tmp_path):
     release = TABLES["release.csv"].replace("time,w [mm]\n", "time,w [mm],g71\n")
     release = "\n".join([line if "g71" in line else f"{line},1" for line in release.splitlines()])
     tip_up = "force,g71,w [mm]\n0,0.5,0.1\n5,120.25,7.3\n"
@@ -96,7 +93,7 @@ def test_a_column_of_no_channel_is_one_remark(tmp_path: Path) -> None:
     assert said.startswith("tip_up.csv and 1 more: no channel has the column 'g71'")
 
 
-def test_hash_follows_every_file(tmp_path: Path) -> None:
+def test_hash_follows_every_file(tmp_path):
     folder = folder_of(tmp_path)
     before = read_campaign(folder).data_hash
     assert read_campaign(folder / "campaign.toml").data_hash == before
@@ -116,7 +113,7 @@ names = st.text(
 
 
 @st.composite
-def campaigns(draw: st.DrawFn) -> Campaign:
+def campaigns(draw):
     channel_names = draw(st.lists(names, min_size=1, max_size=3, unique=True))
     interval = draw(st.floats(1e-5, 1.0))
     channels = {}
@@ -181,7 +178,7 @@ def campaigns(draw: st.DrawFn) -> Campaign:
     )  # fmt: skip
 
 
-def same(one: object, other: object) -> bool:
+def same(one, other):
     if isinstance(one, np.ndarray):
         if not isinstance(other, np.ndarray) or (one.dtype, one.shape) != (other.dtype, other.shape):
             return False
@@ -204,7 +201,7 @@ def same(one: object, other: object) -> bool:
 
 @given(campaigns())
 @settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
-def test_round_trip_keeps_everything(tmp_path_factory: pytest.TempPathFactory, campaign: Campaign) -> None:
+def test_round_trip_keeps_everything(tmp_path_factory, campaign):
     folder = tmp_path_factory.mktemp("campaign")
     again = read_campaign(write_campaign(campaign, folder))
     # Only remarks of the reader itself may be new.
@@ -212,14 +209,14 @@ def test_round_trip_keeps_everything(tmp_path_factory: pytest.TempPathFactory, c
     assert same(replace(again, remarks=campaign.remarks), campaign)
 
 
-def test_what_the_reader_remarked_is_not_said_twice(tmp_path: Path) -> None:
+def test_what_the_reader_remarked_is_not_said_twice(tmp_path):
     once = read_campaign(folder_of(tmp_path / "a"))
     twice = read_campaign(write_campaign(once, tmp_path / "b"))
     assert same(once, twice)
     assert len(once.remarks) == 1
 
 
-def test_what_cannot_be_written_says_so(tmp_path: Path) -> None:
+def test_what_cannot_be_written_says_so(tmp_path):
     campaign = read_campaign(folder_of(tmp_path / "a"))
     with pytest.raises(CampaignFileError, match="no reference temperature"):
         write_campaign(replace(campaign, reference_temperature=None), tmp_path / "b")
@@ -234,7 +231,7 @@ def test_what_cannot_be_written_says_so(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- noise from repeats
 
 
-def test_noise_from_repeats_is_the_pooled_deviation(tmp_path: Path) -> None:
+def test_noise_from_repeats_is_the_pooled_deviation(tmp_path):
     rng = np.random.default_rng(4)
     readings = rng.normal(size=(3, 4)) + np.array([0.0, 10.0, 20.0, 30.0])
     trials = "".join(
@@ -299,13 +296,13 @@ WRONG_TABLES = [
 ]  # fmt: skip
 
 
-def check_sentence(text: str) -> None:
+def check_sentence(text):
     assert text.endswith(".")
     assert "\n" not in text
 
 
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("campaign"))
-def test_a_wrong_key_is_named_in_one_sentence(tmp_path: Path, old: str, new: str, sentence: str) -> None:
+def test_a_wrong_key_is_named_in_one_sentence(tmp_path, old, new, sentence):
     assert old in TOML
     with pytest.raises(CampaignFileError, match=sentence) as caught:
         read_campaign(folder_of(tmp_path, TOML.replace(old, new, 1)))
@@ -314,16 +311,14 @@ def test_a_wrong_key_is_named_in_one_sentence(tmp_path: Path, old: str, new: str
 
 
 @pytest.mark.parametrize(("table", "text", "error", "sentence"), WRONG_TABLES)
-def test_a_wrong_table_is_named_in_one_sentence(
-    tmp_path: Path, table: str, text: str, error: type[DiscrepancyError], sentence: str
-) -> None:
+def test_a_wrong_table_is_named_in_one_sentence(tmp_path, table, text, error, sentence):
     folder = folder_of(tmp_path, **{table: text})
     with pytest.raises(error, match=sentence) as caught:
         read_campaign(folder)
     check_sentence(str(caught.value))
 
 
-def test_missing_folders_and_bytes(tmp_path: Path) -> None:
+def test_missing_folders_and_bytes(tmp_path):
     with pytest.raises(CampaignFileError, match="There is no folder"):
         read_campaign(tmp_path / "nowhere")
     with pytest.raises(CampaignFileError, match=r"There is no campaign.toml in"):
@@ -337,7 +332,7 @@ def test_missing_folders_and_bytes(tmp_path: Path) -> None:
     assert read_campaign(folder).trials[2].values.tolist() == [[9e-4]]
 
 
-def test_times_may_be_printed_with_few_decimals(tmp_path: Path) -> None:
+def test_times_may_be_printed_with_few_decimals(tmp_path):
     interval = 1.0 / 1613.0
     rows = "".join(f"{k * interval:.4f},{k % 7}\n" for k in range(300))
     trial = read_campaign(folder_of(tmp_path, release="time,w [mm]\n" + rows)).trials[1]
@@ -347,9 +342,7 @@ def test_times_may_be_printed_with_few_decimals(tmp_path: Path) -> None:
 
 @given(st.sampled_from([*TABLES, "campaign.toml"]), st.data())
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
-def test_damaged_files_are_refused_or_read_but_never_crash(
-    tmp_path_factory: pytest.TempPathFactory, file: str, data: st.DataObject
-) -> None:
+def test_damaged_files_are_refused_or_read_but_never_crash(tmp_path_factory, file, data):
     folder = folder_of(tmp_path_factory.mktemp("hostile"))
     content = bytearray((folder / file).read_bytes())
     for _ in range(data.draw(st.integers(1, 3))):
@@ -381,7 +374,7 @@ def test_damaged_files_are_refused_or_read_but_never_crash(
          "widest gap, 0.006 s, begins at 0.036 s"),
     ],
 )  # fmt: skip
-def test_uneven_stamps_are_taken_as_they_come(tmp_path: Path, table: str, said: str) -> None:
+def test_uneven_stamps_are_taken_as_they_come(tmp_path, table, said):
     campaign = read_campaign(folder_of(tmp_path, release=table))
     trial = next(trial for trial in campaign.trials if trial.name == "release")
     stamps = [float(line.split(",")[0]) for line in table.splitlines()[1:] if line[:1].isdigit()]
@@ -390,7 +383,7 @@ def test_uneven_stamps_are_taken_as_they_come(tmp_path: Path, table: str, said: 
     assert any(said in remark for remark in campaign.remarks)
 
 
-def test_all_missing_and_all_unknown_keys_are_named_at_once(tmp_path: Path) -> None:
+def test_all_missing_and_all_unknown_keys_are_named_at_once(tmp_path):
     toml = (
         '[[channel]]\nname = "tip"\n[[channel]]\nunit = "mm"\noutput = "x"\nquantity = "displacement"\n'
         '[[trial]]\nkind = "ringdown"\n'

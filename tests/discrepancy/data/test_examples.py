@@ -1,7 +1,5 @@
 """Examples as a user makes them, and that of docs/campaign.md: written, read and checked."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -24,11 +22,11 @@ OUTPUTS = ("x3", "x1", "base_strain", "joint_strain")
 
 
 @pytest.fixture(scope="module")
-def chain() -> LumpedModel:
+def chain():
     return LumpedModel.load("three_mass_chain")
 
 
-def test_written_example_is_sound_and_repeats(chain: LumpedModel, tmp_path: Path) -> None:
+def test_written_example_is_sound_and_repeats(chain, tmp_path):
     plan = plan_for(chain, OUTPUTS, "end")
     one = write_example(chain, tmp_path / "a", "laboratory", 3, plan)
     two = write_example(chain, tmp_path / "b", "laboratory", 3, plan)
@@ -43,7 +41,7 @@ def test_written_example_is_sound_and_repeats(chain: LumpedModel, tmp_path: Path
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_hidden_effects_are_no_faults_of_the_data(chain: LumpedModel, seed: int) -> None:
+def test_hidden_effects_are_no_faults_of_the_data(chain, seed):
     plan = plan_for(chain, OUTPUTS, "end")
     scales = chain.scales(example_campaign(chain, "laboratory", seed, plan))
     force = 0.05 * scales.ports["joint"].stiffness * scales.ports["joint"].displacement
@@ -60,16 +58,16 @@ def test_hidden_effects_are_no_faults_of_the_data(chain: LumpedModel, seed: int)
         assert sum(int((~trial.used).sum()) for trial in marked.trials) <= 2
 
 
-def test_what_cannot_be_an_example(chain: LumpedModel) -> None:
+def test_what_cannot_be_an_example(chain):
     with pytest.raises(
         CampaignFileError, match=r"There is no example 'mission': the kinds are static, ringdown"
     ):
-        example_campaign(chain, "mission", 1)  # type: ignore[arg-type]
+        example_campaign(chain, "mission", 1)
     with pytest.raises(ModelError, match="has no output 'x9'"):
         plan_for(chain, ("x9",), "end")
 
 
-def test_plan_of_the_wing_names_its_outputs() -> None:
+def test_plan_of_the_wing_names_its_outputs():
     plan = wing_plan()
     assert [channel.output for channel in plan.channels][-1] == "tip_displacement"
     assert plan.names(TrialKind.FLIGHT) == plan.names(TrialKind.STATIC)[:-1]
@@ -83,7 +81,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "campaign.md"
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     text = PAGE.read_text(encoding="utf-8")
     toml = re.search(r"```toml\n(.*?)```", text, re.DOTALL)
     tables = re.search(r"begin with\n\n```\n(.*?)```", text, re.DOTALL)
@@ -97,7 +95,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_documented_campaign_is_read(folder: Path) -> None:
+def test_the_documented_campaign_is_read(folder):
     campaign = read_campaign(folder)
     kinds = [TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FLIGHT]
     assert [trial.kind for trial in campaign.trials] == kinds

@@ -1,9 +1,6 @@
 """What a campaign can tell: trials that are held out, and what records say of parameters."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,12 +12,11 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
 from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model, prior_left, unobservable
-from discrepancy.models.lumped import LumpedModel
 from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
 
 
-def trial(name: str, kind: TrialKind, top: float, count: int = 4, run: str = "A", channels=("x",)) -> Trial:
+def trial(name, kind, top, count=4, run="A", channels=("x",)):
     rows = np.linspace(0.0, top, count)
     drive = {
         TrialKind.RINGDOWN: {"release": Release(top)},
@@ -31,20 +27,20 @@ def trial(name: str, kind: TrialKind, top: float, count: int = 4, run: str = "A"
     return Trial.plain(name, kind, tuple(channels), rows, values=values, load_place="x", run=run, **drive)
 
 
-def campaign(*trials: Trial) -> Campaign:
+def campaign(*trials):
     channels = {name: Channel(name, Quantity.DISPLACEMENT, "x", None) for name in ("x", "y")}
     return Campaign("", channels, trials, None, {}, "")
 
 
-def held(*trials: Trial) -> list[str]:
+def held(*trials):
     return [item.name for item in choose_held_out(campaign(*trials)).held_out]
 
 
-def releases(*levels: float) -> list[Trial]:
+def releases(*levels):
     return [trial(f"r{n}", TrialKind.RINGDOWN, value) for n, value in enumerate(levels)]
 
 
-def test_amplitudes_inside_come_first() -> None:
+def test_amplitudes_inside_come_first():
     assert held(*releases(1.0, 0.5, 0.2)) == ["r1"]
     assert held(*releases(0.2, 1.0, 0.3, 0.6)) == ["r3"]
     assert held(*releases(1.0, 0.9, 0.6, 0.5, 0.3, 0.2)) == ["r2", "r3"]
@@ -53,7 +49,7 @@ def test_amplitudes_inside_come_first() -> None:
     assert held(*releases(1.0, 1.0, 1.0, 1.0, 1.0)) == ["r4"]
 
 
-def test_marked_trials_are_respected() -> None:
+def test_marked_trials_are_respected():
     trials = releases(1.0, 0.5, 0.2)
     given_campaign = campaign(
         trials[0], replace(trials[1], held_out=False), replace(trials[2], held_out=True)
@@ -61,14 +57,14 @@ def test_marked_trials_are_respected() -> None:
     assert choose_held_out(given_campaign) is given_campaign
 
 
-def test_what_only_one_trial_has_stays() -> None:
+def test_what_only_one_trial_has_stays():
     trials = releases(1.0, 0.5, 0.2)
     assert held(trials[0], replace(trials[1], run="B"), trials[2]) == []
     two = trial("r1", TrialKind.RINGDOWN, 0.5, channels=("x", "y"))
     assert held(trials[0], two, trials[2]) == []
 
 
-def test_too_few_trials_are_said() -> None:
+def test_too_few_trials_are_said():
     chosen = choose_held_out(campaign(*releases(1.0, 0.5)))
     assert not chosen.held_out
     assert "Nothing is held out" in chosen.remarks[-1]
@@ -76,7 +72,7 @@ def test_too_few_trials_are_said() -> None:
 
 
 @pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.FLIGHT])
-def test_load_levels_of_a_single_trial(kind: TrialKind) -> None:
+def test_load_levels_of_a_single_trial(kind):
     single = trial("s", kind, 8.0, count=9)
     chosen = choose_held_out(campaign(single))
     fitted, proof = chosen.fitted[0], chosen.held_out[0]
@@ -98,7 +94,7 @@ def test_load_levels_of_a_single_trial(kind: TrialKind) -> None:
     )
 )
 @settings(max_examples=100, deadline=None)
-def test_what_is_left_covers_what_is_held_out(rows: list[tuple[TrialKind, float, str]]) -> None:
+def test_what_is_left_covers_what_is_held_out(rows):
     trials = [trial(str(n), kind, top, 8, run) for n, (kind, top, run) in enumerate(rows)]
     before = campaign(*trials)
     chosen = choose_held_out(before)
@@ -121,11 +117,11 @@ TOML = INPUTS.text("cart_campaign.toml")
 
 
 @pytest.fixture
-def model() -> LumpedModel:
+def model():
     return model_of(MODEL)
 
 
-def campaign_of(folder: Path, scale: float = 1.0) -> Campaign:
+def campaign_of(folder, scale=1.0):
     time = np.linspace(0.0, 2.0, 81)
     rows = [f"{t!r},1.0,{scale * 250.0 * t * t!r}" for t in time.tolist()]
     (folder / "push.csv").write_text("\n".join(["time,motor,x", *rows]))
@@ -133,13 +129,13 @@ def campaign_of(folder: Path, scale: float = 1.0) -> Campaign:
     return read_campaign(folder)
 
 
-def test_what_is_left_of_each_prior(tmp_path: Path, model: LumpedModel) -> None:
+def test_what_is_left_of_each_prior(tmp_path, model):
     campaign = campaign_of(tmp_path)
     left = prior_left(campaign, model)
     # by hand: least squares of x by the two parameters, beside their priors
     time = campaign.trials[0].time
 
-    def x(mass: float, damping: float) -> np.ndarray:
+    def x(mass, damping):
         tau = mass / damping
         return (time - tau * (1.0 - np.exp(-time / tau))) / damping
 
@@ -154,11 +150,11 @@ def test_what_is_left_of_each_prior(tmp_path: Path, model: LumpedModel) -> None:
     assert left["mass_factor"] < 0.1
 
 
-def test_a_short_push_of_a_cart_is_no_short_record(tmp_path: Path, model: LumpedModel) -> None:
+def test_a_short_push_of_a_cart_is_no_short_record(tmp_path, model):
     assert not [fault for fault in check_against_model(campaign_of(tmp_path), model) if fault.fatal]
 
 
-def test_what_cannot_be_observed_is_said(tmp_path: Path) -> None:
+def test_what_cannot_be_observed_is_said(tmp_path):
     text = MODEL.replace("damping = { matrix = 0.5 }", "damping = { matrix = 1e-5 }")
     model = model_of(text)
     campaign = campaign_of(tmp_path)
@@ -169,8 +165,8 @@ def test_what_cannot_be_observed_is_said(tmp_path: Path) -> None:
     assert not faults[0].fatal
 
 
-def test_only_plausible_unit_slips_are_looked_for(tmp_path: Path, model: LumpedModel) -> None:
-    def slips(scale: float) -> list[FaultKind]:
+def test_only_plausible_unit_slips_are_looked_for(tmp_path, model):
+    def slips(scale):
         folder = tmp_path / f"{scale:g}"
         folder.mkdir()
         return [fault.kind for fault in check_against_model(campaign_of(folder, scale), model) if fault.fatal]
@@ -183,9 +179,7 @@ def test_only_plausible_unit_slips_are_looked_for(tmp_path: Path, model: LumpedM
 @pytest.mark.parametrize("hold", ["", 'hold = "linear"', 'hold = "smooth"'])
 @pytest.mark.parametrize("forced", [False, True])
 @pytest.mark.parametrize("samples", [9, 200])
-def test_it_is_asked_what_a_coarse_input_did_between_its_samples(
-    tmp_path: Path, model: LumpedModel, samples: int, forced: bool, hold: str
-) -> None:
+def test_it_is_asked_what_a_coarse_input_did_between_its_samples(tmp_path, model, samples, forced, hold):
     time = np.arange(12 * samples) / samples
     rows = [f"{t!r},{float(1.0 * np.sin(2.0 * np.pi * t))!r},{10.0 * t!r}" for t in time.tolist()]
     (tmp_path / "push.csv").write_text("\n".join([f"time,{'force' if forced else 'motor'},x", *rows]))

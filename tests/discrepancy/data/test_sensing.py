@@ -1,7 +1,5 @@
 """Observation of a trial: response of a model seen through the sensors of a patch."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -23,7 +21,7 @@ CONDITIONS = Conditions(np.array([1.0]))
 
 
 @pytest.fixture(scope="module")
-def campaign() -> Campaign:
+def campaign():
     channels = {
         "tip": Channel("tip", Quantity.DISPLACEMENT, "x", None),
         "g0": Channel("g0", Quantity.STRAIN, "strain[0]", None),
@@ -31,7 +29,7 @@ def campaign() -> Campaign:
     }
     time = np.arange(200) * 0.005
 
-    def trial(name: str, kind: TrialKind, names: tuple[str, ...], **more: object) -> Trial:
+    def trial(name, kind, names, **more):
         usual = {"load_place": "x", "start": 60.0, "run": "A"}
         return Trial.plain(name, kind, names, more.pop("time", time), **(usual | more))
 
@@ -43,7 +41,7 @@ def campaign() -> Campaign:
     return Campaign("mass", channels, trials, 20.0, {}, "")
 
 
-def test_without_sensors_it_is_the_response_to_the_last_bit(oscillator, campaign) -> None:
+def test_without_sensors_it_is_the_response_to_the_last_bit(oscillator, campaign):
     for trial in campaign.trials:
         outputs = tuple((campaign.channels[c].output, campaign.channels[c].quantity) for c in trial.channels)
         response = oscillator.respond(trial, outputs, ModelPatch(), CONDITIONS)
@@ -52,7 +50,7 @@ def test_without_sensors_it_is_the_response_to_the_last_bit(oscillator, campaign
         assert (observed.rates is None) == (not trial.is_dynamic)
 
 
-def test_clock_of_patch_and_conditions_add_up(oscillator, campaign) -> None:
+def test_clock_of_patch_and_conditions_add_up(oscillator, campaign):
     ring = campaign.trials[0]
     one, other, plain = (
         observe(oscillator, campaign, ring, ModelPatch(patch), Conditions(np.ones(1), clock=clock)).values
@@ -64,7 +62,7 @@ def test_clock_of_patch_and_conditions_add_up(oscillator, campaign) -> None:
     assert np.abs(one - plain).max() > 1e-5
 
 
-def test_rates_are_derivatives(oscillator, campaign) -> None:
+def test_rates_are_derivatives(oscillator, campaign):
     patch = ModelPatch((SensorGain("*", 0.1), SensorDrift("tip", 0.01, 60.0, 1.5), HighPass("*", 0.2)))
     for trial in campaign.trials[:2]:
         observed = observe(oscillator, campaign, trial, patch, CONDITIONS)
@@ -73,7 +71,7 @@ def test_rates_are_derivatives(oscillator, campaign) -> None:
         assert np.abs(observed.rates[1:-1] - difference).max(axis=0) / scale == pytest.approx(0.0, abs=0.02)
 
 
-def test_turned_gauge_asks_for_components(oscillator, campaign) -> None:
+def test_turned_gauge_asks_for_components(oscillator, campaign):
     pull = campaign.trials[2]
     angle = 0.2
     observed = observe(oscillator, campaign, pull, ModelPatch((SensorRotation("g0", angle),)), CONDITIONS)
@@ -82,11 +80,11 @@ def test_turned_gauge_asks_for_components(oscillator, campaign) -> None:
     assert observed.values[:, 0] == pytest.approx(expected)
 
 
-def test_decaying_line_scales_with_the_release(oscillator, campaign) -> None:
+def test_decaying_line_scales_with_the_release(oscillator, campaign):
     ring = campaign.trials[0]
     patch = ModelPatch((DecayingLine("tip", 7.0, 0.01, 0.2, 0.0),))
 
-    def added(conditions: Conditions) -> float:
+    def added(conditions):
         seen = observe(oscillator, campaign, ring, patch, conditions).values
         return float((seen - observe(oscillator, campaign, ring, ModelPatch(), conditions).values)[0, 1])
 
@@ -94,7 +92,7 @@ def test_decaying_line_scales_with_the_release(oscillator, campaign) -> None:
     assert added(Conditions(np.ones(1), np.array([[0.1, 0.0]]))) == pytest.approx(0.2 * 0.05 * 1.1)
 
 
-def test_channel_of_another_trial_changes_nothing_and_one_of_none_is_refused(oscillator, campaign) -> None:
+def test_channel_of_another_trial_changes_nothing_and_one_of_none_is_refused(oscillator, campaign):
     ring = campaign.trials[0]
     plain = observe(oscillator, campaign, ring, ModelPatch(), CONDITIONS).values
     other = observe(oscillator, campaign, ring, ModelPatch((SensorGain("g0", 0.2),)), CONDITIONS).values

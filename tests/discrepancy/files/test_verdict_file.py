@@ -1,13 +1,9 @@
 """Files of a verdict: round trips to the last bit, the shipped schemas, damaged files."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from math import inf, nan
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -51,6 +47,7 @@ from discrepancy.verdict import (
 from fe.runtime.patch import PRIMITIVES, Line, ModelPatch, PointMass, PowerDamping, PowerStiffness, Window
 from reporting.errors import FileNotWrittenError
 from reporting.provenance import collect_provenance
+from tests.discrepancy.bench import Bench
 
 ORIGIN = Origin(
     "Wing in the laboratory", "wing", "ab" * 32, "cd" * 32, "uav-twin discrepancy campaign --out verdict",
@@ -96,13 +93,13 @@ VERDICT = Verdict(
 )  # fmt: skip
 
 
-def same(first: object, second: object) -> bool:
+def same(first, second):
     """Compare records with nan equal to nan."""
     return repr(first) == repr(second)
 
 
-def test_a_verdict_comes_back_equal(tmp_path: Path, make_bench) -> None:
-    bench = make_bench(amplitudes=(200.0, 150.0), held_out=(False, True))
+def test_a_verdict_comes_back_equal(tmp_path):
+    bench = Bench(amplitudes=(200.0, 150.0), held_out=(False, True))
     fitted = bench.fit(np.random.default_rng(7))
     proof = prove(fitted, fitted)
     for number, content in enumerate((proof, None, replace(proof, held_out_before=None))):
@@ -118,12 +115,12 @@ def test_a_verdict_comes_back_equal(tmp_path: Path, make_bench) -> None:
     assert again.read_bytes() == path.read_bytes()
 
 
-def stored_patch(*effects: NamedEffect, draws: Sequence[Sequence[ModelPatch]] = ()) -> StoredPatch:
+def stored_patch(*effects, draws=()):
     found = patch_effects(effects, draws)
     return StoredPatch(VerdictKind.NAMED, "Two.", found, {}, (STIFFNESS,), ORIGIN)
 
 
-def test_a_patch_comes_back_identical_with_its_intervals(tmp_path: Path) -> None:
+def test_a_patch_comes_back_identical_with_its_intervals(tmp_path):
     generator = np.random.default_rng(1)
     draws = [
         ModelPatch((PowerDamping("root", float(c), 0.0, 0.0, 0.1, 5e-324),))
@@ -146,9 +143,7 @@ def test_a_patch_comes_back_identical_with_its_intervals(tmp_path: Path) -> None
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
-def test_every_primitive_with_any_numbers_survives_the_file(
-    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_every_primitive_with_any_numbers_survives_the_file(data, tmp_path_factory):
     number = st.floats(allow_nan=False, allow_infinity=False)
     primitives = []
     for kind in data.draw(st.lists(st.sampled_from(sorted(PRIMITIVES)), min_size=1, max_size=4)):
@@ -174,7 +169,7 @@ def test_every_primitive_with_any_numbers_survives_the_file(
     assert same(back, effect.patch)  # tells 0.0 from -0.0
 
 
-def test_every_real_parameter_of_every_primitive_has_a_unit() -> None:
+def test_every_real_parameter_of_every_primitive_has_a_unit():
     for kind, primitive in PRIMITIVES.items():
         assert set(PRIMITIVE_UNITS[kind]) == {
             name for name, own in primitive.values().items() if own is float
@@ -182,10 +177,10 @@ def test_every_real_parameter_of_every_primitive_has_a_unit() -> None:
     assert set(PRIMITIVE_UNITS) == set(PRIMITIVES)
 
 
-def json_schema(record: type, schema: str) -> str:
+def json_schema(record, schema):
     """Return the JSON Schema (draft 2020-12) of a document as it is shipped: every key is always there."""
     found = TypeAdapter(record).json_schema()
-    definitions: dict[str, Any] = found["$defs"]
+    definitions = found["$defs"]
     own = {name: table for name, table in found["properties"].items() if name != "origin"}
     of_origin = definitions.pop("Origin")["properties"]
     properties = {"schema": {"const": schema, "type": "string"}, **of_origin, **own}
@@ -209,13 +204,13 @@ def json_schema(record: type, schema: str) -> str:
     ("name", "document", "schema"),
     [("verdict", StoredVerdict, VERDICT_SCHEMA), ("patch", StoredPatch, PATCH_SCHEMA)],
 )
-def test_the_shipped_schema_is_that_of_the_records(name: str, document: type, schema: str) -> None:
+def test_the_shipped_schema_is_that_of_the_records(name, document, schema):
     assert shipped_schema(name) == json.loads(json_schema(document, schema))
     with pytest.raises(VerdictFileError, match="but not for 'report'"):
         shipped_schema("report")
 
 
-def test_every_key_is_in_the_page() -> None:
+def test_every_key_is_in_the_page():
     page = (Path(__file__).parents[3] / "docs" / "verdict.md").read_text(encoding="utf-8")
     for name in ("verdict", "patch"):
         schema = shipped_schema(name)
@@ -230,7 +225,7 @@ def test_every_key_is_in_the_page() -> None:
         assert f"`{kind}`" in page, kind
 
 
-def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
+def test_damaged_files_are_refused_in_one_sentence(tmp_path):
     path = write_verdict(tmp_path / "verdict.json", VERDICT, None, ORIGIN)
     whole = path.read_text(encoding="utf-8")
 
@@ -262,8 +257,8 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
         read_patch(path)
 
 
-def test_nothing_is_written_where_it_cannot_be(tmp_path: Path) -> None:
-    wrong = replace(VERDICT, probability="sure")  # type: ignore[arg-type]
+def test_nothing_is_written_where_it_cannot_be(tmp_path):
+    wrong = replace(VERDICT, probability="sure")
     with pytest.raises(VerdictFileError, match=r"verdict.json cannot be written: verdict.probability"):
         write_verdict(tmp_path / "verdict.json", wrong, None, ORIGIN)
     assert not list(tmp_path.iterdir())
@@ -279,8 +274,8 @@ def test_nothing_is_written_where_it_cannot_be(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- residuals
 
 
-def test_residuals_come_back_to_the_last_bit(tmp_path: Path, make_bench) -> None:
-    bench = make_bench(amplitudes=(200.0, 150.0), held_out=(False, True))
+def test_residuals_come_back_to_the_last_bit(tmp_path):
+    bench = Bench(amplitudes=(200.0, 150.0), held_out=(False, True))
     fitted = bench.fit(np.random.default_rng(7))
     samples = np.random.default_rng(0).standard_normal(50)
     noise = NoiseRecord(2.0, inf, samples, 0.01, "pre-trigger")
@@ -315,10 +310,10 @@ def test_residuals_come_back_to_the_last_bit(tmp_path: Path, make_bench) -> None
                 assert one == two
 
 
-def test_residual_file_carries_units_and_refuses_damage(tmp_path: Path, make_bench) -> None:
+def test_residual_file_carries_units_and_refuses_damage(tmp_path):
     import xarray as xr
 
-    path = write_residuals(tmp_path / "residuals.nc", make_bench().fit(np.random.default_rng(1)))
+    path = write_residuals(tmp_path / "residuals.nc", Bench().fit(np.random.default_rng(1)))
     with xr.open_datatree(path, engine="h5netcdf") as tree:
         group = tree["trial_001"].to_dataset()
         assert group["time"].attrs["units"] == "s"
@@ -345,11 +340,11 @@ def test_residual_file_carries_units_and_refuses_damage(tmp_path: Path, make_ben
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_files_of_earlier_numbers_are_read(number: int, tmp_path: Path) -> None:
+def test_files_of_earlier_numbers_are_read(number, tmp_path):
     path = write_verdict(tmp_path / "verdict.json", VERDICT, None, ORIGIN)
     content = json.loads(path.read_text(encoding="utf-8"))
     content["schema"] = f"uav-twin verdict {number}"
-    later: dict[str, object] = {"force": None}
+    later = {"force": None}
     if number < 3:
         del content["model_file"]
         for row in content["verdict"]["hypotheses"]:

@@ -1,7 +1,5 @@
 """Proof: scores of calibrated predictions, gaps, standard errors over trials."""
 
-from __future__ import annotations
-
 import ast
 import re
 from dataclasses import replace
@@ -15,12 +13,13 @@ from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import FitError
 from discrepancy.judgement.proof import correlation_time, gap_closed, log_density, prove, score_gain, scores
 from discrepancy.location.residuals import ResidualSet
+from tests.discrepancy.bench import Bench
 
 MANY = (200.0, 180.0, 150.0, 120.0, 100.0, 80.0)
 HELD = (False, True, False, True, True, True)
 
 
-def _effect(bench, size: float) -> dict[int, np.ndarray]:
+def _effect(bench, size):
     shape = np.array([1.0, 0.8, 0.5, 0.2])
     return {
         n: size * (np.cos(2 * np.pi * 9.0 * t.time) * np.exp(-0.8 * t.time))[:, np.newaxis] * shape
@@ -29,8 +28,8 @@ def _effect(bench, size: float) -> dict[int, np.ndarray]:
     }
 
 
-def test_scores_of_a_right_model(make_bench) -> None:
-    bench = make_bench(count=400, amplitudes=MANY, held_out=HELD, noise_freedom=2000.0)
+def test_scores_of_a_right_model():
+    bench = Bench(count=400, amplitudes=MANY, held_out=HELD, noise_freedom=2000.0)
     fitted = bench.fit(np.random.default_rng(13))
     for part in (fitted.fitted, fitted.held_out):
         found = scores(part)
@@ -44,8 +43,8 @@ def test_scores_of_a_right_model(make_bench) -> None:
         assert found.rms["g1"] == pytest.approx(2.0, rel=0.1)
 
 
-def test_uniformity_of_transforms_is_calibrated_and_sees_wrong_spread(make_bench) -> None:
-    bench = make_bench(count=100, noise_freedom=np.inf)
+def test_uniformity_of_transforms_is_calibrated_and_sees_wrong_spread():
+    bench = Bench(count=100, noise_freedom=np.inf)
     generator = np.random.default_rng(4)
     p = []
     for _ in range(150):
@@ -60,8 +59,8 @@ def test_uniformity_of_transforms_is_calibrated_and_sees_wrong_spread(make_bench
     assert scores(replace(fitted, trials=wide)).pit_p_value < 1e-6
 
 
-def test_a_closed_gap_is_one_and_an_open_gap_zero(make_bench) -> None:
-    bench = make_bench(amplitudes=MANY, held_out=HELD)
+def test_a_closed_gap_is_one_and_an_open_gap_zero():
+    bench = Bench(amplitudes=MANY, held_out=HELD)
     before = bench.fit(np.random.default_rng(5), extra=_effect(bench, 25.0))
     after = bench.fit(np.random.default_rng(5))
     proof = prove(before, after)
@@ -76,19 +75,19 @@ def test_a_closed_gap_is_one_and_an_open_gap_zero(make_bench) -> None:
     assert none.remaining.startswith("Still unexplained: χ²/dof")
 
 
-def test_half_the_error_leaves_a_quarter_of_the_gap(make_bench) -> None:
-    bench = make_bench(amplitudes=MANY, held_out=HELD, noise_freedom=np.inf)
+def test_half_the_error_leaves_a_quarter_of_the_gap():
+    bench = Bench(amplitudes=MANY, held_out=HELD, noise_freedom=np.inf)
     sets = [bench.fit(np.random.default_rng(6), extra=_effect(bench, size)) for size in (40.0, 20.0)]
     assert prove(*sets).gap_closed == pytest.approx(0.75, abs=0.03)
 
 
-def test_no_gap_is_said_and_not_divided_by(make_bench) -> None:
-    bench = make_bench(amplitudes=(200.0, 150.0), held_out=(False, True))
+def test_no_gap_is_said_and_not_divided_by():
+    bench = Bench(amplitudes=(200.0, 150.0), held_out=(False, True))
     fitted = bench.fit(np.random.default_rng(7))
     proof = prove(fitted, fitted)
     assert isnan(proof.gap_closed)
     assert "show no gap before" in proof.gap_reason
-    without = make_bench().fit(np.random.default_rng(7))
+    without = Bench().fit(np.random.default_rng(7))
     proof = prove(without, without)
     assert isnan(proof.gap_closed)
     assert isnan(proof.log_score_gain)
@@ -97,8 +96,8 @@ def test_no_gap_is_said_and_not_divided_by(make_bench) -> None:
     assert gap_closed(None, None)[1] == "No trial was held out."
 
 
-def test_without_a_noise_record(make_bench) -> None:
-    bench = make_bench(amplitudes=(200.0, 150.0), held_out=(False, True))
+def test_without_a_noise_record():
+    bench = Bench(amplitudes=(200.0, 150.0), held_out=(False, True))
     fitted = bench.fit(np.random.default_rng(8))
     bare = ResidualSet({n: replace(c, noise=None) for n, c in fitted.channels.items()}, fitted.trials)
     proof = prove(bare, bare)
@@ -107,19 +106,19 @@ def test_without_a_noise_record(make_bench) -> None:
     assert "not known" in proof.remaining
 
 
-def test_log_density_against_scipy(make_bench) -> None:
+def test_log_density_against_scipy():
     from scipy import stats
 
-    item = make_bench(count=40).fit(np.random.default_rng(2)).trials[0]
+    item = Bench(count=40).fit(np.random.default_rng(2)).trials[0]
     expected = stats.norm.logpdf(item.residual, scale=item.predictive_deviation) + np.log(
         item.noise_deviation
     )
     np.testing.assert_allclose(log_density(item), expected, rtol=1e-12)
 
 
-def test_standard_error_is_that_of_trials_not_of_samples(make_bench) -> None:
+def test_standard_error_is_that_of_trials_not_of_samples():
     # Gains differ from trial to trial by a random size: only the number of trials can shrink the error.
-    bench = make_bench(count=200, amplitudes=MANY, held_out=HELD, noise_freedom=np.inf)
+    bench = Bench(count=200, amplitudes=MANY, held_out=HELD, noise_freedom=np.inf)
     generator = np.random.default_rng(9)
     gains, errors = [], []
     for _ in range(120):
@@ -137,7 +136,7 @@ def test_standard_error_is_that_of_trials_not_of_samples(make_bench) -> None:
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.std(gains), rel=0.35)
 
 
-def test_correlation_time_of_an_autoregression() -> None:
+def test_correlation_time_of_an_autoregression():
     generator = np.random.default_rng(10)
     found = []
     for _ in range(40):
@@ -150,23 +149,23 @@ def test_correlation_time_of_an_autoregression() -> None:
     assert correlation_time(np.array([1.0, -1.0] * 50)) == 1.0
 
 
-def test_a_set_without_a_used_sample_is_refused(make_bench) -> None:
-    fitted = make_bench().fit(np.random.default_rng(1))
+def test_a_set_without_a_used_sample_is_refused():
+    fitted = Bench().fit(np.random.default_rng(1))
     item = fitted.trials[1]
     unused = replace(item, trial=replace(item.trial, used=np.zeros_like(item.used)))
     with pytest.raises(FitError, match="at least one used sample"):
         scores(replace(fitted, trials=(unused,)))
 
 
-def test_noise_freedom_widens_the_deviation(make_bench) -> None:
-    fitted = make_bench(noise_freedom=np.inf).fit(np.random.default_rng(1))
+def test_noise_freedom_widens_the_deviation():
+    fitted = Bench(noise_freedom=np.inf).fit(np.random.default_rng(1))
     exact = scores(fitted).chi_square_deviation
     channels = {n: replace(c, noise=NoiseRecord(2.0, 10.0)) for n, c in fitted.channels.items()}
     loose = scores(replace(fitted, channels=channels)).chi_square_deviation
     assert loose**2 == pytest.approx(exact**2 + 0.2)
 
 
-def test_what_people_read_spells_chi_square_in_one_way() -> None:
+def test_what_people_read_spells_chi_square_in_one_way():
     """Pages, and the texts of the code that are no docstrings, say χ² and χ²/dof."""
     root = Path(__file__).parents[3]
     other = re.compile(r"chi-square|chi\^2|chi2|chi²|χ² / dof|χ2", re.IGNORECASE)

@@ -1,12 +1,9 @@
 """Backbones: closed forms of four laws, coverage of the error bars, the five real ring-downs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from discrepancy.errors import FitError
@@ -17,16 +14,16 @@ TIME = 0.005 * np.arange(2000)
 OMEGA = 2.0 * np.pi * 5.0
 
 
-def _curve(signal: NDArray[np.float64], **settings: float) -> Backbone:
+def _curve(signal, **settings):
     return backbones(TIME[: signal.size], signal, (5.1,), **settings)[0]
 
 
-def _viscous(zeta: float = 0.01, f: float = 5.0, size: float = 1.0) -> NDArray[np.float64]:
+def _viscous(zeta=0.01, f=5.0, size=1.0):
     w = 2.0 * np.pi * f
     return size * np.exp(-zeta * w * TIME) * np.cos(w * np.sqrt(1.0 - zeta**2) * TIME + 0.4)
 
 
-def test_viscous_damping_is_flat_and_exact() -> None:
+def test_viscous_damping_is_flat_and_exact():
     curve = _curve(_viscous() + 0.2 - 0.01 * TIME)
     np.testing.assert_allclose(curve.frequency, 5.0, rtol=1e-7)
     np.testing.assert_allclose(curve.damping_ratio, 0.01, rtol=1e-5)
@@ -35,7 +32,7 @@ def test_viscous_damping_is_flat_and_exact() -> None:
     assert curve.time[-1] > 9.0
 
 
-def test_two_modes_are_separated() -> None:
+def test_two_modes_are_separated():
     signal = _viscous() + _viscous(0.006, 7.3, 0.5)
     first, second = backbones(TIME, signal, (4.9, 7.5))
     np.testing.assert_allclose(first.frequency, 5.0, rtol=1e-5)
@@ -43,7 +40,7 @@ def test_two_modes_are_separated() -> None:
     np.testing.assert_allclose(second.damping_ratio, 0.006, rtol=1e-3)
 
 
-def test_coulomb_friction_has_a_ratio_that_falls_with_amplitude() -> None:
+def test_coulomb_friction_has_a_ratio_that_falls_with_amplitude():
     # Exact motion: half cycles of cosines about +-delta, delta = Fc / k; peaks fall by 2 delta each.
     delta = 0.004
     half = np.floor(TIME * OMEGA / np.pi).astype(int)
@@ -58,7 +55,7 @@ def test_coulomb_friction_has_a_ratio_that_falls_with_amplitude() -> None:
     np.testing.assert_allclose(curve.frequency[:-2], 5.0, rtol=1e-3)
 
 
-def test_quadratic_damping_has_a_ratio_proportional_to_amplitude() -> None:
+def test_quadratic_damping_has_a_ratio_proportional_to_amplitude():
     # x'' + c |x'| x' + w^2 x = 0: zeta_eq = 4 c A / (3 pi), integrated numerically.
     c = 0.1
     found = solve_ivp(
@@ -73,7 +70,7 @@ def test_quadratic_damping_has_a_ratio_proportional_to_amplitude() -> None:
     assert slope == pytest.approx(1.0, abs=0.02)
 
 
-def test_cubic_spring_has_a_frequency_shift_with_the_square_of_amplitude() -> None:
+def test_cubic_spring_has_a_frequency_shift_with_the_square_of_amplitude():
     # x'' + 2 zeta w x' + w^2 (x + kappa x^3) = 0: f = f0 (1 + 3 kappa A^2 / 8) to first order.
     kappa, zeta = 0.04, 0.008
     found = solve_ivp(
@@ -89,7 +86,7 @@ def test_cubic_spring_has_a_frequency_shift_with_the_square_of_amplitude() -> No
 
 @pytest.mark.long
 @pytest.mark.parametrize("known", [True, False])
-def test_error_bars_cover(known: bool) -> None:
+def test_error_bars_cover(known):
     generator = np.random.default_rng(21)
     noise = 0.02
     z_frequency, z_ratio, z_amplitude = [], [], []
@@ -106,7 +103,7 @@ def test_error_bars_cover(known: bool) -> None:
         assert abs(np.mean(z)) < 0.15
 
 
-def test_a_mode_that_dies_away_is_dropped_and_the_other_goes_on() -> None:
+def test_a_mode_that_dies_away_is_dropped_and_the_other_goes_on():
     generator = np.random.default_rng(3)
     signal = _viscous() + _viscous(0.03, 30.0) + 0.01 * generator.standard_normal(TIME.size)
     first, second = backbones(TIME, signal, (5.0, 30.0), noise_deviation=0.01)
@@ -115,13 +112,13 @@ def test_a_mode_that_dies_away_is_dropped_and_the_other_goes_on() -> None:
     np.testing.assert_allclose(second.frequency[:2], 30.0, rtol=2e-3)
 
 
-def test_pure_noise_gives_no_points() -> None:
+def test_pure_noise_gives_no_points():
     signal = np.random.default_rng(1).standard_normal(600)
     assert backbones(TIME[:600], signal, (5.0,), noise_deviation=1.0)[0].time.size == 0
 
 
-def test_value_at_an_amplitude_is_the_mean_over_trials() -> None:
-    def line(shift: float) -> Backbone:
+def test_value_at_an_amplitude_is_the_mean_over_trials():
+    def line(shift):
         amplitude = np.geomspace(1.0, 0.1, 12)
         one = np.ones(12)
         return Backbone(1, one, amplitude, 0.01 * one, 5.0 + shift - 0.1 * np.log(amplitude), 0.02 * one,
@@ -137,13 +134,13 @@ def test_value_at_an_amplitude_is_the_mean_over_trials() -> None:
     assert at_amplitude([line(0.0)], 50.0).trial_count == 0
 
 
-def test_records_shorter_than_a_window_are_refused() -> None:
+def test_records_shorter_than_a_window_are_refused():
     for periods, words in ((0.1, "at least 12"), (500.0, "the record's length")):
         with pytest.raises(FitError, match=words):
             backbones(TIME, _viscous(), (5.0,), periods=periods)
 
 
-def test_the_real_wing_stiffens_and_its_damping_falls_as_it_comes_to_rest() -> None:
+def test_the_real_wing_stiffens_and_its_damping_falls_as_it_comes_to_rest():
     if not REFERENCE.is_dir():
         pytest.skip(f"the published ring-downs are not at {REFERENCE}")
     from calibration.dynamics.records import read_records

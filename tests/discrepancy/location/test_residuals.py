@@ -1,7 +1,5 @@
 """The hand-over record, and the split of a motion into its modes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +8,10 @@ import pytest
 from discrepancy.errors import FitError
 from discrepancy.location.dependence import modal_motion
 from discrepancy.location.residuals import ResidualSet, quadratic_moments
-from tests.discrepancy.rigs import sensitivity
+from tests.discrepancy.bench import Bench, sensitivity
 
 
-def test_sensitivity_holds_the_leverages_of_least_squares() -> None:
+def test_sensitivity_holds_the_leverages_of_least_squares():
     generator = np.random.default_rng(3)
     jacobian = generator.standard_normal((30, 2, 4))
     noise = np.array([0.5, 2.0])
@@ -25,7 +23,7 @@ def test_sensitivity_holds_the_leverages_of_least_squares() -> None:
     assert np.sum(found**2) == pytest.approx(4.0)
 
 
-def test_moments_of_a_sum_of_squares_are_those_of_the_projection() -> None:
+def test_moments_of_a_sum_of_squares_are_those_of_the_projection():
     generator = np.random.default_rng(5)
     S = np.linalg.qr(generator.standard_normal((12, 3)))[0] * np.array([1.0, 0.9, 0.4])
     A = np.eye(12) - S @ S.T
@@ -37,8 +35,8 @@ def test_moments_of_a_sum_of_squares_are_those_of_the_projection() -> None:
 
 
 @pytest.mark.parametrize("held_out", [False, True])
-def test_restored_residuals_are_white_with_unit_variance(make_bench, held_out: bool) -> None:
-    bench = make_bench(count=40, noise_freedom=np.inf, held_out=(False, held_out))
+def test_restored_residuals_are_white_with_unit_variance(held_out):
+    bench = Bench(count=40, noise_freedom=np.inf, held_out=(False, held_out))
     generator = np.random.default_rng(11)
     draws = np.array([
         np.concatenate([part.ravel() for part in bench.fit(generator).white(generator)]) for _ in range(1200)
@@ -50,8 +48,8 @@ def test_restored_residuals_are_white_with_unit_variance(make_bench, held_out: b
     assert np.max(plain - np.diag(np.diag(plain))) < 6.0 * np.sqrt(1.0 / 1200)
 
 
-def test_without_restoring_the_early_samples_are_too_quiet(make_bench) -> None:
-    bench = make_bench(count=40, noise_freedom=np.inf, static=False)
+def test_without_restoring_the_early_samples_are_too_quiet():
+    bench = Bench(count=40, noise_freedom=np.inf, static=False)
     generator = np.random.default_rng(12)
     squares = np.mean([bench.fit(generator).trials[0].standardised[:8] ** 2 for _ in range(300)], axis=0)
     expected = bench.fit(generator).trials[0].expected_variance[:8]
@@ -60,8 +58,8 @@ def test_without_restoring_the_early_samples_are_too_quiet(make_bench) -> None:
     assert np.mean(squares - expected) == pytest.approx(0.0, abs=0.06)
 
 
-def test_what_no_fit_leaves_is_refused(make_bench) -> None:
-    good = make_bench(count=40).fit(np.random.default_rng(1))
+def test_what_no_fit_leaves_is_refused():
+    good = Bench(count=40).fit(np.random.default_rng(1))
     item = good.trials[0]
     for change in (
         {"residual": np.full_like(item.residual, np.nan)},
@@ -78,8 +76,8 @@ def test_what_no_fit_leaves_is_refused(make_bench) -> None:
             ResidualSet(channels, trials)
 
 
-def test_values_that_are_not_used_may_be_anything(make_bench) -> None:
-    good = make_bench(count=40).fit(np.random.default_rng(1))
+def test_values_that_are_not_used_may_be_anything():
+    good = Bench(count=40).fit(np.random.default_rng(1))
     item = good.trials[0]
     used = item.used.copy()
     used[7, 2] = False
@@ -94,7 +92,7 @@ def test_values_that_are_not_used_may_be_anything(make_bench) -> None:
 # ---------------------------------------------------------------- splitting a motion into its modes
 
 
-def test_two_damped_modes_are_split_up_to_the_ends() -> None:
+def test_two_damped_modes_are_split_up_to_the_ends():
     time = 0.005 * np.arange(800)
     waves = []
     for f, zeta, size in ((5.3, 0.02, 1.0), (28.0, 0.01, 0.4)):
@@ -113,5 +111,5 @@ def test_two_damped_modes_are_split_up_to_the_ends() -> None:
 
 
 @pytest.mark.parametrize("frequencies", [(), (5.0, 120.0), (5.0, 5.01), (0.01,)])
-def test_what_cannot_be_split_is_none(frequencies: tuple[float, ...]) -> None:
+def test_what_cannot_be_split_is_none(frequencies):
     assert modal_motion(np.ones((100, 1)), 0.005, frequencies) is None

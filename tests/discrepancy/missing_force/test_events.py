@@ -1,9 +1,5 @@
 """Forces that act at times: evidence against dense Gaussians, moments against hidden truths."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -18,6 +14,7 @@ from discrepancy.missing_force.windows import residual_windows
 from discrepancy.report.residual_figures import time_line_figure
 from discrepancy.verdict import GapWindow, Moment
 from discrepancy.workflow import investigate
+from tests.discrepancy.bench import Bench
 
 from .test_filtered import dense, trial_of
 
@@ -25,7 +22,7 @@ EVENT, REST = Process(2.0, 0.15, rough=True), Process(0.5, 0.4, rough=True)
 
 
 @pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
-def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven: bool) -> None:
+def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
     random = np.random.default_rng(3)
     time = 0.02 * np.arange(40)
     if uneven:
@@ -53,7 +50,7 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven: bool) ->
             assert search.evidence(*search.whole(0, steps, on)) == pytest.approx(values[a, b], abs=1e-7)
 
 
-def test_a_force_that_turns_is_one_that_does_not_turned() -> None:
+def test_a_force_that_turns_is_one_that_does_not_turned():
     """Its readings before and after a turn have the opposite correlation; what they are alone is the same."""
     trial = trial_of(0.02 * np.arange(40), np.random.default_rng(5).standard_normal((40, 2)))
     never, turns = np.zeros(40, dtype=bool), np.arange(40) == 20
@@ -77,7 +74,7 @@ def test_a_force_that_turns_is_one_that_does_not_turned() -> None:
         ("nothing", 2),
     ],
 )
-def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path: Path, kind: str, seed: int) -> None:
+def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path, kind, seed):
     kinds = ("power", "leak", "tank", "push", "friction", "always", "nothing")
     case = drawn(tmp_path / kind, kind, (1, seed, kinds.index(kind)))
     found = found_in(case)
@@ -89,7 +86,7 @@ def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path: Path, kind: 
 
 
 @pytest.mark.parametrize("kind", ["offset", "random motion", "line", "scatter"])
-def test_moments_of_residuals_are_where_they_were_made(kind: str) -> None:
+def test_moments_of_residuals_are_where_they_were_made(kind):
     generator = np.random.default_rng(5)
     for _ in range(2):
         time, values, truth = record(generator, kind)
@@ -98,22 +95,20 @@ def test_moments_of_residuals_are_where_they_were_made(kind: str) -> None:
         np.testing.assert_allclose(found[:, 0], truth, atol=0.01 * time[-1])
 
 
-def test_quiet_records_of_coloured_noise_have_no_event() -> None:
+def test_quiet_records_of_coloured_noise_have_no_event():
     generator = np.random.default_rng(7)
     for _ in range(5):
         best = found_in_series(np.arange(400.0), noise(generator, 400, 0.5))
         assert not best.moments(0).size
 
 
-def test_a_window_of_a_campaign_is_told_and_drawn(make_bench) -> None:  # type: ignore[no-untyped-def]
-    bench = make_bench(count=300)
+def test_a_window_of_a_campaign_is_told_and_drawn():
+    bench = Bench(count=300)
     event = np.zeros((300, 4))
     event[120:200, 1] = 16.0  # eight noises, from 1.2 s to 2 s
     fitted = bench.fit(np.random.default_rng(4), extra={1: event})
     (window,) = residual_windows(fitted)
     assert (window.trial, window.channels) == ("release 2", ("g2",))
-    assert window.begin is not None
-    assert window.end is not None
     assert window.begin.low - 0.01 <= 1.2 <= window.begin.high + 0.01
     assert window.end.low - 0.01 <= 2.0 <= window.end.high + 0.01
     assert window.size == pytest.approx(8.0, rel=0.1)
@@ -122,19 +117,16 @@ def test_a_window_of_a_campaign_is_told_and_drawn(make_bench) -> None:  # type: 
     sentence = when_sentence((window,))
     assert sentence.startswith("The gap is there in 'release 2' since 1.")
     figure = time_line_figure((window,))
-    assert figure is not None
     assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["release 2"]
     assert residual_windows(bench.fit(np.random.default_rng(4))) == ()
 
 
-def test_a_verdict_tells_when_a_store_leaked(tmp_path: Path) -> None:
+def test_a_verdict_tells_when_a_store_leaked(tmp_path):
     case = drawn(tmp_path / "leak", "leak", (1, 5, 1))
     found = investigate(problem_of(case).campaign, problem_of(case).model)
     told = [window for window in found.verdict.windows if not window.with_effect]
     assert len(told) == len(case.windows)
     for window, (begin, end) in zip(told, case.windows, strict=True):
-        assert window.begin is not None
-        assert window.end is not None
         assert abs(window.begin.value - begin) < 0.01 * case.length
         assert abs(window.end.value - end) < 0.01 * case.length
         assert window.channels == ("block",)
@@ -142,7 +134,7 @@ def test_a_verdict_tells_when_a_store_leaked(tmp_path: Path) -> None:
     assert when_sentence(told) in found.verdict.sentence
 
 
-def test_words_of_windows() -> None:
+def test_words_of_windows():
     whole = GapWindow("a", ("x",), None, None, 0.0, 9.0, 4.0)
     assert when_sentence((whole,)) == "The gap is there throughout the records."
     assert not begins_inside((whole,))

@@ -1,7 +1,5 @@
 """The filter with a missing force against Gaussian conditioning on dense matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -18,7 +16,7 @@ FREQUENCY, RATIO, PARTS = 9.0, 0.05, 8
 PROCESS = Process(2.0, 0.15)
 
 
-def oscillator() -> PortedSystem:
+def oscillator():
     """One mass of 1 kg on a spring: its displacement and its accelerometer, a force at the mass."""
     generator = np.array([[0.0, 1.0], [-(FREQUENCY**2), -2.0 * RATIO * FREQUENCY]])
     return PortedSystem(
@@ -27,15 +25,7 @@ def oscillator() -> PortedSystem:
     )  # fmt: skip
 
 
-def trial_of(
-    time: FloatArray,
-    residual: FloatArray,
-    *,
-    used: NDArray[np.bool_] | None = None,
-    deviation: FloatArray | None = None,
-    local: FloatArray | None = None,
-    coloured: tuple[tuple[int, float, float], ...] = (),
-) -> SeenTrial:
+def trial_of(time, residual, *, used=None, deviation=None, local=None, coloured=()):
     """Return a trial without shared unknowns; the residual is over the noise's deviation."""
     count = len(time)
     used = np.ones(residual.shape, dtype=bool) if used is None else used
@@ -48,12 +38,7 @@ def trial_of(
     )  # fmt: skip
 
 
-def dense(
-    trial: SeenTrial,
-    process: Process,
-    per_second: int = 4000,
-    window: tuple[float, float] = (-np.inf, np.inf),
-) -> tuple[FloatArray, FloatArray]:
+def dense(trial, process, per_second=4000, window=(-np.inf, np.inf)):
     """Return the covariance (N C, N C) of the readings by the force, and of force and readings (N, N C).
 
     By quadrature of what a kernel over all pairs of moments, those of a window, does to an impulse response;
@@ -92,7 +77,7 @@ def dense(
 
 @pytest.mark.parametrize("rough", [False, True], ids=["bends", "jumps"])
 @pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
-def test_evidence_and_force_are_those_of_dense_conditioning(rough: bool, uneven: bool) -> None:
+def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven):
     random = np.random.default_rng(3)
     time = 0.02 * np.arange(40)
     if uneven:
@@ -119,7 +104,7 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough: bool, uneven:
     np.testing.assert_allclose(filtered.deviation(0), np.sqrt(variance), atol=0.02 * process.size)
 
 
-def test_steady_gains_are_those_of_every_step() -> None:
+def test_steady_gains_are_those_of_every_step():
     random = np.random.default_rng(4)
     time = 0.02 * np.arange(900)
     trial = trial_of(time, random.standard_normal((900, 2)))
@@ -139,7 +124,7 @@ def test_steady_gains_are_those_of_every_step() -> None:
     np.testing.assert_allclose(filtered.deviation(0), every.deviation(0), atol=1e-8)
 
 
-def test_the_state_between_samples_is_that_of_samples_in_between() -> None:
+def test_the_state_between_samples_is_that_of_samples_in_between():
     random = np.random.default_rng(5)
     count = 30
     residual = random.standard_normal((count, 2))
@@ -154,7 +139,7 @@ def test_the_state_between_samples_is_that_of_samples_in_between() -> None:
     np.testing.assert_allclose(added, other[::PARTS], atol=1e-9)
 
 
-def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning() -> None:
+def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning():
     random = np.random.default_rng(6)
     time = 0.02 * np.arange(60)
     residual = random.standard_normal((60, 2))
@@ -175,7 +160,7 @@ def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning(
     assert value == pytest.approx(wanted, abs=0.02)
 
 
-def test_a_long_correlation_within_a_short_step_stays_finite() -> None:
+def test_a_long_correlation_within_a_short_step_stays_finite():
     """Backwards the force would grow by e^1000 within a step."""
     trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
     filtered = Filtered(trial, {0: Process(1.0, 1e-3)})
@@ -183,7 +168,7 @@ def test_a_long_correlation_within_a_short_step_stays_finite() -> None:
     assert np.all(np.isfinite(filtered.smoothed(trial.residual)[1]))
 
 
-def test_a_pushed_state_follows_the_closed_form() -> None:
+def test_a_pushed_state_follows_the_closed_form():
     trial = trial_of(0.02 * np.arange(50), np.zeros((50, 2)))
     state = trial.pushed(0, np.ones(len(trial.fine_time)))
     generator = trial.system.generator
@@ -194,13 +179,12 @@ def test_a_pushed_state_follows_the_closed_form() -> None:
     np.testing.assert_allclose(state, wanted, atol=1e-12)
 
 
-def test_noise_of_first_order_is_taken_apart_exactly() -> None:
+def test_noise_of_first_order_is_taken_apart_exactly():
     from discrepancy.campaign.noise import NoiseModel
     from discrepancy.missing_force.trial import decaying_part
 
     noise = NoiseModel(1.0, 1.0 / np.sqrt(1.0 - 0.81), np.inf, np.array([0.9]), 0.01, ())
     found = decaying_part(noise, 0.01)
-    assert found is not None
     assert found[0] == pytest.approx(1.0 - 1e-3, abs=2e-3)
     assert found[1] == pytest.approx(-np.log(0.9) / 0.01, rel=1e-6)
     answer = lfilter([1.0], [1.0, -0.9], np.r_[1.0, np.zeros(3)])

@@ -14,7 +14,7 @@ from calibration.result.file import save_calibration
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import entry
 from fe.runtime import patch
@@ -237,7 +237,7 @@ def test_the_posterior_of_a_calibration_is_the_prior(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     design = load_design().changed(mesh={"refinement": 0.25})
     cache_folder().mkdir()
-    coarse_patch_arrays.save(entry("patches", design.hash, None))
+    entry("patches", design.hash, None).write_bytes(coarse_patch_arrays.to_bytes())
     result = replace(make_calibration(), design=design, design_hash=design.hash)
     save_calibration(result, tmp_path / "wing.nc")
     model = WingModel.of_calibration(tmp_path / "wing.nc")

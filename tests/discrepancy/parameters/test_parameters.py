@@ -1,8 +1,7 @@
 """The posterior of a model's parameters beside closed forms, dense integration and known truths."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,19 +9,18 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationRecordError
 from calibration.result.file import FILE_NAME, load_calibration, result_bytes
-from calibration.result.record import Calibration, ParameterPrior
+from calibration.result.record import ParameterPrior
 from calibration.static.errors_in_variables import exact_posterior
 from calibration.static.experiments import published_measurements
 from calibration.static.stiffness_curve import stiffness_curve_of
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, Quantity, Trial
+from discrepancy.campaign.records import Quantity
 from discrepancy.errors import CampaignDataError, ModelError
 from discrepancy.model_choice import ModelChoice, ModelKind, choose_model
-from discrepancy.models.interface import Conditions, Model, Outputs, Response
-from discrepancy.models.scales import PortScale, Scales
+from discrepancy.models.interface import Model, Response
+from discrepancy.models.scales import Scales
 from discrepancy.parameters.calibration import calibrate_parameters
 from fe.reduction.model_cache import reduced_model
-from fe.runtime.patch import ModelPatch, Primitive
 
 Float = NDArray[np.float64]
 
@@ -38,24 +36,22 @@ class Curve(Model):
     parameters: tuple[ParameterPrior, ...]
     name: str = "curve"
 
-    def output_quantity(self, output: str) -> Quantity | None:
+    def output_quantity(self, output):
         return Quantity.DISPLACEMENT if output == "y" else None
 
-    def supports(self, primitive: type[Primitive]) -> bool:
+    def supports(self, primitive):
         return False
 
-    def scales(self, campaign: Campaign) -> Scales:
-        ports: Mapping[str, PortScale] = {}
+    def scales(self, campaign):
+        ports = {}
         return Scales(1.0, 1.0, 1.0, 1.0, 60.0, 0.0, 1.0, 1.0, ports)
 
-    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
+    def _respond(self, trial, outputs, patch, conditions):
         values = self.law(trial.force, conditions.parameters)
         return Response(np.tile(values[:, np.newaxis], (1, len(outputs))))
 
 
-def choice_of(
-    law: Callable[[Float, Float], Float], *priors: tuple[float, float, float, float]
-) -> ModelChoice:
+def choice_of(law, *priors):
     """Return a curve whose parameters p1, p2, ... have mean, deviation, low, high."""
     parameters = tuple(
         ParameterPrior(f"p{number}", "1", mean, deviation, low, high)
@@ -64,7 +60,7 @@ def choice_of(
     return ModelChoice(Curve(law, parameters), ModelKind.LUMPED, "curve.toml", "0" * 64)
 
 
-def campaign_of(folder: Path, values: Float, *, freedom: int | None = None, more: str = "") -> Campaign:
+def campaign_of(folder, values, *, freedom=None, more=""):
     """Return static readings in metres at `FORCE`, one row of values for each trial."""
     folder.mkdir(parents=True, exist_ok=True)
     known = "" if freedom is None else f", degrees_of_freedom = {freedom}"
@@ -82,11 +78,11 @@ def campaign_of(folder: Path, values: Float, *, freedom: int | None = None, more
     return read_campaign(folder)
 
 
-def line(force: Float, parameters: Float) -> Float:
+def line(force, parameters):
     return np.asarray(parameters[0] * force / 10.0 + parameters[1] * (force / 40.0) ** 2)
 
 
-def spring(force: Float, parameters: Float) -> Float:
+def spring(force, parameters):
     return np.asarray(force / 10.0 / parameters[0])
 
 
@@ -94,7 +90,7 @@ PRIORS = ((1.0, 0.2, -3.0, 5.0), (0.5, 0.3, -3.0, 4.0))
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Calibration, Float]:
+def told(tmp_path_factory):
     """A calibration whose posterior is Gaussian, and the readings."""
     noise = NOISE * np.random.default_rng(3).standard_normal(len(FORCE))
     values = line(FORCE, np.array([1.1, 0.7])) + noise
@@ -102,7 +98,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> tuple[Calibration, Float]:
     return calibrate_parameters(campaign, choice_of(line, *PRIORS), samples=20_000, seed=4), values
 
 
-def test_a_linear_model_has_the_posterior_of_the_closed_form(told: tuple[Calibration, Float]) -> None:
+def test_a_linear_model_has_the_posterior_of_the_closed_form(told):
     found, values = told
     design = np.column_stack([FORCE / 10.0, (FORCE / 40.0) ** 2])
     mean, precision = np.array([1.0, 0.5]), np.diag([0.2**-2, 0.3**-2])
@@ -119,7 +115,7 @@ def test_a_linear_model_has_the_posterior_of_the_closed_form(told: tuple[Calibra
     assert found.channels[0].before > 5.0 > 1.5 > found.channels[0].after
 
 
-def test_the_file_holds_all_of_it_and_refuses_damage(told: tuple[Calibration, Float], tmp_path: Path) -> None:
+def test_the_file_holds_all_of_it_and_refuses_damage(told, tmp_path):
     found, _ = told
     content = result_bytes(found)
     assert content == result_bytes(found)
@@ -138,14 +134,14 @@ def test_the_file_holds_all_of_it_and_refuses_damage(told: tuple[Calibration, Fl
         load_calibration(path)
 
 
-def test_what_is_drawn_together_stays_together(told: tuple[Calibration, Float]) -> None:
+def test_what_is_drawn_together_stays_together(told):
     found, _ = told
     given = found.given("p1", found.mean("p1") + np.array([-0.01, 0.0, 0.01]))["p2"]
     slope = np.cov(found.samples, rowvar=False)[0, 1] / found.samples[:, 0].var()
     np.testing.assert_allclose(np.diff(given), 0.01 * slope, rtol=1e-3)
 
 
-def test_one_parameter_is_integrated_as_densely_as_one_likes(tmp_path: Path) -> None:
+def test_one_parameter_is_integrated_as_densely_as_one_likes(tmp_path):
     """Two readings with much noise, a prior that is cut off, noise known from few degrees of freedom."""
     values = spring(FORCE, np.array([0.7])) + 60.0 * NOISE * np.sin(FORCE)
     more = "[parameters.p1]\nmean = 1.0\ndeviation = 0.6"
@@ -168,7 +164,7 @@ def test_one_parameter_is_integrated_as_densely_as_one_likes(tmp_path: Path) -> 
 
 
 @pytest.mark.long
-def test_intervals_cover_what_is_true(tmp_path: Path) -> None:
+def test_intervals_cover_what_is_true(tmp_path):
     """Truths from the prior; the zero is free, and the noise known from twelve degrees of freedom."""
     generator = np.random.default_rng(12)
     choice = choice_of(line, *PRIORS)
@@ -194,8 +190,8 @@ def test_intervals_cover_what_is_true(tmp_path: Path) -> None:
     assert 0.8 * 2 * total <= inside.sum() <= 0.98 * 2 * total
 
 
-def test_what_is_not_told_is_said(tmp_path: Path) -> None:
-    def tied(force: Float, parameters: Float) -> Float:
+def test_what_is_not_told_is_said(tmp_path):
+    def tied(force, parameters):
         return np.asarray(force / 10.0 * (parameters[0] + parameters[1]) + 0.0 * parameters[2])
 
     noise = NOISE * np.random.default_rng(5).standard_normal(len(FORCE))
@@ -210,10 +206,10 @@ def test_what_is_not_told_is_said(tmp_path: Path) -> None:
     assert any("p1 and p2 are told together and hardly apart" in sentence for sentence in found.findings)
 
 
-def test_a_truth_beyond_the_range_ends_at_its_end(tmp_path: Path) -> None:
+def test_a_truth_beyond_the_range_ends_at_its_end(tmp_path):
     """The model refuses what lies outside, as an FMU does."""
 
-    def bounded(force: Float, parameters: Float) -> Float:
+    def bounded(force, parameters):
         if not 0.9 <= parameters[0] <= 1.1:
             raise ModelError(f"p1 = {float(parameters[0])!r} lies outside the range of the model.")
         return spring(force, parameters)
@@ -226,10 +222,10 @@ def test_a_truth_beyond_the_range_ends_at_its_end(tmp_path: Path) -> None:
     assert any("p1 reaches the end of its range, 0.9 to 1.1" in sentence for sentence in found.findings)
 
 
-def test_where_the_model_cannot_be_had_is_said(tmp_path: Path) -> None:
+def test_where_the_model_cannot_be_had_is_said(tmp_path):
     """Within its range a model refuses what the posterior holds: it ends there, and says so."""
 
-    def refusing(force: Float, parameters: Float) -> Float:
+    def refusing(force, parameters):
         if parameters[0] > 1.1:
             raise ModelError("a stiffness above 1.1 is not known.")
         return spring(force, parameters)
@@ -242,10 +238,10 @@ def test_where_the_model_cannot_be_had_is_said(tmp_path: Path) -> None:
         assert (words in " ".join(found.findings)) == said
 
 
-def test_a_parameter_that_is_not_told_keeps_its_prior_as_it_is_cut_off(tmp_path: Path) -> None:
+def test_a_parameter_that_is_not_told_keeps_its_prior_as_it_is_cut_off(tmp_path):
     """Range of two prior deviations, beside a parameter that is told: moments of a dense grid."""
 
-    def weak(force: Float, parameters: Float) -> Float:
+    def weak(force, parameters):
         return np.asarray(force / 10.0 * parameters[0] + 0.02 * (force / 60.0) * parameters[1])
 
     noise = NOISE * np.random.default_rng(2).standard_normal(len(FORCE))
@@ -269,8 +265,8 @@ def test_a_parameter_that_is_not_told_keeps_its_prior_as_it_is_cut_off(tmp_path:
     assert not any("reaches the end" in sentence for sentence in found.findings)
 
 
-def test_a_bent_ridge_is_followed(tmp_path: Path) -> None:
-    def product(force: Float, parameters: Float) -> Float:
+def test_a_bent_ridge_is_followed(tmp_path):
+    def product(force, parameters):
         return np.asarray(force / 10.0 * parameters[0] * parameters[1])
 
     campaign = campaign_of(tmp_path, FORCE / 10.0)
@@ -287,8 +283,8 @@ def test_a_bent_ridge_is_followed(tmp_path: Path) -> None:
         assert np.quantile(found.samples[:, 0], share) == pytest.approx(expected, abs=0.01)
 
 
-def test_several_maxima_are_told(tmp_path: Path) -> None:
-    def even(force: Float, parameters: Float) -> Float:
+def test_several_maxima_are_told(tmp_path):
+    def even(force, parameters):
         return np.asarray(force / 10.0 * parameters[0] ** 2 + 0.5 * parameters[1])
 
     noise = NOISE * np.random.default_rng(6).standard_normal(len(FORCE))
@@ -303,7 +299,7 @@ def test_several_maxima_are_told(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.abs(found.samples[:, 0]).mean(), 0.8, atol=0.01)
 
 
-def test_a_parameter_far_from_its_prior_is_said(tmp_path: Path) -> None:
+def test_a_parameter_far_from_its_prior_is_said(tmp_path):
     campaign = campaign_of(tmp_path, spring(FORCE, np.array([0.8])))
     found = calibrate_parameters(campaign, choice_of(spring, (1.0, 0.02, 0.5, 1.5)), samples=500)
     assert found.mean("p1") == pytest.approx(0.8, abs=0.01)
@@ -322,16 +318,14 @@ def test_a_parameter_far_from_its_prior_is_said(tmp_path: Path) -> None:
         ("", (1.0, 0.0, 0.5, 1.5), ModelError, r"curve.toml has no parameter to calibrate"),
     ],
 )
-def test_what_cannot_be_calibrated_is_one_sentence(
-    tmp_path: Path, more: str, priors: tuple[float, float, float, float], cause: type[Exception], words: str
-) -> None:
+def test_what_cannot_be_calibrated_is_one_sentence(tmp_path, more, priors, cause, words):
     campaign = campaign_of(tmp_path, spring(FORCE, np.array([1.0])), more=more)
     with pytest.raises(cause, match=words):
         calibrate_parameters(campaign, choice_of(spring, priors))
 
 
-def test_a_mean_outside_the_range_is_said_before_the_model_is_asked(tmp_path: Path) -> None:
-    def law(force: Float, parameters: Float) -> Float:
+def test_a_mean_outside_the_range_is_said_before_the_model_is_asked(tmp_path):
+    def law(force, parameters):
         if parameters[0] > 1.5:
             raise ModelError("The FMU refuses it.")
         return spring(force, parameters)
@@ -342,7 +336,7 @@ def test_a_mean_outside_the_range_is_said_before_the_model_is_asked(tmp_path: Pa
         calibrate_parameters(campaign, choice_of(law, (1.0, 0.1, 0.5, 1.5)))
 
 
-def test_held_out_trials_take_no_part(tmp_path: Path) -> None:
+def test_held_out_trials_take_no_part(tmp_path):
     values = spring(FORCE, np.array([1.1]))
     whole = campaign_of(tmp_path, np.stack([values, 1.2 * values]))
     marked = replace(whole, trials=(whole.trials[0], replace(whole.trials[1], held_out=True)))
@@ -356,7 +350,7 @@ def test_held_out_trials_take_no_part(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-def test_the_published_load_test_gives_the_posterior_of_the_wings_own_calibration(tmp_path: Path) -> None:
+def test_the_published_load_test_gives_the_posterior_of_the_wings_own_calibration(tmp_path):
     """Errors of load and displacement as one: with f = k(e) x, their variances add as S(e) / k^2.
 
     That S grows with e is left out, which is worth 0.03 deviations.

@@ -1,14 +1,12 @@
 """The folder of a verdict: whole or not there, the same bytes again, never lost when it is replaced."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
 import stat
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from html import unescape
 from pathlib import Path
@@ -21,12 +19,11 @@ from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import read_patch
 from discrepancy.files.verdict import read_verdict as read_verdict_folder
 from discrepancy.files.verdict import read_verdict_file as read_verdict
-from discrepancy.judgement.separability import Separability
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import check_folder, write_verdict_folder
-from discrepancy.workflow import Investigation, investigate
+from discrepancy.workflow import investigate
 from reporting.errors import FileNotWrittenError
 from reporting.figures import to_svg
 from reporting.folders import lock_folder
@@ -72,7 +69,7 @@ Replaced = Callable[[Path, int], tuple[int, str]]
 
 
 @pytest.fixture(scope="module")
-def replaced(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Replaced]:
+def replaced(tmp_path_factory):
     """What replaces a verdict in a process that is killed after so many moves: how it ended, and said why.
 
     The processes are forks of one that has imported what they need.
@@ -81,10 +78,8 @@ def replaced(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Replaced]:
     pipe = subprocess.PIPE
     with subprocess.Popen([sys.executable, "-c", SCRIPT], stdin=pipe, stdout=pipe, text=True) as server:
         asks, answers = server.stdin, server.stdout
-        assert asks is not None
-        assert answers is not None
 
-        def replace(folder: Path, moves: int) -> tuple[int, str]:
+        def replace(folder, moves):
             said.write_text("", encoding="utf-8")
             asks.write(f"{folder}\t{moves}\t{said}\n")
             asks.flush()
@@ -95,7 +90,7 @@ def replaced(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Replaced]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     place = tmp_path / "verdict"
     place.mkdir()
     (place / "verdict.json").write_text("first", encoding="utf-8")
@@ -104,9 +99,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("moves", [1, 2, 3])
-def test_a_kill_between_the_moves_of_a_replacement_loses_no_verdict(
-    replaced: Replaced, folder: Path, moves: int
-) -> None:
+def test_a_kill_between_the_moves_of_a_replacement_loses_no_verdict(replaced, folder, moves):
     assert replaced(folder, moves)[0] == -signal.SIGKILL
     check_folder(folder, replace_it=True)
     kept = (folder / "verdict.json").read_text(encoding="utf-8")
@@ -115,7 +108,7 @@ def test_a_kill_between_the_moves_of_a_replacement_loses_no_verdict(
     assert not list(folder.parent.glob(".*.replaced-*"))
 
 
-def test_who_reads_finds_it_too(replaced: Replaced, folder: Path) -> None:
+def test_who_reads_finds_it_too(replaced, folder):
     replaced(folder, 1)
     assert not folder.exists()
     with pytest.raises(VerdictFileError, match="not valid JSON"):  # of the old verdict, which is a word
@@ -123,9 +116,7 @@ def test_who_reads_finds_it_too(replaced: Replaced, folder: Path) -> None:
     assert (folder / "notes.txt").read_text(encoding="utf-8") == "mine"
 
 
-def test_a_whole_replacement_leaves_one_folder_as_the_user_makes_them(
-    replaced: Replaced, folder: Path
-) -> None:
+def test_a_whole_replacement_leaves_one_folder_as_the_user_makes_them(replaced, folder):
     assert replaced(folder, 0) == (0, "")
     assert [path.name for path in folder.parent.iterdir()] == ["verdict"]
     plain = folder.parent / "plain"
@@ -133,7 +124,7 @@ def test_a_whole_replacement_leaves_one_folder_as_the_user_makes_them(
     assert stat.S_IMODE(folder.stat().st_mode) == stat.S_IMODE(plain.stat().st_mode)
 
 
-def test_a_folder_that_another_process_replaces_is_left_alone(replaced: Replaced, folder: Path) -> None:
+def test_a_folder_that_another_process_replaces_is_left_alone(replaced, folder):
     lock = lock_folder(folder)
     assert lock is not None
     _, said = replaced(folder, 0)
@@ -150,7 +141,7 @@ def test_a_folder_that_another_process_replaces_is_left_alone(replaced: Replaced
 pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
 
 
-def test_the_folder_of_a_named_effect(drag: Investigation, written: Path) -> None:
+def test_the_folder_of_a_named_effect(drag, written):
     assert drag.verdict.kind is VerdictKind.NAMED
     folder = written
     page = next(folder.glob("*.html")).read_text(encoding="utf-8")
@@ -176,7 +167,7 @@ def test_the_folder_of_a_named_effect(drag: Investigation, written: Path) -> Non
     assert not list(folder.parent.glob(".*"))  # nothing half-written is left
 
 
-def test_a_report_repeats_bit_for_bit(drag: Investigation, able: Separability, written: Path) -> None:
+def test_a_report_repeats_bit_for_bit(drag, able, written):
     effects = read_patch(written / "patch.json").effects
     content = ReportInput(drag, ORIGIN, able, intervals=[effect.intervals for effect in effects])
     figures = report_figures(content)
@@ -184,7 +175,7 @@ def test_a_report_repeats_bit_for_bit(drag: Investigation, able: Separability, w
     assert page == next(written.glob("*.html")).read_text(encoding="utf-8")
 
 
-def test_a_null_has_no_patch_and_no_model_after(tmp_path: Path) -> None:
+def test_a_null_has_no_patch_and_no_model_after(tmp_path):
     campaign, model = measured(kind="static")
     found = investigate(campaign, model, library())
     assert found.verdict.kind is VerdictKind.NOTHING_MISSING
@@ -195,7 +186,7 @@ def test_a_null_has_no_patch_and_no_model_after(tmp_path: Path) -> None:
     assert "nothing is missing" in page
 
 
-def test_faults_of_the_data_are_reported_and_nothing_else(tmp_path: Path) -> None:
+def test_faults_of_the_data_are_reported_and_nothing_else(tmp_path):
     campaign, model = measured(kind="static")
     wrong = tuple(replace(trial, values=1e6 * trial.values) for trial in campaign.trials)
     found = investigate(replace(campaign, trials=wrong), model, library())
@@ -207,7 +198,7 @@ def test_faults_of_the_data_are_reported_and_nothing_else(tmp_path: Path) -> Non
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["report.html", "verdict.json"]
 
 
-def test_a_folder_is_replaced_on_demand_only_and_only_if_it_is_a_verdict(tmp_path: Path) -> None:
+def test_a_folder_is_replaced_on_demand_only_and_only_if_it_is_a_verdict(tmp_path):
     campaign, model = measured(kind="static")
     content = ReportInput(investigate(campaign, model, library()), ORIGIN)
     folder = tmp_path / "v"
@@ -226,14 +217,12 @@ def test_a_folder_is_replaced_on_demand_only_and_only_if_it_is_a_verdict(tmp_pat
         check_folder(other / "chapter.tex", replace_it=True)
 
 
-def test_a_failure_while_writing_leaves_the_old_folder(
-    drag: Investigation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failure_while_writing_leaves_the_old_folder(drag, tmp_path, monkeypatch):
     folder = tmp_path / "v"
     folder.mkdir()
     (folder / "verdict.json").write_text("old", encoding="utf-8")
 
-    def refuse(patch: Path, target: Path) -> str:
+    def refuse(patch, target):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(FileNotWrittenError, match="No space"):

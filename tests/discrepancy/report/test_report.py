@@ -1,10 +1,7 @@
 """What a page says of a verdict: the finding first, then its grounds."""
 
-from __future__ import annotations
-
 import html
 import re
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -36,7 +33,6 @@ from discrepancy.report.text import (
     shares_sentence,
 )
 from discrepancy.verdict import ExplainedShare, NotFitted, RemainderEstimate, VerdictKind
-from discrepancy.workflow import Investigation
 from reporting.page import Page
 from reporting.words import listing
 from tests.discrepancy.rigs import FEW, ORIGIN
@@ -44,17 +40,17 @@ from tests.discrepancy.rigs import FEW, ORIGIN
 pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
 
 
-def read(page: str) -> str:
+def read(page):
     """Return a page as a browser shows it."""
     return html.unescape(page).replace("\N{NO-BREAK SPACE}", " ")
 
 
-def text_of(investigation: Investigation) -> str:
+def text_of(investigation):
     """Return the whole page of an investigation without its figures."""
     return read(render_report(ReportInput(investigation, ORIGIN), {}, {}))
 
 
-def section_of(add: Callable[..., None], content: object) -> str:
+def section_of(add, content):
     """Return what is added to a page."""
     page = Page("a", "b")
     page.add_section("c")
@@ -62,10 +58,8 @@ def section_of(add: Callable[..., None], content: object) -> str:
     return read(page.render())
 
 
-def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag: Investigation) -> None:
-    assert drag.proof is not None
+def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
     closed, held = drag.proof.gap_closed, drag.proof.held_out_after
-    assert held is not None
     said = closing_sentence(drag)
     assert said.startswith(f"It closes {percent(closed)} % of the gap on held-out trials: χ²/dof is ")
     assert f"and {number(held.chi_square_per_dof)} after it" in said
@@ -82,9 +76,8 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag: 
     assert closing_sentence(replace(drag, proof=None)) == ""
 
 
-def test_a_report_opens_with_effect_size_share_and_probability(drag: Investigation) -> None:
+def test_a_report_opens_with_effect_size_share_and_probability(drag):
     force = drag.verdict.force
-    assert force is not None
     assert force.held_out is not None
     text = text_of(drag)
     opening = (
@@ -95,7 +88,7 @@ def test_a_report_opens_with_effect_size_share_and_probability(drag: Investigati
     assert places == sorted(places)
 
 
-def test_members_of_a_group_stand_apart_and_first(drag: Investigation) -> None:
+def test_members_of_a_group_stand_apart_and_first(drag):
     (effect,) = drag.verdict.effects
     rival = replace(effect, identifier="rival", name="a rival")
     hypotheses = tuple(
@@ -114,7 +107,7 @@ def test_members_of_a_group_stand_apart_and_first(drag: Investigation) -> None:
     assert [role for _, role in roles[:4]] == ["member of the group"] * 2 + [""] * 2
 
 
-def test_what_was_not_compared_is_told_by_reason(drag: Investigation) -> None:
+def test_what_was_not_compared_is_told_by_reason(drag):
     left = tuple(NotFitted(name, "No flight trial.") for name in ("washout", "inertia_relief"))
     left += (NotFitted("free_play", "screened out: 0.3 nat at most", 0.3),)
     text = section_of(add_not_compared, replace(drag.verdict, not_fitted=left))
@@ -122,22 +115,21 @@ def test_what_was_not_compared_is_told_by_reason(drag: Investigation) -> None:
     assert "<td>Screened out</td><td>free play (0.3 nat)</td>" in text
 
 
-def test_parameters_are_shown_before_and_after(drag: Investigation) -> None:
+def test_parameters_are_shown_before_and_after(drag):
     rows = parameter_rows(drag)
     assert [row[0] for row in rows] == ["stiffness factor", "damping factor"]
-    assert drag.fit is not None
-    fitted = drag.problem.shared.parameters(drag.fit.point.shared)  # type: ignore[union-attr]
+    fitted = drag.problem.shared.parameters(drag.fit.point.shared)
     for row, item, value in zip(rows, drag.model.parameters, fitted, strict=True):
         moments = [[float(part) for part in cell.split(" ± ")] for cell in row[2:]]
         assert moments[0] == pytest.approx([item.mean, norm.ppf(0.95) * item.deviation], rel=0.03)
         assert moments[2][0] == pytest.approx(value, abs=0.06 * moments[2][1])
         assert moments[2][1] < moments[0][1]
-    nothing = replace(drag, fit=drag.search.none)  # type: ignore[union-attr]
+    nothing = replace(drag, fit=drag.search.none)
     assert [row[:4] for row in parameter_rows(nothing)] == [row[:4] for row in rows]
     assert {len(row) for row in parameter_rows(nothing)} == {4}
 
 
-def test_gates_say_what_they_compare(drag: Investigation) -> None:
+def test_gates_say_what_they_compare(drag):
     text = section_of(add_gates, drag)
     absolute, shape, consistency, _ = drag.verdict.gates
     for gate in (absolute, consistency):
@@ -146,9 +138,7 @@ def test_gates_say_what_they_compare(drag: Investigation) -> None:
     assert f"at most {shape.limit:g} nat</td>" in text
 
 
-def test_the_gate_that_decided_stands_out_where_the_absolute_fit_could_not_be_judged(
-    drag: Investigation,
-) -> None:
+def test_the_gate_that_decided_stands_out_where_the_absolute_fit_could_not_be_judged(drag):
     absolute, shape, consistency, _ = drag.verdict.gates
     gates = (
         replace(absolute, passed=None, statistic=float("nan")), shape,
@@ -159,7 +149,7 @@ def test_the_gate_that_decided_stands_out_where_the_absolute_fit_could_not_be_ju
     assert "p of the consistency; a fit has at least 0.001" in text
 
 
-def test_a_reader_sees_which_trial_is_held_out(drag: Investigation) -> None:
+def test_a_reader_sees_which_trial_is_held_out(drag):
     assert drag.before is not None
     _, names, _ = size_table(drag.before)
     trials = drag.campaign.trials
@@ -169,9 +159,7 @@ def test_a_reader_sees_which_trial_is_held_out(drag: Investigation) -> None:
     assert f"Held out: {listing(trial.name for trial in trials if trial.held_out)};" in caption
 
 
-def test_what_explains_most_of_the_gap_is_told_first(drag: Investigation) -> None:
-    assert drag.location is not None
-    assert drag.before is not None
+def test_what_explains_most_of_the_gap_is_told_first(drag):
     gap = {"static": 0.0, "ring-down": 0.0}
     for item in drag.before.trials:
         if not item.trial.held_out:
@@ -182,7 +170,7 @@ def test_what_explains_most_of_the_gap_is_told_first(drag: Investigation) -> Non
     assert told == sorted(told, reverse=True)
 
 
-def test_each_reason_is_given_once_and_each_confusion_by_name(able: Separability) -> None:
+def test_each_reason_is_given_once_and_each_confusion_by_name(able):
     assert untested_lines(able) == ["Not testable: washout. The campaign has no flight trial to fit."]
     lines = confused_lines(able)
     assert len(lines) == sum(bool(neighbours(able, name)) for name in able.identifiers)
@@ -192,7 +180,7 @@ def test_each_reason_is_given_once_and_each_confusion_by_name(able: Separability
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_an_effect_is_not_the_nearest_to_itself(drag: Investigation, count: int) -> None:
+def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     hidden = tuple(
         Detectability(effect, "", "", DETECTED / (n + 2) ** 2, "size", 1.0, "1", 0.5)
         for n, effect in enumerate(FEW[:count])
@@ -207,7 +195,7 @@ def test_an_effect_is_not_the_nearest_to_itself(drag: Investigation, count: int)
     assert told.endswith("with noise 2 times smaller or 4 times as many trials.")
 
 
-def test_rows_of_what_can_be_decided(drag: Investigation, able: Separability) -> None:
+def test_rows_of_what_can_be_decided(drag, able):
     rows = {row[0]: row for row in rows_of(able)}
     assert set(rows) == {effect.identifier for effect in FEW}
     assert rows["washout"][1] == "no"
@@ -222,7 +210,7 @@ def test_rows_of_what_can_be_decided(drag: Investigation, able: Separability) ->
         assert group[0].replace("_", " ") in text
 
 
-def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(drag: Investigation) -> None:
+def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(drag):
     verdict = replace(
         drag.verdict,
         kind=VerdictKind.NAMED_IN_PART,

@@ -2,7 +2,6 @@
 
 import os
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from discrepancy.errors import CampaignFileError
 from discrepancy.model_choice import load_model
 from discrepancy.models.interface import Model
 from discrepancy.sources.measured_rigs import write_rig_campaign
-from discrepancy.verdict import Verdict, VerdictKind
+from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from uav_twin.cli import app
 
@@ -29,8 +28,8 @@ Rig = tuple[Campaign, Model]
 
 
 @pytest.fixture(scope="module")
-def rig(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Rig]:
-    def made(name: str) -> Rig:
+def rig(tmp_path_factory):
+    def made(name):
         if not (PUBLISHED / name).is_dir():
             pytest.skip(f"the published records of {name} are not beside the project")
         folder = write_rig_campaign(name, PUBLISHED / name, tmp_path_factory.mktemp(name) / "campaign")
@@ -40,26 +39,26 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Rig]:
 
 
 @pytest.fixture(scope="module")
-def phone(rig: Callable[[str], Rig]) -> Rig:
+def phone(rig):
     return rig("falling_phone")
 
 
 @pytest.fixture(scope="module")
-def tanks(rig: Callable[[str], Rig]) -> Rig:
+def tanks(rig):
     return rig("two_tanks")
 
 
 @pytest.fixture(scope="module")
-def pendulum(rig: Callable[[str], Rig]) -> Rig:
+def pendulum(rig):
     return rig("pendulum")
 
 
-def judged(rig: Rig, *effects: str) -> Verdict:
+def judged(rig, *effects):
     chosen = [effect_by_identifier(name, library()) for name in effects]
     return investigate(*rig, chosen, thorough=False).verdict
 
 
-def write_falls(folder: Path, size: int = 400) -> Path:
+def write_falls(folder, size=400):
     """Write a rest of a second and a half, a fall of 0.4 s in the middle of a record, and a second record."""
     folder.mkdir()
     time = 0.005 * np.arange(size)
@@ -71,7 +70,7 @@ def write_falls(folder: Path, size: int = 400) -> Path:
     return folder
 
 
-def test_only_the_fall_is_taken_without_its_ends(tmp_path: Path) -> None:
+def test_only_the_fall_is_taken_without_its_ends(tmp_path):
     read = read_campaign(
         write_rig_campaign("falling_phone", write_falls(tmp_path / "data"), tmp_path / "out")
     )
@@ -82,7 +81,7 @@ def test_only_the_fall_is_taken_without_its_ends(tmp_path: Path) -> None:
         assert trial.time[-1] == pytest.approx(0.345)
 
 
-def test_the_command_writes_what_run_reads(tmp_path: Path) -> None:
+def test_the_command_writes_what_run_reads(tmp_path):
     out, data = tmp_path / "out", write_falls(tmp_path / "data")
     words = ["discrepancy", "convert", str(out), "--rig", "falling_phone", "--data", str(data)]
     said = CliRunner().invoke(app, words)
@@ -95,7 +94,7 @@ def test_the_command_writes_what_run_reads(tmp_path: Path) -> None:
     ]
 
 
-def test_what_is_not_as_published_is_refused_in_a_sentence_and_nothing_is_written(tmp_path: Path) -> None:
+def test_what_is_not_as_published_is_refused_in_a_sentence_and_nothing_is_written(tmp_path):
     out, data = tmp_path / "out", write_falls(tmp_path / "data")
     with pytest.raises(
         CampaignFileError, match="There is no rig 'wing': give one of real_wing, falling_phone, two_tanks"
@@ -118,29 +117,27 @@ def test_what_is_not_as_published_is_refused_in_a_sentence_and_nothing_is_writte
     assert not out.exists()
 
 
-def test_a_fall_is_no_short_record(phone: Rig) -> None:
+def test_a_fall_is_no_short_record(phone):
     assert not [fault for fault in check_against_model(*phone) if fault.fatal]
 
 
 @pytest.mark.long  # what reads the rig is tested above, and how drag is named in test_naming.py
-def test_drag_is_named_with_its_exponent_and_nothing_that_only_describes(phone: Rig) -> None:
+def test_drag_is_named_with_its_exponent_and_nothing_that_only_describes(phone):
     verdict = judged(
         phone, "quadratic_damping", "coulomb_friction", "cubic_stiffness", "joint_micro_slip",
         "gauge_zero_drift", "clock_error",
     )  # fmt: skip
     assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
     assert [effect.identifier for effect in verdict.effects] == ["quadratic_damping"]
-    assert verdict.explained is not None
     assert verdict.explained.trials == "held-out"
     assert verdict.explained.low > 0.9
     told = re.search(r"exponent of the speed \S+ \((\S+) to (\S+)\)", verdict.sentence)
-    assert told is not None, verdict.sentence
     low, high = map(float, told.groups())
     assert 1.0 < low < 2.0 < high
     assert {"joint_micro_slip", "cubic_stiffness"} <= {item.identifier for item in verdict.not_fitted}
 
 
-def test_readings_at_the_end_of_the_level_sensor_are_left_out(tanks: Rig) -> None:
+def test_readings_at_the_end_of_the_level_sensor_are_left_out(tanks):
     campaign, _ = tanks
     assert [trial.name for trial in campaign.held_out] == ["validation"]
     for trial, left_out in zip(campaign.trials, (47, 37), strict=True):
@@ -150,17 +147,16 @@ def test_readings_at_the_end_of_the_level_sensor_are_left_out(tanks: Rig) -> Non
 
 
 @pytest.mark.long
-def test_the_tanks_have_a_root_of_the_level_and_an_overflow_in_part(tanks: Rig) -> None:
+def test_the_tanks_have_a_root_of_the_level_and_an_overflow_in_part(tanks):
     verdict = judged(tanks, "outflow", "overflow", "logger_clock")
     assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
     found = {(effect.identifier, effect.place) for effect in verdict.effects}
     assert found == {("outflow", "lower outlet"), ("overflow", "upper outlet")}
-    assert verdict.explained is not None
     assert verdict.explained.trials == "held-out"
     assert verdict.explained.low > 0.5
 
 
-def test_a_sample_of_the_pendulum_is_a_fiftieth_of_a_second(pendulum: Rig) -> None:
+def test_a_sample_of_the_pendulum_is_a_fiftieth_of_a_second(pendulum):
     campaign, _ = pendulum
     assert [trial.name for trial in campaign.held_out] == ["ilqr"]
     for trial, count in zip(campaign.trials, (195, 1000), strict=True):
@@ -168,14 +164,14 @@ def test_a_sample_of_the_pendulum_is_a_fiftieth_of_a_second(pendulum: Rig) -> No
         assert float(np.median(np.diff(trial.time))) == pytest.approx(0.02, rel=0.01)
 
 
-def test_the_pendulum_has_no_name_and_its_share_is_said(pendulum: Rig) -> None:
+def test_the_pendulum_has_no_name_and_its_share_is_said(pendulum):
     verdict = judged(pendulum, "coulomb_friction", "quadratic_damping", "clock_error")
     assert verdict.kind is VerdictKind.UNEXPLAINED
     assert "is missing at 'pivot', ordered by" in verdict.sentence
     assert verdict.explained is None or verdict.explained.value < 0.5
 
 
-def write_public(folder: Path) -> None:
+def write_public(folder):
     """Write records in the form in which they were published: a fall, a cooling and a swing."""
     time = 0.1 * np.arange(500)
     tables = {
@@ -188,7 +184,7 @@ def write_public(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_a_public_record_becomes_a_campaign_that_its_model_can_follow(name: str, tmp_path: Path) -> None:
+def test_a_public_record_becomes_a_campaign_that_its_model_can_follow(name, tmp_path):
     write_public(tmp_path)
     folder = write(name, tmp_path, tmp_path / name)
     campaign, model = read_campaign(folder), load_model(folder / "model.toml")
@@ -213,7 +209,7 @@ def test_a_public_record_becomes_a_campaign_that_its_model_can_follow(name: str,
         ("swinging_gate", VerdictKind.UNEXPLAINED),
     ],
 )
-def test_public_records_have_the_verdict_of_the_page(name: str, kind: VerdictKind, tmp_path: Path) -> None:
+def test_public_records_have_the_verdict_of_the_page(name, kind, tmp_path):
     folder = write(name, Path(str(PUBLIC)), tmp_path / name)
     verdict = investigate(folder, folder / "model.toml", thorough=False).verdict
     assert verdict.kind is kind, verdict.sentence

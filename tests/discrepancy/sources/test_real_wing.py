@@ -1,7 +1,5 @@
 """The real wing's measurements as a campaign: windows, slow zero, noise; the published records."""
 
-from __future__ import annotations
-
 from math import pi
 from pathlib import Path
 
@@ -27,7 +25,7 @@ STEP = 8.1112e-3
 NOISE = 5e-5
 
 
-def write_records(folder: Path, count: int = 4, size: int = 795, seed: int = 3) -> np.ndarray:
+def write_records(folder, count=4, size=795, seed=3):
     """Write ring-downs (count, size) of one motion, a zero that they share, and noise; return the zero."""
     generator = np.random.default_rng(seed)
     place = folder / "step3"
@@ -47,7 +45,7 @@ def write_records(folder: Path, count: int = 4, size: int = 795, seed: int = 3) 
     return np.asarray(zero)
 
 
-def test_a_sample_is_the_mean_of_four_columns_without_the_shared_zero(tmp_path: Path) -> None:
+def test_a_sample_is_the_mean_of_four_columns_without_the_shared_zero(tmp_path):
     write_records(tmp_path)
     plain = wing_campaign(tmp_path, detrended=False, columns=1)
     averaged = wing_campaign(tmp_path, detrended=False)
@@ -61,12 +59,12 @@ def test_a_sample_is_the_mean_of_four_columns_without_the_shared_zero(tmp_path: 
     assert abs(slow[1]) < 0.1 * abs(slow[0])
 
 
-def test_the_scatter_between_trials_is_the_noise(tmp_path: Path) -> None:
+def test_the_scatter_between_trials_is_the_noise(tmp_path):
     generator = np.random.default_rng(5)
-    time: FloatArray = 0.03 * np.arange(400, dtype=np.float64)
+    time = 0.03 * np.arange(400, dtype=np.float64)
     # a motion of no law that a model could have, the same in all trials but for size, delay and zero
     motion = np.sin(30.0 * np.sqrt(1.0 + time)) / (1.0 + time)
-    windows: list[tuple[FloatArray, FloatArray]] = []
+    windows = []
     for k in range(5):
         shown = (1.0 + 0.02 * k) * motion + 1e-3 * k * np.gradient(motion) + 0.1 * k
         windows.append((time, np.asarray(shown + 1e-2 * generator.normal(size=400))))
@@ -75,15 +73,14 @@ def test_the_scatter_between_trials_is_the_noise(tmp_path: Path) -> None:
     assert np.std(noise) == pytest.approx(1e-2, rel=0.06)
 
 
-def test_the_noise_record_holds_scatter_and_reading_error(tmp_path: Path) -> None:
+def test_the_noise_record_holds_scatter_and_reading_error(tmp_path):
     write_records(tmp_path)
     record = wing_campaign(tmp_path).channels[SIGNAL].noise
-    assert record is not None
     # the average of four columns has half the noise; the shared zero takes little of it
     assert record.standard_deviation == pytest.approx(np.hypot(NOISE / 2.0, READING_ERROR), rel=0.08)
 
 
-def test_a_folder_without_records_or_with_too_short_ones_is_refused(tmp_path: Path) -> None:
+def test_a_folder_without_records_or_with_too_short_ones_is_refused(tmp_path):
     with pytest.raises(CampaignFileError, match="cannot be read"):
         wing_campaign(tmp_path / "nowhere")
     write_records(tmp_path / "short", size=200)
@@ -95,7 +92,7 @@ def test_a_folder_without_records_or_with_too_short_ones_is_refused(tmp_path: Pa
 
 
 @pytest.mark.skipif(not PUBLISHED.is_dir(), reason="the published measurements are not beside the project")
-def test_the_published_measurements_make_a_campaign_that_reads_back(tmp_path: Path) -> None:
+def test_the_published_measurements_make_a_campaign_that_reads_back(tmp_path):
     made = wing_campaign(PUBLISHED)
     assert [trial.kind for trial in made.trials] == [TrialKind.STATIC] * 2 + [TrialKind.RINGDOWN] * 5
     assert [trial.name for trial in made.held_out] == ["release 3", "release 5"]

@@ -23,8 +23,6 @@ from twin_master.assets.parameter import draw_parameter
 from twin_master.assets.resolution import (
     Overrides,
     asset_source,
-    located_scenario,
-    portable_scenario,
     resolve_scenario,
 )
 from twin_master.errors import MissionInputError, ScenarioError
@@ -113,10 +111,10 @@ def test_paths_start_at_the_scenario_and_leave_no_trace_of_the_machine(file: Pat
     scenario = resolve_scenario(load_scenario(scenario_with(file.parent, "my wing.nc")), Overrides())
     assert scenario.calibration.file == str(file)
     assert (scenario.asset.kind, scenario.belief.kind) == ("calibration", "calibration")
-    portable = portable_scenario(scenario)
+    portable = scenario.portable()
     assert portable.calibration.file == "asset/calibration.nc"
     assert str(file.parent) not in json.dumps(portable.to_dict())
-    located = located_scenario(portable, Path("/elsewhere"))
+    located = portable.moved(Path("/elsewhere"))
     assert located.calibration.file == "/elsewhere/asset/calibration.nc"
     source = asset_source(scenario)
     assert isinstance(scenario.asset.source(scenario), FmuSource)
@@ -178,7 +176,7 @@ def test_the_wing_among_several_fmus_is_tailored_too(file: Path, tmp_path: Path)
     with zipfile.ZipFile(tmp_path / "run" / "asset" / "components" / "wing.fmu") as archive:
         record = json.loads(archive.read("resources/calibration.json"))
     assert record["asset"] == "Wing 7 (é)"
-    moved = located_scenario(portable_scenario(scenario), tmp_path / "run")
+    moved = scenario.portable().moved(tmp_path / "run")
     assert moved.asset.component[1].design == "calibration"
 
 

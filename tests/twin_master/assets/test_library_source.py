@@ -20,7 +20,7 @@ from fmu_asset.packing.script import build_script_fmu
 from reporting.progress import SilentProgress
 from scenarios import asset_scripts
 from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded_from, table_of
-from twin_master.assets.observation_library import ObservationLibrary, load_observation_library
+from twin_master.assets.library_source import ObservationLibrary, load_observation_library
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import InvalidObservationLibraryError, ScenarioError, TwinMasterError
 from twin_master.library.request import grid_of_scenario

@@ -25,13 +25,11 @@ from reporting.progress import SilentProgress
 from tests.command_line import refused
 from tests.conftest import synthetic_library
 from tests.twin_master.runs import text_of, written
-from twin_master.assets.asset_source import PairedSource
-from twin_master.assets.interface import AssetReading, StatelessAsset
+from twin_master.assets.asset_source import AssetReading, PairedSource, StatelessAsset
 from twin_master.assets.mismatch import find_misfit
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.errors import MissingObservationModelError, MissionInputError, ScenarioError
 from twin_master.fleet.reading import Outcomes
 from twin_master.fleet.store import in_credible_set

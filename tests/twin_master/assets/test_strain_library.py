@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from twin_master.assets.strain_library import StrainLibrary, load_strain_library
+from twin_master.assets.strain_library_source import StrainLibrary, load_strain_library
 from twin_master.errors import InvalidStrainLibraryError
 
 LEVELS = [[0, 20, 40], [0, 50]]

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from fmu_asset.errors import FmuCallError, FmuTimeoutError, FmuWorkerError
 from fmu_asset.packing.script import build_script_fmu
-from twin_master.assets.observation_library import load_observation_library
+from twin_master.assets.library_source import load_observation_library
 from twin_master.errors import InvalidObservationLibraryError
 from twin_master.library.grid import SamplingGrid
 from twin_master.library.request import grid_of_fmu, parse_grid

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.seeds import fly_seeds
 from tests.twin_master.runs import of_library, table_of
-from twin_master.assets.interface import AssetReading, StatelessAsset
+from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import AssetOutputError, NotResumableError
 from twin_master.mission.loop import Checkpoint, fly

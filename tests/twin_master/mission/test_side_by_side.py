@@ -11,7 +11,7 @@ import pytest
 
 from fmu_asset.errors import FmuEndedError
 from tests.twin_master.runs import of_library
-from twin_master.assets.interface import AssetReading, StatelessAsset
+from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.errors import AssetOutputError
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import ENDED, FLOWN, in_credible_set, outcomes_of

@@ -151,7 +151,7 @@ def test_a_problem_whose_tables_do_not_fit_is_refused() -> None:
     problem = tiger(0.9)
     with pytest.raises(PlanningError, match="sum to one"):
         replace(problem, likelihood=(problem.likelihood[0] * 0.5, *problem.likelihood[1:]))
-    with pytest.raises(PlanningError, match="expected rewards of shape"):
+    with pytest.raises(PlanningError, match="expected likelihoods of controls of shape"):
         replace(problem, likelihood=problem.likelihood[:2])
 
 

@@ -13,8 +13,7 @@ from scipy.stats import binom
 
 from fe.runtime.kept_arrays import arrays_to_bytes
 from scenarios import scenario_files
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.errors import ImpossibleObservation, InvalidModelError
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.network.estimator import Carried, Estimate, ExactFilter, Learnt

@@ -13,9 +13,7 @@ from hypothesis import strategies as st
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from tests.twin_master.runs import table_of, text_of, written
-from twin_master.assets.asset_source import FlownAndBelieved
-from twin_master.assets.interface import Asset, AssetReading, StatelessAsset
-from twin_master.assets.parameter import draw_parameter
+from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, FlownAndBelieved, StatelessAsset
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import ScenarioError, TwinMasterError, UnknownScenarioError
 from twin_master.mission.preparation import prepare_knowledge
@@ -256,37 +254,23 @@ class Bellows(AssetSection):
         return BellowsSource(scenario, self)
 
 
-class BellowsSource:
+class BellowsSource(AssetSource):
     """What is made of it; it is believed as well."""
 
+    label = "bellows"
+
     def __init__(self, scenario: Scenario, section: Bellows) -> None:
-        self.scenario, self.section = scenario, section
-        self.origin = FlownAndBelieved("bellows", "bellows")
-
-    def check(self) -> None:
-        """Accept anything."""
-
-    def files(self) -> dict[str, bytes]:
-        return {}
-
-    def prepare(self, folder: Path, progress: object) -> dict[str, str]:
-        return {}
-
-    def draws(self, seed: int) -> Any:
-        return draw_parameter(self.scenario.calibration, seed)
+        super().__init__(scenario)
+        self.section, self.count = section, scenario.observation.count
 
     def observation_table(self, draws: Any, model: Any) -> Any:
-        loads = np.array([control.values["load_factor"] for control in self.scenario.control])
+        loads = np.array([control.values["load_factor"] for control in self._scenario.control])
         left = 1.0 - model.states.coordinates.mean(axis=1)
-        count = self.scenario.observation.count
         table = loads / (self.section.stiffness * draws.values[:, None, None] * left[None, :, None])
-        return np.repeat(table[..., None], count, axis=-1)
+        return np.repeat(table[..., None], self.count, axis=-1)
 
     def open(self) -> Asset:
-        return StatelessAsset(lambda control, health: AssetReading(np.zeros(self.scenario.observation.count)))
-
-    def write_field(self, path: Path, state: object, control: object) -> bool:
-        return False
+        return StatelessAsset(lambda control, health: AssetReading(np.zeros(self.count)))
 
 
 def test_a_kind_of_one_s_own_is_one_class(tmp_path: Path) -> None:
@@ -329,6 +313,6 @@ def test_a_strain_library_may_be_believed_of_an_fmu(library_file: Path, tmp_path
     source = asset_source(resolve_scenario(loaded, Overrides()))
     source.check()
     assert source.origin == FlownAndBelieved(
-        "FMU of the reduced model of the design", "strain library", differ=True
+        "FMU of the reduced model of the design UAV wing", "strain library", differ=True
     )
     assert len(source.draws(0).values) == 5
