@@ -17,7 +17,7 @@ def check_scenario(loaded: LoadedScenario, overrides: Overrides | None = None) -
     """Return what a scenario is with the overrides, once everything that it names was looked at.
 
     Beside what it flies and believes, in words, these are the sizes of the twin: `levels` of each factor,
-    joint `states` S, `controls`, `sensors` G, and the `memory` of its arrays, (E, S, U, G) among them [bytes].
+    joint `states`, `controls`, `sensors`, and the `memory` of all its arrays [bytes].
 
     Raises
     ------
