@@ -1,7 +1,5 @@
 """Arrays in files, of every kind that is kept: reproducible, read to the last bit, or refused in words."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from contextlib import suppress
