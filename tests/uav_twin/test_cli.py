@@ -178,8 +178,8 @@ def test_every_shipped_scenario_is_sound_or_says_what_it_needs(name: str) -> Non
             check_scenario(load_scenario(name))
         return
     found = check_scenario(load_scenario(name))
-    assert found.name == name
-    assert found.memory > 0
+    assert found["name"] == name
+    assert found["memory"] > 0
 
 
 ASSUMED = "standard_deviation_microstrain = 125"

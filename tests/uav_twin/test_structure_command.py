@@ -34,8 +34,11 @@ STRUCTURE = """
 name = "bar"
 mesh = "bar.inp"
 length_unit = "mm"
-[[parameter]]
-name = "e"
+parameter = [{ name = "e" }]
+support = [{ set = "ROOT", hold = ["x", "y", "z"] }]
+load = [{ name = "pull", set = "END", force = [2000, 0, 0] }]
+gauge = [{ name = "top", point = [50, 5, 10], direction = [1, 0, 0] }]
+displacement = [{ name = "end", point = [100, 5, 5], direction = [1, 0, 0] }]
 [[material]]
 name = "steel"
 set = "BAR"
@@ -43,21 +46,6 @@ density = 7800
 young_modulus = 2e11
 poisson_ratio = 0.0
 scaled_by = "e"
-[[support]]
-set = "ROOT"
-hold = ["x", "y", "z"]
-[[load]]
-name = "pull"
-set = "END"
-force = [2000, 0, 0]
-[[gauge]]
-name = "top"
-point = [50, 5, 10]
-direction = [1, 0, 0]
-[[displacement]]
-name = "end"
-point = [100, 5, 5]
-direction = [1, 0, 0]
 """
 
 

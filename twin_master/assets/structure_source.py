@@ -286,23 +286,15 @@ class StructureFmuSource(_Structure, FmuSource):
 
     def _check_history(self) -> None:
         """Refuse a scripted truth beyond the ranges of the damage regions; raises `MissionInputError`."""
-        scenario, last_step = self._scenario, self._scenario.mission.steps - 1
+        scenario, history = self._scenario, self._scenario.scripted_history()
         largest = {part.name: part.largest_loss for part in self.design.damage}
-        for state in scenario.state:  # each is a region: names were checked
-            gains = np.zeros(last_step + 1)
-            gains[0] = state.levels[int(np.argmax(state.prior))]
-            for entry in scenario.truth.gains:
-                if entry.state == state.name:
-                    end = entry.first_step if entry.last_step is None else entry.last_step
-                    gains[entry.first_step : end + 1] += entry.gain
-            loss = np.cumsum(gains)
-            outside = np.flatnonzero((loss < -1e-9) | (loss > largest[state.name] + 1e-9))
+        for name, loss in zip(scenario.state_names, history.T, strict=True):  # each is a region
+            outside = np.flatnonzero((loss < -1e-9) | (loss > largest[name] + 1e-9))
             if outside.size:
                 raise MissionInputError(
-                    f"`truth.gains` bring {state.name} to {loss[outside[0]]:.6g} in "
-                    f"{scenario.mission.step_name} {outside[0]}, but the structure {self.design.name} gives "
-                    f"it the range 0 to {largest[state.name]:g}; give smaller gains, or another "
-                    "`largest_loss` in its file."
+                    f"`truth.gains` bring {name} to {loss[outside[0]]:.6g} in {scenario.mission.step_name} "
+                    f"{outside[0]}, but the structure {self.design.name} gives it the range 0 to "
+                    f"{largest[name]:g}; give smaller gains, or another `largest_loss` in its file."
                 )
 
     def _make(self, progress: Progress) -> dict[str, str]:

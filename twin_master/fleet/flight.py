@@ -27,8 +27,6 @@ from twin_master.fleet.store import FAILED, FleetStore, check_installed, sizes_o
 from twin_master.mission.opening import released
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
-from twin_master.mission.truth import Truth
-from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
@@ -280,8 +278,7 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
     e = np.array([member.parameters.get(name, own) for member in group.members])
     states = np.zeros((1, len(scenario.state)))
     if scenario.truth.kind == "scripted":
-        truth = Truth(scenario, build_graphical_model(scenario), group.members[0].seed)
-        states = np.array([truth.state(step, None, None) for step in range(scenario.mission.steps)])
+        states = scenario.scripted_history()
     found = [(name, e, ranges[name], "assets")]
     found += [
         (region, states[:, place], ranges[region], f"{scenario.mission.step_name}s")

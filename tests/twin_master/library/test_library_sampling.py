@@ -25,24 +25,12 @@ from twin_master.library.request import grid_of_fmu, parse_grid
 from twin_master.library.sampling import blocks_folder, sample_library
 
 BINDING = """
-[binding]
-name = "wayward"
-step_size = 1.0
-[control.push]
-variable = "push"
-unit = "N"
-[control.mode]
-variable = "mode"
-unit = "1"
-[health.wear]
-variable = "wear"
-unit = "1"
-[parameter.gain]
-variable = "gain"
-unit = "1"
-[observation.lever]
-variables = ["shown", "double"]
-unit = ["m", "mm"]
+binding = { name = "wayward", step_size = 1.0 }
+control.push = { variable = "push", unit = "N" }
+control.mode = { variable = "mode", unit = "1" }
+health.wear = { variable = "wear", unit = "1" }
+parameter.gain = { variable = "gain", unit = "1" }
+observation.lever = { variables = ["shown", "double"], unit = ["m", "mm"] }
 """
 FINE, LAG, COUNT, DIE, SLEEP, REFUSE, SLOW = (float(mode) for mode in range(7))
 WEAR, GAIN, PUSH = (0.0, 0.25, 0.5), (0.9, 1.0, 1.1), (2.0, 4.0)

@@ -54,6 +54,7 @@ def read(folder: Path, config_hash: str = "abc") -> Checkpoint | None:
 
 def test_round_trip_is_exact(tmp_path: Path) -> None:
     turns = flown(3)
+    assert read(tmp_path) is None
     write(tmp_path, turns)
     found = read(tmp_path)
     assert found is not None
@@ -66,10 +67,6 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
         assert reading.happened.observation.tobytes() == written.happened.observation.tobytes()
         assert reading.happened.monitors == written.happened.monitors
     assert found.asset_state == 3 * STATE
-
-
-def test_none_before_the_first_turn(tmp_path: Path) -> None:
-    assert read(tmp_path) is None
 
 
 def test_a_line_cut_off_anywhere_is_flown_again(tmp_path: Path) -> None:

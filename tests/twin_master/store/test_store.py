@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from reporting.errors import DamagedFileError, FileNotWrittenError
-from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
+from tests.twin_master.runs import of_library
 from twin_master.mission.loop import fly
-from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Reference
@@ -29,12 +28,10 @@ def result(library_file: Path) -> MissionResult:
 
 
 def flown(name: str, library_file: Path) -> MissionResult:
-    scenario = load_scenario(name).scenario
-    source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
-    knowledge = prepare_knowledge(scenario, source, 3)
+    knowledge, source = of_library(name, library_file)
     truth = knowledge.truth(3)
-    flight = fly(scenario, knowledge.twin(), knowledge.plant(truth, source.open()))
-    return MissionResult(scenario, knowledge, flight, truth)
+    flight = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truth, source.open()))
+    return MissionResult(knowledge.scenario, knowledge, flight, truth)
 
 
 def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(
@@ -131,36 +128,28 @@ def controls(*gentle: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("gentle", "delay", "early"),
+    ("gentle", "truth", "delay", "early"),
     [
-        (range(31, 50), 1, None),
-        (range(33, 50), 3, None),
-        ([*range(25, 27), *range(32, 50)], 2, 25),
-        (range(29, 50), 0, 29),
-        ([], None, None),
+        (range(31, 50), TRUTH, 1, None),
+        (range(33, 50), TRUTH, 3, None),
+        ([*range(25, 27), *range(32, 50)], TRUTH, 2, 25),
+        (range(29, 50), TRUTH, 0, 29),
+        ([], TRUTH, None, None),
+        ([12], np.zeros((50, 2)), None, 12),  # no damage calls for it
     ],
 )
-def test_fallback(gentle: range | list[int], delay: int | None, early: int | None) -> None:
-    found = find_fallback(MODEL.states, POLICY, 1, controls(*gentle), TRUTH)
+def test_fallback(gentle: range | list[int], truth: np.ndarray, delay: int | None, early: int | None) -> None:
+    found = find_fallback(MODEL.states, POLICY, 1, controls(*gentle), truth)
     assert (found.switch_state, found.switch_level) == ("z1", 0.6)
-    assert found.called_for_step == 30
-    assert found.delay == delay
-    assert found.early_step == early
+    assert found.called_for_step == (30 if truth.any() else None)
+    assert (found.delay, found.early_step) == (delay, early)
 
 
 def test_a_policy_of_several_states_or_none_has_no_switch() -> None:
     both = np.where(MODEL.states.coordinates.sum(axis=1) > 0.59, 0, 1)
     for policy in (both, np.ones(25, dtype=np.int64)):
         found = find_fallback(MODEL.states, policy, 1, controls(31), TRUTH)
-        assert found.switch_state is None
-        assert found.delay is None
-
-
-def test_no_damage_calls_for_no_fallback() -> None:
-    found = find_fallback(MODEL.states, POLICY, 1, controls(12), np.zeros((50, 2)))
-    assert found.called_for_step is None
-    assert found.early_step == 12
-    assert found.delay is None
+        assert (found.switch_state, found.delay) == (None, None)
 
 
 def test_rms_error_of_a_certain_belief() -> None:
@@ -175,23 +164,19 @@ def each(request: pytest.FixtureRequest, library_file: Path) -> MissionResult:
     return flown(request.param, library_file)
 
 
-def test_every_figure_is_one_that_a_reference_can_name(each: MissionResult) -> None:
+def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(each: MissionResult) -> None:
     turns = []
     for turn in each.flight.turns:
         happened = turn.reading.happened._replace(monitors={"strain_error_bound": 2e-6})
         turns.append(replace(turn, reading=replace(turn.reading, happened=happened)))
-    complete = replace(each, flight=replace(each.flight, turns=turns))
-    figures = summarise(complete, np.zeros((50, 3)))
-    assert tuple(figure.key for figure in figures) == each.scenario.figure_names
-
-
-def test_figures_stand_beside_the_references_of_the_scenario(each: MissionResult) -> None:
     references = (
         Reference(figure="fallback_delay", value="1 or 2", source="somewhere"),
         Reference(figure="mean_reward_error", value=-0.4, source="elsewhere"),
     )
     scenario = each.scenario.model_copy(update={"reference": references})
-    figures = summarise(replace(each, scenario=scenario), np.zeros((50, 3)))
+    complete = replace(each, scenario=scenario, flight=replace(each.flight, turns=turns))
+    figures = summarise(complete, np.zeros((50, 3)))
+    assert tuple(figure.key for figure in figures) == each.scenario.figure_names
     found = {f.key: (f.reference, f.reference_source) for f in figures if f.reference is not None}
     assert found == {"fallback_delay": ("1 or 2", "somewhere"), "mean_reward_error": (-0.4, "elsewhere")}
 
