@@ -158,7 +158,7 @@ class ProjectedBasis:
     """
 
     def __init__(self, norm: Norm, sums: Sequence[tuple[Any, ...]], *, drop: float) -> None:
-        self._norm, self._sums, self._drop = norm, sums, drop
+        self.norm, self._sums, self._drop = norm, sums, drop
         self.vectors = self._products = np.empty((sums[0][0].shape[0], 0))
         self.inner = [np.empty((len(terms), 0, 0)) for terms in sums]
 
@@ -178,20 +178,20 @@ class ProjectedBasis:
 
     def _new(self, vectors: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """Return what is new enough in vectors (n, m), orthonormal, with its products."""
-        products = self._norm.product(vectors)
+        products = self.norm.product(vectors)
         length = np.sqrt(np.maximum(np.einsum("ik,ik->k", vectors, products), 0.0))
         used = np.flatnonzero(length > 0.0)
         vectors, products = vectors[:, used] / length[used], products[:, used] / length[used]
         for number in range(2):
             vectors, products = self._outside(vectors, products)
             if number == 0 and self.vectors.size:
-                products = self._norm.product(vectors)
+                products = self.norm.product(vectors)
         kept: list[tuple[FloatArray, FloatArray]] = []
         for vector, product in zip(vectors.T, products.T, strict=True):
             vector, product = _without(kept, *_without(kept, vector, product))
             size = float(vector @ product)
             if size < NEARLY_DEPENDENT**2:
-                vector, product = self._outside(vector, self._norm.product(vector))
+                vector, product = self._outside(vector, self.norm.product(vector))
                 vector, product = _without(kept, vector, product)
                 size = float(vector @ product)
             if size > self._drop**2:

@@ -19,7 +19,7 @@ from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel, StaticResponse
 
 from .settings import TOGETHER
-from .terms import ReductionTerms, State, solved_together
+from .terms import ReductionTerms, State
 
 DUAL_TOLERANCE, COMBINED_TOLERANCE = 0.05, 0.01
 """Relative residual of approximate dual solutions at their own states, taken alone and combined."""
@@ -56,7 +56,7 @@ def dual_solutions(
     for first in range(0, len(states), at_once):
         chosen = states[first : first + at_once]
         tolerance = COMBINED_TOLERANCE if combined else DUAL_TOLERANCE
-        found += solved_together(terms, norm, chosen, terms.outputs, [start] * len(chosen), tolerance)
+        found += terms.solved_together(norm, chosen, terms.outputs, [start] * len(chosen), tolerance)
         advance(len(chosen), "dual solutions")
     solutions = np.stack(found)
     del found  # as large as they are
@@ -170,7 +170,7 @@ class StaticReduction:
         # a basis vector may be rough, since errors are bounded by residuals; the first one measures rounding
         tolerance = SNAPSHOT_TOLERANCE if self.snapshots else FIRST_TOLERANCE
         starts = [self._galerkin(theta) for theta in thetas]
-        solutions = solved_together(self.terms, self.norm, thetas, self.terms.loads, starts, tolerance)
+        solutions = self.terms.solved_together(self.norm, thetas, self.terms.loads, starts, tolerance)
         (images,) = self.basis.extend(np.concatenate(solutions, axis=1))
         if not images[0].size:
             return False  # rounding is reached; what the search reached is judged after it
