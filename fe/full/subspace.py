@@ -13,18 +13,14 @@ from .factorisation import Factorisation
 
 Norm = Factorisation
 """The energy norm of a stiffness is what its factorisation gives."""
+MOST_ITERATIONS = 100
+"""Limit of conjugate gradients."""
 NEARLY_DEPENDENT = 0.1
 """Where less than this fraction of a vector is new, the pair is made to fit together again."""
 
 
 def conjugate_gradients(
-    matrices: Sequence[Any],
-    preconditioner: Norm,
-    right: FloatArray,
-    start: FloatArray,
-    *,
-    tolerance: float,
-    most_iterations: int = 100,
+    matrices: Sequence[Any], preconditioner: Norm, right: FloatArray, start: FloatArray, tolerance: float
 ) -> FloatArray:
     """Return solutions of several systems by preconditioned conjugate gradients.
 
@@ -42,8 +38,6 @@ def conjugate_gradients(
         Starting values.
     tolerance : float
         Residual wanted, relative to the right-hand side, both in the norm dual to the preconditioner.
-    most_iterations : int
-        Limit.
 
     Returns
     -------
@@ -65,7 +59,7 @@ def conjugate_gradients(
     residual = right - product(solution)
     direction = correction = preconditioner.riesz(residual)
     size = np.einsum("ik,ik->k", residual, correction)
-    for _ in range(most_iterations + 1):
+    for _ in range(MOST_ITERATIONS + 1):
         if np.all(size <= wanted):
             return solution
         image = product(direction)
@@ -81,7 +75,7 @@ def conjugate_gradients(
     missed = size > wanted
     reached = tolerance * float(np.sqrt(np.max(size[missed] / wanted[missed])))
     raise SolutionError(
-        f"Conjugate gradients reached {reached:.2g} in {most_iterations} iterations, but {tolerance:g} "
+        f"Conjugate gradients reached {reached:.2g} in {MOST_ITERATIONS} iterations, but {tolerance:g} "
         "is needed; the stiffness terms must be positive semi-definite."
     )
 

@@ -204,5 +204,5 @@ class ReductionTerms:
         """Solve the full model at coefficients (T,) for the same right-hand sides (n, k); (n, k) each."""
         matrices = [self.stiffness(theta) for theta in at]
         rights, begin = (np.concatenate(part, axis=1) for part in ([right] * len(at), starts))
-        solved = conjugate_gradients(matrices, norm, rights, begin, tolerance=tolerance)
+        solved = conjugate_gradients(matrices, norm, rights, begin, tolerance)
         return np.split(solved, len(at), axis=1)
