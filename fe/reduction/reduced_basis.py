@@ -226,7 +226,7 @@ def reduce_structure(
         basis, modal = modal_basis(terms, norm, settings.modal, stage, followed_load)
     with progress.stage("Reducing the statics") as stage:
         fixed, states = _named(terms, name) | modal, terms.training()
-        static = StaticReduction(terms, norm, fixed, basis, stage.advance)
+        static = StaticReduction(terms, norm, fixed, basis, stage)
         history = greedy(
             static, states, tolerance=settings.bound_tolerance, most_snapshots=settings.most_snapshots
         )
