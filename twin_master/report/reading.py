@@ -13,7 +13,6 @@ from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.folders import restore_folder
 from reporting.json_file import read_json
-from reporting.words import capital, parameter_title
 from twin_master.errors import RunFolderError, TwinMasterError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import smooth
@@ -22,8 +21,7 @@ from twin_master.report.view import PrintedFactor, PrintedSensors, printed_facto
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.store.mission_result import MOMENTS, LearntQuantity, printed_learnt
-from twin_master.store.results import SCHEMA
+from twin_master.store.mission_result import MOMENTS, SCHEMA, LearntQuantity, printed_learnt, titles_of
 from twin_master.store.writing import RUN_NAME, SUMMARY_NAME
 from twin_master.store.writing import read_run as read_tree
 
@@ -34,12 +32,6 @@ if TYPE_CHECKING:
 _GROUPS = ("observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth")
 """Groups that are read; the last one not every run has."""
 _UNREAD = ("noise_standard_deviation", "residual", "sensors_received", "sensor_status")
-_TITLES = {
-    "noise_scale": "Noise, as a factor on the assumed one",
-    "gauge_gain": "Gain error",
-    "gauge_offset": "Offset",
-    "transition_factor": "Factor on the transitions",
-}
 _ROUNDING = 1e-6
 
 
@@ -155,11 +147,9 @@ class Run:
                 for part in ("", "_prior")
             )
             truth = self.get(f"truth/{name}")
-            title = _TITLES.get(name, capital(parameter_title(name)))
             unit = "µε" if unit == "microstrain" else unit
-            found.append(
-                LearntQuantity(name, title, unit, course, prior, None if truth is None else scale * truth)
-            )
+            truth = None if truth is None else scale * truth
+            found.append(LearntQuantity(name, titles_of(name)[1], unit, course, prior, truth))
         return tuple(found)
 
     def smoothed_until(self, now: int) -> Float:
