@@ -43,12 +43,6 @@ def test_posterior_lies_between_and_is_narrower(designed, shift):
     assert length.posterior.standard_deviation <= length.prior.deviation
 
 
-def test_the_published_file_gives_the_published_figures(reference):
-    for read, published in zip(read_lengths(reference), published_lengths(), strict=True):
-        assert read.designed == pytest.approx(published.designed, rel=1e-12)
-        assert read.measured == pytest.approx(published.measured, rel=1e-12)
-
-
 GOOD = """parameter,designed,manufactured
 length,1828.8,1828.0
 chord_{root},435.61,433.0
@@ -56,23 +50,30 @@ chord_{tip},261.112,260.0
 """
 
 
-def test_a_file_of_its_own(tmp_path):
+def test_files_of_lengths(tmp_path):
     file = tmp_path / "lengths.csv"
+    with pytest.raises(ExperimentFileError, match="does not hold"):
+        read_lengths(tmp_path)
+    with pytest.raises(ExperimentFileError, match="does not exist"):
+        read_lengths(file)
     file.write_text(GOOD, encoding="utf-8")
-    for read, published in zip(read_lengths(file), published_lengths(), strict=True):
-        assert read.posterior.mean == pytest.approx(published.posterior.mean, rel=1e-12)
+    for own, published in zip(read_lengths(file), published_lengths(), strict=True):
+        assert own.posterior.mean == pytest.approx(published.posterior.mean, rel=1e-12)
+
+
+def test_the_published_file_gives_the_published_figures(reference):
+    for read, published in zip(read_lengths(reference), published_lengths(), strict=True):
+        found = read.designed, read.measured
+        assert found == pytest.approx((published.designed, published.measured), rel=1e-12)
 
 
 @pytest.mark.parametrize(
     ("text", "error", "words"),
     [
-        ("", ExperimentFileError, "is empty"),
         (GOOD.replace("manufactured", "as_built"), ExperimentFileError, "no column 'manufactured'"),
         (GOOD.replace("chord_{tip}", "chord_end"), ExperimentFileError, "lacks the row chord_{tip}"),
         (GOOD.replace("433.0", "nan"), ExperimentDataError, "line 3: column 'manufactured' holds nan"),
-        (GOOD.replace("433.0", ""), ExperimentFileError, "must hold a number, and nothing came"),
         (GOOD.replace("433.0", "433,4"), ExperimentFileError, "line 3: 4 cells came, and the header has 3"),
-        (GOOD.replace("433.0", "٤٣٣"), ExperimentFileError, "must hold a number, and '٤٣٣' came"),
         (GOOD + "chord_{root},435.61,431.0\n", ExperimentFileError, "lines 3 and 5 hold the same parameter"),
         (GOOD.replace("1828.0", "1.828"), ExperimentDataError, "looks like m"),
         (GOOD.replace("1828.0", "182.8"), ExperimentDataError, "more than 10 % apart"),
@@ -83,10 +84,3 @@ def test_bad_files_are_told_in_one_sentence(tmp_path, text, error, words):
     file.write_text(text, encoding="utf-8")
     with pytest.raises(error, match=words):
         read_lengths(file)
-
-
-def test_missing_files(tmp_path):
-    with pytest.raises(ExperimentFileError, match="does not hold"):
-        read_lengths(tmp_path)
-    with pytest.raises(ExperimentFileError, match="does not exist"):
-        read_lengths(tmp_path / "nothing")

@@ -21,6 +21,17 @@ from discrepancy.campaign.noise import (
 from discrepancy.campaign.noise_tests import ljung_box
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
 
+
+def test_records_that_say_little():
+    """No record, a stated deviation, and a record too short for a spectrum."""
+    for record, freedom, deviation in ((None, 0.0, 0.7), (NoiseRecord(2.0, inf), inf, 2.0)):
+        found = noise_model(Channel("g", Quantity.STRAIN, "g", record), 0.7)
+        assert found.degrees_of_freedom == freedom
+        assert found.standard_deviation == found.static_deviation == deviation
+    short = noise_model(channel(np.random.default_rng(0).standard_normal(30)), 0.7)
+    assert not short.autoregression.size
+
+
 INTERVAL = 0.002
 
 
@@ -65,19 +76,6 @@ def test_white_records_stay_white():
     assert np.count_nonzero(orders) <= binom.isf(1e-4, 300, 1e-3)
 
 
-def test_lines_are_found_where_they_are_and_taken_out():
-    generator = np.random.default_rng(6)
-    time = INTERVAL * np.arange(1000)
-    for frequency in (50.0, 60.0):
-        samples = generator.standard_normal(1000) + 0.5 * np.cos(2.0 * np.pi * frequency * time + 0.3)
-        rest, lines = without_lines(samples, INTERVAL)
-        assert lines == (frequency,)
-        assert rest.std() == pytest.approx(1.0, rel=0.1)
-    # 400 Hz is not below half the rate of 500 Hz: it shows at 100 Hz
-    samples = generator.standard_normal(1000) + np.cos(2.0 * np.pi * 100.0 * time)
-    assert without_lines(samples, INTERVAL)[1] == (400.0,)
-
-
 @pytest.mark.parametrize("coefficients", [pytest.param((), marks=pytest.mark.long), (0.9,)])
 def test_lines_are_not_found_in_noise(coefficients):
     """Level 1e-4 a line against a level known from 20 neighbours: (1 + 9.2 / 20)^-20 = 5e-4, three lines."""
@@ -88,6 +86,28 @@ def test_lines_are_not_found_in_noise(coefficients):
     assert found <= binom.isf(1e-3, 2100, 6e-4)
 
 
+@pytest.mark.parametrize(
+    ("interval", "count", "shown", "size", "line"),
+    [
+        (INTERVAL, 1000, 50.0, 0.5, 50.0),
+        (INTERVAL, 1000, 60.0, 0.5, 60.0),
+        (INTERVAL, 1000, 100.0, 1.0, 400.0),  # above half the rate: it shows at 100 Hz
+        # a record of 8 s resolves 0.125 Hz, and 400 Hz may be off by 0.4 Hz
+        *(
+            (1e-3, 8000, 400.0 * (1.0 + share * MAINS_DEVIATION), 2.0, 400.0)
+            for share in (-0.8, -0.2, 0.5, 1.0)
+        ),
+    ],
+)
+def test_lines_are_found_where_they_are_and_taken_out(interval, count, shown, size, line):
+    time = interval * np.arange(count)
+    noise = np.random.default_rng(9).standard_normal(count)
+    rest, lines = without_lines(noise + size * np.cos(2.0 * np.pi * shown * time + 0.3), interval)
+    assert lines == (line,)
+    assert rest.std() == pytest.approx(1.0, rel=0.1 if count == 1000 else 0.03)
+    assert ljung_box(rest)[1] > 1e-3
+
+
 @given(st.floats(0.0, 1e3), st.floats(1e-4, 1e-1))
 def test_aliases_agree_at_the_samples(frequency, interval):
     shown = aliased(frequency, interval)
@@ -96,17 +116,6 @@ def test_aliases_agree_at_the_samples(frequency, interval):
     np.testing.assert_allclose(
         np.cos(2.0 * np.pi * frequency * time), np.cos(2.0 * np.pi * shown * time), atol=1e-5
     )
-
-
-def test_records_that_say_little():
-    """No record, a stated deviation, and a record too short for a spectrum."""
-    none = noise_model(Channel("g", Quantity.STRAIN, "g", None), 0.7)
-    assert none.degrees_of_freedom == 0.0
-    assert none.standard_deviation == none.static_deviation == 0.7
-    stated = noise_model(Channel("g", Quantity.STRAIN, "g", NoiseRecord(2.0, inf)), 0.7)
-    assert (stated.standard_deviation, stated.degrees_of_freedom) == (2.0, inf)
-    short = noise_model(channel(np.random.default_rng(0).standard_normal(30)), 0.7)
-    assert not short.autoregression.size
 
 
 @pytest.mark.parametrize("coefficients", [(0.9,), (1.2, -0.6), (0.5, 0.0, 0.3)])
@@ -120,16 +129,3 @@ def test_whitening_is_that_of_the_whole_covariance(coefficients):
     white = noise.whiten(x, INTERVAL)
     np.testing.assert_allclose(white @ white.T, x @ np.linalg.solve(covariance, x.T), rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(noise.whiten(x[:, :2], INTERVAL), white[:, :2], rtol=1e-12)
-
-
-@pytest.mark.parametrize("share", [-0.8, -0.2, 0.5, 1.0])
-def test_lines_are_found_where_the_mains_are_off(share):
-    """A record of 8 s resolves 0.125 Hz, and 400 Hz may be off by 0.4 Hz."""
-    generator = np.random.default_rng(9)
-    time = 1e-3 * np.arange(8000)
-    frequency = 400.0 * (1.0 + share * MAINS_DEVIATION)
-    samples = generator.standard_normal(8000) + 2.0 * np.cos(2.0 * np.pi * frequency * time + 0.3)
-    rest, lines = without_lines(samples, 1e-3)
-    assert lines == (400.0,)
-    assert rest.std() == pytest.approx(1.0, rel=0.03)
-    assert ljung_box(rest)[1] > 1e-3

@@ -2,6 +2,7 @@
 
 import os
 import re
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,9 @@ Rig = tuple[Campaign, Model]
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory):
+    """What makes campaign and model of a published rig, once."""
+
+    @cache
     def made(name):
         if not (PUBLISHED / name).is_dir():
             pytest.skip(f"the published records of {name} are not beside the project")
@@ -38,24 +42,13 @@ def rig(tmp_path_factory):
     return made
 
 
-@pytest.fixture(scope="module")
-def phone(rig):
-    return rig("falling_phone")
-
-
-@pytest.fixture(scope="module")
-def tanks(rig):
-    return rig("two_tanks")
-
-
-@pytest.fixture(scope="module")
-def pendulum(rig):
-    return rig("pendulum")
-
-
 def judged(rig, *effects):
     chosen = [effect_by_identifier(name, library()) for name in effects]
     return investigate(*rig, chosen, thorough=False).verdict
+
+
+def is_sound(campaign, model):
+    return not any(fault.fatal for fault in check_against_model(campaign, model))
 
 
 def write_falls(folder, size=400):
@@ -70,61 +63,58 @@ def write_falls(folder, size=400):
     return folder
 
 
-def test_only_the_fall_is_taken_without_its_ends(tmp_path):
-    read = read_campaign(
-        write_rig_campaign("falling_phone", write_falls(tmp_path / "data"), tmp_path / "out")
-    )
-    assert [trial.name for trial in read.trials] == ["fall_2", "fall_10"]
-    for trial in read.trials:
-        np.testing.assert_allclose(trial.values, 0.2)
-        assert trial.time[0] == pytest.approx(0.04)
-        assert trial.time[-1] == pytest.approx(0.345)
-
-
-def test_the_command_writes_what_run_reads(tmp_path):
+def test_only_the_fall_is_taken_without_its_ends_and_run_reads_it(tmp_path):
     out, data = tmp_path / "out", write_falls(tmp_path / "data")
     words = ["discrepancy", "convert", str(out), "--rig", "falling_phone", "--data", str(data)]
     said = CliRunner().invoke(app, words)
     assert said.exit_code == 0, said.output
     assert "2 trials" in said.output
-    assert not [
-        fault
-        for fault in check_against_model(read_campaign(out), load_model(out / "model.toml"))
-        if fault.fatal
-    ]
+    read = read_campaign(out)
+    assert is_sound(read, load_model(out / "model.toml"))
+    assert [trial.name for trial in read.trials] == ["fall_2", "fall_10"]
+    for trial in read.trials:
+        np.testing.assert_allclose(trial.values, 0.2)
+        assert (trial.time[0], trial.time[-1]) == pytest.approx((0.04, 0.345))
 
 
 def test_what_is_not_as_published_is_refused_in_a_sentence_and_nothing_is_written(tmp_path):
     out, data = tmp_path / "out", write_falls(tmp_path / "data")
-    with pytest.raises(
-        CampaignFileError, match="There is no rig 'wing': give one of real_wing, falling_phone, two_tanks"
+    flat = "".join(f"{0.01 * k},0,0,9.7\n" for k in range(20))
+    for name, rows, words in (
+        ("wing", None, "There is no rig 'wing': give one of real_wing, falling_phone, two_tanks"),
+        ("two_tanks", None, r"There is no .*dataBenchmark\.csv: give the folder"),
+        ("pendulum", None, r"There is no .*pd_trajectory\.csv: give the folder"),
+        ("falling_phone", "0,0,0\n" * 20, r"fall_2\.csv is not as it was published: it needs the column"),
+        ("falling_phone", flat, "holds no fall"),
+        ("falling_phone", "0.1,0,0,0.1\n" * 20, "its times must increase"),
     ):
-        write_rig_campaign("wing", data, out)
-    for name, missing in (("two_tanks", r"dataBenchmark\.csv"), ("pendulum", r"pd_trajectory\.csv")):
-        with pytest.raises(CampaignFileError, match=rf"There is no .*{missing}: give the folder"):
+        if rows:
+            (data / "fall_2.csv").write_text("t,x,y,z\n" + rows)
+        with pytest.raises(CampaignFileError, match=words):
             write_rig_campaign(name, data, out)
-    (data / "fall_2.csv").write_text("t,x,y,z\n" + "0,0,0\n" * 20)
-    with pytest.raises(
-        CampaignFileError, match=r"fall_2\.csv is not as it was published: it needs the column"
-    ):
-        write_rig_campaign("falling_phone", data, out)
-    (data / "fall_2.csv").write_text("t,x,y,z\n" + "".join(f"{0.01 * k},0,0,9.7\n" for k in range(20)))
-    with pytest.raises(CampaignFileError, match="holds no fall"):
-        write_rig_campaign("falling_phone", data, out)
-    (data / "fall_2.csv").write_text("t,x,y,z\n" + "0.1,0,0,0.1\n" * 20)
-    with pytest.raises(CampaignFileError, match="its times must increase"):
-        write_rig_campaign("falling_phone", data, out)
     assert not out.exists()
 
 
-def test_a_fall_is_no_short_record(phone):
-    assert not [fault for fault in check_against_model(*phone) if fault.fatal]
+def test_published_records_are_read_as_they_were_measured(rig):
+    """A fall is no short record; readings at the end of the level sensor go; the pendulum has 50 Hz."""
+    assert is_sound(*rig("falling_phone"))
+    tanks, _ = rig("two_tanks")
+    assert [trial.name for trial in tanks.held_out] == ["validation"]
+    for trial, left_out in zip(tanks.trials, (47, 37), strict=True):
+        assert trial.values.shape == (1024, 1)
+        assert int((~trial.used).sum()) == left_out
+        assert float(trial.values[trial.used].max()) < 10.0
+    pendulum, _ = rig("pendulum")
+    assert [trial.name for trial in pendulum.held_out] == ["ilqr"]
+    assert [len(trial.time) for trial in pendulum.trials] == [195, 1000]
+    for trial in pendulum.trials:
+        assert float(np.median(np.diff(trial.time))) == pytest.approx(0.02, rel=0.01)
 
 
 @pytest.mark.long  # what reads the rig is tested above, and how drag is named in test_naming.py
-def test_drag_is_named_with_its_exponent_and_nothing_that_only_describes(phone):
+def test_drag_is_named_with_its_exponent_and_nothing_that_only_describes(rig):
     verdict = judged(
-        phone, "quadratic_damping", "coulomb_friction", "cubic_stiffness", "joint_micro_slip",
+        rig("falling_phone"), "quadratic_damping", "coulomb_friction", "cubic_stiffness", "joint_micro_slip",
         "gauge_zero_drift", "clock_error",
     )  # fmt: skip
     assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
@@ -137,18 +127,9 @@ def test_drag_is_named_with_its_exponent_and_nothing_that_only_describes(phone):
     assert {"joint_micro_slip", "cubic_stiffness"} <= {item.identifier for item in verdict.not_fitted}
 
 
-def test_readings_at_the_end_of_the_level_sensor_are_left_out(tanks):
-    campaign, _ = tanks
-    assert [trial.name for trial in campaign.held_out] == ["validation"]
-    for trial, left_out in zip(campaign.trials, (47, 37), strict=True):
-        assert trial.values.shape == (1024, 1)
-        assert int((~trial.used).sum()) == left_out
-        assert float(trial.values[trial.used].max()) < 10.0
-
-
 @pytest.mark.long
-def test_the_tanks_have_a_root_of_the_level_and_an_overflow_in_part(tanks):
-    verdict = judged(tanks, "outflow", "overflow", "logger_clock")
+def test_the_tanks_have_a_root_of_the_level_and_an_overflow_in_part(rig):
+    verdict = judged(rig("two_tanks"), "outflow", "overflow", "logger_clock")
     assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
     found = {(effect.identifier, effect.place) for effect in verdict.effects}
     assert found == {("outflow", "lower outlet"), ("overflow", "upper outlet")}
@@ -156,16 +137,8 @@ def test_the_tanks_have_a_root_of_the_level_and_an_overflow_in_part(tanks):
     assert verdict.explained.low > 0.5
 
 
-def test_a_sample_of_the_pendulum_is_a_fiftieth_of_a_second(pendulum):
-    campaign, _ = pendulum
-    assert [trial.name for trial in campaign.held_out] == ["ilqr"]
-    for trial, count in zip(campaign.trials, (195, 1000), strict=True):
-        assert len(trial.time) == count
-        assert float(np.median(np.diff(trial.time))) == pytest.approx(0.02, rel=0.01)
-
-
-def test_the_pendulum_has_no_name_and_its_share_is_said(pendulum):
-    verdict = judged(pendulum, "coulomb_friction", "quadratic_damping", "clock_error")
+def test_the_pendulum_has_no_name_and_its_share_is_said(rig):
+    verdict = judged(rig("pendulum"), "coulomb_friction", "quadratic_damping", "clock_error")
     assert verdict.kind is VerdictKind.UNEXPLAINED
     assert "is missing at 'pivot', ordered by" in verdict.sentence
     assert verdict.explained is None or verdict.explained.value < 0.5
@@ -187,8 +160,8 @@ def write_public(folder):
 def test_a_public_record_becomes_a_campaign_that_its_model_can_follow(name, tmp_path):
     write_public(tmp_path)
     folder = write(name, tmp_path, tmp_path / name)
-    campaign, model = read_campaign(folder), load_model(folder / "model.toml")
-    assert not [fault for fault in check_against_model(campaign, model) if fault.fatal]
+    campaign = read_campaign(folder)
+    assert is_sound(campaign, load_model(folder / "model.toml"))
     (trial,) = campaign.trials
     swing = [0.1 * np.exp(-0.03 * t) * np.cos(0.7 * t) for t in BLOWN + 0.1 * np.arange(4)]
     last, value = {  # of the swing means of four, from the moment on at which nobody blows any more
