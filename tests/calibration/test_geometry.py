@@ -1,6 +1,7 @@
 """Calibration step 1: conjugate posterior, published lengths, bad files."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.geometry import READING_UNCERTAINTY, MeasuredLength, published_lengths, read_lengths
+from calibration.geometry import (
+    READING_UNCERTAINTY,
+    MeasuredLength,
+    published_lengths,
+    read_lengths,
+    tailored_design,
+    tailored_geometry,
+)
+from fe.runtime.errors import InvalidDesignError
+from fe.wing.design import load_design
+from fe.wing.mesh import build_mesh
 
 
 def test_the_published_lengths():
@@ -84,3 +95,84 @@ def test_bad_files_are_told_in_one_sentence(tmp_path, text, error, words):
     file.write_text(text, encoding="utf-8")
     with pytest.raises(error, match=words):
         read_lengths(file)
+
+
+# -------------------------------- the measured planform in the design, and what a wing cannot be
+
+
+def lengths(**measured):
+    """The published lengths, some measured otherwise [m]."""
+    published = published_lengths()
+    changes = {name: replace(getattr(published, name), measured=value) for name, value in measured.items()}
+    return published._replace(**changes)
+
+
+def test_the_published_lengths_are_the_shipped_design():
+    """So nothing is built anew for the wing of the paper."""
+    assert tailored_design(load_design(), published_lengths()).hash == load_design().hash
+
+
+def test_the_planform_is_the_posterior_mean_to_a_tenth_of_a_millimetre():
+    measured = lengths(semi_span=1.83517, root_chord=0.4401, tip_chord=0.25541)
+    found = tailored_geometry(measured)
+    # precision-weighted means by hand: tolerances of 2.54 and 0.2 mm
+    share = 0.2**-2 / (0.2**-2 + 2.54**-2)
+    for name, designed in (("semi_span", 1.8288), ("root_chord", 0.43561), ("tip_chord", 0.261112)):
+        mean = designed + share * (getattr(measured, name).measured - designed)
+        assert getattr(found, name) == pytest.approx(mean, abs=0.5e-4)
+        assert getattr(found, name) * 1e4 == pytest.approx(round(mean * 1e4), abs=1e-9)
+
+
+def test_what_moves_with_the_planform_and_what_stays():
+    drawn = load_design()
+    tailored = tailored_design(drawn, lengths(semi_span=1.9, root_chord=0.44, tip_chord=0.255))
+    before, after = drawn.model_dump(), tailored.model_dump()
+    assert {key for key in before if before[key] != after[key]} == {"planform"}
+    planform = tailored.planform
+    assert (planform.semi_span, planform.root_chord, planform.tip_chord) != (1.828, 0.433, 0.26)
+    assert planform.straight_chord_line == drawn.planform.straight_chord_line
+    mesh = build_mesh(tailored)
+    corner = mesh.corners.reshape(-1, 3)
+    assert corner[:, 1].max() == pytest.approx(planform.semi_span)
+    # the test load stays 5 cm from the tip, a gauge where it was glued
+    assert tailored.tip_load.distance_from_tip == 0.05
+    assert tailored.gauges.positions == drawn.gauges.positions
+
+
+def test_another_wing_than_the_design_is_refused():
+    other = load_design().changed(planform={"semi_span": 2.4})
+    with pytest.raises(ExperimentDataError, match=r"semi_span measures 1828\.0 mm.*2400\.0 mm.*--design"):
+        tailored_design(other, published_lengths())
+
+
+def crowded(**sections):
+    """The shipped design with something at the end of its wing."""
+    return load_design().changed(**sections)
+
+
+@pytest.mark.parametrize(
+    ("design", "place"),
+    [
+        (crowded(gauges={"positions": [[1.81, 0.4]]}), r"gauges\.positions\[0\] is 1\.81 m from the root"),
+        (
+            crowded(
+                defects=[
+                    {"span_start": 0.1, "span_end": 0.3, "chord_start": 0.2, "chord_end": 0.3},
+                    {"span_start": 1.5, "span_end": 1.828, "chord_start": 0.2, "chord_end": 0.3},
+                ]
+            ),
+            r"defects\[1\] ends 1\.828 m from the root, off the wing",
+        ),
+    ],
+)
+def test_what_no_longer_fits_is_refused_with_its_place(design, place):
+    with pytest.raises(InvalidDesignError, match=rf"does not fit the measured planform .*{place}") as caught:
+        tailored_design(design, lengths(semi_span=1.8))
+    assert "the changed design" not in str(caught.value)
+    assert str(caught.value).endswith(".")
+
+
+def test_a_skin_too_thick_for_the_measured_chord_is_refused():
+    thick = crowded(skin={"thickness": 0.0023})
+    with pytest.raises(InvalidDesignError, match=r"the skin of 0\.0023 m does not fit"):
+        tailored_design(thick, lengths(tip_chord=0.24))
