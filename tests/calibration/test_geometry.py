@@ -139,40 +139,23 @@ def test_what_moves_with_the_planform_and_what_stays():
     assert tailored.gauges.positions == drawn.gauges.positions
 
 
-def test_another_wing_than_the_design_is_refused():
-    other = load_design().changed(planform={"semi_span": 2.4})
-    with pytest.raises(ExperimentDataError, match=r"semi_span measures 1828\.0 mm.*2400\.0 mm.*--design"):
-        tailored_design(other, published_lengths())
-
-
-def crowded(**sections):
-    """The shipped design with something at the end of its wing."""
-    return load_design().changed(**sections)
-
-
 @pytest.mark.parametrize(
-    ("design", "place"),
+    ("changes", "measured", "error", "words"),
     [
-        (crowded(gauges={"positions": [[1.81, 0.4]]}), r"gauges\.positions\[0\] is 1\.81 m from the root"),
-        (
-            crowded(
-                defects=[
-                    {"span_start": 0.1, "span_end": 0.3, "chord_start": 0.2, "chord_end": 0.3},
-                    {"span_start": 1.5, "span_end": 1.828, "chord_start": 0.2, "chord_end": 0.3},
-                ]
-            ),
-            r"defects\[1\] ends 1\.828 m from the root, off the wing",
-        ),
+        ({"planform": {"semi_span": 2.4}}, {}, ExperimentDataError,
+         r"semi_span measures 1828\.0 mm.*2400\.0 mm.*--design"),
+        ({"gauges": {"positions": [[1.81, 0.4]]}}, {"semi_span": 1.8}, InvalidDesignError,
+         r"does not fit the measured planform .*gauges\.positions\[0\] is 1\.81 m from the root.*\.$"),
+        ({"defects": [
+            {"span_start": 0.1, "span_end": 0.3, "chord_start": 0.2, "chord_end": 0.3},
+            {"span_start": 1.5, "span_end": 1.828, "chord_start": 0.2, "chord_end": 0.3},
+        ]}, {"semi_span": 1.8}, InvalidDesignError,
+         r"does not fit the measured planform .*defects\[1\] ends 1\.828 m from the root, off the wing.*\.$"),
+        ({"skin": {"thickness": 0.0023}}, {"tip_chord": 0.24}, InvalidDesignError,
+         r"the skin of 0\.0023 m does not fit"),
     ],
-)
-def test_what_no_longer_fits_is_refused_with_its_place(design, place):
-    with pytest.raises(InvalidDesignError, match=rf"does not fit the measured planform .*{place}") as caught:
-        tailored_design(design, lengths(semi_span=1.8))
+)  # fmt: skip
+def test_what_no_longer_fits_is_refused_with_its_place(changes, measured, error, words):
+    with pytest.raises(error, match=words) as caught:
+        tailored_design(load_design().changed(**changes), lengths(**measured))
     assert "the changed design" not in str(caught.value)
-    assert str(caught.value).endswith(".")
-
-
-def test_a_skin_too_thick_for_the_measured_chord_is_refused():
-    thick = crowded(skin={"thickness": 0.0023})
-    with pytest.raises(InvalidDesignError, match=r"the skin of 0\.0023 m does not fit"):
-        tailored_design(thick, lengths(tip_chord=0.24))
