@@ -14,7 +14,6 @@ from calibration.joint.wing_table import TOTAL_MASS, tabulate_wing, weighed
 from calibration.paper.procedure import damping_coefficients, fit_masses, read_published_results
 from fe.runtime.modal_system import rayleigh_damping_ratio
 
-
 MASSES = {"servo_mass": (0.05, 0.3), "pitot_mass": (0.0, 0.3)}
 READ = (weighed(), *PUBLISHED_MODES)
 
