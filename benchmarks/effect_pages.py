@@ -42,8 +42,6 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
     """Return the page of an effect."""
     tank = effect.identifier in FLOWS
     what = "Tank" if tank else "Cantilever"
-    names = {other.identifier: other.name for other in library()}
-    kinds = [name for kind, name in KIND_NAMES.items() if kind in effect.acts_on]
     places = effect.places(setting)
     _, place = picture_patch(effect, setting)
     values = picture_of(effect).values
@@ -55,14 +53,12 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         f"- {s.symbol} (`{s.name}`): {s.description}; {s.canonical:g}, in the family {range_of(s.prior)}."
         for s in effect.shape
     ]
-    where = f"Trials: {', '.join(kinds)}."
-    if places != ("",):
-        where += f" Places in the picture: {', '.join(f'`{name}`' for name in places)}."
+    where = f" Places in the picture: {', '.join(f'`{name}`' for name in places)}." if any(places) else ""
     shown = ", ".join(f"{name} = {value:g}" for name, value in values.items())
     lines = [
         f"# {effect.name[0].upper()}{effect.name[1:]}",
         "",
-        f"`{effect.identifier}`, family: {effect.family}. {where}",
+        f"`{effect.identifier}`, family: {effect.family}.{where}",
         "",
         text["what"].strip(),
         "",
@@ -79,7 +75,7 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         f"{what}: {shown}" + (f", place `{place}`." if place else "."),
         "",
         "## Easily confused with",
-        *(f"- [{names[other]}]({other}.md): {text['tell'][other]}" for other in effect.confusable),
+        *(f"- [`{other}`]({other}.md): {text['tell'][other]}" for other in effect.confusable),
         "",
         "## References",
         *(f"- {reference}" for reference in text["references"]),

@@ -49,8 +49,8 @@ from fmu_asset.door.history_file import read_histories
 from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.ssp.reader import read_ssp
 from scenarios import binding_files
-from twin_master.assets.observation_library import load_observation_library
-from twin_master.assets.strain_library import load_strain_library
+from twin_master.assets.library_source import load_observation_library
+from twin_master.assets.strain_library_source import load_strain_library
 from twin_master.mission.loop import CheckpointFile
 from twin_master.report.reading import read_run as read_record
 from twin_master.run_folder import read_config

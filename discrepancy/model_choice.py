@@ -11,8 +11,7 @@ from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
-from discrepancy.models.reduced_structure import StructureModel
-from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
+from discrepancy.models.structures import SHIPPED_PRIOR, StructureModel, WingModel
 from discrepancy.sources import from_run
 from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError

@@ -20,7 +20,7 @@ from discrepancy.models.interface import NO_PATCH, Conditions, Memory, Outputs, 
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from fe.runtime import patch as changes
-from fe.runtime.motion import NO_LAWS, Laws
+from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, Primitive
 from fmu_asset.errors import FmuError
 
@@ -173,7 +173,7 @@ class FmuModel(DescribedModel):
         """
         asked, (columns, orders) = self._asked(trial, conditions, patch), self._read(outputs)
         if not trial.is_dynamic:
-            if any(quantity.is_rate for _, quantity in outputs):
+            if any(quantity.order > 0 for _, quantity in outputs):
                 raise ModelError(
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )
@@ -287,7 +287,7 @@ class FmuModel(DescribedModel):
                 key: value for key, value in item.to_mapping().items() if key != "kind"
             }
             settings |= {f"{effect}.{key}": float(value) for key, value in values.items()}
-        laws = self.laws_at(rest.of(*INTERNAL_FORCES), self.ports())
+        laws = laws_of(rest.of(*INTERNAL_FORCES), self.ports())
         return Asked(trial, conditions, laws, tuple(sorted(settings.items())), load)
 
     def _run(self, asked: Asked, refinement: int) -> Run:

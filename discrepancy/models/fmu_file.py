@@ -6,13 +6,7 @@ from typing import ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from discrepancy.campaign.records import Quantity
-from discrepancy.models.model_file import (
-    ModelDescription,
-    NamedSection,
-    ParameterSection,
-    Section,
-    check_unique,
-)
+from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
 from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
 from reporting.section import Name, Number, Positive
 from scenarios import binding_files
@@ -207,7 +201,7 @@ class FmuModelDescription(ModelDescription):
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         for kind in ("port", "parameter", "output", "input"):
-            check_unique(kind, [item.name for item in getattr(self, kind)])
+            self.check_unique(kind, [item.name for item in getattr(self, kind)])
         for kind in self.effects:
             if kind not in CARRIED:
                 raise ValueError(

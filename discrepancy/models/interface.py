@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -14,8 +14,7 @@ from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.scales import Scales
-from fe.runtime.errors import InvalidPatchError
-from fe.runtime.motion import NO_LAWS, Laws, laws_of
+from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.state import Losses
 from reporting.words import brief, capital, counted
@@ -312,23 +311,6 @@ class Model(ABC):
                     f"{quantity.value}."
                 )
 
-    def check_carried(self, patch: ModelPatch) -> None:
-        """Refuse a primitive that it cannot carry; those of sensors are not asked for."""
-        for item in patch:
-            at_port = isinstance(item, PortForce) and item.port in self.ports()
-            if not (isinstance(item, SENSORS) or self.supports(type(item)) or at_port):
-                port = " (it has no port)" if isinstance(item, INTERNAL_FORCES) and not self.ports() else ""
-                raise ModelError(f"{capital(self.what)} cannot carry the primitive {item.kind!r}{port}.")
-
-    def laws_at(self, forces: ModelPatch, ports: Collection[str]) -> Laws:
-        """Return the laws of internal forces at ports; raises `ModelError` where one cannot be."""
-        if not len(forces):
-            return NO_LAWS
-        try:
-            return laws_of(forces, ports, in_windows=self.follows_windows)
-        except InvalidPatchError as cause:
-            raise ModelError(str(cause)) from cause
-
     def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
         """Return the losses of its regions in each row from those (N, K) that a trial names.
 
@@ -389,8 +371,16 @@ class Model(ABC):
             whole = (self.patch + patch).in_trial(trial.name)
             self.check(trial)
             self.check_outputs(outputs)
-            self.check_carried(whole)
-            return trial, self._respond(trial, outputs, whole, conditions)
+            ports = self.ports()
+            for item in whole:
+                at_port = isinstance(item, PortForce) and item.port in ports
+                if not (isinstance(item, SENSORS) or self.supports(type(item)) or at_port):
+                    port = " (it has no port)" if isinstance(item, INTERNAL_FORCES) and not ports else ""
+                    raise ModelError(f"{capital(self.what)} cannot carry the primitive {item.kind!r}{port}.")
+            try:
+                return trial, self._respond(trial, outputs, whole, conditions)
+            except FiniteElementError as cause:
+                raise ModelError(str(cause)) from cause
 
         if self._kept is None:
             return answer()[1]

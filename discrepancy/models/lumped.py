@@ -11,16 +11,7 @@ from scipy.linalg import eigh
 from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import (
-    Acting,
-    Course,
-    FormulaCourse,
-    Load,
-    LoadChange,
-    Shown,
-    order_of,
-    place_among,
-)
+from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, LoadChange, Shown, place_among
 from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
 from discrepancy.models.lumped_file import GAINS, ControllerSection, InputSection, LumpedDescription
 from discrepancy.models.model_file import DescribedModel
@@ -223,7 +214,7 @@ class LumpedModel(DescribedModel, SystemModel):
                         "`reference` and `hold` out."
                     )
                 values = rig.factors.get(item.name, 1.0) * values
-                drives[item.name] = Course.of(trial.time, values, Hold.SMOOTH, order_of(item.quantity))
+                drives[item.name] = Course.of(trial.time, values, Hold.SMOOTH, item.quantity.order)
                 continue
             if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
                 values = change.changed(values, item.values)
@@ -298,7 +289,7 @@ class LumpedModel(DescribedModel, SystemModel):
                 courses = [(float(push @ along), course) for push, course in loads if push @ along != 0.0]
                 found.append(Shown(loop.gives, courses=courses))
             else:
-                row, order = description.padded(item.vector or ()), order_of(item.quantity) + further
+                row, order = description.padded(item.vector or ()), item.quantity.order + further
                 seen = Shown.of(row, order, further, description.width - description.size)
                 found.append(seen._replace(constant=item.constant * (not further)))
         return found
@@ -404,7 +395,7 @@ class LumpedModel(DescribedModel, SystemModel):
             named = (factors.get(f"{item.name}.{gain}", 1.0) * getattr(item, gain) for gain in GAINS)
             gains = [factors.get(item.name, 1.0) * gain for gain in named]
             row, acts = description.padded(item.vector), description.padded(item.acts)
-            sees = Shown.of(row, order_of(item.quantity), states=description.width - n).rows
+            sees = Shown.of(row, item.quantity.order, states=description.width - n).rows
             rig.loops[item.name] = Loop(item, gains, sees, acts, state if item.integral else None)
             state += item.integral != 0.0
         return rig

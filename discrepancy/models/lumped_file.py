@@ -12,14 +12,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import order_of
-from discrepancy.models.model_file import (
-    ModelDescription,
-    NamedSection,
-    ParameterSection,
-    Section,
-    check_unique,
-)
+from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.laws.interface import PortForce
@@ -294,7 +287,9 @@ class LumpedDescription(ModelDescription):
 
     def padded(self, row: Sequence[float] | FloatArray) -> FloatArray:
         """Return a row of the file with the integrals of controllers after it."""
-        return np.pad(np.array(row, dtype=np.float64), (0, self.width - len(row)))
+        found = np.zeros(self.width)
+        found[: len(row)] = row
+        return found
 
     @cached_property
     def is_plain(self) -> bool:
@@ -349,7 +344,7 @@ class LumpedDescription(ModelDescription):
         """Refuse matrices of another size, that are not symmetric, feed energy or leave something loose."""
         n, m = self.size, self.states
         parts = [part.name for kind in KINDS for part in getattr(self, f"{kind}_part")]
-        check_unique("part", [*KINDS, *parts])
+        self.check_unique("part", [*KINDS, *parts])
         if n == 0 and m == 0:
             raise ValueError("mass is missing (or capacity, of states of first order)")
         if n and not (self.stiffness or self.stiffness_part or self.free):
@@ -411,7 +406,7 @@ class LumpedDescription(ModelDescription):
                     f"`acts` of the port {item.name!r} is for states, and must take from what its vector sees"
                 )
         if isinstance(item, ControllerSection):
-            order, what = order_of(item.quantity), "a state" if any(row[n:]) else "a speed"
+            order, what = item.quantity.order, "a state" if any(row[n:]) else "a speed"
             if order == 2:
                 raise ValueError(f"the controller {item.name!r} cannot follow an acceleration")
             if item.derivative and (any(row[n:]) or order == 1):
@@ -431,7 +426,7 @@ class LumpedDescription(ModelDescription):
         names["input or reference"] = [*names["input"], *references]
         names["place station"] = [f"{place.station:g}" for place in self.place]
         for kind, given in names.items():
-            check_unique(kind, given)
+            self.check_unique(kind, given)
         kinds = (*(KINDS[:3] if self.size else ()), *(OF_STATES if self.states else ()))
         terms, gains = [*kinds, *parts], [f"{name}.{gain}" for name in names["controller"] for gain in GAINS]
         more = ("law",) if self.is_plain else ("input", "load", "law", "controller")

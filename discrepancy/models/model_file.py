@@ -68,6 +68,13 @@ class ModelDescription(Section):
         """Read a file; raises `ModelError` if it is not there, not TOML, or its content is no such model."""
         return cls.parse(read_toml(path, ModelError, what=cls.what.partition(" ")[2]), str(path))
 
+    @staticmethod
+    def check_unique(kind: str, names: list[str]) -> None:
+        """Refuse a name that is there twice; raises `ValueError`."""
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"there are two of {kind} {name!r}")
+
 
 class DescribedModel(Model):
     """What models of a file know of themselves.
@@ -87,10 +94,3 @@ class DescribedModel(Model):
             for item in description.parameter
         )
         self.port_names = tuple(item.name for item in description.port)
-
-
-def check_unique(kind: str, names: list[str]) -> None:
-    """Refuse a name that is there twice; raises `ValueError`."""
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"there are two of {kind} {name!r}")

@@ -16,9 +16,6 @@ Unnamed = tuple[Any, ...]
 FIRST_PARTS = 400
 """Parts in which the way from a law's last position to the first one of a motion is followed."""
 
-STILL, SPEED, POSITION, FLEXIBLE = 0, 1, 2, 3
-"""How a law acts: not, its port being still; on the modes, by speed or position; on what they leave out."""
-
 
 class Steps(NamedTuple):
     """K steps, M modes, J laws; boundary k is the begin of step k.
@@ -120,7 +117,7 @@ class Acting(NamedTuple):
     Attributes
     ----------
     route : (J,) ndarray of int
-        `STILL`, `SPEED`, `POSITION` or `FLEXIBLE`.
+        `STILL`, `SPEED`, `POSITION` or `FLEXIBLE` of `motion_kernel`.
     leader : (J,) ndarray of int
         The first law at the same flexible port; -1 elsewhere.
     springs : (J,) ndarray of int

@@ -20,23 +20,12 @@ into the FMU. `discrepancy.models.compiled_motion` has the same compiled.
 import numpy as np
 
 from . import laws
-from .motion_arrays import (
-    FIRST_PARTS,
-    FLEXIBLE,
-    POSITION,
-    SPEED,
-    STILL,
-    Acting,
-    FloatArray,
-    Ports,
-    Samples,
-    State,
-    Steps,
-    Unnamed,
-    add,
-    at_port,
-)
+from .arrays import FloatArray
+from .motion_arrays import FIRST_PARTS, Acting, Ports, Samples, State, Steps, Unnamed, add, at_port
 from .static_path import pull_of, settle_port
+
+STILL, SPEED, POSITION, FLEXIBLE = 0, 1, 2, 3
+"""How a law acts: not, its port being still; on the modes, by speed or position; on what they leave out."""
 
 
 def integrate(

@@ -1,7 +1,5 @@
 """What tests of missions share: scenarios with changes, twins of a strain library, runs cut off."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Iterator
@@ -12,8 +10,7 @@ from typing import Any
 import pytest
 
 from scenarios import scenario_files
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.mission.loop import CheckpointFile
 from twin_master.mission.preparation import Knowledge, prepare_knowledge

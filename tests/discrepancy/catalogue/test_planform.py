@@ -11,7 +11,7 @@ from discrepancy.campaign.records import Campaign, Release, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
 from discrepancy.catalogue.scales import loss_integral
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from tests.discrepancy.models.test_wing import RING
 
 RELEASE = 0.03

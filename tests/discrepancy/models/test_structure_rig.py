@@ -15,7 +15,7 @@ from discrepancy.campaign.records import Quantity, Release, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
-from discrepancy.models.reduced_structure import StructureModel
+from discrepancy.models.structures import StructureModel
 from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.patch import PowerStiffness
 from fe.runtime.reduced import ReducedModel

@@ -14,7 +14,7 @@ from calibration.result.file import save_calibration
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import entry
 from fe.runtime import patch

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from discrepancy.files.verdict import primitive_intervals
 from discrepancy.judgement.conclusion import named_effects, probability_text
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from discrepancy.report.residual_figures import (
     gauge_places,
     planform_figure,

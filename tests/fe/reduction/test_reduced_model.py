@@ -1,7 +1,5 @@
 """The contract of reduced models of a wing, a structure, springs: the full model within certified bounds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

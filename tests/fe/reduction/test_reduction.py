@@ -1,7 +1,5 @@
 """The offline reduction, against pyMOR's own reductor and direct solutions; what cannot be reduced."""
 
-from __future__ import annotations
-
 import tomllib
 from contextlib import contextmanager
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The patched wing against the full model with the same change, each change made in its own way there."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
