@@ -50,7 +50,7 @@ class Quantity(StrEnum):
     @property
     def order(self) -> int:
         """How often a displacement is derived to be this; if it is, it is nought at rest."""
-        return self.moving.index(self) if self.moving else 0
+        return _ORDERS.get(self, 0)
 
     def derivatives_of(self, output: "Quantity") -> int:
         """Return how often an output of a model is derived in time for a channel of this quantity."""
@@ -65,6 +65,7 @@ _MOVING = (
     (Quantity.DISPLACEMENT, Quantity.VELOCITY, Quantity.ACCELERATION),
     (Quantity.ANGLE, Quantity.ANGULAR_VELOCITY, Quantity.ANGULAR_ACCELERATION),
 )
+_ORDERS = {quantity: order for family in _MOVING for order, quantity in enumerate(family)}
 
 
 class Hold(StrEnum):

@@ -59,11 +59,6 @@ class Course:
     edges: ClassVar[tuple[float, ...]] = ()
     """Moments at which it jumps between the stamps: none."""
 
-    @property
-    def is_smooth(self) -> bool:
-        """Whether it is a spline."""
-        return self.hold is Hold.SMOOTH
-
     @cached_property
     def _splines(self) -> list[PPoly]:
         """The spline and its derivatives up to the third, before it those that lead to a motion."""
@@ -111,7 +106,7 @@ class Course:
             held = self.at(0.5 * (time[1:] + time[:-1]))
             return held, held
         found, bend = self.at(time, order), np.diff(time) ** 2 / 12.0
-        curve = self.at(time, order + 2) if self.is_smooth and order < 2 else np.zeros(len(time))
+        curve = self.at(time, order + 2) if self.hold is Hold.SMOOTH and order < 2 else np.zeros(len(time))
         return found[:-1] - bend * curve[:-1], found[1:] - bend * curve[1:]
 
 
@@ -130,7 +125,7 @@ class FormulaCourse:
     formula: Expression
     spans: tuple[tuple[float, float], ...] = ()
 
-    is_smooth: ClassVar[bool] = True
+    hold: ClassVar[Hold] = Hold.SMOOTH
 
     @property
     def edges(self) -> tuple[float, ...]:

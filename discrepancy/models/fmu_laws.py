@@ -8,6 +8,7 @@ beforehand, so that friction can stop it. Second order in the step. The laws are
 from collections.abc import Callable, Hashable, Sequence
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -23,7 +24,7 @@ from discrepancy.models.port_system import PortSystem
 from fe.compilation import callable_when_compiled, compiled
 from fe.runtime import laws
 from fe.runtime.arrays import IntArray
-from fe.runtime.motion import Laws, static_solution
+from fe.runtime.motion import NO_LAWS, Laws, static_solution
 from fe.runtime.motion_arrays import FIRST_PARTS, Ports
 
 CONVERGED = 1e-4
@@ -164,13 +165,17 @@ class Coupling:
         np.subtract.at(given, self._index, self._forces)
         return given
 
-    def along(self, system: PortSystem, free: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return states (N + 1, n) and forces (N, P) of a system at rest, beside a free motion (N + 1, 2 P).
+    def along(
+        self, system: PortSystem, free: FloatArray, start: Any = 0.0, pushed: Any = 0.0
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return states (N + 1, n) and forces (N, P) of a system beside a free motion (N + 1, 2 P).
 
-        The outputs of the system are those of `PortSystem.of_ports`.
+        The outputs of the system are those of `PortSystem.of_ports`. It begins at a state (n,), and forces
+        (N, P) beside those of the laws push it.
         """
         transition, drive = system.over(self._step)
         applied, states = np.zeros((len(free) - 1, drive.shape[1])), np.zeros((len(free), len(drive)))
+        applied[:], states[0] = pushed, start
         arrays = map(np.ascontiguousarray, (transition, drive, system.outputs, system.direct))
         _loops()[2](
             tuple(arrays), np.ascontiguousarray(free), self._step, self._gain, self._index, self._ports,
@@ -277,8 +282,13 @@ class FmuLaws(FmuMotion):
             key = (run.state, run.step, run.steps)
             inverse = self._starts.get(key, lambda: system.starting(count, run.step, run.steps))
             start = inverse @ free[1:, self.x].ravel()
-        coarse = system.motion(forces, run.step, start)
-        found = system.motion(np.repeat(forces, parts, axis=0), run.step / parts, start)
+
+        def moved(parts: int) -> FloatArray:
+            given, none = np.repeat(forces, parts, axis=0), np.zeros((parts * run.steps + 1, 2 * count))
+            alone = Coupling(NO_LAWS, [], np.zeros((count, count)), run.step / parts, none)
+            return system.seen(*alone.along(system, none, start, given))
+
+        coarse, found = moved(1), moved(parts)
         grid = run.step * np.arange(run.steps + 1)
         fine = np.linspace(0.0, grid[-1], len(found))
         for number, (slow, fast) in enumerate(zip(self.x, self.v, strict=True)):

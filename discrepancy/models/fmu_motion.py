@@ -328,22 +328,18 @@ def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Seq
     derivatives : sequence of int
         For each column, how often it is derived in the response: 0, 1 or 2.
     """
-    before = times < 0.0
-    index = np.round(times / step)
+    before, index = times < 0.0, np.round(times / step)
+    row = np.clip(index.astype(int), 0, len(values) - 1)
     on_grid = bool(np.all(np.abs(times / step - index) < 1e-6))
     if on_grid and len(values) >= len(SLOPES) and not any(derivatives):
-        at_index = np.clip(index.astype(int), 0, len(values) - 1)
-        first = np.clip(at_index - len(SLOPES) // 2, 0, len(values) - len(SLOPES))
+        first = np.clip(row - len(SLOPES) // 2, 0, len(values) - len(SLOPES))
         around = values[first[:, np.newaxis] + np.arange(len(SLOPES))]
-        rates = np.einsum("nk,nkc->nc", SLOPES[at_index - first] / step, around)
+        rates = np.einsum("nk,nkc->nc", SLOPES[row - first] / step, around)
         rates[before] = 0.0
-        return values[at_index], rates
+        return values[row], rates
     grid = step * np.arange(len(values))
-    curve = CubicSpline(grid, values)
-    at = np.clip(times, 0.0, grid[-1])
-    shown, rates = curve(at), curve(at, 1)
-    if on_grid:
-        shown = values[np.clip(index.astype(int), 0, len(values) - 1)]
+    curve, at = CubicSpline(grid, values), np.clip(times, 0.0, grid[-1])
+    shown, rates = values[row] if on_grid else curve(at), curve(at, 1)
     rates[before] = 0.0
     for column, order in enumerate(derivatives):
         if order > 0:

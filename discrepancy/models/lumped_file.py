@@ -287,7 +287,9 @@ class LumpedDescription(ModelDescription):
 
     def padded(self, row: Sequence[float] | FloatArray) -> FloatArray:
         """Return a row of the file with the integrals of controllers after it."""
-        return np.pad(np.array(row, dtype=np.float64), (0, self.width - len(row)))
+        found = np.zeros(self.width)
+        found[: len(row)] = row
+        return found
 
     @cached_property
     def is_plain(self) -> bool:

@@ -85,11 +85,10 @@ class PortSystem:
         rows, at_once = self.rows([*((column, 0) for column in x), *speeds])
         return replace(self, outputs=rows, direct=at_once)
 
-    def motion(self, forces: FloatArray, step: float, start: FloatArray | float = 0.0) -> FloatArray:
-        """Return the outputs (N + 1, C) under forces (N, P) held over steps [s], from a state (n,)."""
+    def motion(self, forces: FloatArray, step: float) -> FloatArray:
+        """Return the outputs (N + 1, C) under forces (N, P) that are held over steps [s], from rest."""
         transition, drive = self.over(step)
-        states = np.zeros((len(forces) + 1, len(transition)))
-        states[0], states[1:] = start, forces @ drive.T
+        states = np.vstack((np.zeros(len(transition)), forces @ drive.T))
         for before, after in pairwise(states):
             after += transition @ before
         return self.seen(states, forces)

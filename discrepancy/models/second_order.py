@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray, Release, Start
+from discrepancy.campaign.records import FloatArray, Hold, Release, Start
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown
 from discrepancy.models.compiled_motion import compiled_kernel
@@ -291,7 +291,7 @@ class SecondOrderSystem(LinearSystem):
         if free is not None:
             none = np.zeros((len(stamps), 0))
             return ModalMotion(*free, none, none, NO_LAWS.memory())
-        smooth = bool(acting.drives) or any(course.is_smooth for _, course in acting.loads)
+        smooth = bool(acting.drives) or any(course.hold is Hold.SMOOTH for _, course in acting.loads)
         edges = (*laws.edges, *(moment for _, course in acting.loads for moment in course.edges))
         boundaries = substeps(self.modal, laws, stamps, refinement, SMOOTH_PARTS if smooth else 1, edges)
         feed = np.zeros((len(boundaries.time), len(laws)))

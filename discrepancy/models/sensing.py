@@ -14,11 +14,7 @@ from fe.runtime.sensors import SensorRecord, apply_sensors, check_channels, cloc
 
 
 def observe(
-    model: Model,
-    campaign: Campaign,
-    trial: Trial,
-    patch: ModelPatch,
-    conditions: Conditions,
+    model: Model, campaign: Campaign, trial: Trial, patch: ModelPatch, conditions: Conditions
 ) -> Response:
     """Return what the channels of a trial would show; gains and zeros that are nuisances are not in it.
 

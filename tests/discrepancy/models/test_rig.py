@@ -367,24 +367,9 @@ def test_states_may_be_given_by_parts_alone() -> None:
 @pytest.mark.parametrize(
     ("name", "item", "begins", "sentence"),
     [
-        (
-            "tanks",
-            ("hose", Quantity.VOLTAGE),
-            Start.STILL,
-            "input 'hose', which .* not have; it has pump",
-        ),
-        (
-            "tanks",
-            ("pump", Quantity.FLOW),
-            Start.STILL,
-            "'pump' .* is voltage, but .* records flow",
-        ),
-        (
-            "pendulum",
-            ("target", Quantity.ANGLE),
-            Start.STILL,
-            "which the controller 'position' cannot",
-        ),
+        ("tanks", ("hose", Quantity.VOLTAGE), Start.STILL, "input 'hose', which .* not have; it has pump"),
+        ("tanks", ("pump", Quantity.FLOW), Start.STILL, "'pump' .* is voltage, but .* records flow"),
+        ("pendulum", ("target", Quantity.ANGLE), Start.STILL, "which the controller 'position' cannot"),
         ("falling_body", None, Start.SETTLED, 'say `begins` = "still" or "unknown"'),
     ],
 )
