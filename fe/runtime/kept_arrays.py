@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
 from math import isfinite
 from pathlib import Path
-from typing import Any, ClassVar, Self, get_args
+from typing import Any, ClassVar, NoReturn, Self, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -146,19 +146,20 @@ class KeptArrays:
             if number is float:
                 low, high = map(float, axes)
                 if not (isfinite(array) and low <= array <= high):
-                    raise ReducedModelFileError(
-                        f"The {item.name} of {self.what} must lie between {low:.2g} and {high:g}, but is "
-                        f"{array!r}; build it anew."
-                    )
+                    self.refuse(f"must have a {item.name} between {low:.2g} and {high:g}, but has {array!r}")
                 continue
             (kind,) = get_args(get_args(number)[1])
             lengths = {**dict(zip(axes, array.shape, strict=False)), **lengths}
             expected = tuple(axis if isinstance(axis, int) else lengths.get(axis, 0) for axis in axes)
             if array.shape != expected or array.dtype != kind or not np.isfinite(array).all():
-                raise ReducedModelFileError(
-                    f"The array {item.name} of {self.what} must hold finite numbers in the shape "
-                    f"{expected}, but it has shape {array.shape} and type {array.dtype}; build it anew."
+                self.refuse(
+                    f"must hold finite numbers in shape {expected} in its array {item.name}, but that has "
+                    f"shape {array.shape} and type {array.dtype}"
                 )
+
+    def refuse(self, fault: str) -> NoReturn:
+        """Refuse a record that cannot be: `fault` says what is wrong with it."""
+        raise ReducedModelFileError(f"{self.what[0].upper()}{self.what[1:]} {fault}; build it anew.")
 
     def _lengths(self) -> dict[str | int, int]:
         """Return the lengths of axes that follow from others or from names."""

@@ -143,25 +143,10 @@ class Laws:
         """Return the memory (J, 5 + E) of laws that have never been loaded, E at least 1."""
         return np.zeros((len(self), HEAD + max(1, self.values.shape[1] - PARAMETERS)))
 
-    def at(
-        self,
-        rows: FloatArray,
-        flexibility: FloatArray | None = None,
-        relaxation: float = 0.0,
-        acts: FloatArray | None = None,
-    ) -> Ports:
-        """Return the laws at ports, for the loops; what is given is that of `Ports`."""
-        return Ports(
-            rows,
-            self.numbers,
-            self.of_speed,
-            self.values,
-            np.zeros(len(self)) if flexibility is None else flexibility,
-            float(relaxation),
-            np.zeros(len(self)),
-            rows if acts is None else acts,
-            self.rate,
-        )
+    def at(self, rows: FloatArray) -> Ports:
+        """Return the laws at ports (J, M), for the loops; modes hold all that the ports yield."""
+        none, feed = np.zeros((2, len(self)))
+        return Ports(rows, self.numbers, self.of_speed, self.values, none, 0.0, feed, rows, self.rate)
 
 
 NO_LAWS = Laws((), np.zeros(0, dtype=np.int64), np.zeros((0, PARAMETERS)))

@@ -5,7 +5,7 @@ equations are in `docs/reduced_model.md`. NumPy and relative imports only: this 
 """
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from math import inf, sqrt
@@ -16,9 +16,8 @@ from numpy import einsum
 from numpy.linalg import solve
 
 from .arrays import FloatArray, IntArray
-from .errors import ReducedModelFileError
 from .kept_arrays import KeptArrays
-from .state import MOST_REGIONS, Losses, losses_of
+from .state import MOST_REGIONS, GivenLosses, Losses, losses_of
 
 MOST_ANCHORS = 16
 """Largest number of approximate dual solutions of a reduced model."""
@@ -36,16 +35,13 @@ class RegionArrays(KeptArrays):
 
     regions: tuple[str, ...]
 
-    def losses(self, stiffness_loss: Mapping[str, float] | Iterable[float]) -> Losses:
+    def losses(self, stiffness_loss: GivenLosses) -> Losses:
         """Return one stiffness loss for each region, in their order; see `fe.runtime.state.losses_of`."""
         return losses_of(stiffness_loss, self.regions)
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.regions) <= MOST_REGIONS:
-            raise ReducedModelFileError(
-                f"{self.what.capitalize()} must have 1 to {MOST_REGIONS} damage regions, but names "
-                f"{len(self.regions)}; build it anew."
-            )
+            self.refuse(f"must have 1 to {MOST_REGIONS} damage regions, but names {len(self.regions)}")
         super().__post_init__()
 
 
@@ -175,29 +171,21 @@ class ReducedArrays(RegionArrays):
             or counts.ndim != 1
             or not 1 <= counts.min(initial=1) <= counts.prod() <= MOST_ANCHORS
         ):
-            raise ReducedModelFileError(
-                f"A reduced model must have 1 to {MOST_ANCHORS} approximate dual solutions, at least one "
-                f"along each loss, but has {counts.tolist()}; build it anew."
+            self.refuse(
+                f"must have 1 to {MOST_ANCHORS} approximate dual solutions, at least one along a loss, but "
+                f"has {counts.tolist()}"
             )
         super().__post_init__()
-        if not 1 <= self.mode_count <= self.modal_stiffness.shape[1]:
-            raise ReducedModelFileError(
-                f"A reduced model with {self.modal_stiffness.shape[1]} modal basis vectors cannot have "
-                f"{self.mode_count} modes; build the model anew."
-            )
-        for name, known in (
-            ("stiffness_factors", (len(self.parameters), len(self.regions))),
-            ("load_factors", (len(self.controls), len(self.masses))),
-        ):
+        modal = self.modal_stiffness.shape[1]
+        if not 1 <= self.mode_count <= modal:
+            self.refuse(f"with {modal} modal basis vectors cannot have {self.mode_count} modes")
+        regions, masses = (len(self.parameters), len(self.regions)), (len(self.controls), len(self.masses))
+        for name, known in (("stiffness_factors", regions), ("load_factors", masses)):
             array = getattr(self, name)
             if array.min(initial=0) < 0 or np.any(array > known):
-                raise ReducedModelFileError(
-                    f"The array {name} of {self.what} names what is not there; build it anew."
-                )
+                self.refuse(f"names by its array {name} what is not there")
         if self.stiffness_factors[-1].any() or len(self.control_units) != len(self.controls):
-            raise ReducedModelFileError(
-                f"The terms or units of {self.what} are not those of its names; build it anew."
-            )
+            self.refuse("has terms or units that are not those of its names")
 
     @cached_property
     def chosen(self) -> tuple[str, ...]:

@@ -150,7 +150,9 @@ def advance(
     flexibility, before = port_flexibility(system, laws), np.ones(count, dtype=bool)
     for first, last, acting in _sections(laws, steps.time):
         now = acting[:, None]
-        ports = laws.at(rows * now, flexibility, system.relaxation, acts * now)
+        ports = laws.at(rows * now)._replace(
+            flexibility=flexibility, relaxation=float(system.relaxation), acts=acts * now
+        )
         for j in np.flatnonzero(acting & ~before):
             state.memory[j] = 0.0
             if laws.of_speed[j]:

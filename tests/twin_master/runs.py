@@ -1,7 +1,5 @@
 """What tests of missions share: scenarios with changes, twins of a strain library, runs cut off."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Iterator

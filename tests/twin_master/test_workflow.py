@@ -1,7 +1,5 @@
 """Runs from scenario to report: what a run folder holds, who may take it, what is refused, what survives."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -80,7 +78,7 @@ def make(folder: Path, name: str, *, replace: bool = False) -> None:
     os.close(create_run_folder(folder, {"kind": KIND, "name": name}, replace=replace))
 
 
-def test_a_run_that_flies_is_not_replaced(tmp_path: Path) -> None:
+def test_a_run_that_flies_is_not_replaced(tmp_path):
     folder = tmp_path / "run"
     lock = create_run_folder(folder, {"kind": KIND, "name": "first"})
     with pytest.raises(RunFolderError, match="another process is flying"):
@@ -112,7 +110,7 @@ create_run_folder(Path({folder!r}), {{"kind": {kind!r}, "name": "second"}}, repl
 
 
 @pytest.mark.parametrize("moves", [1, 2, 3])
-def test_a_kill_between_the_moves_of_a_replacement_loses_no_run(tmp_path: Path, moves: int) -> None:
+def test_a_kill_between_the_moves_of_a_replacement_loses_no_run(tmp_path, moves):
     folder = tmp_path / "run[1]"
     make(folder, "first")
     (folder / "notes.txt").write_text("mine", encoding="utf-8")
@@ -126,9 +124,7 @@ def test_a_kill_between_the_moves_of_a_replacement_loses_no_run(tmp_path: Path, 
     assert restore_folder(folder) is False
 
 
-def test_a_replacement_that_was_killed_is_put_back_and_said_and_not_before(
-    whole: Path, library_file: Path
-) -> None:
+def test_a_replacement_that_was_killed_is_put_back_and_said_and_not_before(whole, library_file):
     aside = whole.parent / ".run.old-x" / "run"
     aside.parent.mkdir()
     whole.rename(aside)
@@ -140,7 +136,7 @@ def test_a_replacement_that_was_killed_is_put_back_and_said_and_not_before(
     assert [path.name for path in whole.parent.iterdir()] == ["run"]
 
 
-def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+def test_what_killed_writers_left_is_removed_and_nothing_else(tmp_path):
     half_field = tmp_path / f".{FIELD_NAME}.ab12"
     half_field.mkdir()
     for path in (
@@ -160,7 +156,7 @@ DEEP = '{"a":' * 5000 + "1" + "}" * 5000
 
 
 @pytest.mark.parametrize("text", [DEEP, "[1]", "", '{"kind": NaN}', '{"kind": ' + "1" * 5000 + "}"])
-def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path: Path, text: str) -> None:
+def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
     written(tmp_path, text, name="config.json")
     assert not is_run_folder(tmp_path)
     with pytest.raises(NotResumableError, match="is no run folder"):
@@ -173,7 +169,7 @@ def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path: Path, t
         assert finished_run(tmp_path) is None
 
 
-def test_what_a_run_folder_holds(tmp_path: Path, library_file: Path) -> None:
+def test_what_a_run_folder_holds(tmp_path, library_file):
     folder = fly(tmp_path / "a" / "run", library_file, "failing_gauges").folder
     tree = read_run(folder)
     groups = {"observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth", "notice"}
@@ -204,7 +200,7 @@ def test_what_a_run_folder_holds(tmp_path: Path, library_file: Path) -> None:
     assert json.loads((folder / "timing.json").read_text(encoding="utf-8"))["turns"] == 50
 
 
-def test_the_field_of_a_belief_that_rounds_beyond_the_last_level() -> None:
+def test_the_field_of_a_belief_that_rounds_beyond_the_last_level():
     """A mean of 0.8000000000000003 lies outside every model that ends at 0.8."""
     scenario = load_scenario("level_turns").scenario
     model = build_graphical_model(scenario)
@@ -226,9 +222,7 @@ def test_the_field_of_a_belief_that_rounds_beyond_the_last_level() -> None:
     ("scenario", "turns"),
     [("level_turns", 1), ("failing_gauges", 50), pytest.param("growing_damage", 30, marks=pytest.mark.long)],
 )
-def test_a_resumed_run_is_bit_identical(
-    flown: RunOutcome, tmp_path: Path, library_file: Path, scenario: str, turns: int
-) -> None:
+def test_a_resumed_run_is_bit_identical(flown, tmp_path, library_file, scenario, turns):
     """Though its folder was moved and the files that were given are gone; the seed tells the mission."""
     library = tmp_path / "a library" / "é.json"
     library.parent.mkdir()
@@ -266,9 +260,7 @@ class Notes(SilentProgress):
         self.said.append(message)
 
 
-def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(
-    flown: RunOutcome, whole: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flown, whole, monkeypatch):
     def report(folder: Path) -> Path:
         (folder / "report.html").write_text("report", encoding="utf-8")
         return folder / "report.html"
@@ -287,9 +279,7 @@ def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(
     assert resume_run(whole).report.is_file()
 
 
-def test_a_seed_that_cannot_be_stored_is_refused_before_the_flight(
-    tmp_path: Path, library_file: Path
-) -> None:
+def test_a_seed_that_cannot_be_stored_is_refused_before_the_flight(tmp_path, library_file):
     with pytest.raises(ScenarioError, match=r"at most 9223372036854775807 .*mission.seed"):
         fly(tmp_path / "run", library_file, seed=10**40)
     huge = written(tmp_path, text_of("level_turns", ("seed = 2021", f"seed = {10**40}")))
@@ -298,9 +288,7 @@ def test_a_seed_that_cannot_be_stored_is_refused_before_the_flight(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_full_disk_loses_nothing(
-    flown: RunOutcome, tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_loses_nothing(flown, tmp_path, library_file, monkeypatch):
     flush, count = os.fsync, 0
 
     def full(descriptor: int) -> None:
@@ -319,7 +307,7 @@ def test_a_full_disk_loses_nothing(
     check_same(tmp_path / "part", flown.folder, *SAME)
 
 
-def test_existing_folders_are_refused(whole: Path, tmp_path: Path, library_file: Path) -> None:
+def test_existing_folders_are_refused(whole, tmp_path, library_file):
     written(whole, "mine", name="notes.txt")
     with pytest.raises(RunFolderExistsError, match="--resume"):
         fly(whole, library_file)
@@ -337,7 +325,7 @@ def test_existing_folders_are_refused(whole: Path, tmp_path: Path, library_file:
     fly(tmp_path / "empty", library_file)
 
 
-def test_what_cannot_be_resumed(tmp_path: Path, library_file: Path) -> None:
+def test_what_cannot_be_resumed(tmp_path, library_file):
     for place, sentence in ((tmp_path / "nothing", "there is no run folder"), (tmp_path, "is no run folder")):
         with pytest.raises(NotResumableError, match=sentence):
             resume_run(place)
@@ -372,7 +360,7 @@ def test_what_cannot_be_resumed(tmp_path: Path, library_file: Path) -> None:
 
 
 @pytest.mark.parametrize("table", ["scenario", "scenario_file", "provenance", "inputs"])
-def test_a_damaged_configuration_is_one_sentence(whole: Path, table: str) -> None:
+def test_a_damaged_configuration_is_one_sentence(whole, table):
     config = json.loads((whole / "config.json").read_text(encoding="utf-8"))
     for damage in (3, None, []):
         written(whole, json.dumps({**config, table: damage}), name="config.json")
@@ -380,9 +368,7 @@ def test_a_damaged_configuration_is_one_sentence(whole: Path, table: str) -> Non
             resume_run(whole)
 
 
-def test_an_error_before_the_first_turn_says_how_to_begin_anew(
-    tmp_path: Path, library_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_error_before_the_first_turn_says_how_to_begin_anew(tmp_path, library_file, monkeypatch):
     def broken(*_: object) -> None:
         raise MissionInputError("the parameter cannot be drawn.")
 
@@ -392,7 +378,7 @@ def test_an_error_before_the_first_turn_says_how_to_begin_anew(
     assert caught.value.__notes__ == ["Nothing was flown yet: once this is mended, fly again with --replace."]
 
 
-def test_overrides(tmp_path: Path, library_file: Path) -> None:
+def test_overrides(tmp_path, library_file):
     loaded, fmu = load_scenario("level_turns"), tmp_path / "x.fmu"
     with pytest.raises(MissionInputError, match="either"):
         resolve_scenario(loaded, Overrides(strain_library=library_file, fmu=fmu))
@@ -406,7 +392,7 @@ def test_overrides(tmp_path: Path, library_file: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_kill_at_random_moments(library_file: Path) -> None:
+def test_kill_at_random_moments(library_file):
     """A few trials; `python -m benchmarks.kill_and_resume --trials 20` makes more."""
     words = ["-m", "benchmarks.kill_and_resume", "--trials", "1", "--seed", "5", "--", "--no-report"]
     line = [sys.executable, *words, "--strain-library", str(library_file)]

@@ -3,14 +3,12 @@
 import csv
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from calibration.result.file import load_calibration, save_calibration
-from calibration.result.record import Calibration
 from scenarios import structure_files
 from tests.command_line import refused, said
 
@@ -62,7 +60,7 @@ def to(lab: Path, asset: str) -> tuple[object, ...]:
     return words(lab, "--out", lab.parent / "out", "--asset", asset)
 
 
-def test_a_campaign_gives_a_file_a_report_and_a_table(lab: Path) -> None:
+def test_a_campaign_gives_a_file_a_report_and_a_table(lab):
     out = lab.parent / "out"
     shown = said(*to(lab, "spring 7"))
     assert "factor" in shown
@@ -86,7 +84,7 @@ def test_a_campaign_gives_a_file_a_report_and_a_table(lab: Path) -> None:
     assert (record["explained"], record["procedure"]) == (True, "quadrature")
 
 
-def test_a_report_of_something_else_stays(lab: Path) -> None:
+def test_a_report_of_something_else_stays(lab):
     kept = [lab.parent / "out" / name for name in ("report.html", "figures/posterior.svg")]
     kept[1].parent.mkdir(parents=True)
     for file in kept:
@@ -95,9 +93,7 @@ def test_a_report_of_something_else_stays(lab: Path) -> None:
     assert [file.read_text() for file in kept] == ["mine", "mine"]
 
 
-def test_a_calibration_of_the_other_kind_is_not_overwritten(
-    lab: Path, make_calibration: Callable[..., Calibration]
-) -> None:
+def test_a_calibration_of_the_other_kind_is_not_overwritten(lab, make_calibration):
     """A wing's by a campaign's and a campaign's by a wing's, of the same and of another asset."""
     out, wing = lab.parent / "out", make_calibration().asset
     kept = save_calibration(make_calibration(), out / "calibration.nc")
@@ -132,16 +128,14 @@ def test_a_calibration_of_the_other_kind_is_not_overwritten(
         (".", ",", "line 2: 4 cells came, and the header has 2 columns. A decimal comma makes two cells"),
     ],
 )
-def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
-    lab: Path, old: str, new: str, sentence: str
-) -> None:
+def test_what_is_wrong_is_one_sentence_and_nothing_is_written(lab, old, new, sentence):
     for file in (lab / "up.csv",) if old == "." else (lab / "campaign.toml", lab.parent / "model.toml"):
         file.write_text(file.read_text().replace(old, new))
     assert sentence in refused(*words(lab, "--out", lab.parent / "out"), code=None)
     assert not (lab.parent / "out").exists()
 
 
-def test_a_structure_without_its_mesh_is_refused(lab: Path) -> None:
+def test_a_structure_without_its_mesh_is_refused(lab):
     own = lab.parent / "my_part.toml"
     own.write_text(structure_files()["bracket"].read_text(encoding="utf-8"))
     assert "bracket.inp" in refused("calibrate", "campaign", lab, "--model", own, code=None)
@@ -168,7 +162,7 @@ def plots(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("options", [(), ("--extremes",), ("--fitted",)])
-def test_ringdown(plots: Path, tmp_path: Path, options: tuple[str, ...]) -> None:
+def test_ringdown(plots, tmp_path, options):
     out = tmp_path / "out"
     said("calibrate", "ringdown", "--data", plots, "--out", out, *options)
     with (out / "ringdown.csv").open(encoding="utf-8", newline="") as stream:

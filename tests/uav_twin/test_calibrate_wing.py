@@ -1,7 +1,5 @@
 """`uav-twin calibrate` of a wing, `simulate` before it, and what follows: files, FMUs, flights."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -35,6 +33,7 @@ from fe.wing.design import SHIPPED_DESIGN, load_design
 from fe.wing.operators import assemble
 from fmu_asset.door.session import FmiAsset
 from tests.command_line import call, command, refused, said
+from tests.kept import FE, ROOT, kept_folder
 from tests.twin_master.runs import check_same, cut_off_after, edited, figures_of, text_of, written
 from tests.wings import tip_stiffness
 from twin_master.errors import NotResumableError
@@ -56,7 +55,7 @@ def simulate(out: Path, *words: object) -> tuple[Any, ...]:
     return ("calibrate", "simulate", "--out", out, "--sampling-rate", 250, "--seed", 3, *words)
 
 
-def test_a_laboratory_is_simulated_with_its_truth(tmp_path: Path) -> None:
+def test_a_laboratory_is_simulated_with_its_truth(tmp_path):
     out = tmp_path / "lab"
     given = ("--e", 0.99, "--servo-mass", 0.18, "--pitot-mass", 0.11, "--alpha", 0.9, "--beta", 5e-4)
     said(*simulate(out, *given))
@@ -86,7 +85,7 @@ def test_a_laboratory_is_simulated_with_its_truth(tmp_path: Path) -> None:
     said("calibrate", "ringdown", "--data", out, "--fitted")
 
 
-def test_what_cannot_be_simulated_is_refused(tmp_path: Path) -> None:
+def test_what_cannot_be_simulated_is_refused(tmp_path):
     out, none = tmp_path / "lab", tmp_path / "none.fmu"
     for words, sentence in (
         (("--servo-mass", 2), "servo_mass must lie between"),
@@ -102,7 +101,7 @@ def test_what_cannot_be_simulated_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_an_fmu_and_another_design_are_measured_alike(tmp_path: Path) -> None:
+def test_an_fmu_and_another_design_are_measured_alike(tmp_path):
     fmu, model, flown = tmp_path / "wing.fmu", tmp_path / "model", tmp_path / "flown"
     said("fmu", "build", "--out", fmu)
     said(*simulate(model))
@@ -131,7 +130,7 @@ class Tailored:
 
     @property
     def out(self) -> Path:
-        return self.lab.with_name("out")
+        return self.lab.with_name(f"calibrated_{self.name}")
 
     @property
     def file(self) -> Path:
@@ -142,7 +141,9 @@ class Tailored:
     @cached_property
     def said(self) -> str:
         report = ["--no-report"] if self.name == "stiff" else []
-        return said(*self.words, "--out", self.out, *report)
+        lab = [path.read_bytes() for path in sorted(self.lab.rglob("*")) if path.is_file()]
+        places = (*FE, ROOT / "calibration", ROOT / "uav_twin")
+        return kept_folder(self.out, lambda: said(*self.words, "--out", self.out, *report), places, lab)
 
     @property
     def words(self) -> tuple[object, ...]:
@@ -172,7 +173,7 @@ def wings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Tailored]:
 
 
 @pytest.mark.parametrize("name", ["soft", pytest.param("stiff", marks=pytest.mark.long)])
-def test_the_truth_lies_in_the_posterior(wings: dict[str, Tailored], name: str) -> None:
+def test_the_truth_lies_in_the_posterior(wings, name):
     made = wings[name]
     assert made.result.asset == name
     assert made.result.design_hash == reduced_model().design_hash  # published lengths: nothing was built anew
@@ -188,7 +189,7 @@ def test_the_truth_lies_in_the_posterior(wings: dict[str, Tailored], name: str) 
             assert made.result.mean(entry) > soft.mean(entry)
 
 
-def test_the_published_figures_give_table_1() -> None:
+def test_the_published_figures_give_table_1():
     rows = {line.split("  ")[0].strip(): line for line in said("calibrate").splitlines() if "±" in line}
     table = {name: re.findall(r"[−+]?[\d.]+", line.replace(name, "", 1)) for name, line in rows.items()}
     assert table["modulus factor e"][4:8] == ["1.0073", "0.0103", "1.0073", "0.0103"]  # procedure and paper
@@ -199,7 +200,7 @@ def test_the_published_figures_give_table_1() -> None:
     assert {name: table[name][6] for name in lengths} == lengths
 
 
-def test_what_a_calibration_leaves_and_says(wings: dict[str, Tailored]) -> None:
+def test_what_a_calibration_leaves_and_says(wings):
     made = wings["soft"]
     for word in (
         "Step 1: step1/geometry_data.csv read",
@@ -218,7 +219,7 @@ def test_what_a_calibration_leaves_and_says(wings: dict[str, Tailored]) -> None:
     assert "Calibration of soft" in page
     assert "This calibration beside Table 1 of the paper" in page
     assert not re.search(r"https?://", page.replace("http://www.w3.org", ""))  # nothing is fetched
-    assert str(made.out) not in page
+    assert "pytest-of" not in page  # where it was made
     result = made.result
     assert [reading.experiment for reading in result.readings] == [
         *["planform"] * 3, "load test", "weighing", *["ring-down"] * 4,
@@ -233,9 +234,7 @@ def test_what_a_calibration_leaves_and_says(wings: dict[str, Tailored]) -> None:
 
 
 @pytest.mark.long
-def test_a_calibration_repeats_to_the_byte_and_another_wing_is_not_overwritten(
-    wings: dict[str, Tailored], tmp_path: Path
-) -> None:
+def test_a_calibration_repeats_to_the_byte_and_another_wing_is_not_overwritten(wings, tmp_path):
     made, out, file = wings["soft"], tmp_path / "out", tmp_path / "out" / "calibration.nc"
     before = made.file.read_bytes()
     shutil.copytree(made.out, out)
@@ -253,7 +252,7 @@ def test_a_calibration_repeats_to_the_byte_and_another_wing_is_not_overwritten(
 
 
 @pytest.mark.long
-def test_two_wings_are_two_fmus(wings: dict[str, Tailored], tmp_path: Path) -> None:
+def test_two_wings_are_two_fmus(wings, tmp_path):
     seen, guid = {}, set()
     variables = ("young_modulus_factor", "mass.servo", "mass.pitot", "damping.alpha", "damping.beta")
     for name, made in wings.items():
@@ -297,7 +296,7 @@ def short_scenario(folder: Path, *, parameters: bool = True) -> Path:
 
 @pytest.mark.long
 @pytest.mark.usefixtures("no_report")
-def test_two_wings_are_two_flights(wings: dict[str, Tailored], tmp_path: Path) -> None:
+def test_two_wings_are_two_flights(wings, tmp_path):
     """Without a truth of its own in the scenario, each wing is flown as it was calibrated."""
     scenario = short_scenario(tmp_path, parameters=False)
     predicted, true = {}, {}
@@ -325,7 +324,7 @@ def test_two_wings_are_two_flights(wings: dict[str, Tailored], tmp_path: Path) -
 
 @pytest.mark.long
 @pytest.mark.usefixtures("no_report")
-def test_the_truth_of_the_scenario_stays_and_is_told(wings: dict[str, Tailored], tmp_path: Path) -> None:
+def test_the_truth_of_the_scenario_stays_and_is_told(wings, tmp_path):
     true, scenario = [], short_scenario(tmp_path)
     for name, made in wings.items():
         done = command("run", scenario, "--calibration", made.file, "--out", tmp_path / name)
@@ -342,9 +341,7 @@ def test_the_truth_of_the_scenario_stays_and_is_told(wings: dict[str, Tailored],
 
 @pytest.mark.long
 @pytest.mark.usefixtures("no_report")
-def test_a_run_with_a_calibration_needs_nothing_but_its_folder(
-    wings: dict[str, Tailored], tmp_path: Path
-) -> None:
+def test_a_run_with_a_calibration_needs_nothing_but_its_folder(wings, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     file = Path(shutil.copy(wings["soft"].file, tmp_path / "elsewhere" / "wing.nc"))
     given = ("run", short_scenario(tmp_path), "--calibration", file, "-q", "--out")
@@ -362,9 +359,7 @@ def test_a_run_with_a_calibration_needs_nothing_but_its_folder(
         resume_run(moved)
 
 
-def test_missing_steps_are_told_and_a_full_disk_leaves_nothing(
-    wings: dict[str, Tailored], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_steps_are_told_and_a_full_disk_leaves_nothing(wings, tmp_path, monkeypatch):
     # The published frequencies ask the softer wing for masses beyond the model.
     lab = tmp_path / "lab"
     shutil.copytree(wings["stiff"].lab / "step2", lab / "step2")
@@ -391,7 +386,7 @@ def test_missing_steps_are_told_and_a_full_disk_leaves_nothing(
 
 
 @pytest.mark.long
-def test_records_may_be_left_aside(wings: dict[str, Tailored]) -> None:
+def test_records_may_be_left_aside(wings):
     out = said("calibrate", "--data", wings["stiff"].lab, "--published", "--procedure", "paper")
     assert "Nothing was written" in out.splitlines()[-1]
     assert "Step 3: records left aside as asked; published" in out
@@ -408,7 +403,7 @@ def measured_planform(folder: Path, semi_span: float) -> Path:
 
 
 @pytest.mark.long
-def test_the_model_follows_the_measured_planform(tmp_path: Path) -> None:
+def test_the_model_follows_the_measured_planform(tmp_path):
     """The tailored wing is shorter and stiffer than the one on the drawing (a coarse mesh, for speed)."""
     text = SHIPPED_DESIGN.read_text(encoding="utf-8")
     coarse = written(tmp_path, text, ("refinement = 1.0", "refinement = 0.25"))
@@ -425,7 +420,7 @@ def test_the_model_follows_the_measured_planform(tmp_path: Path) -> None:
     assert model.tip_stiffness(1.0) == pytest.approx(expected, rel=5e-3)
 
 
-def test_a_design_that_the_measured_planform_spoils_is_refused(tmp_path: Path) -> None:
+def test_a_design_that_the_measured_planform_spoils_is_refused(tmp_path):
     text = SHIPPED_DESIGN.read_text(encoding="utf-8")
     last = text.rindex("span_end = ")
     design = written(tmp_path, text[:last] + re.sub(r"^span_end = .*", "span_end = 1.825", text[last:]))
@@ -507,9 +502,7 @@ SPOILT: dict[str, tuple[str, Callable[[str], str], str]] = {
         for kind in SPOILT
     ],
 )
-def test_a_wrong_file_is_one_sentence_and_leaves_nothing(
-    kind: str, wings: dict[str, Tailored], tmp_path: Path
-) -> None:
+def test_a_wrong_file_is_one_sentence_and_leaves_nothing(kind, wings, tmp_path):
     lab, out = tmp_path / "lab", tmp_path / "out"
     shutil.copytree(wings["soft"].lab, lab)
     name, change, sentence = SPOILT[kind]
@@ -518,7 +511,7 @@ def test_a_wrong_file_is_one_sentence_and_leaves_nothing(
     assert not out.exists()
 
 
-def test_other_refusals(wings: dict[str, Tailored], tmp_path: Path) -> None:
+def test_other_refusals(wings, tmp_path):
     empty, file, renamed = tmp_path / "lab", tmp_path / "a file", tmp_path / "renamed"
     (empty / "step1").mkdir(parents=True)
     (tmp_path / "none").mkdir()

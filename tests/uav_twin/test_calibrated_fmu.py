@@ -1,7 +1,5 @@
 """An FMU with a binding: operating points at rest as a campaign, calibrated, flown."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -79,7 +77,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_an_fmu_is_calibrated_at_operating_points_and_flown(bench: Path, tmp_path: Path) -> None:
+def test_an_fmu_is_calibrated_at_operating_points_and_flown(bench, tmp_path):
     arguments = (bench / "lab", "--model", bench / "model.toml", "--out", tmp_path / "out", "--no-report")
     said("calibrate", "campaign", *arguments)
     file = tmp_path / "out/calibration.nc"
@@ -115,7 +113,7 @@ def test_an_fmu_is_calibrated_at_operating_points_and_flown(bench: Path, tmp_pat
         asset_source(resolved).check()
 
 
-def test_what_an_fmu_does_not_have_is_one_sentence(bench: Path) -> None:
+def test_what_an_fmu_does_not_have_is_one_sentence(bench):
     for old, new, words in (
         ('name = "pressure", quantity', 'name = "pressuer", quantity', "pressuer"),
         ("input = [", "input = [] # ", "does not have; it has none: name it in"),

@@ -1,7 +1,5 @@
 """From a structure file to a twin with calibrated parameters: model file, campaign, calibration, mission."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path
@@ -74,14 +72,14 @@ def mission(**calibration: object) -> LoadedScenario:
     return loaded_from(table, "bracket")
 
 
-def test_the_campaign_tells_the_modulus_and_not_the_mass(calibrated: Path) -> None:
+def test_the_campaign_tells_the_modulus_and_not_the_mass(calibrated):
     found = load_calibration(calibrated)
     assert abs(found.mean("e") - TRUTH["e"]) < 3.0 * found.standard_deviation("e") < 0.03
     assert found.explained is True
     assert any("does not tell pump" in sentence for sentence in found.findings)
 
 
-def test_the_twin_flies_with_it(calibrated: Path, tmp_path: Path) -> None:
+def test_the_twin_flies_with_it(calibrated, tmp_path):
     """Its draws are those of the file; what flies stands at the means; the mass follows the modulus."""
     found = load_calibration(calibrated)
     said: list[str] = []
@@ -134,7 +132,7 @@ class _Noted(SilentProgress):
         self._said.append(message)
 
 
-def test_what_the_calibration_does_not_fit_is_refused(calibrated: Path, tmp_path: Path) -> None:
+def test_what_the_calibration_does_not_fit_is_refused(calibrated, tmp_path):
     with pytest.raises(Exception, match="has no samples of `pomp`; it has e, pump"):
         new_run(mission(parameter="pomp"), tmp_path / "run", Overrides(calibration=calibrated), report=False)
     source = structure_files()["bracket"]

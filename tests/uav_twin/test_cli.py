@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from importlib.metadata import version
-from pathlib import Path
 
 import pytest
 
@@ -36,7 +35,7 @@ def leaves(command: object, *words: str) -> list[tuple[tuple[str, ...], object]]
     return found
 
 
-def test_commands_options_and_scenarios_are_listed() -> None:
+def test_commands_options_and_scenarios_are_listed():
     text = said("--help")
     assert all(word in text for word in ("run", "wing", "calibrate", "scenarios", "fmu"))
     text = said("run", "--help")
@@ -55,7 +54,7 @@ def test_commands_options_and_scenarios_are_listed() -> None:
 
 
 @pytest.mark.usefixtures("no_report")
-def test_run_prints_figures_and_report(tmp_path: Path, library_file: Path) -> None:
+def test_run_prints_figures_and_report(tmp_path, library_file):
     out = tmp_path / "run"
     words = ("run", "level_turns", "--out", out, "--strain-library", library_file)
     text = said(*words, "--seed", "3")
@@ -75,7 +74,7 @@ def test_run_prints_figures_and_report(tmp_path: Path, library_file: Path) -> No
     assert "reference" not in text  # the scenario has none, and no column for them
 
 
-def test_what_is_wrong_is_one_sentence_with_its_exit_code(tmp_path: Path) -> None:
+def test_what_is_wrong_is_one_sentence_with_its_exit_code(tmp_path):
     broken = written(tmp_path, "format = 3", name="broken.toml")
     for words, sentence, code in (
         (["run"], "", 2),
@@ -107,7 +106,7 @@ def test_what_is_wrong_is_one_sentence_with_its_exit_code(tmp_path: Path) -> Non
     assert told.strip().endswith(sentence)
 
 
-def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch):
     def broken() -> None:
         raise ZeroDivisionError
 
@@ -118,9 +117,7 @@ def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch: pytest.MonkeyPatch
     assert issubclass(ScenarioError, ValueError)
 
 
-def test_ctrl_c_ends_every_command_alike_and_says_how_to_go_on(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, library_file: Path
-) -> None:
+def test_ctrl_c_ends_every_command_alike_and_says_how_to_go_on(monkeypatch, tmp_path, library_file):
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
@@ -131,7 +128,7 @@ def test_ctrl_c_ends_every_command_alike_and_says_how_to_go_on(
     assert refused("wing", code=130) == "Interrupted."
 
 
-def test_the_master_script_is_the_same_command(tmp_path: Path) -> None:
+def test_the_master_script_is_the_same_command(tmp_path):
     for module, words in (("twin_master", []), ("uav_twin", ["run"])):
         line = [sys.executable, "-m", module, *words, "--resume", str(tmp_path / "nothing")]
         environment = os.environ | {"COLUMNS": "200"}
@@ -140,7 +137,7 @@ def test_the_master_script_is_the_same_command(tmp_path: Path) -> None:
         assert "there is no run folder" in done.stderr
 
 
-def test_start_up_is_lazy() -> None:
+def test_start_up_is_lazy():
     """`--help` must not import what only a flight needs."""
     heavy = "numpy scipy skfem pymor fmpy xarray matplotlib numba pydantic pint openpyxl"
     code = f"import sys, uav_twin.cli\nprint(sorted(set('{heavy}'.split()) & set(sys.modules)))"
@@ -148,14 +145,14 @@ def test_start_up_is_lazy() -> None:
     assert result.stdout.strip() == "[]"
 
 
-def test_the_page_of_commands_is_that_of_the_commands() -> None:
+def test_the_page_of_commands_is_that_of_the_commands():
     """If this fails: python -m benchmarks.command_page."""
     text = command_page.PAGE.read_text(encoding="utf-8")
     assert command_page.page(text) == text
     assert command_page.page(text.replace("uav-twin scenarios\n", "")) == text
 
 
-def test_a_scenario_is_described() -> None:
+def test_a_scenario_is_described():
     text = said("scenario", "check", "level_turns")
     for part in (
         "Flown: FMU of the reduced model of the design UAV wing.",
@@ -172,7 +169,7 @@ def test_a_scenario_is_described() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(scenario_files()))
-def test_every_shipped_scenario_is_sound_or_says_what_it_needs(name: str) -> None:
+def test_every_shipped_scenario_is_sound_or_says_what_it_needs(name):
     if name == "model_mismatch":  # it names no strain library of its own
         with pytest.raises(MissionInputError, match="--strain-library FILE"):
             check_scenario(load_scenario(name))
@@ -200,7 +197,7 @@ ASSUMED = "standard_deviation_microstrain = 125"
         (ASSUMED, "standard_deviation = 125", "write `observation.standard_deviation_microstrain = 125`"),
     ],
 )
-def test_a_fault_is_one_sentence(old: str, new: str, sentence: str, tmp_path: Path) -> None:
+def test_a_fault_is_one_sentence(old, new, sentence, tmp_path):
     path = written(tmp_path, text_of("level_turns").replace(old, new))
     done = command("scenario", "check", path)
     assert (done.returncode, done.stdout) == (1, "")
@@ -208,7 +205,7 @@ def test_a_fault_is_one_sentence(old: str, new: str, sentence: str, tmp_path: Pa
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_checks_of_a_wing_are_listed_and_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_checks_of_a_wing_are_listed_and_kept(monkeypatch, tmp_path):
     nan, out = float("nan"), tmp_path / "out"
     checks = [Check("patch test", "strain", 1e-15, 1e-12), Check("mesh", "order", nan)]
     monkeypatch.setattr(wing, "all_checks", lambda *_, **__: checks)
@@ -226,7 +223,7 @@ def test_checks_of_a_wing_are_listed_and_kept(monkeypatch: pytest.MonkeyPatch, t
     assert "2 of 2 checks broke their limit: wing, mass; wing, energy." in done.stderr
 
 
-def test_every_check_of_a_coarse_wing_is_kept_and_convergence_names_every_gauge() -> None:
+def test_every_check_of_a_coarse_wing_is_kept_and_convergence_names_every_gauge():
     design = load_design().changed(mesh={"refinement": 0.25})
     checks = [*wing.element_checks(), *wing.balance_checks(assemble(design))]
     groups = {"patch test", "unsupported body", "cantilever", "MacNeal-Harder", "wing"}

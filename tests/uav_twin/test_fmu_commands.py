@@ -3,8 +3,6 @@
 import json
 import re
 import zipfile
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -13,7 +11,7 @@ from tests.command_line import command, refused, said
 from tests.twin_master.runs import text_of, written
 
 
-def test_the_version_and_interface_are_those_that_were_asked_for(tmp_path: Path) -> None:
+def test_the_version_and_interface_are_those_that_were_asked_for(tmp_path):
     for options, expected in (
         (("--fmi", "3"), ('fmiVersion="3.0"', "<CoSimulation")),
         (("--interface", "model-exchange"), ('fmiVersion="2.0"', "<ModelExchange")),
@@ -36,14 +34,12 @@ def test_the_version_and_interface_are_those_that_were_asked_for(tmp_path: Path)
         (("--fmi", "4"), "less than or equal to 3"),
     ],
 )
-def test_what_does_not_fit_together_is_refused(
-    tmp_path: Path, options: tuple[str, ...], sentence: str
-) -> None:
+def test_what_does_not_fit_together_is_refused(tmp_path, options, sentence):
     assert sentence in refused("fmu", "build", *options, "--out", tmp_path / "w.fmu", code=None)
     assert not list(tmp_path.iterdir())
 
 
-def test_an_fmu_is_bound_and_checked(foreign_fmu: Any, tmp_path: Path) -> None:
+def test_an_fmu_is_bound_and_checked(foreign_fmu, tmp_path):
     fmu, file = foreign_fmu("ball2"), tmp_path / "ball.toml"
     drafted = said("fmu", "bind", fmu, "--out", file, "--step-size", "0.05")
     assert f"uav-twin fmu check {fmu} --binding {file}" in " ".join(drafted.split())
@@ -61,7 +57,7 @@ def test_an_fmu_is_bound_and_checked(foreign_fmu: Any, tmp_path: Path) -> None:
     assert said("fmu", "check", fmu, "--binding", file, "--cycles", "0", "-q") == ""
 
 
-def test_a_problem_is_named_and_the_exit_code_says_so(foreign_fmu: Any, tmp_path: Path) -> None:
+def test_a_problem_is_named_and_the_exit_code_says_so(foreign_fmu, tmp_path):
     words = ("fmu", "check", foreign_fmu("hostile2", "SEGFAULT"), "--cycles", "0")
     checked = command(*words)
     assert checked.returncode == 1
@@ -78,8 +74,8 @@ def test_a_problem_is_named_and_the_exit_code_says_so(foreign_fmu: Any, tmp_path
 
 
 def test_an_fmu_is_described_whole_and_one_for_another_platform_said_not_to_fly(
-    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    foreign_fmu, tmp_path, monkeypatch
+):
     fmu, elsewhere = foreign_fmu("ball2"), tmp_path / "elsewhere.fmu"
     with zipfile.ZipFile(fmu) as old, zipfile.ZipFile(elsewhere, "w") as new:
         for name in old.namelist():
@@ -113,7 +109,7 @@ GRID = (
 )
 
 
-def test_from_a_script_to_a_library(tmp_path: Path) -> None:
+def test_from_a_script_to_a_library(tmp_path):
     fmu, out = tmp_path / "pump.fmu", tmp_path / "pump.nc"
     said("fmu", "build", "--script", "gear_pump", "--out", fmu)
     said("fmu", "check", fmu, "--cycles", "5")
@@ -140,7 +136,7 @@ def test_from_a_script_to_a_library(tmp_path: Path) -> None:
         assert out.read_bytes() == content
 
 
-def test_a_wrong_call_of_sampling_is_said_to_be_so(tmp_path: Path) -> None:
+def test_a_wrong_call_of_sampling_is_said_to_be_so(tmp_path):
     out = ("--out", tmp_path / "x.nc")
     for words, sentence, code in (
         ((), "give a scenario, or --fmu and --binding", 2),
@@ -155,7 +151,7 @@ def test_a_wrong_call_of_sampling_is_said_to_be_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_a_run_of_the_pump_speaks_of_pumps(tmp_path: Path) -> None:
+def test_a_run_of_the_pump_speaks_of_pumps(tmp_path):
     scenario = written(
         tmp_path, text_of("pump_wear", ("steps = 60", "steps = 12"), ("draws = 40", "draws = 6"))
     )

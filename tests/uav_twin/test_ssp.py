@@ -44,9 +44,7 @@ def mapped(*entries: tuple[str, str]) -> dict[str, str]:
     return {END: "".join(texts) + END}
 
 
-def test_export_check_and_run(
-    monkeypatch: pytest.MonkeyPatch, scenario: Path, system: Path, tmp_path: Path
-) -> None:
+def test_export_check_and_run(monkeypatch, scenario, system, tmp_path):
     monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
     text, out = said("ssp", "check", system), tmp_path / "run"
     assert "no problem found; 8 connections, 2 parameters" in text
@@ -58,7 +56,7 @@ def test_export_check_and_run(
     assert (out / "csv" / "observed.csv").is_file()
 
 
-def test_bad_calls_are_one_sentence(scenario: Path, library_file: Path, tmp_path: Path) -> None:
+def test_bad_calls_are_one_sentence(scenario, library_file, tmp_path):
     bad, none, out = tmp_path / "bad.ssp", tmp_path / "none.ssp", tmp_path / "x.ssp"
     bad.write_bytes(b"nothing")
     library = f'[asset]\nkind = "strain_library"\nfile = "{library_file}"\n\n[belief]\nkind = "asset"\n\n'
@@ -82,7 +80,7 @@ def test_bad_calls_are_one_sentence(scenario: Path, library_file: Path, tmp_path
     assert {path.name for path in tmp_path.iterdir()} == {"bad.ssp", "library.toml"}
 
 
-def test_a_system_is_simulated_as_it_lies_there(system: Path, tmp_path: Path) -> None:
+def test_a_system_is_simulated_as_it_lies_there(system, tmp_path):
     """Against the closed form of the heat exchanger: what the file says, and what is set instead."""
     table, picture = tmp_path / "x.csv", tmp_path / "x.svg"
     simulate = ("ssp", "simulate", system, "--stop-time", "3", "--step-size", "1", "--in-process")
@@ -103,7 +101,7 @@ def test_a_system_is_simulated_as_it_lies_there(system: Path, tmp_path: Path) ->
     assert asked in refused(*simulate, "--interpolation", "linear")
 
 
-def test_what_nothing_takes_is_a_warning_and_not_flown(scenario: Path, system: Path, tmp_path: Path) -> None:
+def test_what_nothing_takes_is_a_warning_and_not_flown(scenario, system, tmp_path):
     """The nearest name is said; what another entry gives is not missed."""
     file = changed(system, tmp_path / "more.ssp", **mapped(("conductance", "baffle")))
     named = f"{file} sets parameters that nothing takes: heat_exchanger.baffle; correct"
@@ -120,7 +118,7 @@ def test_what_nothing_takes_is_a_warning_and_not_flown(scenario: Path, system: P
     assert not out.exists()
 
 
-def test_the_words_of_ssp_2_are_read(system: Path, tmp_path: Path) -> None:
+def test_the_words_of_ssp_2_are_read(system, tmp_path):
     """The numbers of FMI 3, metadata and the version; what 1.0 has no word for is refused."""
     meta, end = (
         '<ssc:MetaData kind="general" type="text/plain" source="note.txt" />',
@@ -148,6 +146,6 @@ def test_the_words_of_ssp_2_are_read(system: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-def test_the_wing_of_a_design(tmp_path: Path) -> None:
+def test_the_wing_of_a_design(tmp_path):
     said("ssp", "export", "uav_wing", "--out", tmp_path / "wing.ssp")
     assert "evaluated in the order uav_wing (uav_wing)" in said("ssp", "check", tmp_path / "wing.ssp")

@@ -1,7 +1,5 @@
 """From matrices that CalculiX stored to an FMU, a calibration and a twin: a stiffened skin of shells."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -117,7 +115,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @needs_calculix
-def test_the_reduced_model_is_calculixs_within_its_bound(file: Path, tmp_path: Path) -> None:
+def test_the_reduced_model_is_calculixs_within_its_bound(file, tmp_path):
     model = reduced_structure(file)
     for e, loss in ((1.0, 0.0), (1.05, 0.55)):
         strain, corner = calculix(tmp_path, e, loss)
@@ -134,7 +132,7 @@ def test_the_reduced_model_is_calculixs_within_its_bound(file: Path, tmp_path: P
 
 
 @needs_calculix
-def test_every_command_takes_it(file: Path, tmp_path: Path) -> None:
+def test_every_command_takes_it(file, tmp_path):
     """Info, reduce and fmu as of a mesh; FMPy finds nothing; what needs a mesh says so."""
     info = said("structure", "info", file, "--modes", "2")
     assert "725 free" in info
@@ -150,7 +148,7 @@ def test_every_command_takes_it(file: Path, tmp_path: Path) -> None:
 
 
 @needs_calculix
-def test_a_campaign_tells_its_parameter_and_that_nothing_is_missing(file: Path, tmp_path: Path) -> None:
+def test_a_campaign_tells_its_parameter_and_that_nothing_is_missing(file, tmp_path):
     """What CalculiX answers with 0.96 times the modulus, read with noise."""
     strain, corner = calculix(tmp_path, 0.96, 0.0)
     random = np.random.default_rng(7)
@@ -176,7 +174,7 @@ def test_a_campaign_tells_its_parameter_and_that_nothing_is_missing(file: Path, 
 
 
 @needs_calculix
-def test_a_twin_finds_the_patch_that_calculix_weakened(file: Path, tmp_path: Path) -> None:
+def test_a_twin_finds_the_patch_that_calculix_weakened(file, tmp_path):
     """The strains flown are CalculiX' with that patch."""
     table = parse_toml(MISSION, "mission", ValueError)
     scenario = LoadedScenario(parse_scenario(table, "mission"), file.with_name("mission.toml"), "0" * 64)

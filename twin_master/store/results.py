@@ -2,9 +2,7 @@
 
 import csv
 import io
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,15 +14,10 @@ from twin_master.mission.truth import SensorStatus, Truth
 from twin_master.network.inference import known_control
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import printed_state
-from twin_master.store.mission_result import MOMENTS, SEVERAL_UNITS, MissionResult
+from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, MissionResult
 
 Float = NDArray[np.float64]
 
-
-SCHEMA: dict[str, dict[str, list[str]]] = tomllib.loads(
-    Path(__file__).with_name("run.toml").read_text(encoding="utf-8")
-)
-"""Axes, unit and meaning of every variable, by its group."""
 
 Entry = tuple[str, NDArray[Any], Mapping[str, str]]
 """A name in the schema, the values, and the words that stand in its braces."""

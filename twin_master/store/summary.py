@@ -18,7 +18,7 @@ from twin_master.scenario.schema import (
     Scenario,
 )
 from twin_master.scenario.section import printed_state
-from twin_master.store.mission_result import MissionResult, printed_learnt
+from twin_master.store.mission_result import MissionResult, printed_learnt, titles_of
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -220,14 +220,6 @@ def _parameter_figures(result: MissionResult) -> list[Figure]:
     return figures
 
 
-_LEARNT_WORDS = {
-    "noise_scale": "noise factor",
-    "gauge_offset": "offset",
-    "gauge_gain": "gain error",
-    "transition_factor": "transition factor",
-}
-
-
 def _learnt_figures(result: MissionResult) -> list[Figure]:
     """Return what was learnt beside the parameter; the sensor that departs most stands for all of them."""
     figures = []
@@ -236,7 +228,7 @@ def _learnt_figures(result: MissionResult) -> list[Figure]:
         if quantity.name == result.scenario.calibration.parameter:
             continue
         factor, unit = printed_learnt(quantity.name, quantity.unit)
-        word, last = f"{_LEARNT_WORDS[quantity.name]} learnt", factor * quantity.course[-1]
+        word, last = f"{titles_of(quantity.name)[2]} learnt", factor * quantity.course[-1]
         if quantity.of_sensors:
             departure = np.abs(last[:, 0] - factor * quantity.prior[:, 0]) / last[:, 1]
             most = int(np.nanargmax(departure))

@@ -320,19 +320,13 @@ def test_the_three_layouts_of_files(tmp_path):
     ("text", "error", "words"),
     [
         (None, ExperimentFileError, "does not exist"),
-        ("", ExperimentFileError, "is empty"),
-        ("time,spanwise\n", ExperimentFileError, "no rows"),
         ("time,strain\n0,1\n1,2\n", ExperimentFileError, "lacks the column spanwise"),
         ("t_s,V_mid\n0,1\n1,2\n", ExperimentFileError, "lacks the column V_low"),
         ("time (ms),spanwise (V)\n0,1\n1,2\n", ExperimentDataError, "give it in s"),
         ("seconds,spanwise\n0,1\n1,2\n", ExperimentFileError, "lacks the column time"),
         ("0.0\n0.1\n", ExperimentFileError, "has 1 column; time"),
-        ("time,spanwise\n0,1\n1,two\n", ExperimentFileError, "line 3: column 'spanwise' must hold a number"),
         ("0 1 2\n1 2\n", ExperimentFileError, "line 2: 2 cells came"),
-        ("time,spanwise\n0,0,1,5\n1,0,2,5\n", ExperimentFileError, "line 2: 4 cells came"),
         ("0,0,1,5\n1,0,2,5\n", ExperimentFileError, "has 4 columns; time"),
-        ("0.0\t1,5\n0.1\t2,5\n", ExperimentFileError, "'spanwise' must hold a number, and '1,5' came"),
-        ("time,spanwise\n٠,1\n1,2\n", ExperimentFileError, "must hold a number, and '٠' came"),
     ],
 )
 def test_bad_files(tmp_path, text, error, words):

@@ -83,31 +83,36 @@ def test_our_wing_on_the_published_targets(reference):
         fit_masses(wing.frequency, np.array([1.0, 1.5]), wing.validity, READ)
 
 
-def test_refusals():
-    one = np.ones(1)
-    with pytest.raises(ExperimentDataError, match="cannot weigh 2 kg"):
-        fit_masses(line_model, one, MASSES, read(weighed_mass=2.0))
-    with pytest.raises(ExperimentDataError, match="cannot weigh nan"):
-        fit_masses(line_model, one, MASSES, read(weighed_mass=math.nan))
-    with pytest.raises(ExperimentDataError, match="at the limit of the model"):
-        fit_masses(line_model, one, MASSES, read(frequency_1=7.0))
-    with pytest.raises(ExperimentDataError, match="neither may be negative"):
-        fit_masses(line_model, one, MASSES, read(damping_ratio_1=0.02, damping_ratio_2=0.5))
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"weighed_mass": 2.0}, "cannot weigh 2 kg"),
+        ({"weighed_mass": math.nan}, "cannot weigh nan"),
+        ({"frequency_1": 7.0}, "at the limit of the model"),
+        ({"damping_ratio_1": 0.02, "damping_ratio_2": 0.5}, "neither may be negative"),
+    ],
+)
+def test_refusals(changed, words):
+    with pytest.raises(ExperimentDataError, match=words):
+        fit_masses(line_model, np.ones(1), MASSES, read(**changed))
 
 
-def test_bad_files(tmp_path):
-    file = tmp_path / "e.csv"
-    header = "e_sample,target_freq_1,target_freq_2,zeta_1,zeta_2,mass_servo_1,mass_pitot,freq_1,freq_2\n"
-    row = "1,5.6,29.9,.03,.07,.17,.1,5.6,28.6\n"
-    for text, words in (
-        (header, "no rows"),
-        (header.replace("freq_2\n", "f\n") + row, "no column 'freq_2'"),
-        (header + row.replace(".17,.1,", ".17,,"), "'mass_pitot' must hold a number, and nothing"),
-    ):
-        file.write_text(text, encoding="utf-8")
-        with pytest.raises(ExperimentFileError, match=words):
-            read_published_results(file)
-    with pytest.raises(ExperimentFileError, match="does not hold"):
-        read_published_results(tmp_path)
-    with pytest.raises(ExperimentFileError, match="does not exist"):
-        read_published_results(tmp_path / "nothing")
+HEADER = "e_sample,target_freq_1,target_freq_2,zeta_1,zeta_2,mass_servo_1,mass_pitot,freq_1,freq_2\n"
+
+ROW = "1,5.6,29.9,.03,.07,.17,.1,5.6,28.6\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("e.csv", HEADER.replace("freq_2\n", "f\n") + ROW, "no column 'freq_2'"),
+        ("e.csv", HEADER + ROW.replace(".17,.1,", ".17,,"), "'mass_pitot' must hold a number, and nothing"),
+        ("", "", "does not hold"),
+        ("nothing", "", "does not exist"),
+    ],
+)
+def test_bad_files(tmp_path, name, text, words):
+    if text:
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(ExperimentFileError, match=words):
+        read_published_results(tmp_path / name)

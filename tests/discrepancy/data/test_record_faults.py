@@ -20,7 +20,6 @@ from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
 
 FloatArray = NDArray[np.float64]
-
 MODEL = Inputs(__file__).text("mass_on_a_spring.toml")
 CHANNEL = """
 [[channel]]
@@ -42,22 +41,20 @@ TIME = 0.005 * np.arange(1600)
 Change = Callable[[FloatArray], None]
 
 
-def nothing(_):
-    """Leave a record as it is."""
-
-
-def campaign_of(folder, ring=nothing, rest=nothing, digit=1e-6, trials=2):
+def campaign_of(folder, ring=None, rest=None, digit=1e-6, trials=2):
     """Write rings of x and y [mm] and a rest, changed in place, and return them as read."""
     generator = np.random.default_rng(5)
     folder.mkdir(exist_ok=True)
     text = 'format = 1\nname = "rings"\n' + NOISE + CHANNEL.format("x") + CHANNEL.format("y")
     tables = {"rest": 0.02 * generator.standard_normal((800, 2))}
-    rest(tables["rest"])
+    if rest:
+        rest(tables["rest"])
     for number in range(trials):
         # a tenth stiffer than the model has it: records in phase with it would say less
         motion = (20.0 + number) * np.exp(-0.2 * TIME) * np.cos(np.sqrt(440.0) * TIME + number)
         values = np.column_stack((motion, -0.5 * motion)) + 0.02 * generator.standard_normal((1600, 2))
-        ring(values)
+        if ring:
+            ring(values)
         tables[str(number)] = np.round(values / digit) * digit
         text += TRIAL.format(number)
     for name, values in tables.items():
@@ -81,10 +78,17 @@ def only(faults, kind):
 
 
 def test_sound_rings_have_no_fault(tmp_path, model):
+    """A motion that begins somehow tells its parameters, and none does not."""
     for digit in (1e-6, 0.5):
         campaign = campaign_of(tmp_path, digit=digit)
         assert [item for item in check_data(campaign) if item.kind is not FaultKind.NOISE_LABEL] == []
         assert check_against_model(campaign, model) == ()
+
+    def still(values):
+        values[:] = 0.02 * np.random.default_rng(1).standard_normal(values.shape)
+
+    fault = only(check_against_model(campaign_of(tmp_path, still), model), FaultKind.UNOBSERVABLE)
+    assert "'oil'" in fault.sentence
 
 
 # ---------------------------------------------------------------- held
@@ -139,23 +143,49 @@ def _sound(digit, pace, generator):
 @pytest.mark.parametrize("digit", [1e-3, 0.02, 0.2])
 @pytest.mark.parametrize("pace", [0.4, 1.3, 6.0])
 def test_what_rests_is_not_frozen(digit, pace):
+    """Where encoders show no noise, what the others do meanwhile tells a pause from a fault."""
     used = np.ones(len(TIME), dtype=bool)
     other = np.cos(5.0 * TIME)[:, np.newaxis]
     for name, values in _sound(digit, pace, np.random.default_rng(2)).items():
         assert held_spans(values, used, np.zeros((len(TIME), 0))) == [], name
         if name in ("ring", "warming", "day", "backlash", "dead zone"):
             assert held_spans(values, used, other) == [], name
-
-
-def test_a_pause_of_all_is_no_fault_and_a_held_value_is(tmp_path):
-    """Where encoders show no noise, what the others do meanwhile tells a pause from a fault."""
     clock = np.interp(TIME, [0.0, 3.0, 4.0, 8.0], [0.0, 3.0, 3.0, 7.0])
     motion = clock + 0.1 * clock**2
-    used = np.ones(len(TIME), dtype=bool)
-    fine, coarse = np.round(motion, 3), np.round(motion, 2)
-    assert held_spans(fine, used, coarse[:, np.newaxis]) == []
-    going_on = np.round(np.sin(3.0 * TIME), 3)[:, np.newaxis]
-    assert held_spans(fine, used, going_on) == [(600, 801)]
+    for beside, spans in ((np.round(motion, 2), []), (np.round(np.sin(3.0 * TIME), 3), [(600, 801)])):
+        assert held_spans(np.round(motion, 3), used, beside[:, np.newaxis]) == spans
+
+
+def test_loads_and_readings_in_another_unit():
+    """What four and a half times the load would do, a structure may do as well: no fault, but a limit."""
+    model = LumpedModel.load("three_mass_chain")
+    campaign = example_campaign(model, "laboratory", 3, plan_for(model, ("x3", "x1", "base_strain"), "end"))
+    channels = {
+        name: replace(item, unit="mm" if item.quantity is Quantity.DISPLACEMENT else "microstrain")
+        for name, item in campaign.channels.items()
+    }
+    campaign = replace(campaign, channels=channels)
+    assert check_against_model(campaign, model) == ()
+
+    def judged(change):
+        return check_against_model(
+            replace(campaign, trials=tuple(replace(t, **change(t)) for t in campaign.trials)), model
+        )
+
+    fault = only(
+        judged(lambda t: {"values": t.values * np.where(np.array(t.channels) == "x3", 1.0 / 25.4, 1.0)}),
+        FaultKind.UNIT_SLIP,
+    )
+    assert "'x3' shows about 0.0393701 times what the model says (inch given as mm?)" in fault.sentence
+    assert fault.fatal
+    static = [trial.name for trial in campaign.trials if not trial.is_dynamic]
+    for size, kind, unit in (
+        (9.80665, FaultKind.INPUT_SLIP, "kgf"), (4.448, FaultKind.UNIT_DOUBT, "lbf"),
+    ):  # fmt: skip
+        faults = judged(lambda t, size=size: {"force": t.force / size})
+        assert [(fault.kind, fault.trial) for fault in faults] == [(kind, name) for name in static]
+        assert f"({unit} given as N?)" in faults[0].sentence
+        assert faults[0].fatal is (unit == "kgf")
 
 
 # ---------------------------------------------------------------- copied
@@ -227,47 +257,6 @@ def test_a_factor_names_its_pair_of_units(scale, quantity, stated, drive, pair):
     assert str(slip_between(scale, quantity, stated, drive=drive) or "").strip("(?)") == pair
 
 
-@pytest.fixture(scope="module")
-def chain():
-    model = LumpedModel.load("three_mass_chain")
-    plan = plan_for(model, ("x3", "x1", "base_strain"), "end")
-    campaign = example_campaign(model, "laboratory", 3, plan)
-    channels = {
-        name: replace(item, unit="mm" if item.quantity is Quantity.DISPLACEMENT else "microstrain")
-        for name, item in campaign.channels.items()
-    }
-    return replace(campaign, channels=channels), model
-
-
-def test_inches_stated_as_millimetres(chain):
-    campaign, model = chain
-
-    def inches(campaign):
-        trials = []
-        for trial in campaign.trials:
-            scale = np.where(np.array(trial.channels) == "x3", 1.0 / 25.4, 1.0)
-            trials.append(replace(trial, values=trial.values * scale))
-        return replace(campaign, trials=tuple(trials))
-
-    assert check_against_model(campaign, model) == ()
-    faults = check_against_model(inches(campaign), model)
-    fault = only(faults, FaultKind.UNIT_SLIP)
-    assert "'x3' shows about 0.0393701 times what the model says (inch given as mm?)" in fault.sentence
-    assert fault.fatal
-
-
-@pytest.mark.parametrize(("unit", "kind"), [(9.80665, FaultKind.INPUT_SLIP), (4.448, FaultKind.UNIT_DOUBT)])
-def test_loads_in_another_unit(chain, unit, kind):
-    """What four and a half times the load would do, a structure may do as well: no fault, but a limit."""
-    campaign, model = chain
-    trials = tuple(replace(trial, force=trial.force / unit) for trial in campaign.trials)
-    faults = check_against_model(replace(campaign, trials=trials), model)
-    static = [trial.name for trial in campaign.trials if not trial.is_dynamic]
-    assert [(fault.kind, fault.trial) for fault in faults] == [(kind, name) for name in static]
-    assert f"({'kgf' if unit > 9.0 else 'lbf'} given as N?)" in faults[0].sentence
-    assert faults[0].fatal is (kind is FaultKind.INPUT_SLIP)
-
-
 # ---------------------------------------------------------------- at rest
 
 
@@ -312,16 +301,3 @@ def test_a_noise_record_that_moves_is_a_limit(tmp_path, model, motion, what):
     assert {(item.channel, item.fatal) for item in faults} == {("y", False)}
     assert any("the column 'y [mm]' of rest.csv, " in item.sentence for item in faults)
     assert any(what in item.sentence for item in faults), [item.sentence for item in faults]
-
-
-# ---------------------------------------------------------------- what a motion of unknown begin tells
-
-
-def test_a_motion_that_begins_somehow_tells_its_parameters(tmp_path, model):
-    assert check_against_model(campaign_of(tmp_path), model) == ()
-
-    def still(values):
-        values[:] = 0.02 * np.random.default_rng(1).standard_normal(values.shape)
-
-    fault = only(check_against_model(campaign_of(tmp_path, still), model), FaultKind.UNOBSERVABLE)
-    assert "'oil'" in fault.sentence

@@ -16,6 +16,7 @@ from openpyxl import Workbook
 from discrepancy.campaign.importing import Understanding
 from discrepancy.campaign.sheet import read_sheet
 from discrepancy.errors import CampaignFileError, DiscrepancyError
+from tests.refusals import refused
 
 ODD = {
     "title rows, units row, footer with statistics": (
@@ -178,33 +179,27 @@ _TABLES = st.integers(2, 4).flatmap(
 @given(_TABLES, st.sampled_from([";", ",", "\t"]), st.sampled_from(".,"), st.data())
 @settings(deadline=None, suppress_health_check=list(HealthCheck))
 def test_a_table_comes_back_from_any_dialect(tmp_path_factory, table, separator, mark, data):
-    grouped = data.draw(st.sampled_from(["", *{".": ",'\u202f", ",": ".'\u202f"}[mark]]))
+    def drawn(*choices):
+        return data.draw(st.sampled_from(choices))
+
+    grouped = drawn("", *{".": ",'\u202f", ",": ".'\u202f"}[mark])
 
     def written(value):
         text = repr(value) if "e" in repr(value) else f"{value:,}".replace(",", "\0")
         return text.replace(".", mark).replace("\0", grouped)
 
     stream = io.StringIO()
-    quoting = data.draw(st.sampled_from([csv.QUOTE_MINIMAL, csv.QUOTE_ALL]))
-    writer = csv.writer(
-        stream,
-        delimiter=separator,
-        quoting=quoting,
-        lineterminator=data.draw(st.sampled_from(["\n", "\r\n"])),
-    )
-    heads = [f"c{at} [mm]" for at in range(len(table[0]))]
+    how = {"quoting": drawn(csv.QUOTE_MINIMAL, csv.QUOTE_ALL), "lineterminator": drawn("\n", "\r\n")}
+    writer = csv.writer(stream, delimiter=separator, **how)
     for _ in range(data.draw(st.integers(0, 3))):
-        writer.writerow([data.draw(st.sampled_from(["Versuch", "a; b, c", "", "Prüfer: Müller"]))])
-    writer.writerow(heads)
+        writer.writerow([drawn("Versuch", "a; b, c", "", "Prüfer: Müller")])
+    writer.writerow([f"c{at} [mm]" for at in range(len(table[0]))])
     writer.writerows([written(value) for value in row] for row in table)
-    encoding = data.draw(
-        st.sampled_from(["utf-8", "utf-8-sig", "latin-1" if grouped != "\u202f" else "utf-8"])
-    )
-    folder = tmp_path_factory.mktemp("sheet")
-    sheet = sheet_of(folder, stream.getvalue().encode(encoding))
+    encoding = drawn("utf-8", "utf-8-sig", *(["latin-1"] if grouped != "\u202f" else []))
+    sheet = sheet_of(tmp_path_factory.mktemp("sheet"), stream.getvalue().encode(encoding))
     told = any(mark in written(value) for row in table for value in row)  # not by 6e-06
     assert sheet.decimal in (mark, None) or not told
-    assert sheet.heads == tuple(f"c{at}" for at in range(len(heads)))
+    assert sheet.heads == tuple(f"c{at}" for at in range(len(table[0])))
     read = [[float(cell) for cell in sheet.numbers(head, mark)] for head in sheet.heads]
     assert read == [list(column) for column in zip(*table, strict=True)]
 
@@ -282,37 +277,33 @@ ROWS = [
 ]
 
 
-def test_an_excel_workbook(tmp_path):
-    sheet = read_sheet(book_of(tmp_path, ROWS))
-    assert (sheet.name, sheet.heads, sheet.units) == ("lab.xlsx", ("Zeit", "Weg"), ("s", "mm"))
-    assert text_of(sheet) == ["0 1.234", "0.500000 5"]  # typed numbers are in no doubt
-    assert sheet.remark.startswith("rows 4 to 5; the column 'Notiz'") or "rows 4 to 5" in sheet.remark
-
-
-def test_times_of_excel(tmp_path):
-    of_day = [["t", "w [mm]"], [clock(10, 0, 0), 1], [clock(10, 0, 2), 2]]
-    assert text_of(read_sheet(book_of(tmp_path, of_day))) == ["0 1", "2 2"]
-    lasting = [["t", "w [mm]"], [timedelta(seconds=1.5), 1], [timedelta(hours=30, seconds=2), 2]]
-    sheet = read_sheet(book_of(tmp_path, lasting))
-    assert [float(cell) for cell in sheet.numbers("t", ".")] == [0.0, 108000.5]
-
-
-def test_texts_in_excel_cells_are_read_like_those_of_a_file(tmp_path):
-    rows = [["t [s]", "w [mm]"], [0.125, "1,5"], [1.125, "2,5"]]
-    assert text_of(read_sheet(book_of(tmp_path, rows))) == ["0.125 1.5", "1.125 2.5"]
-
-
-def test_true_and_false_are_no_numbers(tmp_path):
-    rows = [["t [s]", "w [mm]", "ok"], [0.125, 1.5, True], [1.125, 2.5, False]]
-    assert read_sheet(book_of(tmp_path, rows)).heads == ("t", "w")
+@pytest.mark.parametrize(
+    ("rows", "text"),
+    [
+        (ROWS, ["0 1.234", "0.500000 5"]),  # typed numbers are in no doubt
+        ([["t", "w [mm]"], [clock(10, 0, 0), 1], [clock(10, 0, 2), 2]], ["0 1", "2 2"]),
+        ([["t", "w [mm]"], [timedelta(seconds=1.5), 1], [timedelta(hours=30, seconds=2), 2]],
+         ["0 1", "108000.500000 2"]),
+        # texts are read like those of a file; true and false are no numbers
+        ([["t [s]", "w [mm]"], [0.125, "1,5"], [1.125, "2,5"]], ["0.125 1.5", "1.125 2.5"]),
+        ([["t [s]", "w [mm]", "ok"], [0.125, 1.5, True], [1.125, 2.5, False]], ["0.125 1.5", "1.125 2.5"]),
+    ],
+)  # fmt: skip
+def test_excel_workbooks(tmp_path, rows, text):
+    sheet = read_sheet(book_of(tmp_path, rows))
+    assert text_of(sheet) == text
+    assert len(sheet.heads) == 2
+    if rows is ROWS:
+        assert (sheet.name, sheet.heads, sheet.units) == ("lab.xlsx", ("Zeit", "Weg"), ("s", "mm"))
+        assert "rows 4 to 5" in sheet.remark
 
 
 def test_one_of_several_sheets(tmp_path):
     path = book_of(tmp_path, ROWS, Ruhe=[["Zeit [s]", "Weg [mm]"], [0, 0.5], [1, 0.25]])
-    with pytest.raises(CampaignFileError, match=r"has the sheets Messung, Ruhe: say which as lab.xlsx#SHEET"):
-        read_sheet(path)
     assert text_of(read_sheet(Path(f"{path}#Ruhe"))) == ["0 0.5", "1 0.25"]
-    with pytest.raises(CampaignFileError, match="say which as"):
+    with refused(CampaignFileError, r"has the sheets Messung, Ruhe: say which as lab.xlsx#SHEET"):
+        read_sheet(path)
+    with refused(CampaignFileError, "say which as"):
         read_sheet(Path(f"{path}#Ruh"))
 
 

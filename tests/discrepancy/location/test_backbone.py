@@ -9,6 +9,16 @@ from scipy.integrate import solve_ivp
 from discrepancy.errors import FitError
 from discrepancy.location.backbone import Backbone, at_amplitude, backbones
 
+
+def _moved(force):
+    """Return x of x'' + w^2 x + force(x, x') = 0 from one, integrated numerically."""
+    found = solve_ivp(
+        lambda t, y: [y[1], -(OMEGA**2) * y[0] - force(*y)], (0.0, TIME[-1]), [1.0, 0.0], t_eval=TIME,
+        rtol=1e-9, atol=1e-11,
+    )  # fmt: skip
+    return found.y[0]
+
+
 REFERENCE = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
 TIME = 0.005 * np.arange(2000)
 OMEGA = 2.0 * np.pi * 5.0
@@ -33,11 +43,21 @@ def test_viscous_damping_is_flat_and_exact():
 
 
 def test_two_modes_are_separated():
-    signal = _viscous() + _viscous(0.006, 7.3, 0.5)
-    first, second = backbones(TIME, signal, (4.9, 7.5))
+    """A mode that dies away is dropped, the other goes on; pure noise gives no points."""
+    first, second = backbones(TIME, _viscous() + _viscous(0.006, 7.3, 0.5), (4.9, 7.5))
     np.testing.assert_allclose(first.frequency, 5.0, rtol=1e-5)
     np.testing.assert_allclose(second.frequency, 7.3, rtol=1e-5)
     np.testing.assert_allclose(second.damping_ratio, 0.006, rtol=1e-3)
+    noise = np.random.default_rng(3).standard_normal(TIME.size)
+    signal = _viscous() + _viscous(0.03, 30.0) + 0.01 * noise
+    first, second = backbones(TIME, signal, (5.0, 30.0), noise_deviation=0.01)
+    assert second.time[-1] < 3.0 < 8.0 < first.time[-1]
+    assert np.all(second.amplitude > 4.0 * second.amplitude_error)
+    np.testing.assert_allclose(second.frequency[:2], 30.0, rtol=2e-3)
+    assert backbones(TIME[:600], noise[:600], (5.0,), noise_deviation=1.0)[0].time.size == 0
+    for periods, words in ((0.1, "at least 12"), (500.0, "the record's length")):
+        with pytest.raises(FitError, match=words):
+            backbones(TIME, _viscous(), (5.0,), periods=periods)
 
 
 def test_coulomb_friction_has_a_ratio_that_falls_with_amplitude():
@@ -56,13 +76,8 @@ def test_coulomb_friction_has_a_ratio_that_falls_with_amplitude():
 
 
 def test_quadratic_damping_has_a_ratio_proportional_to_amplitude():
-    # x'' + c |x'| x' + w^2 x = 0: zeta_eq = 4 c A / (3 pi), integrated numerically.
     c = 0.1
-    found = solve_ivp(
-        lambda t, y: [y[1], -c * abs(y[1]) * y[1] - OMEGA**2 * y[0]],
-        (0.0, TIME[-1]), [1.0, 0.0], t_eval=TIME, rtol=1e-9, atol=1e-11,
-    )  # fmt: skip
-    curve = _curve(found.y[0], periods=3.0)
+    curve = _curve(_moved(lambda x, v: c * abs(v) * v), periods=3.0)
     exact = 4.0 * c * curve.amplitude / (3.0 * np.pi)
     assert curve.amplitude[0] > 3.0 * curve.amplitude[-1]
     np.testing.assert_allclose(curve.damping_ratio, exact, rtol=0.03)
@@ -71,13 +86,9 @@ def test_quadratic_damping_has_a_ratio_proportional_to_amplitude():
 
 
 def test_cubic_spring_has_a_frequency_shift_with_the_square_of_amplitude():
-    # x'' + 2 zeta w x' + w^2 (x + kappa x^3) = 0: f = f0 (1 + 3 kappa A^2 / 8) to first order.
+    # f = f0 (1 + 3 kappa A^2 / 8) to first order
     kappa, zeta = 0.04, 0.008
-    found = solve_ivp(
-        lambda t, y: [y[1], -2 * zeta * OMEGA * y[1] - OMEGA**2 * (y[0] + kappa * y[0] ** 3)],
-        (0.0, TIME[-1]), [1.0, 0.0], t_eval=TIME, rtol=1e-9, atol=1e-11,
-    )  # fmt: skip
-    curve = _curve(found.y[0])
+    curve = _curve(_moved(lambda x, v: 2.0 * zeta * OMEGA * v + OMEGA**2 * kappa * x**3))
     shift = curve.frequency / 5.0 - 1.0
     np.testing.assert_allclose(shift, 0.375 * kappa * curve.amplitude**2, atol=2e-4, rtol=0.04)
     slope = np.polyfit(np.log(curve.amplitude[:6]), np.log(shift[:6]), 1)[0]
@@ -103,20 +114,6 @@ def test_error_bars_cover(known):
         assert abs(np.mean(z)) < 0.15
 
 
-def test_a_mode_that_dies_away_is_dropped_and_the_other_goes_on():
-    generator = np.random.default_rng(3)
-    signal = _viscous() + _viscous(0.03, 30.0) + 0.01 * generator.standard_normal(TIME.size)
-    first, second = backbones(TIME, signal, (5.0, 30.0), noise_deviation=0.01)
-    assert second.time[-1] < 3.0 < 8.0 < first.time[-1]
-    assert np.all(second.amplitude > 4.0 * second.amplitude_error)
-    np.testing.assert_allclose(second.frequency[:2], 30.0, rtol=2e-3)
-
-
-def test_pure_noise_gives_no_points():
-    signal = np.random.default_rng(1).standard_normal(600)
-    assert backbones(TIME[:600], signal, (5.0,), noise_deviation=1.0)[0].time.size == 0
-
-
 def test_value_at_an_amplitude_is_the_mean_over_trials():
     def line(shift):
         amplitude = np.geomspace(1.0, 0.1, 12)
@@ -132,12 +129,6 @@ def test_value_at_an_amplitude_is_the_mean_over_trials():
     single = at_amplitude([line(0.0)], 0.4)
     assert 0.02 / np.sqrt(12) < single.frequency_error < 0.02
     assert at_amplitude([line(0.0)], 50.0).trial_count == 0
-
-
-def test_records_shorter_than_a_window_are_refused():
-    for periods, words in ((0.1, "at least 12"), (500.0, "the record's length")):
-        with pytest.raises(FitError, match=words):
-            backbones(TIME, _viscous(), (5.0,), periods=periods)
 
 
 def test_the_real_wing_stiffens_and_its_damping_falls_as_it_comes_to_rest():

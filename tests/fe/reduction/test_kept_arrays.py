@@ -139,7 +139,7 @@ def test_arrays_of_a_wrong_kind_are_refused(kept: KeptArrays, value: np.ndarray)
         ("straight_chord_line", lambda _: 2.0, "straight_chord_line"),
         ("weight", lambda _: np.zeros(2), "weight"),
         ("strip_of", lambda strips: np.array([99, *strips[1:]]), "strips"),
-        ("stations", lambda stations: stations[::-1].copy(), "must rise"),
+        ("stations", lambda stations: stations[::-1].copy(), "stations that rise"),
     ],
 )
 def test_values_that_cannot_be_are_refused(

@@ -170,7 +170,7 @@ def test_a_structure_that_softens_away_is_refused() -> None:
 @pytest.mark.parametrize("flexibility", [0.1, 0.16])  # from 1/6 m/N on there is more than one root
 def test_a_sine_on_flexibility_is_settled(flexibility: float) -> None:
     sine = laws(patch.SineForce("tip", 2.0, 3.0, 0.4))
-    ports = sine.at(np.zeros((1, 0)), np.array([flexibility]), 0.0, np.zeros((2, 1)))
+    ports = sine.at(np.zeros((1, 0)))._replace(flexibility=np.array([flexibility]))
     for y in np.linspace(-9.0, 9.0, 91):
         state = State(np.zeros(0), np.zeros(0), sine.memory(), np.zeros(1))
         x = settle_port(0, np.zeros(1, dtype=np.int64), ports, state, y, flexibility, 1.0, 1)

@@ -1,7 +1,5 @@
 """A calibration file in a scenario: what the twin draws from it, what the run keeps, what is refused."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Callable
@@ -66,7 +64,7 @@ def scenario_with(folder: Path, name: str) -> Path:
     return written(folder, TEXT[:begin] + table + TEXT[end:])
 
 
-def test_draws_come_from_the_samples(file: Path) -> None:
+def test_draws_come_from_the_samples(file):
     result = load_calibration(file)
     for name in ("young_modulus_factor", "servo_mass"):
         draws = draw_parameter(section(file, parameter=name), 3)
@@ -84,9 +82,7 @@ def test_draws_come_from_the_samples(file: Path) -> None:
         draw_parameter(section(file, parameter="wall_thickness"), 0)
 
 
-def test_the_records_are_plain_and_the_same_for_the_same_file(
-    file: Path, make_calibration: MakeCalibration
-) -> None:
+def test_the_records_are_plain_and_the_same_for_the_same_file(file, make_calibration):
     result = load_calibration(file)
     text = to_json(run_record(result, "young_modulus_factor"))
     assert text == to_json(run_record(load_calibration(file), "young_modulus_factor"))
@@ -107,7 +103,7 @@ def test_the_records_are_plain_and_the_same_for_the_same_file(
     assert single["correlation"]["matrix"] == np.eye(5).tolist()
 
 
-def test_paths_start_at_the_scenario_and_leave_no_trace_of_the_machine(file: Path) -> None:
+def test_paths_start_at_the_scenario_and_leave_no_trace_of_the_machine(file):
     scenario = resolve_scenario(load_scenario(scenario_with(file.parent, "my wing.nc")), Overrides())
     assert scenario.calibration.file == str(file)
     assert (scenario.asset.kind, scenario.belief.kind) == ("calibration", "calibration")
@@ -123,7 +119,7 @@ def test_paths_start_at_the_scenario_and_leave_no_trace_of_the_machine(file: Pat
     assert source.files()["asset/calibration.nc"] == file.read_bytes()
 
 
-def test_the_option_stands_over_the_scenario(file: Path, tmp_path: Path) -> None:
+def test_the_option_stands_over_the_scenario(file, tmp_path):
     loaded = load_scenario("level_turns")
     scenario = resolve_scenario(loaded, Overrides(calibration=file))
     assert (scenario.calibration.source, scenario.calibration.file) == ("file", str(file))
@@ -136,7 +132,7 @@ def test_the_option_stands_over_the_scenario(file: Path, tmp_path: Path) -> None
     assert (of_ssp.kind, of_ssp.parameters) == ("ssp", pump.scenario.asset.parameters)
 
 
-def test_what_is_refused_before_a_folder_is_made(file: Path, tmp_path: Path, library_file: Path) -> None:
+def test_what_is_refused_before_a_folder_is_made(file, tmp_path, library_file):
     loaded, nothing = load_scenario("level_turns"), Overrides()
     with pytest.raises(MissionInputError, match="a strain library brings its own samples"):
         resolve_scenario(loaded, Overrides(calibration=file, strain_library=library_file))
@@ -165,7 +161,7 @@ def test_what_is_refused_before_a_folder_is_made(file: Path, tmp_path: Path, lib
 
 
 @pytest.mark.long
-def test_the_wing_among_several_fmus_is_tailored_too(file: Path, tmp_path: Path) -> None:
+def test_the_wing_among_several_fmus_is_tailored_too(file, tmp_path):
     scenario = resolve_scenario(load_scenario("three_fmus"), Overrides(calibration=file))
     assert [component.design for component in scenario.asset.component] == [None, "calibration", None]
     source = asset_source(scenario)
@@ -180,7 +176,7 @@ def test_the_wing_among_several_fmus_is_tailored_too(file: Path, tmp_path: Path)
     assert moved.asset.component[1].design == "calibration"
 
 
-def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file: Path, tmp_path: Path) -> None:
+def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file, tmp_path):
     design = ('design = "uav_wing"', 'design = "my.toml"')
     text = edited(text_of("three_fmus"), design, design)
     scenario = resolve_scenario(load_scenario(written(tmp_path, text)), Overrides(calibration=file))
@@ -203,9 +199,7 @@ OF_A_WING = r"the parameter servo_mass, which the reduced model of the design .*
         (COUPLED, {"young_modulus_factor": 1.0, "nonsense": 1.0}, "parameter nonsense, which the binding"),
     ],
 )
-def test_what_a_calibration_from_a_campaign_has_must_be_known(
-    tmp_path: Path, scenario: str, means: dict[str, float], words: str
-) -> None:
+def test_what_a_calibration_from_a_campaign_has_must_be_known(tmp_path, scenario, means, words):
     given = Overrides(calibration=of_campaign(tmp_path / "calibration.nc", **means))
     with pytest.raises(MissionInputError, match=words):
         new_run(load_scenario(scenario), tmp_path / "run", given, report=False)

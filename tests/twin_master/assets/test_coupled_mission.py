@@ -1,7 +1,5 @@
 """Any FMU with a binding and a scenario flies, and so do coupled ones: in a worker, resumed, from an SSP."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -97,7 +95,7 @@ def rows(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((run / "csv").iterdir())}
 
 
-def test_a_heat_exchanger_is_watched_and_steered(direct: dict[str, Path]) -> None:
+def test_a_heat_exchanger_is_watched_and_steered(direct):
     run = direct["fouling"]
     tree = read_run(run)
     observed, truth = tree["observed"], tree["truth"]
@@ -115,7 +113,7 @@ def test_a_heat_exchanger_is_watched_and_steered(direct: dict[str, Path]) -> Non
     assert headers[1].startswith("step,fouling_true_m2.K/W")
 
 
-def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(folder: Path, tmp_path: Path) -> None:
+def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(folder, tmp_path):
     # The twin's table has two levels, so that only the flown asset misbehaves.
     load = "wall_temperature = 80.0"
     loaded = changed(
@@ -132,9 +130,7 @@ def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(folder: Path, tmp_
         resume_run(tmp_path / "run")
 
 
-def test_a_system_of_one_fmu_flies_as_the_fmu_alone(
-    folder: Path, direct: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_system_of_one_fmu_flies_as_the_fmu_alone(folder, direct, tmp_path):
     """In a worker and in this process."""
     assert rows(direct["coupled_fouling"]) == rows(direct["fouling"])
     loaded = load_scenario(folder / "coupled_fouling.toml")
@@ -143,9 +139,7 @@ def test_a_system_of_one_fmu_flies_as_the_fmu_alone(
 
 
 @BOTH
-def test_a_flight_is_the_same_resumed_and_from_an_ssp_file(
-    folder: Path, direct: dict[str, Path], tmp_path: Path, name: str
-) -> None:
+def test_a_flight_is_the_same_resumed_and_from_an_ssp_file(folder, direct, tmp_path, name):
     """The FMU cannot save its state: its inputs are replayed. What is flown lies in the run folder."""
     loaded = load_scenario(folder / f"{name}.toml")
     with cut_off_after(11):
@@ -160,7 +154,7 @@ def test_a_flight_is_the_same_resumed_and_from_an_ssp_file(
     assert rows(resume_run(flown).folder) == rows(direct[name])
 
 
-def test_what_does_not_fit_is_said_before_a_folder_is_made(folder: Path, tmp_path: Path) -> None:
+def test_what_does_not_fit_is_said_before_a_folder_is_made(folder, tmp_path):
     (folder / "broken.fmu").write_bytes(b"PK no archive")
     twice = '{ conductance = 5000.0, "conductance[{1..1}]" = 1.0 }'
     for old, new, kind, words in (
@@ -214,7 +208,7 @@ def test_what_does_not_fit_is_said_before_a_folder_is_made(folder: Path, tmp_pat
     assert [path.name for path in tmp_path.iterdir()] == ["bad.ssp"]
 
 
-def test_the_schema_of_the_truth() -> None:
+def test_the_schema_of_the_truth():
     table = table_of("three_fmus")
     nothing = {"state": {}, "observation": None, "received": None}
     for change, words in (
@@ -250,7 +244,7 @@ def plant_of(loaded: LoadedScenario, folder: Path) -> Plant:
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-def test_three_fmus_live_the_script_of_a_scenario(tmp_path: Path) -> None:
+def test_three_fmus_live_the_script_of_a_scenario(tmp_path):
     """Damage, drift and lost gauges of failing_gauges, once as its truth and once in the FMUs: to the bit."""
     script = (
         (10, 19, "z1", 0.02), (20, 20, "z1", 0.2), (30, 30, "z1", 0.2),
@@ -286,7 +280,7 @@ def test_three_fmus_live_the_script_of_a_scenario(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-def test_the_shipped_scenario_in_process_in_workers_and_resumed(tmp_path: Path) -> None:
+def test_the_shipped_scenario_in_process_in_workers_and_resumed(tmp_path):
     loaded = shipped("three_fmus", tmp_path, ("steps = 50", "steps = 24"))
     whole = new_run(loaded, tmp_path / "whole").folder
     inside = new_run(loaded, tmp_path / "inside", Overrides(in_process=True)).folder
@@ -304,7 +298,7 @@ def test_the_shipped_scenario_in_process_in_workers_and_resumed(tmp_path: Path) 
     assert rows(new_run(loaded, tmp_path / "ssp", Overrides(ssp=ssp)).folder) == rows(whole)
 
 
-def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path: Path) -> None:
+def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path):
     fleet = ensemble("three_fmus", range(3))
     (group,) = fleet.groups
     (scenario,) = group.scenarios
@@ -313,7 +307,7 @@ def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path: Path) 
         fly_fleet(replace(fleet, groups=(replace(group, scenarios=(seedless,)),)), tmp_path / "fleet")
 
 
-def test_the_law_of_the_shipped_damage_is_what_the_twin_believes() -> None:
+def test_the_law_of_the_shipped_damage_is_what_the_twin_believes():
     scenario = load_scenario("three_fmus").scenario
     values = scenario.asset.component[0].parameters
     for control in scenario.control:

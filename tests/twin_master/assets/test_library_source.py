@@ -1,7 +1,5 @@
 """A twin that believes an observation library, and the pump's mission against brute force."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math
@@ -88,7 +86,7 @@ def library(made: Path) -> ObservationLibrary:
     return load_observation_library(made)
 
 
-def test_a_table_over_another_parameter_grid_is_interpolated(library: ObservationLibrary) -> None:
+def test_a_table_over_another_parameter_grid_is_interpolated(library):
     nodes = library.at_draws("viscosity_factor", library.draws[[3, 7]])
     np.testing.assert_array_equal(nodes, library.values[[3, 7]])
     between = library.at_draws("viscosity_factor", np.array([0.955]))
@@ -97,7 +95,7 @@ def test_a_table_over_another_parameter_grid_is_interpolated(library: Observatio
     assert not library.holds_draws(np.array([0.955]))
 
 
-def test_a_run_with_a_library_keeps_it_and_can_be_resumed(made: Path, tmp_path: Path) -> None:
+def test_a_run_with_a_library_keeps_it_and_can_be_resumed(made, tmp_path):
     path = Path(shutil.copy(made, tmp_path / "pump.nc"))
     whole = new_run(small_pump(), tmp_path / "whole", Overrides(library=path))
     assert not whole.origin.differ
@@ -120,7 +118,7 @@ def test_a_run_with_a_library_keeps_it_and_can_be_resumed(made: Path, tmp_path: 
 
 
 @pytest.mark.long
-def test_a_library_of_the_same_draws_gives_the_same_run(tmp_path: Path) -> None:
+def test_a_library_of_the_same_draws_gives_the_same_run(tmp_path):
     library = Overrides(library=sampled(tmp_path))
     new_run(small_pump(), tmp_path / "asked")
     new_run(small_pump(), tmp_path / "sampled", library)
@@ -131,7 +129,7 @@ def test_a_library_of_the_same_draws_gives_the_same_run(tmp_path: Path) -> None:
         new_run(small_pump(), tmp_path / "other", Overrides(library=library.library, seed=3))
 
 
-def test_a_library_of_another_fmu_is_flown_with_a_notice(made: Path, tmp_path: Path) -> None:
+def test_a_library_of_another_fmu_is_flown_with_a_notice(made, tmp_path):
     script = tmp_path / "gear_pump.py"
     text = asset_scripts()["gear_pump"].read_text(encoding="utf-8")
     script.write_text(text.replace("COOLING = 250.0", "COOLING = 200.0"))
@@ -157,14 +155,12 @@ def test_a_library_of_another_fmu_is_flown_with_a_notice(made: Path, tmp_path: P
         ("state.0.unit", "percent", "has the states in clogging: 1, wear: 1"),
     ],
 )
-def test_what_a_library_lacks_is_named(
-    made: Path, tmp_path: Path, key: str, entry: object, words: str
-) -> None:
+def test_what_a_library_lacks_is_named(made, tmp_path, key, entry, words):
     with pytest.raises(InvalidObservationLibraryError, match=words):
         new_run(changed(key, entry), tmp_path / "run", Overrides(library=made))
 
 
-def test_names_and_order_of_controls_and_states_do_not_matter(made: Path, tmp_path: Path) -> None:
+def test_names_and_order_of_controls_and_states_do_not_matter(made, tmp_path):
     table, figures = pump_table(), []
     table["state"].reverse()
     table["control"].reverse()
@@ -174,7 +170,7 @@ def test_names_and_order_of_controls_and_states_do_not_matter(made: Path, tmp_pa
     assert figures[0]["filtered_rms_error_wear"] == pytest.approx(figures[1]["filtered_rms_error_wear"])
 
 
-def test_files_that_are_no_library_are_refused(made: Path, library_file: Path, tmp_path: Path) -> None:
+def test_files_that_are_no_library_are_refused(made, library_file, tmp_path):
     """Also one with a number that is none; and a scenario without an FMU cannot be sampled."""
     (tmp_path / "noise.nc").write_bytes(b"no NetCDF at all")
     xr.Dataset({"x": 1.0}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
@@ -222,7 +218,7 @@ def test_files_that_are_no_library_are_refused(made: Path, library_file: Path, t
         ("truth.noise", {"standard_deviation": [1.0]}, r"`truth\.noise\.standard_deviation`"),
     ],
 )
-def test_keys_and_lists_that_do_not_fit_are_refused(key: str, entry: object, words: str) -> None:
+def test_keys_and_lists_that_do_not_fit_are_refused(key, entry, words):
     with pytest.raises(ScenarioError, match=words):
         changed(key, entry)
 
@@ -290,7 +286,7 @@ def shown(run: Any) -> list[Float]:
     return [tables[index] for index in run["observed"]["control_index"].values.tolist()]
 
 
-def test_filter_smoother_and_prediction_equal_enumeration(run: Any, shown: list[Float]) -> None:
+def test_filter_smoother_and_prediction_equal_enumeration(run, shown):
     observed = run["observed"]["operation"].values
     controls = [str(name) for name in run["policy"]["control"].values]
     flown = [controls[index] for index in run["observed"]["control_index"].values]
@@ -345,7 +341,7 @@ def test_filter_smoother_and_prediction_equal_enumeration(run: Any, shown: list[
     np.testing.assert_allclose(run["predicted"]["control_probability"].values[-1], asked, atol=1e-12)
 
 
-def test_rewards_are_those_of_the_sensors_that_have_a_limit(run: Any, shown: list[Float]) -> None:
+def test_rewards_are_those_of_the_sensors_that_have_a_limit(run, shown):
     for t, values in enumerate(shown):
         health = 1.0 - np.maximum(values[..., 2] / 50.0, values[..., 3] / 5.0)
         seen, probability = run["observed"]["operation"].values[t], run["filtered"]["probability"].values[t]

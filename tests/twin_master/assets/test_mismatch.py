@@ -1,11 +1,8 @@
 """A twin that believes another model than the one that flies: sources, misfit, refusals, runs."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
-from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -18,7 +15,6 @@ from hypothesis import strategies as st
 
 from benchmarks.seeds import fly_seeds
 from calibration.result.file import load_calibration, save_calibration
-from calibration.result.record import Calibration
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from reporting.progress import SilentProgress
@@ -67,7 +63,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", sorted(REFUSED))
-def test_combinations_that_mean_nothing_are_refused_in_one_sentence(case: str, tmp_path: Path) -> None:
+def test_combinations_that_mean_nothing_are_refused_in_one_sentence(case, tmp_path):
     change, words = REFUSED[case]
     with pytest.raises(ScenarioError) as caught:
         load_scenario(written(tmp_path, TEXT, change))
@@ -77,7 +73,7 @@ def test_combinations_that_mean_nothing_are_refused_in_one_sentence(case: str, t
         assert word in sentence, sentence
 
 
-def test_without_the_library_one_sentence_says_where_to_get_it(tmp_path: Path) -> None:
+def test_without_the_library_one_sentence_says_where_to_get_it(tmp_path):
     error = refused("run", "model_mismatch", "--out", tmp_path / "run")
     for word in ("UAV-Digital-Twin", "UAVconfig.json", "--strain-library FILE", "asset.file"):
         assert word in error
@@ -89,9 +85,7 @@ def resolved(library: Path, path: Path | str = "model_mismatch") -> Scenario:
 
 
 @pytest.mark.long
-def test_the_twin_may_believe_a_calibrated_wing(
-    library_file: Path, tmp_path: Path, make_calibration: Callable[..., Calibration]
-) -> None:
+def test_the_twin_may_believe_a_calibrated_wing(library_file, tmp_path, make_calibration):
     file = save_calibration(make_calibration(), tmp_path / "wing.nc")
     overrides = Overrides(strain_library=library_file, calibration=file)
     scenario = resolve_scenario(load_scenario("model_mismatch"), overrides)
@@ -109,7 +103,7 @@ def test_the_twin_may_believe_a_calibrated_wing(
         resolve_scenario(load_scenario("level_turns"), overrides)
 
 
-def test_the_option_names_the_file_and_keeps_the_model(library_file: Path, tmp_path: Path) -> None:
+def test_the_option_names_the_file_and_keeps_the_model(library_file, tmp_path):
     scenario = resolved(library_file)
     assert scenario.asset.file == str(library_file)
     assert scenario.another_model
@@ -129,7 +123,7 @@ def test_the_option_names_the_file_and_keeps_the_model(library_file: Path, tmp_p
         resolve_scenario(load_scenario("model_mismatch"), Overrides(fmu=tmp_path / "x.fmu"))
 
 
-def test_what_asset_and_model_cannot_agree_on_is_refused(library_file: Path, tmp_path: Path) -> None:
+def test_what_asset_and_model_cannot_agree_on_is_refused(library_file, tmp_path):
     for change, error, sentence in (
         (("= 3.0 }", "= 2.5 }"), MissingObservationModelError, r"3g at load factor 3, .* 2\.5"),
         (
@@ -157,7 +151,7 @@ def linear_case(seed: int, spread: float) -> tuple[np.ndarray, ...]:
 
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), spread=st.sampled_from([0.0, 30e-6]))
-def test_the_bias_of_a_linear_model_is_that_of_least_squares(seed: int, spread: float) -> None:
+def test_the_bias_of_a_linear_model_is_that_of_least_squares(seed, spread):
     """Where everything is linear the bias is exact: whiten by the covariance, and solve by lstsq."""
     scenario = load_scenario("level_turns").scenario
     model = build_graphical_model(scenario)
@@ -195,7 +189,7 @@ def test_the_bias_of_a_linear_model_is_that_of_least_squares(seed: int, spread: 
     weights=st.lists(st.integers(0, 5), min_size=25, max_size=25).filter(any),
     truth=st.tuples(st.integers(0, 80), st.integers(0, 80)),
 )
-def test_the_credible_set_by_enumeration(weights: list[int], truth: tuple[int, int]) -> None:
+def test_the_credible_set_by_enumeration(weights, truth):
     """The set of all states at least as probable as p, for the largest p at which it holds 90 %."""
     model = build_graphical_model(load_scenario("level_turns").scenario)
     probability = np.array(weights) / sum(weights)
@@ -214,7 +208,7 @@ def test_the_credible_set_by_enumeration(weights: list[int], truth: tuple[int, i
     assert found.tolist() == [expected]
 
 
-def test_standard_errors_of_a_study() -> None:
+def test_standard_errors_of_a_study():
     random = np.random.default_rng(1)
     error = random.standard_normal((50, 2))
     study = Outcomes(
@@ -237,7 +231,7 @@ def test_standard_errors_of_a_study() -> None:
     assert study.bias(1).value == pytest.approx(error[:, 1].mean())
 
 
-def test_a_model_error_reaches_the_twin(library_file: Path, tmp_path: Path) -> None:
+def test_a_model_error_reaches_the_twin(library_file, tmp_path):
     """A twin that doubts its model trusts an observation less, and its run says what it assumed."""
     path = written(tmp_path, TEXT, (MODEL + DESIGN, ITSELF), ("# model_error_percent", "model_error_percent"))
     doubting = resolved(library_file, path)
@@ -306,7 +300,7 @@ class TestOnTheWing:
         flown = StrainLibrarySource(scenario, load_strain_library(library), "h")
         return scenario, own, PairedSource(flown, own)
 
-    def test_a_library_of_the_same_wing_is_no_mismatch(self, wing: ReducedModel, tmp_path: Path) -> None:
+    def test_a_library_of_the_same_wing_is_no_mismatch(self, wing, tmp_path):
         library = library_of(wing, np.ones(24), tmp_path / "UAVconfig.json")
         scenario, own, mixed = self.sources(wing, library)
         knowledge = prepare_knowledge(scenario, mixed, 1)
@@ -320,9 +314,7 @@ class TestOnTheWing:
         assert misfit.rms < 1.2 * abs(mean / 1.0073 - 1.0) + 1e-5
         assert np.abs(misfit.bias).max() < 0.01
 
-    def test_the_misfit_is_what_was_put_in_and_the_estimate_goes_where_it_says(
-        self, wing: ReducedModel, twisted: Path, scale: np.ndarray
-    ) -> None:
+    def test_the_misfit_is_what_was_put_in_and_the_estimate_goes_where_it_says(self, wing, twisted, scale):
         scenario, own, mixed = self.sources(wing, twisted)
         knowledge = prepare_knowledge(scenario, mixed, 0)
         misfit = find_misfit(scenario, knowledge.model, knowledge.sensor_model, mixed.open())
@@ -340,7 +332,7 @@ class TestOnTheWing:
         assert wrong.credible_share.value < right.credible_share.value
 
     @pytest.mark.long
-    def test_the_study_prints_its_table(self, wing: ReducedModel, twisted: Path) -> None:
+    def test_the_study_prints_its_table(self, wing, twisted):
         """Scaled gauge by gauge, the model of the twin is that of this library, and is as good as the own."""
         result = subprocess.run(
             [sys.executable, "-m", "benchmarks.study_level_turns", "--combinations", "--strain-library",
@@ -361,7 +353,7 @@ class TestOnTheWing:
         )  # between the levels the library is interpolated
         assert found["library", "our wing", "none"][-1] < own[-1] - 1.0
 
-    def test_study_on_the_published_library(self, wing: ReducedModel, published_library: Path) -> None:
+    def test_study_on_the_published_library(self, wing, published_library):
         """Our model holds the wing of the authors well enough to steer it; bounds for 30 missions."""
         scenario, _, mixed = self.sources(wing, published_library)
         knowledge = prepare_knowledge(scenario, mixed, 0)

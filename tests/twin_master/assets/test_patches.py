@@ -1,7 +1,5 @@
 """Missing effects in a mission: hidden in the asset, known to the twin, refused where they cannot be."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Callable
@@ -59,7 +57,7 @@ def scenario_of(folder: Path, lines: str = "", parameters: str = "", belief: str
     return written(folder, text)
 
 
-def test_combinations_that_mean_nothing_are_refused(tmp_path: Path) -> None:
+def test_combinations_that_mean_nothing_are_refused(tmp_path):
     design = 'kind = "design"\ndesign = "uav_wing"'
     for lines, old, new, key in (
         (PATCH, design, 'kind = "fmu"\nfile = "w.fmu"', "asset.patch"),
@@ -73,7 +71,7 @@ def test_combinations_that_mean_nothing_are_refused(tmp_path: Path) -> None:
         resolve_scenario(loaded, Overrides(fmu=tmp_path / "other.fmu"))
 
 
-def test_what_changes_within_a_mission_is_no_model_of_the_twin(tmp_path: Path) -> None:
+def test_what_changes_within_a_mission_is_no_model_of_the_twin(tmp_path):
     for primitive, words in (
         (SensorDrift("strain[1]", 1e-5, 1.0), "depends on time"),
         (BoucWen("tip", 1.0, 1e-3, 1.0), "loads before"),
@@ -85,7 +83,7 @@ def test_what_changes_within_a_mission_is_no_model_of_the_twin(tmp_path: Path) -
     check_model_patch(parse_patch(write_patch(tmp_path, offset).read_bytes()), 24)
 
 
-def test_wrong_names_and_files_are_refused_before_anything_is_made(tmp_path: Path) -> None:
+def test_wrong_names_and_files_are_refused_before_anything_is_made(tmp_path):
     write_patch(tmp_path, *DRIFT)
     for lines, parameters, belief, words in (
         (PATCH, '"effect.hiden.active" = 0', "", "effect.hiden.active"),
@@ -97,7 +95,7 @@ def test_wrong_names_and_files_are_refused_before_anything_is_made(tmp_path: Pat
         assert not (tmp_path / "run").exists()
 
 
-def test_what_is_flown_and_what_is_believed_has_its_name(tmp_path: Path) -> None:
+def test_what_is_flown_and_what_is_believed_has_its_name(tmp_path):
     write_patch(tmp_path, *STRUCTURE)
     source = asset_source(
         resolve_scenario(load_scenario(scenario_of(tmp_path, PATCH, belief=PATCH)), Overrides())
@@ -120,7 +118,7 @@ def mission(tmp_path: Path, no_report: None) -> Callable[..., Path]:
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-def test_a_mission_with_a_hidden_drift(mission: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_mission_with_a_hidden_drift(mission, tmp_path):
     write_patch(tmp_path, *DRIFT)
     folder = mission("hidden", PATCH)
     folders = mission("plain"), folder, mission("off", PATCH, '"effect.hidden.active" = 0')
@@ -144,7 +142,7 @@ def test_a_mission_with_a_hidden_drift(mission: Callable[..., Path], tmp_path: P
 
 @pytest.mark.long
 @pytest.mark.xdist_group("wing")
-def test_a_twin_that_knows_the_effect_has_no_misfit(mission: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_twin_that_knows_the_effect_has_no_misfit(mission, tmp_path):
     write_patch(tmp_path, *STRUCTURE)
     ways = {"ignorant": (PATCH, ""), "knowing": (PATCH, PATCH), "mistaken": ("", PATCH)}
     misfit = {
@@ -158,7 +156,7 @@ def test_a_twin_that_knows_the_effect_has_no_misfit(mission: Callable[..., Path]
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-def test_the_asset_with_its_effects_can_be_exported(tmp_path: Path) -> None:
+def test_the_asset_with_its_effects_can_be_exported(tmp_path):
     write_patch(tmp_path, *DRIFT)
     loaded = load_scenario(scenario_of(tmp_path, PATCH, '"effect.hidden.gain" = 0.2'))
     ssp = tmp_path / "wing.ssp"

@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +45,7 @@ def loaded(folder: Path, content: object) -> StrainLibrary:
     return load_strain_library(folder)
 
 
-def test_published_format(tmp_path: Path) -> None:
+def test_published_format(tmp_path):
     library = loaded(tmp_path, small_content())
     assert library.controls == ("2g", "3g")
     assert library.states.shape == (3, 2)
@@ -66,7 +63,7 @@ def test_published_format(tmp_path: Path) -> None:
     np.testing.assert_array_equal(by_file.strain, library.strain)
 
 
-def test_between_the_levels_strain_is_multilinear(tmp_path: Path) -> None:
+def test_between_the_levels_strain_is_multilinear(tmp_path):
     library = loaded(tmp_path, small_content())
     for z1, z2 in [(0.0, 0.0), (0.4, 0.5), (0.2, 0.0), (0.07, 0.21), (0.39, 0.5)]:
         expected = 1e-6 * strain(100 * z1, 100 * z2, 3)
@@ -99,16 +96,14 @@ def test_between_the_levels_strain_is_multilinear(tmp_path: Path) -> None:
         (lambda content: content.update(states=LEVELS[:1]), "levels of 2 regions"),
     ],
 )
-def test_an_incomplete_library_is_refused(
-    tmp_path: Path, change: Callable[[dict[str, Any]], object], sentence: str
-) -> None:
+def test_an_incomplete_library_is_refused(tmp_path, change, sentence):
     content = small_content()
     change(content)
     with pytest.raises(InvalidStrainLibraryError, match=sentence):
         loaded(tmp_path, content)
 
 
-def test_a_missing_or_damaged_file_is_refused(tmp_path: Path) -> None:
+def test_a_missing_or_damaged_file_is_refused(tmp_path):
     with pytest.raises(InvalidStrainLibraryError, match="cannot be read"):
         load_strain_library(tmp_path)
     for text, sentence in (
@@ -119,7 +114,7 @@ def test_a_missing_or_damaged_file_is_refused(tmp_path: Path) -> None:
             loaded(tmp_path, text)
 
 
-def test_what_is_known_of_the_published_library(published_library: Path) -> None:
+def test_what_is_known_of_the_published_library(published_library):
     """Gauge 16 carries the maximum everywhere."""
     library = load_strain_library(published_library)
     assert library.strain_per_draw.shape == (30, 25, 2, 24)

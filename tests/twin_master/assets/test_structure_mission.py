@@ -1,7 +1,5 @@
 """A structure from a mesh as asset and belief: its strains, frequencies and modes; gauges beside its own."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -66,7 +64,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return new_run(short(), tmp_path_factory.mktemp("bracket") / "run", report=False).folder
 
 
-def test_the_twin_finds_the_damage_of_the_full_model(flown: Path) -> None:
+def test_the_twin_finds_the_damage_of_the_full_model(flown):
     """The strains flown are those of the full model within their bound; the heel is accused, not the arm."""
     tree, structure = read_run(flown), load_and_assemble(FILE)
     unit = structure.load("weight", 1.0)
@@ -91,7 +89,7 @@ def test_the_twin_finds_the_damage_of_the_full_model(flown: Path) -> None:
 
 
 @pytest.mark.parametrize("between", [True, False])
-def test_damage_between_two_levels_does_not_condemn_a_sound_region(tmp_path: Path, between: bool) -> None:
+def test_damage_between_two_levels_does_not_condemn_a_sound_region(tmp_path, between):
     """The heel stands at 70 %, half way between two levels, and the gauge of the arm is lost.
 
     A twin that takes it to be at a level believes with certainty that the arm has lost 80 %.
@@ -115,7 +113,7 @@ def test_damage_between_two_levels_does_not_condemn_a_sound_region(tmp_path: Pat
 
 
 @pytest.mark.long
-def test_damage_is_found_from_frequencies_alone(tmp_path: Path) -> None:
+def test_damage_is_found_from_frequencies_alone(tmp_path):
     """Three natural frequencies in the place of gauges; those flown are the full model's."""
     rewards = {"health_limit": 100.0, "error_scale": 1.0}
     rewards |= dict.fromkeys(("health_limit_microstrain", "error_scale_microstrain"))
@@ -136,7 +134,7 @@ def test_damage_is_found_from_frequencies_alone(tmp_path: Path) -> None:
         new_run(seen(7, 1.0), tmp_path / "no")
 
 
-def test_a_resumed_flight_is_bit_identical_after_the_files_are_gone(flown: Path, tmp_path: Path) -> None:
+def test_a_resumed_flight_is_bit_identical_after_the_files_are_gone(flown, tmp_path):
     files = [Path(shutil.copy(FILE.with_name(name), tmp_path)) for name in ("bracket.toml", "bracket.inp")]
     own = {"structure": str(files[0])}
     with cut_off_after(4):
@@ -176,15 +174,13 @@ def test_a_resumed_flight_is_bit_identical_after_the_files_are_gone(flown: Path,
         ({"truth": {"gains": [BEYOND]}}, r"bring z_heel to 0\.9 in shift 4, .* range 0 to 0\.8"),
     ],
 )
-def test_what_does_not_fit_is_refused_before_a_folder_is_made(
-    changes: Changes, sentence: str, tmp_path: Path
-) -> None:
+def test_what_does_not_fit_is_refused_before_a_folder_is_made(changes, sentence, tmp_path):
     with pytest.raises((TwinMasterError, FiniteElementError), match=sentence):
         new_run(short(**changes), tmp_path / "run", report=False)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_mesh_without_a_set_and_one_that_lies_elsewhere_are_refused(tmp_path: Path) -> None:
+def test_a_mesh_without_a_set_and_one_that_lies_elsewhere_are_refused(tmp_path):
     """The sentence names the user's mesh, not a copy of it."""
     mesh = Path(shutil.copy(FILE.with_name("bracket.inp"), tmp_path))
     (tmp_path / "sub").mkdir()
@@ -254,7 +250,7 @@ def features(tree: Any, titles: list[str]) -> tuple[np.ndarray, np.ndarray, np.n
     return truth["modes"].values, tree["observed"]["modes"].values, errors
 
 
-def test_the_twin_finds_the_loss_from_records_of_accelerations(decays: Path) -> None:
+def test_the_twin_finds_the_loss_from_records_of_accelerations(decays):
     """Features lie within their errors of those of the model that flies; the inner region is accused."""
     tree = read_run(decays)
     true, seen, errors = features(tree, TITLES)
@@ -267,8 +263,8 @@ def test_the_twin_finds_the_loss_from_records_of_accelerations(decays: Path) -> 
 
 @pytest.mark.long
 def test_ambient_records_tell_the_same_mode_and_a_resumed_flight_goes_on_with_its_records(
-    file: Path, decays: Path, tmp_path: Path
-) -> None:
+    file, decays, tmp_path
+):
     """White noise on the push: its three features within four standard errors of the record."""
     modes = MODES | {"bands": MODES["bands"][:1], "numbers": [1]}
     changes = {"mission": {"steps": 1}, "truth": {"gains": []}, "observation": {"modes": modes}}
@@ -301,14 +297,14 @@ def test_ambient_records_tell_the_same_mode_and_a_resumed_flight_goes_on_with_it
     ],
 )
 def test_what_does_not_go_together_or_the_structure_does_not_tell_is_refused(
-    file: Path, changes: Changes, sentence: str, tmp_path: Path
-) -> None:
+    file, changes, sentence, tmp_path
+):
     with pytest.raises(TwinMasterError, match=sentence):
         new_run(mission(file, "decay", **changes), tmp_path / "run", report=False)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_watch_takes_features_with_their_covariance(file: Path) -> None:
+def test_a_watch_takes_features_with_their_covariance(file):
     """Messages of features give the belief of the mission; a covariance that is none is refused."""
     scenario = mission(file, "decay").scenario
     reader, count = MessageReader(scenario), scenario.observation.count
@@ -330,7 +326,7 @@ def panel() -> Scenario:
     return resolve_scenario(load_scenario("stiffened_panel"), Overrides())
 
 
-def test_gauges_that_cannot_stand_beside_those_of_the_file(panel: Scenario, tmp_path: Path) -> None:
+def test_gauges_that_cannot_stand_beside_those_of_the_file(panel, tmp_path):
     """What is wrong names the option."""
     folder = tmp_path / "0"
     with pytest.raises(MissionInputError, match="--candidates needs at least one place"):

@@ -1,7 +1,5 @@
 """Fleets: plan, shards, store, what goes on after a kill, and what is refused."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path
@@ -38,7 +36,7 @@ def whole(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return fly_fleet(growing(library_file), tmp_path_factory.mktemp("whole") / "fleet").folder
 
 
-def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file: Path, tmp_path: Path) -> None:
+def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, tmp_path):
     given = Overrides(strain_library=library_file)
     outcome = fly_fleet(ensemble("level_turns", range(2020, 2023), given), tmp_path / "many")
     group = fleet_groups(outcome.folder)["level_turns"]
@@ -54,7 +52,7 @@ def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file: Path, tmp_pa
         assert np.array_equal(group[ours].values[row], single.astype(group[ours].dtype)), ours
 
 
-def test_shards_and_workers_change_nothing(library_file: Path, whole: Path, tmp_path: Path) -> None:
+def test_shards_and_workers_change_nothing(library_file, whole, tmp_path):
     cut = fly_fleet(growing(library_file, shard=3), tmp_path / "cut", Engine(2))
     assert cut.shards_flown == 4
     first, second = (fleet_groups(folder)["growing_damage"] for folder in (whole, cut.folder))
@@ -65,9 +63,7 @@ def test_shards_and_workers_change_nothing(library_file: Path, whole: Path, tmp_
     assert len(np.unique(first["state"].values[:, -1], axis=0)) > 1
 
 
-def test_a_fleet_goes_on_where_it_was_killed(
-    library_file: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monkeypatch):
     fleet, cut, finish = growing(library_file), tmp_path / "cut", FleetStore.finish
 
     def dying(self: FleetStore, shard: int, told: Any) -> None:
@@ -95,7 +91,7 @@ def test_a_fleet_goes_on_where_it_was_killed(
     assert fly_fleet(fleet, cut).shards_flown == 0
 
 
-def test_a_folder_keeps_what_it_holds(library_file: Path, tmp_path: Path) -> None:
+def test_a_folder_keeps_what_it_holds(library_file, tmp_path):
     fleet, other, folder = growing(library_file, count=2), growing(library_file, count=3), tmp_path / "fleet"
     fly_fleet(fleet, folder)
     with pytest.raises(RunFolderExistsError, match="another fleet"):
@@ -140,7 +136,7 @@ def changed(file: Path, *changes: tuple[str, str], seed: int | None = None) -> F
     return load_fleet(written(file.parent, FLEET, *changes, name=file.name), seed=seed)
 
 
-def test_a_twin_has_a_seed_of_its_own_whatever_else_flies(fleet_file: Path) -> None:
+def test_a_twin_has_a_seed_of_its_own_whatever_else_flies(fleet_file):
     fleet, fewer = load_fleet(fleet_file), changed(fleet_file, ("count = 3", "count = 1"))
     seeds, left = (
         [member.seed for group in one.groups for member in group.members] for one in (fleet, fewer)
@@ -164,12 +160,12 @@ def test_a_twin_has_a_seed_of_its_own_whatever_else_flies(fleet_file: Path) -> N
         ("seed = 5", "sead = 5", "sead"),
     ],
 )
-def test_a_wrong_fleet_file_is_refused(fleet_file: Path, old: str, new: str, sentence: str) -> None:
+def test_a_wrong_fleet_file_is_refused(fleet_file, old, new, sentence):
     with pytest.raises(FleetError, match=sentence):
         changed(fleet_file, (old, new))
 
 
-def test_all_assets_that_cannot_fly_are_in_one_list(fleet_file: Path) -> None:
+def test_all_assets_that_cannot_fly_are_in_one_list(fleet_file):
     for name in ("a", "b"):
         (fleet_file.parent / f"{name}.fmu").write_bytes(b"no FMU")
     fleet = changed(fleet_file, ("count = 3", 'fmus = "*.fmu"'), ("young_modulus_factor", "colour"))
@@ -182,12 +178,12 @@ def test_all_assets_that_cannot_fly_are_in_one_list(fleet_file: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["7", "3:3", "5:1", "a:b", "-1:4", "1:2:3", "0:1000000000000"])
-def test_seeds_are_a_range(text: str) -> None:
+def test_seeds_are_a_range(text):
     with pytest.raises(FleetError, match=r"FIRST:END|1000000 twins at most"):
         seed_range(text)
 
 
-def test_a_truth_beyond_the_model_is_refused(fleet_file: Path) -> None:
+def test_a_truth_beyond_the_model_is_refused(fleet_file):
     soft = r"south: the true young_modulus_factor of 2 of 2 assets is outside"
     with pytest.raises(FleetError, match=soft):
         fly_fleet(changed(fleet_file, ("mean = 1.0,", "mean = 1.3,")), fleet_file.parent / "out")
@@ -199,9 +195,7 @@ def test_a_truth_beyond_the_model_is_refused(fleet_file: Path) -> None:
     assert not (fleet_file.parent / "out").exists()
 
 
-def test_one_calibration_that_fails_costs_its_own_asset(
-    fleet_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_calibration_that_fails_costs_its_own_asset(fleet_file, monkeypatch):
     for name in ("a", "b"):
         (fleet_file.parent / f"{name}.fmu").write_bytes(b"for its name alone")
 
@@ -219,7 +213,7 @@ def test_one_calibration_that_fails_costs_its_own_asset(
     assert outcome.failures == {"north/a": "no posterior.", "north/b": "it was flown"}
 
 
-def test_figures_are_those_of_the_flights(library_file: Path, tmp_path: Path) -> None:
+def test_figures_are_those_of_the_flights(library_file, tmp_path):
     fleet = growing(library_file, count=4)
     folder, (group,) = fly_fleet(fleet, tmp_path / "fleet").folder, fleet.groups
     knowledge = kept_knowledge(group_folder(folder, group, 0), group.scenarios[0])
@@ -239,7 +233,7 @@ def test_figures_are_those_of_the_flights(library_file: Path, tmp_path: Path) ->
         assert found.value == pytest.approx(expected, rel=1e-5)
 
 
-def test_the_command_line(library_file: Path, tmp_path: Path) -> None:
+def test_the_command_line(library_file, tmp_path):
     words = ("run", "growing_damage", "--strain-library", library_file, "--workers", 0, "--json", "--seeds")
     told = json.loads(said(*words, "0:3", "--out", tmp_path / "a"))
     assert (told["twins"], told["failed"]) == (3, 0)
@@ -250,9 +244,7 @@ def test_the_command_line(library_file: Path, tmp_path: Path) -> None:
         refused("run", "growing_damage", *wrong, code=2)
 
 
-def test_without_the_extra_or_a_scheduler_nothing_is_begun(
-    library_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_the_extra_or_a_scheduler_nothing_is_begun(library_file, tmp_path, monkeypatch):
     fleet, folder = growing(library_file), tmp_path / "fleet"
     monkeypatch.setattr("twin_master.fleet.engine.CONNECTING", 0.2)
     with pytest.raises(FleetError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):

@@ -1,7 +1,5 @@
 """Many real assets under watch: files that grow, topics of a broker, kills, and what is lost alone."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -107,9 +105,7 @@ def watched(fleet_file: Path, out: Path, stop_after: int | None = None) -> Fleet
     return fleet
 
 
-def test_each_asset_has_the_journal_of_a_watch_alone(
-    fleet_file: Path, alone: list[bytes], tmp_path: Path
-) -> None:
+def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path):
     assert watched(fleet_file, tmp_path / "once").failures == {}
     assert journals(tmp_path / "once") == alone
     again = tmp_path / "again"
@@ -128,9 +124,7 @@ def test_each_asset_has_the_journal_of_a_watch_alone(
     assert "3 assets, 9 turns, 0 alarms" in done.stderr
 
 
-def test_files_that_grow(
-    fleet_file: Path, alone: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_grow(fleet_file, alone, tmp_path, monkeypatch):
     monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
     (tmp_path / "growing").mkdir()
     pieces = [(path.name, path.read_bytes()) for path in sorted((tmp_path / "logs").glob("*.csv"))]
@@ -149,7 +143,7 @@ def test_files_that_grow(
     assert journals(tmp_path / "out") == alone
 
 
-def test_an_asset_is_lost_alone(fleet_file: Path, alone: list[bytes], tmp_path: Path) -> None:
+def test_an_asset_is_lost_alone(fleet_file, alone, tmp_path):
     for name, text in (("wing-0", "turn,colour\n0,red\n"), ("not a name!", "turn\n"), ("void", "")):
         (tmp_path / "logs" / f"{name}.csv").write_text(text)
     failures = watched(fleet_file, tmp_path / "out").failures
@@ -197,9 +191,7 @@ def make_unwell(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setattr(Watch, "decisions", once_unwell)
 
 
-def test_an_asset_that_was_lost_is_taken_up_again(
-    fleet_file: Path, alone: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_asset_that_was_lost_is_taken_up_again(fleet_file, alone, tmp_path, monkeypatch):
     """One whose file was wrong, and one that met an error of ours; a log that is gone is awaited."""
     for name in ("SEARCH_SECONDS", "AGAIN_SECONDS"):
         monkeypatch.setattr(f"twin_master.fleet.watching.{name}", 0.0)
@@ -233,7 +225,7 @@ def test_an_asset_that_was_lost_is_taken_up_again(
     assert sorted(again) == ["north/wing-1 is watched again.", "north/wing-2 is watched again."]
 
 
-def test_a_topic_for_each_asset(broker: Mosquitto, alone: list[bytes], tmp_path: Path) -> None:
+def test_a_topic_for_each_asset(broker, alone, tmp_path):
     heard, sent, told = list[tuple[str, int]](), list[int](), list[int]()
     listener, publisher = broker.client("listener"), broker.client("publisher")
     listener.on_message = lambda _client, _data, message: heard.append(
@@ -267,9 +259,7 @@ def test_a_topic_for_each_asset(broker: Mosquitto, alone: list[bytes], tmp_path:
     assert {topic for topic, _ in heard} == {"wings/wing-0/decision", "wings/wing-2/decision"}
 
 
-def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(
-    broker: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(broker, tmp_path, monkeypatch):
     monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
     make_unwell(monkeypatch, "wing-0")
     publisher, notes, told, sent = broker.client("publisher"), list[str](), list[int](), list[int]()
@@ -305,7 +295,7 @@ def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(
     assert fleet.assets["north/wing-0"].keep.intake.counts.missing == 0
 
 
-def test_a_topic_that_jumps_ahead_and_is_left_alone(broker: Mosquitto, tmp_path: Path) -> None:
+def test_a_topic_that_jumps_ahead_and_is_left_alone(broker, tmp_path):
     publisher, notes, told = broker.client("publisher"), list[str](), list[tuple[str, int, int]]()
     last = 2 * TURNS_AT_ONCE  # a single message that brings more turns than a file is read at once
 
@@ -329,9 +319,7 @@ def test_a_topic_that_jumps_ahead_and_is_left_alone(broker: Mosquitto, tmp_path:
     assert [len(inbox.came) for inbox in inboxes.values() if inbox] == [0, 0]  # nineteen came too late
 
 
-def test_an_asset_that_falls_silent_while_another_is_heard(
-    broker: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, monkeypatch):
     """Also one that was watched before; and what was decided of it and never published is."""
     monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
     monkeypatch.setattr("twin_master.watch.mqtt.HEARTBEAT_SECONDS", 0.0)
@@ -374,7 +362,7 @@ def test_an_asset_that_falls_silent_while_another_is_heard(
     assert max(one["quiet"] for one in heard if "quiet" in one) == 1
 
 
-def test_recordings_are_flown_as_a_fleet(fleet_file: Path, alone: list[bytes], tmp_path: Path) -> None:
+def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     short = log_of(tmp_path, 0)
     short.write_text("".join(short.read_text().splitlines(keepends=True)[:4]))
     planned = load_fleet(fleet_of(tmp_path, "logs/*.csv", f"steps = {TURNS}"))
@@ -403,7 +391,7 @@ def test_recordings_are_flown_as_a_fleet(fleet_file: Path, alone: list[bytes], t
         fly_fleet(load_fleet(fleet_of(tmp_path, "logs/*.csv", south)), tmp_path / "other", Engine(0))
 
 
-def test_recordings_teach_what_the_flights_taught(fleet_file: Path, tmp_path: Path) -> None:
+def test_recordings_teach_what_the_flights_taught(fleet_file, tmp_path):
     fly_fleet(ensemble(str(tmp_path / "wing.toml"), range(4)), tmp_path / "flown", Engine(0))
     group = fleet_groups(tmp_path / "flown")["growing_damage"]
     for row in range(4):
@@ -417,7 +405,7 @@ def test_recordings_teach_what_the_flights_taught(fleet_file: Path, tmp_path: Pa
     assert [m.mean for m in first] == [m.mean for m in second]
 
 
-def test_the_store_counts_the_notices_that_watches_gave(fleet_file: Path, tmp_path: Path) -> None:
+def test_the_store_counts_the_notices_that_watches_gave(fleet_file, tmp_path):
     """And a watched asset says how probably it leaves its control, as the store does."""
     wing, log = tmp_path / "wing.toml", log_of(tmp_path, 1)
     wing.write_text(wing.read_text().removeprefix("notice = false\n"))
@@ -453,7 +441,7 @@ def test_the_store_counts_the_notices_that_watches_gave(fleet_file: Path, tmp_pa
     assert [again.assets[asset.name].record().leaving for asset in assets] == pytest.approx(found)
 
 
-def test_who_needs_attention_next_comes_first(fleet_file: Path, tmp_path: Path) -> None:
+def test_who_needs_attention_next_comes_first(fleet_file, tmp_path):
     flown = ensemble(str(tmp_path / "wing.toml"), range(60))
     fly_fleet(flown, tmp_path / "flown", Engine(0))
     group = fleet_groups(tmp_path / "flown")["growing_damage"]
@@ -495,7 +483,7 @@ def served(fleet_file: Path, tmp_path: Path) -> Iterator[Callable[..., tuple[int
     serving.join()
 
 
-def test_the_page_of_a_fleet(served: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+def test_the_page_of_a_fleet(served, tmp_path):
     status, page = served("/")
     assert status == 200
     for words in (

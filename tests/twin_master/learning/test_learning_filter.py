@@ -79,7 +79,7 @@ def learner_of_all() -> LearningFilter:
     return LearningFilter(model(), sensors(), priors, [model(f).transition for f in FACTORS])
 
 
-def test_states_draws_and_transition_factors_are_those_of_the_sum_over_all_trajectories() -> None:
+def test_states_draws_and_transition_factors_are_those_of_the_sum_over_all_trajectories():
     learner = learner_of_all()
     estimates = run(learner, observations(), CONTROLS)
     evidence = 0.0
@@ -100,7 +100,7 @@ def test_states_draws_and_transition_factors_are_those_of_the_sum_over_all_traje
         np.testing.assert_allclose(smoothed[turn], table.sum(axis=others), rtol=1e-10)
 
 
-def test_a_filter_that_learns_nothing_is_the_exact_filter() -> None:
+def test_a_filter_that_learns_nothing_is_the_exact_filter():
     exact = ExactFilter(model(), sensors())
     learner = LearningFilter(model(), sensors(), LearntPriors())
     estimates = run(learner, observations(), CONTROLS)
@@ -120,9 +120,7 @@ def test_a_filter_that_learns_nothing_is_the_exact_filter() -> None:
 
 @pytest.mark.parametrize("degrees", [0.0, 6.0])
 @pytest.mark.parametrize(("gain", "offset"), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.5), (0.3, 0.5)])
-def test_noise_gain_and_offset_of_a_gauge_are_a_conjugate_regression(
-    degrees: float, gain: float, offset: float
-) -> None:
+def test_noise_gain_and_offset_of_a_gauge_are_a_conjugate_regression(degrees, gain, offset):
     """With one state the evidence is that of a multivariate Student or normal density, for each draw."""
     value = np.random.default_rng(3).normal(2.0, 1.0, size=(DRAWS, 1, 2, 1))
     sensor = GaussianSensorModel(value, 0.7, [0.2, 0.5, 0.3])
@@ -144,7 +142,7 @@ def test_noise_gain_and_offset_of_a_gauge_are_a_conjugate_regression(
     np.testing.assert_allclose(np.exp(estimates[-1].carried.arrays["log_belief"][:, 0]), weight, rtol=1e-9)
 
 
-def test_noise_gain_and_offset_are_found_from_many_observations() -> None:
+def test_noise_gain_and_offset_are_found_from_many_observations():
     random = np.random.default_rng(5)
     value = np.array([[1.0, 3.0], [3.0, 1.0]])[None, None].repeat(1, axis=0)  # (1, 1, U, G)
     sensor = GaussianSensorModel(value, 1.0)
@@ -160,7 +158,7 @@ def test_noise_gain_and_offset_are_found_from_many_observations() -> None:
         assert abs(found.mean - truth) < 3.0 * found.standard_deviation < 0.7, name
 
 
-def test_the_interval_of_a_state_is_not_learnt_as_noise() -> None:
+def test_the_interval_of_a_state_is_not_learnt_as_noise():
     """Four gauges that two regions move together: half of what is seen could be explained by either."""
     random = np.random.default_rng(6)
     interval = 2.0 * random.normal(size=(1, 2, 4, 2))
@@ -181,7 +179,7 @@ def test_the_interval_of_a_state_is_not_learnt_as_noise() -> None:
     np.testing.assert_allclose(evidence, exact, atol=1e-10)
 
 
-def test_the_interval_of_a_parameter_does_not_depend_on_where_its_draws_lie() -> None:
+def test_the_interval_of_a_parameter_does_not_depend_on_where_its_draws_lie():
     """Draws wider apart than the posterior: the evidence between them is interpolated."""
     fine, coarse = np.linspace(-3, 3, 2001), np.linspace(-3, 3, 25)
 
@@ -198,14 +196,14 @@ def test_the_interval_of_a_parameter_does_not_depend_on_where_its_draws_lie() ->
     assert exact.standard_deviation == pytest.approx(spread, rel=0.01)
 
 
-def test_draws_that_are_the_same_or_few_give_their_own_posterior() -> None:
+def test_draws_that_are_the_same_or_few_give_their_own_posterior():
     found = DrawsPosterior([2.0, 1.0, 2.0], [0.25, 0.5, 0.25]).of([0.4, 0.2, 0.4])
     assert (found.mean, found.lower, found.upper) == pytest.approx((1.8, 1.0, 2.0))
     single = DrawsPosterior([2.0], [1.0], "Pa").of([1.0])
     assert (single.mean, single.standard_deviation, single.unit) == (2.0, 0.0, "Pa")
 
 
-def test_a_belief_that_underflows_comes_back() -> None:
+def test_a_belief_that_underflows_comes_back():
     """The hypothesis that is right from the second turn on had a weight below the doubles."""
     value = np.array([0.0, 60.0])[:, None, None, None].repeat(2, axis=2)  # (E, 1, U, 1)
     learner = LearningFilter(model(levels=1), GaussianSensorModel(value, 1.0), LearntPriors("e", [0, 60]))
@@ -215,7 +213,7 @@ def test_a_belief_that_underflows_comes_back() -> None:
     np.testing.assert_allclose(log_belief[2][0], -1800.0, rtol=1e-12)
 
 
-def test_an_average_inside_the_product_is_refused() -> None:
+def test_an_average_inside_the_product_is_refused():
     with pytest.raises(InvalidModelError, match="learning needs"):
         LearningFilter(model(), sensors(average="inside"), LearntPriors("e", [1, 2, 3]))
     with pytest.raises(InvalidModelError, match="one transition table for each"):
@@ -243,9 +241,7 @@ def moments(values: Float, weight: Float) -> tuple[Float, Float]:
     return mean, np.sqrt(np.tensordot(share, (values - mean) ** 2, axes=weight.ndim))
 
 
-def test_filtered_and_smoothed_are_sums_over_all_trajectories(
-    turns: list[Estimate], expectation: LearntExpectation
-) -> None:
+def test_filtered_and_smoothed_are_sums_over_all_trajectories(turns, expectation):
     carried, seen, rewards = (
         [turn.carried for turn in turns],
         observations(),
@@ -273,9 +269,7 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(
                 np.testing.assert_allclose(found.reward_standard_deviation[t, place], deviation[0], atol=1e-7)
 
 
-def test_predicted_follows_the_scenario_through_the_policy(
-    turns: list[Estimate], expectation: LearntExpectation
-) -> None:
+def test_predicted_follows_the_scenario_through_the_policy(turns, expectation):
     found = expectation.predicted([turns[2].carried], 2)
     table = enumerated(3).sum(axis=(0, 1, 4))  # (S, E)
     table = table / table.sum()
@@ -298,7 +292,7 @@ def test_predicted_follows_the_scenario_through_the_policy(
     assert found.reward_mean[0, 1, 1] == pytest.approx(asked)
 
 
-def test_gain_offset_and_noise_are_those_of_the_regression() -> None:
+def test_gain_offset_and_noise_are_those_of_the_regression():
     value = np.full((1, 1, 2, 1), 5.0)
     value[0, 0, 1] = 8.0
     sensor, one = GaussianSensorModel(value, [0.5]), model(levels=1)
@@ -330,7 +324,7 @@ def test_gain_offset_and_noise_are_those_of_the_regression() -> None:
     assert (found.lower[-1, 0], found.upper[-1, 0]) == pytest.approx((low, high), abs=1e-3 * spread)
 
 
-def test_a_turn_says_what_the_store_says(turns: list[Estimate], expectation: LearntExpectation) -> None:
+def test_a_turn_says_what_the_store_says(turns, expectation):
     found = expectation.filtered([turn.carried for turn in turns], observations())
     for t, turn in enumerate(turns):
         assert turn.expected is not None
@@ -339,7 +333,7 @@ def test_a_turn_says_what_the_store_says(turns: list[Estimate], expectation: Lea
         np.testing.assert_allclose(found.noise[t], noise)
 
 
-def test_quantiles_are_those_of_the_mixture() -> None:
+def test_quantiles_are_those_of_the_mixture():
     weight, mean, deviation = np.array([0.5, 0.3, 0.2]), np.array([0.0, 4.0, 5.0]), np.array([1.0, 0.5, 0.0])
     levels = np.array([0.025, 0.5, 0.9])
     result = quantiles_of(weight, mean[:, None], deviation[:, None], levels)

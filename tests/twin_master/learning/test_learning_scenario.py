@@ -29,7 +29,7 @@ def knowledge() -> Knowledge:
     return prepare_twin("level_turns_learning")
 
 
-def test_a_twin_learns_a_soft_wing_and_the_noise_of_its_gauges(knowledge: Knowledge) -> None:
+def test_a_twin_learns_a_soft_wing_and_the_noise_of_its_gauges(knowledge):
     soft = int(knowledge.draws.values.argmin())
     shown = knowledge.sensor_model.value_per_draw[soft, 0, 1]
     random, twin = np.random.default_rng(0), knowledge.twin()
@@ -43,13 +43,13 @@ def test_a_twin_learns_a_soft_wing_and_the_noise_of_its_gauges(knowledge: Knowle
     assert sum(scale.lower < 1.2 < scale.upper for scale in scales) >= 18
 
 
-def test_without_the_table_the_filter_is_the_exact_one() -> None:
+def test_without_the_table_the_filter_is_the_exact_one():
     loaded = load_scenario("level_turns")
     assert "learning" not in loaded.scenario.to_dict()
     assert isinstance(prepare_twin("paper_level_turns").twin().estimator, ExactFilter)
 
 
-def test_a_factor_on_the_transitions_multiplies_the_probability_to_leave() -> None:
+def test_a_factor_on_the_transitions_multiplies_the_probability_to_leave():
     scenario = load_scenario("level_turns").scenario
     once, thrice = (build_graphical_model(scenario, factor).transition.matrix for factor in (1.0, 3.0))
     assert thrice[1, 0, 1] == pytest.approx(0.3 * 0.7)
@@ -75,14 +75,12 @@ NOISE, NOTICE = "noise_degrees = 10 ", "threshold = 100 "
         (NOTICE, "colour = true", "colour"),
     ],
 )
-def test_what_cannot_be_learnt_or_noticed_is_refused_in_a_sentence(
-    tmp_path: Path, old: str, new: str, sentence: str
-) -> None:
+def test_what_cannot_be_learnt_or_noticed_is_refused_in_a_sentence(tmp_path, old, new, sentence):
     with pytest.raises(TwinMasterError, match=sentence):
         load_scenario(written(tmp_path, TEXT, (old, f"{new} ")))
 
 
-def test_more_transitions_than_there_can_be_are_refused(tmp_path: Path) -> None:
+def test_more_transitions_than_there_can_be_are_refused(tmp_path):
     file = written(tmp_path, TEXT, (NOISE, "transition_factors = [1.0, 11.0] "))
     knowledge = prepare_twin(load_scenario(file))
     with pytest.raises(TwinMasterError, match=r"smaller `learning.transition_factors`"):
@@ -105,7 +103,7 @@ rate_microstrain_per_step = 1e14
 # What the figures"""
 
 
-def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path: Path) -> None:
+def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
     assert dict(Noticing()) == vars(Noticing())
     for name in scenario_files():
         loaded = load_scenario(name)
@@ -130,7 +128,7 @@ def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path: Path
         assert not load_scenario(file).remark
 
 
-def test_sensors_with_parameters_of_their_own_are_refused(tmp_path: Path) -> None:
+def test_sensors_with_parameters_of_their_own_are_refused(tmp_path):
     learning = TEXT[TEXT.index("[learning]") : TEXT.index("[notice]")]
     inside = ("[transition]", 'average_over_draws = "inside"\n[transition]')
     file = written(tmp_path, TEXT, (learning, ""), inside)
@@ -152,19 +150,19 @@ def folder(scenario: Path) -> Path:
     return run
 
 
-def test_the_search_for_causes_is_named_for_a_wing_alone() -> None:
+def test_the_search_for_causes_is_named_for_a_wing_alone():
     for name, searched in (("watched_wing", True), ("three_regions", False), ("pump_wear", False)):
         assert load_scenario(name).scenario.searchable is searched
 
 
-def test_the_console_names_turn_gauge_and_the_command(folder: Path) -> None:
+def test_the_console_names_turn_gauge_and_the_command(folder):
     text = (folder.parent / "said.txt").read_text()
     alarm = next(line for line in text.splitlines() if line.startswith("Turn ") and "gauge 5" in line)
     assert f"to find the cause: uav-twin discrepancy run --from-run {folder}" in alarm
     assert "Turn 3: gauge 12 shows 1e+14 microstrain, and no state can show less than" in text
 
 
-def test_journal_store_and_summary_agree(folder: Path) -> None:
+def test_journal_store_and_summary_agree(folder):
     notices = json.loads((folder / "summary.json").read_text())["notices"]
     assert {n["kind"] for n in notices} == {"gauge_left_out", "alarm", "hypothesis"}
     assert {(n["kind"], *n["sensors"]) for n in notices} >= {("gauge_left_out", 12), ("alarm", 5)}
@@ -187,7 +185,7 @@ def test_journal_store_and_summary_agree(folder: Path) -> None:
     assert sum(told.values()) == pytest.approx(1.0, abs=0.03)
 
 
-def test_the_report_has_the_alarm(folder: Path) -> None:
+def test_the_report_has_the_alarm(folder):
     text = render_page(read_run(folder), {}, {})
     assert "gauge 5 shows too much" in text
     decided = read_run(folder).summary["figures"][-1]
@@ -196,7 +194,7 @@ def test_the_report_has_the_alarm(folder: Path) -> None:
     assert "gauge 12 shows 1e+14 microstrain" in text
 
 
-def test_a_run_that_was_cut_off_ends_the_same(folder: Path) -> None:
+def test_a_run_that_was_cut_off_ends_the_same(folder):
     cut = Path(shutil.copytree(folder, folder.parent / "cut"))
     lines = (cut / JOURNAL_NAME).read_text().splitlines(keepends=True)
     (cut / JOURNAL_NAME).write_text("".join(lines[:6]))

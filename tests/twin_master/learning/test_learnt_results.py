@@ -66,7 +66,7 @@ def value_of(learnt: xr.Dataset, name: str, moment: str) -> np.ndarray[Any, Any]
     return (values.sel(sensor=int(sensor)) if sensor else values).values
 
 
-def test_the_store_holds_what_the_twin_said_in_every_turn(folder: Path, learnt: xr.Dataset) -> None:
+def test_the_store_holds_what_the_twin_said_in_every_turn(folder, learnt):
     lines = [line["learnt"] for line in journal(folder)]
     assert len(lines) == TURNS
     assert len(lines[0]) == 1 + 1 + 24 + 24 + 23  # parameter, transitions, noise, gain, offset
@@ -81,7 +81,7 @@ def test_the_store_holds_what_the_twin_said_in_every_turn(folder: Path, learnt: 
         assert variable.attrs["long_name"]
 
 
-def test_the_prior_is_that_of_the_scenario(learnt: xr.Dataset, run: xr.DataTree) -> None:
+def test_the_prior_is_that_of_the_scenario(learnt, run):
     draws = run["calibration"]["draw_value"].values
     mean, wide = (learnt[f"young_modulus_factor_prior_{name}"].item() for name in MOMENTS[:2])
     assert mean == pytest.approx(draws.mean(), abs=0.1 * draws.std())  # between the draws as well
@@ -97,7 +97,7 @@ def test_the_prior_is_that_of_the_scenario(learnt: xr.Dataset, run: xr.DataTree)
     assert gain == pytest.approx(0.02 * np.sqrt(squared.mean()))
 
 
-def test_the_truth_stands_where_the_scenario_tells_it(run: xr.DataTree) -> None:
+def test_the_truth_stands_where_the_scenario_tells_it(run):
     truth = run["truth"].to_dataset()
     assert float(truth["young_modulus_factor"]) == 0.95
     np.testing.assert_allclose(truth["noise_scale"], 150 / 125)
@@ -105,9 +105,7 @@ def test_the_truth_stands_where_the_scenario_tells_it(run: xr.DataTree) -> None:
     assert "transition_factor" not in truth  # scripted damage has no probability
 
 
-def test_the_summary_says_what_was_learnt_and_what_was_believed_before(
-    scenario: Path, folder: Path, learnt: xr.Dataset, summary: dict[str, Any]
-) -> None:
+def test_the_summary_says_what_was_learnt_and_what_was_believed_before(scenario, folder, learnt, summary):
     figures = {figure["key"]: figure for figure in summary["figures"]}
     assert tuple(figures) == load_scenario(scenario).scenario.figure_names
     assert figures["young_modulus_factor_mean"]["value"] == learnt["young_modulus_factor_mean"].values[-1]
@@ -127,7 +125,7 @@ def test_the_summary_says_what_was_learnt_and_what_was_believed_before(
     assert summary["learnt"]["gauge_offset"]["posterior"]["mean"][23] is None
 
 
-def test_the_report_draws_and_lists_what_was_learnt(folder: Path, learnt: xr.Dataset) -> None:
+def test_the_report_draws_and_lists_what_was_learnt(folder, learnt):
     record = read_run(folder)
     figure = learnt_figure(record)
     assert len(figure.axes) == 2 + 3 * 2
@@ -144,9 +142,7 @@ def test_the_report_draws_and_lists_what_was_learnt(folder: Path, learnt: xr.Dat
     assert "posterior mean of the Young" not in text
 
 
-def test_what_the_gauges_are_expected_to_show_is_what_was_learnt(
-    run: xr.DataTree, learnt: xr.Dataset
-) -> None:
+def test_what_the_gauges_are_expected_to_show_is_what_was_learnt(run, learnt):
     filtered = run["filtered"].to_dataset()
     noise = 1e6 * filtered["noise_standard_deviation"].values
     np.testing.assert_allclose(noise, 125 * learnt["noise_scale_mean"].values, rtol=0.05)
@@ -161,7 +157,7 @@ def test_what_the_gauges_are_expected_to_show_is_what_was_learnt(
     assert np.median(ahead) == pytest.approx(1.0, abs=0.02)
 
 
-def test_the_view_shows_what_was_learnt(folder: Path, run: xr.DataTree) -> None:
+def test_the_view_shows_what_was_learnt(folder, run):
     """From the posterior of each quantity alone, which the journal tells."""
     flight, filtered = Flight(folder), run["filtered"].to_dataset()
     flight.update()
@@ -181,7 +177,7 @@ def test_the_view_shows_what_was_learnt(folder: Path, run: xr.DataTree) -> None:
     assert learnt < 0.06 < 0.3 < off()  # as calibrated
 
 
-def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario: Path, run: xr.DataTree) -> None:
+def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario, run):
     knowledge = prepare_twin(str(scenario))
     history = History(twin := knowledge.twin(), 24)
     observed = run["observed"].to_dataset()
@@ -192,9 +188,7 @@ def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario: Path, run: xr.D
     assert gap["rms_residual"] == pytest.approx(np.sqrt(np.mean(residual**2)))
 
 
-def test_a_watch_keeps_the_last_turns_of_what_it_learnt(
-    scenario: Path, folder: Path, learnt: xr.Dataset
-) -> None:
+def test_a_watch_keeps_the_last_turns_of_what_it_learnt(scenario, folder, learnt):
     out = folder.parent / "watch"
     said("watch", scenario, "--observations", folder, "--out", out, "--no-report", "--last", 4)
     watched = open_run(out)["learnt"].to_dataset()

@@ -1,13 +1,10 @@
 """A wing that is inspected and repaired: actions in a scenario, flown, planned on the belief."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -82,7 +79,7 @@ def asset_of(known: Knowledge) -> Any:
     return ReducedModelSource(known.scenario, reduced_model(load_design())).open()
 
 
-def test_an_action_is_a_control_with_a_price_that_reads_back() -> None:
+def test_an_action_is_a_control_with_a_price_that_reads_back():
     written = scenario()
     assert written.control_names == ("2g", "3g", "inspect", "repair_1", "repair_2")
     assert written.control[INSPECT].values == {"load_factor": 2.0}
@@ -93,7 +90,7 @@ def test_an_action_is_a_control_with_a_price_that_reads_back() -> None:
     assert own.transition.probability["inspect"] == 0.0
 
 
-def test_a_repair_follows_the_growth_of_its_turn() -> None:
+def test_a_repair_follows_the_growth_of_its_turn():
     moved = knowledge().model.transition
     row = moved.row(REPAIR_1, 4 * 5 + 1).reshape(5, 5)
     assert row[0] == pytest.approx([0.0, 0.95, 0.05, 0.0, 0.0])
@@ -117,14 +114,14 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_what_is_wrong_with_an_action_is_said_in_one_sentence(case: str) -> None:
+def test_what_is_wrong_with_an_action_is_said_in_one_sentence(case):
     old, new, words = WRONG[case]
     with pytest.raises(ScenarioError) as error:
         scenario((old, new))
     assert all(word in str(error.value) for word in words), error.value
 
 
-def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_turn() -> None:
+def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_turn():
     known = knowledge()
     row = np.full(26, np.nan)
     row[24] = 0.37
@@ -137,7 +134,7 @@ def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_turn() -> None:
 
 
 @pytest.mark.parametrize("gauges", [True, False])
-def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(gauges: bool) -> None:
+def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(gauges):
     known = knowledge()
     model, sensors = known.model, known.sensor_model
     exact = ExactFilter(model, sensors, "x")
@@ -160,7 +157,7 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
     assert found[0].filtered.max() > 0.3  # something was told
 
 
-def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(tmp_path: Path) -> None:
+def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(tmp_path):
     learning = ("steps = 120", "steps = 12"), ("[planner]", "[learning]\n[notice]\n[planner]")
     path, policy = written(tmp_path, TEXT, *learning), tmp_path / "policy.npz"
     write_policy(policy, BeliefPolicy(np.ones((1, 25)), np.array([INSPECT])), knowledge().model)
@@ -177,7 +174,7 @@ def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(tmp
     assert "notice" in run
 
 
-def test_missions_side_by_side_are_those_alone_with_readings_and_repairs() -> None:
+def test_missions_side_by_side_are_those_alone_with_readings_and_repairs():
     known = knowledge("qmdp")
     together = side_by_side(known, 3)
     alone = fly(known.scenario, known.twin(), known.plant(known.truth(1), asset_of(known)))
@@ -188,7 +185,7 @@ def test_missions_side_by_side_are_those_alone_with_readings_and_repairs() -> No
     assert (together.control_index == REPAIR_1).any()
 
 
-def test_an_action_that_ends_ends_the_mission() -> None:
+def test_an_action_that_ends_ends_the_mission():
     written = scenario(('repairs = ["z2"]', "ends = true"), ("cost = 3.0\nrepairs", "cost = 0.0\nrepairs"))
     known = known_of(written)
     stop = following(known, BeliefPolicy(np.ones((1, 25)), np.array([4])))
@@ -207,7 +204,7 @@ def planned() -> tuple[Any, Any]:
     return problem, expected_plan(known.scenario, problem, known.rewards)[0]
 
 
-def test_flown_missions_bring_the_return_that_was_promised() -> None:
+def test_flown_missions_bring_the_return_that_was_promised():
     known, (problem, plan) = knowledge(), planned()
     count = 300
     flown = side_by_side(following(known, plan.policy), count)
@@ -223,7 +220,7 @@ def test_flown_missions_bring_the_return_that_was_promised() -> None:
     assert 0.05 < inspections < 0.3
 
 
-def test_a_limit_is_kept_by_the_plan() -> None:
+def test_a_limit_is_kept_by_the_plan():
     known, (problem, plan) = knowledge(), planned()
     free = risk_of(known.scenario, problem, known.rewards, plan.policy)
     limited = scenario(policy="belief", limit_probability=round(0.6 * free, 4))
@@ -233,7 +230,7 @@ def test_a_limit_is_kept_by_the_plan() -> None:
     assert promised(limited, problem, careful.policy).mean < promised(limited, problem, plan.policy).mean
 
 
-def test_a_policy_file_is_flown_and_kept_with_what_the_twin_knew(tmp_path: Path) -> None:
+def test_a_policy_file_is_flown_and_kept_with_what_the_twin_knew(tmp_path):
     known, (_, plan) = knowledge(), planned()
     write_policy(tmp_path / "policy.npz", plan.policy, known.model)
     policy = read_policy(tmp_path / "policy.npz", known.model)
@@ -247,7 +244,7 @@ def test_a_policy_file_is_flown_and_kept_with_what_the_twin_knew(tmp_path: Path)
         read_policy(tmp_path / "other.npz", known.model)
 
 
-def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path: Path) -> None:
+def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path):
     policy, picture = tmp_path / "policy.npz", tmp_path / "plan.svg"
     words = ("plan", "inspected_wing", "--out", policy, "--picture", picture, "--value-of", "inspect")
     record = json.loads(said(*words, "--json"))
@@ -258,7 +255,7 @@ def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path: 
     assert "`25` came" in refused("plan", "inspected_wing", "--value-of", "25")
 
 
-def test_inspections_of_a_fleet_go_where_they_are_worth_most() -> None:
+def test_inspections_of_a_fleet_go_where_they_are_worth_most():
     known, (_, plan) = knowledge(), planned()
     ahead = np.random.default_rng(0).dirichlet(np.full(25, 0.3), 60)
     model = replace(known.model, transition=TransitionModel((np.tile(np.eye(25), (5, 1, 1)),)))
@@ -276,7 +273,7 @@ def test_inspections_of_a_fleet_go_where_they_are_worth_most() -> None:
     assert np.array_equal(np.delete(few, wanting), np.delete(chosen, wanting))
 
 
-def test_a_budget_of_inspections_is_kept_in_every_turn() -> None:
+def test_a_budget_of_inspections_is_kept_in_every_turn():
     known, (_, plan) = knowledge(), planned()
     settings = known.scenario.planner.model_copy(update={"inspections_a_turn": 3})
     written = known.scenario.model_copy(update={"planner": settings})
@@ -285,7 +282,7 @@ def test_a_budget_of_inspections_is_kept_in_every_turn() -> None:
     assert inspections.max() == 3
 
 
-def test_a_fleet_shares_its_inspections_in_one_shard(tmp_path: Path) -> None:
+def test_a_fleet_shares_its_inspections_in_one_shard(tmp_path):
     text = 'format = 1\nfleet = { name = "inspected", shard = 20 }\n[[group]]\nname = "all"\n'
     text += 'scenario = "inspected_wing"\ncount = 30\ninspections_a_turn = 2\n'
     with pytest.raises(FleetError, match="`shard` be 30 or more"):
@@ -294,7 +291,7 @@ def test_a_fleet_shares_its_inspections_in_one_shard(tmp_path: Path) -> None:
     assert fleet.groups[0].scenarios[0].planner.inspections_a_turn == 2
 
 
-def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path: Path) -> None:
+def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path):
     text = text_of("inspected_wing")
     flown = text[text.index("# What flies.") : text.index("# What the twin believes")]
     path = written(tmp_path, text[: text.index("[truth]")], (flown, ""))

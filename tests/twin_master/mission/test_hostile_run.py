@@ -1,7 +1,5 @@
 """A run whose FMU crashes, hangs or lies stops with one sentence, and goes on when the cause is gone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
+from fmu_asset.errors import FmuMemoryError, FmuTimeoutError, FmuWorkerError
 from tests.twin_master.runs import check_same, written
 from twin_master.environment import ScenarioEnvironment
 from twin_master.fleet.flight import fly_fleet
@@ -72,10 +70,7 @@ def scenario(folder: Path, fmu: Path, *changes: tuple[str, str], binding: str = 
         ),
     ],
 )
-def test_a_run_is_resumed_once_the_cause_is_gone(
-    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str, kind: type[FmuError],
-    sentence: str,
-) -> None:  # fmt: skip
+def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypatch, what, kind, sentence):
     fmu, flag = foreign_fmu("hostile2", what, "STATELESS", "AFTER=20"), tmp_path / "flag"
     monkeypatch.setenv("HOSTILE_FLAG", str(flag))
     loaded = scenario(tmp_path, fmu, binding=f"{BINDING}limits = {{ step_time = 3.0, memory = 400.0 }}\n")
@@ -91,8 +86,8 @@ def test_a_run_is_resumed_once_the_cause_is_gone(
 
 
 def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
-    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    foreign_fmu, tmp_path, monkeypatch
+):
     """In a run, a fleet and an environment."""
     fmu, flag = foreign_fmu("hostile2", "ENDS", "STATELESS", "AFTER=20"), tmp_path / "flag"
     monkeypatch.setenv("HOSTILE_FLAG", str(flag))
@@ -138,7 +133,7 @@ record.variables = ["state/calls", "y"]
 """
 
 
-def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu: Any, tmp_path: Path) -> None:
+def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu, tmp_path):
     """Its outputs grow with every step, so that only the way through twin, store and names is looked at."""
     fmu = foreign_fmu.changed("array3", "names", ('name="calls"', 'name="state/calls"'))
     changes = ("steps = 30", "steps = 3"), *[("standard_deviation = 0.1", "standard_deviation = 0.05")] * 2

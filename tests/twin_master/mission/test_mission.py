@@ -1,7 +1,5 @@
 """The mission loop and its truth: timing, history, growth, faults, resuming at every turn, what stops it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -48,7 +46,7 @@ def stopped(kept: Kept) -> Checkpoint:
 
 
 @pytest.mark.parametrize("name", ["level_turns", "growing_damage", "failing_gauges"])
-def test_resuming_after_any_turn_is_bit_identical(name: str, library_file: Path) -> None:
+def test_resuming_after_any_turn_is_bit_identical(name, library_file):
     known, kept = of_library(name, library_file), Kept()
     whole = flown(known, keep=lambda *told: kept.append(told))
     assert len(kept) == 50
@@ -64,7 +62,7 @@ def test_resuming_after_any_turn_is_bit_identical(name: str, library_file: Path)
         flown(known, checkpoint=altered)
 
 
-def test_timing_of_a_turn(paper: Known) -> None:
+def test_timing_of_a_turn(paper):
     """Control u_t is in force while d_t, the gain of step t included, is observed; noise alone is added."""
     knowledge, source = paper
     asked: list[tuple[float, float, float]] = []
@@ -89,7 +87,7 @@ def test_timing_of_a_turn(paper: Known) -> None:
     np.testing.assert_array_equal(twin.smoothed(), flight.smoothed)
 
 
-def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(paper: Known) -> None:
+def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(paper):
     inner, kept = paper[1].open(), Kept()
 
     def broken(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
@@ -106,7 +104,7 @@ def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(paper: 
         flown(paper, 1, StatelessAsset(short))
 
 
-def test_study_on_the_published_library(published_library: Path) -> None:
+def test_study_on_the_published_library(published_library):
     """Policy and reliability of the reference twin; the bars are those of 300 missions, widened for 60."""
     knowledge, source = of_library("paper_level_turns", published_library, 0)
     z1 = knowledge.model.states.coordinates[:, 0]
@@ -124,7 +122,7 @@ def truth_of(scenario: Scenario | str, seed: int = 1) -> Truth:
     return Truth(found, build_graphical_model(found), seed)
 
 
-def test_the_papers_history() -> None:
+def test_the_papers_history():
     truth = truth_of("level_turns")
     history = np.array([truth.state(step, None, None) for step in range(50)])
     # Written out from the text: z1 gains 2 at 10..19 and 20 at 20 and 30, z2 2 at 5..14 and 20 at 5 and 25.
@@ -133,7 +131,7 @@ def test_the_papers_history() -> None:
     np.testing.assert_array_equal(history, np.array([z1, z2]).T / 100.0)
 
 
-def test_random_growth_follows_the_transitions_of_the_control() -> None:
+def test_random_growth_follows_the_transitions_of_the_control():
     scenario = load_scenario("growing_damage").scenario
     model, worse = build_graphical_model(scenario), np.zeros((2, 2))
     for seed in range(60):
@@ -150,7 +148,7 @@ def test_random_growth_follows_the_transitions_of_the_control() -> None:
     assert np.all(np.abs(rate - [0.05, 0.10]) < 4 * error)
 
 
-def test_the_same_seed_meets_the_same_noise_whatever_else_is_drawn() -> None:
+def test_the_same_seed_meets_the_same_noise_whatever_else_is_drawn():
     noise = truth_of("level_turns", 7).noise
     np.testing.assert_array_equal(noise, truth_of("growing_damage", 7).noise)
     assert not np.array_equal(noise, truth_of("level_turns", 8).noise)
@@ -158,7 +156,7 @@ def test_the_same_seed_meets_the_same_noise_whatever_else_is_drawn() -> None:
     assert len({generator(3, purpose).random() for purpose in PURPOSES}) == len(PURPOSES)
 
 
-def test_faults() -> None:
+def test_faults():
     truth = truth_of("failing_gauges")
     lost, healthy = SensorStatus.LOST, SensorStatus.HEALTHY
     for part, status in (

@@ -1,11 +1,8 @@
 """Which sensors tell most, against exhaustive search and integrals."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import meshio
@@ -33,7 +30,7 @@ def knowledge() -> Knowledge:
     return prepare_knowledge(scenario, ReducedModelSource(scenario, reduced_model(load_design())), 3)
 
 
-def test_the_information_of_a_sensor_is_that_of_an_integral() -> None:
+def test_the_information_of_a_sensor_is_that_of_an_integral():
     means, rng = np.array([0.0, 1.0, 3.0]), np.random.default_rng(0)
     state = np.arange(60_000) % 3
     shown = means[state] + rng.standard_normal(len(state))
@@ -47,7 +44,7 @@ def test_the_information_of_a_sensor_is_that_of_an_integral() -> None:
     assert readings.information([0]) == pytest.approx(exact, abs=0.01)
 
 
-def test_what_moves_all_sensors_together_is_a_covariance() -> None:
+def test_what_moves_all_sensors_together_is_a_covariance():
     rng = np.random.default_rng(1)
     moved, residual = rng.normal(size=(2, 3, 2)), rng.normal(size=(4, 2, 3))
     state = np.array([0, 1, 0, 1])
@@ -63,7 +60,7 @@ def test_what_moves_all_sensors_together_is_a_covariance() -> None:
     assert found == pytest.approx(1.0 + np.log2(posterior[np.arange(4), state]).mean(), rel=1e-12)
 
 
-def test_three_of_twenty_four_are_those_of_an_exhaustive_search() -> None:
+def test_three_of_twenty_four_are_those_of_an_exhaustive_search():
     readings = drawn_readings(knowledge())
     found = chosen_sensors(readings, range(24), 3)
     told = {
@@ -78,7 +75,7 @@ def test_three_of_twenty_four_are_those_of_an_exhaustive_search() -> None:
         chosen_sensors(readings, [0, 1], 3)
 
 
-def test_a_gauge_beside_a_region_separates_it_and_the_other_region_is_hardly_told() -> None:
+def test_a_gauge_beside_a_region_separates_it_and_the_other_region_is_hardly_told():
     known = knowledge()
     readings = drawn_readings(known)
     apart = separations(known, readings, range(24))
@@ -88,7 +85,7 @@ def test_a_gauge_beside_a_region_separates_it_and_the_other_region_is_hardly_tol
     assert all(fewer[place] <= far + 1e-9 for place, far in apart.items())
 
 
-def test_the_command_chooses_draws_and_names_what_is_not_separated(tmp_path: Path) -> None:
+def test_the_command_chooses_draws_and_names_what_is_not_separated(tmp_path):
     picture, points = tmp_path / "design.png", tmp_path / "gauges.vtu"
     words = ("design", "level_turns", "--sensors", 2, "--among")
     record = json.loads(said(*words, "1,17,24", "--picture", picture, "--vtu", points, "--json"))
@@ -106,7 +103,7 @@ def designed(*words: object) -> dict[str, Any]:
     return record
 
 
-def test_gauges_may_be_anywhere_on_the_surface_of_a_structure(tmp_path: Path) -> None:
+def test_gauges_may_be_anywhere_on_the_surface_of_a_structure(tmp_path):
     points, picture = tmp_path / "gauges.vtu", tmp_path / "design.svg"
     declared = designed("--sensors", 2)
     found = designed("--sensors", 2, "--candidates", 10, "--vtu", points, "--picture", picture)
@@ -122,7 +119,7 @@ def test_gauges_may_be_anywhere_on_the_surface_of_a_structure(tmp_path: Path) ->
     assert picture.read_bytes().startswith(b"<?xml")
 
 
-def test_a_listed_candidate_tells_what_the_same_gauge_of_the_file_does(tmp_path: Path) -> None:
+def test_a_listed_candidate_tells_what_the_same_gauge_of_the_file_does(tmp_path):
     listed = tmp_path / "more.toml"
     listed.write_text(
         '[[gauge]]\nname = "twin_of_end"\npoint = [40, 50, -20]\ndirection = [1, 0, 0]\nlength = 5\n'

@@ -1,8 +1,6 @@
 """Twins flown side by side against the same twins flown alone: equal to the last bit."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,7 +44,7 @@ def same(first: Flights, second: Flights) -> bool:
     ("name", "decide_on"),
     [("level_turns", "filtered"), ("growing_damage", "predicted"), ("failing_gauges", "filtered")],
 )
-def test_each_twin_flies_what_it_flies_alone(name: str, decide_on: str, library_file: Path) -> None:
+def test_each_twin_flies_what_it_flies_alone(name, decide_on, library_file):
     knowledge, asset = known(name, library_file, decide_on)
     truths = [knowledge.truth(seed) for seed in range(5)]
     together = fly_side_by_side(knowledge, truths, [asset] * 5)
@@ -85,9 +83,7 @@ def until_soft(asset: StatelessAsset, error: Exception) -> StatelessAsset:
 
 
 @pytest.mark.parametrize("driven", [lambda asset: asset, Remembering])
-def test_an_asset_that_fails_does_not_touch_the_others(
-    driven: Callable[[StatelessAsset], StatelessAsset], library_file: Path
-) -> None:
+def test_an_asset_that_fails_does_not_touch_the_others(driven, library_file):
     knowledge, asset = known("growing_damage", library_file)
     truths = [knowledge.truth(seed) for seed in range(6)]
     whole = fly_side_by_side(knowledge, truths, [asset] * 6)
@@ -104,7 +100,7 @@ def test_an_asset_that_fails_does_not_touch_the_others(
         assert (found.control_index[twin, end:] == -1).all()
 
 
-def test_an_asset_that_ends_keeps_what_it_has_flown(library_file: Path) -> None:
+def test_an_asset_that_ends_keeps_what_it_has_flown(library_file):
     knowledge, asset = known("growing_damage", library_file)
     truths = [knowledge.truth(seed) for seed in range(3)]
     assets = [Remembering(until_soft(asset, FmuEndedError("It asked to end.", time=1.0))) for _ in truths]
@@ -123,7 +119,7 @@ def test_an_asset_that_ends_keeps_what_it_has_flown(library_file: Path) -> None:
         assert kept["credible"][row] == np.float32(inside.mean())
 
 
-def test_an_impossible_observation_ends_one_flight_only(library_file: Path) -> None:
+def test_an_impossible_observation_ends_one_flight_only(library_file):
     knowledge, asset = known("level_turns", library_file)
     truths = [knowledge.truth(seed) for seed in range(2)]
     truths[1].noise[4] = 1e200
@@ -135,7 +131,7 @@ def test_an_impossible_observation_ends_one_flight_only(library_file: Path) -> N
     assert "step 4" in found.failure[1]
 
 
-def test_a_product_of_tables_flies_the_same_and_damage_grows_as_the_model_says(library_file: Path) -> None:
+def test_a_product_of_tables_flies_the_same_and_damage_grows_as_the_model_says(library_file):
     knowledge, asset = known("growing_damage", library_file)
     model = knowledge.model
     tables = model.transition.blocks[0].reshape(2, 5, 5, 5, 5)

@@ -1,7 +1,5 @@
 """Quantities, rewards and plans: sums over states, controls and draws; optimal values."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

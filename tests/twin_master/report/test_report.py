@@ -5,7 +5,6 @@ import html
 import json
 import os
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,6 @@ import xarray as xr
 from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.result.plain import run_record
-from calibration.result.record import Calibration
 from reporting.errors import DiskFullError
 from reporting.figures import to_svg
 from reporting.words import number
@@ -48,7 +46,7 @@ KEPT = "The twin kept 3g at every turn"
 REACHED = f"; {REGION} reached the 60 % from which the policy leaves 3g at turn 30."
 
 
-def test_the_page_begins_with_what_was_decided_believed_and_explained(run: Run) -> None:
+def test_the_page_begins_with_what_was_decided_believed_and_explained(run):
     decided, believed, explained = opening_sentences(run)
     assert decided.startswith("The twin fell back from 3g to 2g at turn 31, one turn after")
     both = np.where(run.model.states.coordinates.sum(axis=1) > 0.59, 0, 1)
@@ -98,13 +96,11 @@ def first_sentence(run: Run, *gentle: int, level: float = 0.6, **changes: np.nda
         ((), {"truth": None}, f"{KEPT}."),
     ],
 )  # fmt: skip
-def test_the_first_sentence_follows_the_record(
-    run: Run, gentle: tuple[int, ...], changes: dict[str, np.ndarray | None], said: str
-) -> None:
+def test_the_first_sentence_follows_the_record(run, gentle, changes, said):
     assert first_sentence(run, *gentle, **changes) == said  # type: ignore[arg-type]
 
 
-def test_of_a_real_asset_nothing_is_said_but_what_was_recorded(run: Run) -> None:
+def test_of_a_real_asset_nothing_is_said_but_what_was_recorded(run):
     watched = replace(altered(run, truth=None), config={**run.config, "watched": True})
     observed = watched.tree["observed"].to_dataset()
     watched.tree["observed"] = observed.assign_coords(step=observed["step"] + 1000)
@@ -117,7 +113,7 @@ def test_of_a_real_asset_nothing_is_said_but_what_was_recorded(run: Run) -> None
     assert "truth" not in " ".join(opening_sentences(watched))
 
 
-def test_the_last_sentence_judges_the_scatter_and_what_was_learnt_is_said(run: Run) -> None:
+def test_the_last_sentence_judges_the_scatter_and_what_was_learnt_is_said(run):
     random, expected, noise = np.random.default_rng(3), run["filtered/quantity_mean"], 125e-6
     known = altered(run, filtered__quantity_standard_deviation=np.zeros_like(expected))
     draws = random.standard_normal(expected.shape)
@@ -145,14 +141,14 @@ def test_the_last_sentence_judges_the_scatter_and_what_was_learnt_is_said(run: R
 
 
 @pytest.mark.parametrize("now", [0, 18])
-def test_smoothing_up_to_a_turn_equals_a_mission_that_ended_there(run: Run, tmp_path: Path, now: int) -> None:
+def test_smoothing_up_to_a_turn_equals_a_mission_that_ended_there(run, tmp_path, now):
     shorter = flown(tmp_path / "short", steps=now + 1)
     assert_array_equal(shorter["filtered/probability"], run["filtered/probability"][: now + 1])
     assert_allclose(run.smoothed_until(now), shorter["smoothed/probability"], atol=1e-12)
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_origins_and_references_are_told_where_there_are_any(run: Run, tmp_path: Path) -> None:
+def test_origins_and_references_are_told_where_there_are_any(run, tmp_path):
     text = text_of(run, tmp_path / "same")
     assert "model differ" not in text
     assert "source of the reference" in text
@@ -164,9 +160,7 @@ def test_origins_and_references_are_told_where_there_are_any(run: Run, tmp_path:
     assert "reference</th>" not in text
 
 
-def test_the_page_needs_nothing_from_outside_and_equal_runs_give_equal_bytes(
-    run: Run, folder: Path, tmp_path: Path
-) -> None:
+def test_the_page_needs_nothing_from_outside_and_equal_runs_give_equal_bytes(run, folder, tmp_path):
     page = report.write_report(folder).read_bytes()
     other = stored(run, tmp_path / "elsewhere")
     (other / "timing.json").write_text('{"total_seconds": 4.321}')
@@ -191,7 +185,7 @@ def test_the_page_needs_nothing_from_outside_and_equal_runs_give_equal_bytes(
         assert word in text
 
 
-def test_captions_tell_the_decision_and_what_it_rests_on(run: Run, folder: Path, tmp_path: Path) -> None:
+def test_captions_tell_the_decision_and_what_it_rests_on(run, folder, tmp_path):
     asked = run["filtered/decision_probability"][18, 1]
     sentence = "At the end of turn 18 the twin decided on 3g for the next one: the policy asks for it with "
     captions = {figure.name: figure.caption for figure in report.report_figures(folder, 18)}
@@ -200,13 +194,13 @@ def test_captions_tell_the_decision_and_what_it_rests_on(run: Run, folder: Path,
     assert "in the state predicted for that turn." in next(report.report_figures(place, 18)).caption
 
 
-def test_words() -> None:
+def test_words():
     assert turn_ranges([4]) == "turn 4"
     assert turn_ranges([4, 5, 6, 9]) == "turns 4–6, 9"
     assert [number(value) for value in (None, -0.123456, 3, True)] == ["—", "−0.12346", "3", "yes"]
 
 
-def test_the_present_is_chosen_before_the_first_change_of_control(run: Run) -> None:
+def test_the_present_is_chosen_before_the_first_change_of_control(run):
     def now(control: np.ndarray) -> int:
         return default_now(altered(run, observed__control_index=control))
 
@@ -218,7 +212,7 @@ def test_the_present_is_chosen_before_the_first_change_of_control(run: Run) -> N
     assert now(np.where(turns < 6, 1, 0)) == 3
 
 
-def test_a_fallback_that_came_before_the_damage_has_no_delay() -> None:
+def test_a_fallback_that_came_before_the_damage_has_no_delay():
     scenario = load_scenario("level_turns").scenario
 
     def values(*steps: int | None) -> list[object]:
@@ -231,7 +225,7 @@ def test_a_fallback_that_came_before_the_damage_has_no_delay() -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_what_nobody_knows_is_left_out(run: Run, tmp_path: Path) -> None:
+def test_what_nobody_knows_is_left_out(run, tmp_path):
     text = text_of(replace(altered(run, truth=None), summary={}), tmp_path / "run")
     assert text.count("<figure") == 7
     assert "truth" not in text.replace("the truth, which", "")
@@ -239,7 +233,7 @@ def test_what_nobody_knows_is_left_out(run: Run, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize(("steps", "horizon"), [(1, 10), (12, 10), (2, 3), (3, 1)])
-def test_short_missions(run: Run, tmp_path: Path, steps: int, horizon: int) -> None:
+def test_short_missions(run, tmp_path, steps, horizon):
     part = {"step": slice(steps), "horizon": slice(horizon), "sensor": slice(5)}
     tree = run.tree.isel(part, missing_dims="ignore")
     short = rescripted(replace(run, tree=tree), observation={"count": 5})
@@ -247,7 +241,7 @@ def test_short_missions(run: Run, tmp_path: Path, steps: int, horizon: int) -> N
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_lost_gauges_are_told_and_marked(run: Run, tmp_path: Path) -> None:
+def test_lost_gauges_are_told_and_marked(run, tmp_path):
     """Also one that never reports, and a run without any observation."""
     observed = run.observed.copy()
     observed[12:19, 16:20] = observed[3:5] = np.nan
@@ -262,7 +256,7 @@ def test_lost_gauges_are_told_and_marked(run: Run, tmp_path: Path) -> None:
         assert "Observations lost" in text_of(altered(run, observed__strain=observed), tmp_path / name)
 
 
-def test_a_calibration_file_shows_its_wing(run: Run, make_calibration: Callable[..., Calibration]) -> None:
+def test_a_calibration_file_shows_its_wing(run, make_calibration):
     wing = make_calibration(young_modulus_factor=1.05)
     tree = altered(run).tree
     tree["calibration"] = xr.Dataset({"draw_value": ("draw", wing.draws_of("young_modulus_factor"))})
@@ -299,7 +293,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_damaged_run_gives_one_sentence(run: Run, tmp_path: Path, name: str) -> None:
+def test_a_damaged_run_gives_one_sentence(run, tmp_path, name):
     place = stored(run, tmp_path / "run")
     file, content, sentence = BROKEN[name]
     (place / file).unlink() if content is None else (place / file).write_bytes(content)
@@ -309,7 +303,7 @@ def test_a_damaged_run_gives_one_sentence(run: Run, tmp_path: Path, name: str) -
     assert not (place / "report.html").exists()
 
 
-def test_another_layout_and_other_axes_give_one_sentence(run: Run, tmp_path: Path) -> None:
+def test_another_layout_and_other_axes_give_one_sentence(run, tmp_path):
     for missing in ("filtered", "filtered__probability", "observed", "policy__action_value"):
         with pytest.raises(RunFolderError, match="layout of a run"):
             read_run(stored(altered(run, **{missing: None}), tmp_path / missing))
@@ -319,7 +313,7 @@ def test_another_layout_and_other_axes_give_one_sentence(run: Run, tmp_path: Pat
         read_run(stored(changed, tmp_path / "axes"))
 
 
-def test_a_run_that_was_cut_off_anywhere_is_one_sentence(folder: Path, tmp_path: Path) -> None:
+def test_a_run_that_was_cut_off_anywhere_is_one_sentence(folder, tmp_path):
     whole = (folder / "run.nc").read_bytes()
     (tmp_path / "config.json").write_bytes((folder / "config.json").read_bytes())
     for length in (1, 100, 2_000, len(whole) // 3, len(whole) - 10):
@@ -332,7 +326,7 @@ def test_a_run_that_was_cut_off_anywhere_is_one_sentence(folder: Path, tmp_path:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_a_full_disk_keeps_the_old_report(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_keeps_the_old_report(run, tmp_path, monkeypatch):
     place = stored(run, tmp_path / "run")
     (place / "report.html").write_text("old")
 
@@ -346,7 +340,7 @@ def test_a_full_disk_keeps_the_old_report(run: Run, tmp_path: Path, monkeypatch:
     assert list((place / "figures").iterdir()) == []
 
 
-def test_a_title_that_would_be_broken_mathematics(run: Run) -> None:
+def test_a_title_that_would_be_broken_mathematics(run):
     titles = [f"gauge ${number}^" for number in range(1, 25)]
     odd = rescripted(run, state={"title": r"loss of $\frac{1$"}, observation={"titles": titles})
     assert to_svg(mission_figure(odd, 20))

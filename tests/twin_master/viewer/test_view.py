@@ -1,7 +1,5 @@
 """The view of a flight: its numbers against those of the run, its protocol, its page in a real browser."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -97,7 +95,7 @@ def asked(first: int = 0, end: int = 0, turn: int = LATEST, **changed: int) -> R
     return Request(first=first, end=end, turn=turn, **given)
 
 
-def test_every_number_is_that_of_the_run(run: Path) -> None:
+def test_every_number_is_that_of_the_run(run):
     flight, stored = whole(run), open_run(run)
     assert flight.turns == TURNS
     believed, expected = flight.believed(0, TURNS), flight.predicted(28)
@@ -122,7 +120,7 @@ def test_every_number_is_that_of_the_run(run: Path) -> None:
     np.testing.assert_array_equal(flight.truth(0, TURNS), stored["truth"]["state"].values)
 
 
-def test_turns_are_seen_as_soon_as_their_lines_are_whole(run: Path, begun: Path, lines: list[bytes]) -> None:
+def test_turns_are_seen_as_soon_as_their_lines_are_whole(run, begun, lines):
     flight = Flight(begun)
     assert not flight.update()
     add(begun, *lines[:3], lines[3][:40])
@@ -137,7 +135,7 @@ def test_turns_are_seen_as_soon_as_their_lines_are_whole(run: Path, begun: Path,
     )
 
 
-def test_turns_that_were_taken_back_are_forgotten(begun: Path, lines: list[bytes]) -> None:
+def test_turns_that_were_taken_back_are_forgotten(begun, lines):
     add(begun, *lines[:21])
     flight = whole(begun)
     number = flight.number
@@ -149,15 +147,13 @@ def test_turns_that_were_taken_back_are_forgotten(begun: Path, lines: list[bytes
     assert (answer["first"], answer["count"], len(answer["past"]["control"])) == (0, 10, 10)
 
 
-def test_a_changed_line_ends_the_view_with_its_turn(begun: Path, lines: list[bytes]) -> None:
+def test_a_changed_line_ends_the_view_with_its_turn(begun, lines):
     add(begun, *lines[:5], lines[5].replace(b'"turn": 4', b'"turn": 5'), *lines[6:])
     with pytest.raises(RunFolderError, match=r"line 6 of the journal .* was changed or is damaged"):
         whole(begun)
 
 
-def test_an_observation_that_came_late_stands_in_its_turn(
-    begun: Path, lines: list[bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_observation_that_came_late_stands_in_its_turn(begun, lines, monkeypatch):
     """And turns beyond those kept are read again and are the same."""
     turns = [json.loads(line[65:]) for line in lines[1:]]
     missed = turns[6] | {"observed": [None] * 24}
@@ -194,9 +190,7 @@ def test_an_observation_that_came_late_stands_in_its_turn(
     assert few.turns == 3
 
 
-def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown(
-    begun: Path, lines: list[bytes]
-) -> None:
+def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown(begun, lines):
     add(begun, *lines)
     flight = whole(begun)
     before, number = flight.believed(0, 5).sensor_mean, flight.number
@@ -211,7 +205,7 @@ def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PK\x05\x06" + bytes(18), b"no archive"])
-def test_without_what_the_twin_knew_nothing_is_shown(begun: Path, content: bytes | None) -> None:
+def test_without_what_the_twin_knew_nothing_is_shown(begun, content):
     (begun / KNOWLEDGE_NAME).unlink()
     if content is not None:
         (begun / KNOWLEDGE_NAME).write_bytes(content)
@@ -224,7 +218,7 @@ def told(teller: Teller, *words: int, **changed: int) -> dict[str, Any]:
     return answer
 
 
-def test_a_viewer_is_told_what_it_misses_and_nothing_else(run: Path) -> None:
+def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
     flight = whole(run)
     teller = teller_of(flight)
     everything = told(teller)
@@ -253,12 +247,12 @@ def test_a_viewer_is_told_what_it_misses_and_nothing_else(run: Path) -> None:
     "text",
     ["", "[]", "[" * 4000, "{}", '{"number": 1}', "x" * 100, json.dumps(asked().__dict__ | {"turn": 1.5})],
 )
-def test_a_request_of_another_form_is_refused(text: str) -> None:
+def test_a_request_of_another_form_is_refused(text):
     with pytest.raises(ValueError, match=r"for Request"):
         parse_request(text)
 
 
-def test_the_wing_stands_in_its_place(run: Path) -> None:
+def test_the_wing_stands_in_its_place(run):
     flight, design = Flight(run), load_design()
     planform = scene_of(run, flight.knowledge).planform
     assert planform is not None
@@ -303,7 +297,7 @@ def check_that_only_this_machine_is_served(address: str) -> None:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
-def test_the_page_in_a_browser(begun: Path, lines: list[bytes], tmp_path: Path) -> None:
+def test_the_page_in_a_browser(begun, lines, tmp_path):
     add(begun, *lines[:31])
     with open_browser() as browser, served(begun) as address:
         check_that_only_this_machine_is_served(address)
@@ -371,7 +365,7 @@ def test_the_page_in_a_browser(begun: Path, lines: list[bytes], tmp_path: Path) 
             assert all(url.startswith((address, "data:", "about:")) for url in tab.requests)
 
 
-def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file: Path, run: Path, tmp_path: Path) -> None:
+def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file, run, tmp_path):
     words = ["run", "level_turns", "--out", tmp_path / "run", "--strain-library", library_file, "--no-report"]
     line = [sys.executable, "-m", "uav_twin", *map(str, words), "--view"]
     null, pipe = subprocess.DEVNULL, subprocess.PIPE
@@ -388,7 +382,7 @@ def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file: Path, run: P
     check_same(tmp_path / "run", run, "run.nc", JOURNAL_NAME, KNOWLEDGE_NAME, "config.json")
 
 
-def test_a_folder_without_a_run_is_one_sentence(tmp_path: Path) -> None:
+def test_a_folder_without_a_run_is_one_sentence(tmp_path):
     result = command("view", tmp_path / "none")
     assert result.returncode == 1
     assert result.stderr.startswith(f"there is no run folder {tmp_path / 'none'}")

@@ -1,7 +1,5 @@
 """A watch over a real broker."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -21,8 +19,6 @@ from tests.twin_master.runs import journal
 from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, killed_at, soon_quiet, wait_until
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.turns import History
-from twin_master.scenario.reading import LoadedScenario
 from twin_master.watch.broker import PASSWORD_VARIABLE, Broker, broker_of
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
@@ -86,9 +82,7 @@ def heard_at(broker: Mosquitto, name: str, topic: str = DECISION) -> tuple[Any, 
 
 @needs_mosquitto
 @pytest.mark.parametrize("tls", [False, True])
-def test_over_a_broker_that_stops_and_a_hostile_publisher(
-    base: Watch, mission: History, whole: Path, tmp_path: Path, tls: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_over_a_broker_that_stops_and_a_hostile_publisher(base, mission, whole, tmp_path, tls, monkeypatch):
     broker, turns = Mosquitto(tmp_path, tls=tls), len(mission.observed)
     secure = f"mqtts://wing@localhost:{broker.port}/{TOPIC}"
     where = broker_of(secure, broker.authority) if tls else where_of(broker)
@@ -134,8 +128,8 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(
 
 @pytest.mark.parametrize("kills", [4, pytest.param(100, marks=pytest.mark.long)])
 def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_killed(
-    base: Watch, broker: Mosquitto, tmp_path: Path, kills: int
-) -> None:
+    base, broker, tmp_path, kills
+):
     turns, chance, where = 60 * kills, random.Random(kills), where_of(broker)
     watch = begun(base, tmp_path / "watch")
     listener, heard = heard_at(broker, "listener")
@@ -167,9 +161,8 @@ def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_kil
 
 
 def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
-    scenario: LoadedScenario, base: Watch, broker: Mosquitto, tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    scenario, base, broker, tmp_path, monkeypatch
+):
     publisher, notes = broker.client("publisher"), list[str]()
 
     def watched(watch: Watch, turns: int, *sent: int) -> Counts:
@@ -225,7 +218,7 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     publisher.disconnect()
 
 
-def test_a_broker_that_refuses_what_it_allowed_before(base: Watch, broker: Mosquitto, tmp_path: Path) -> None:
+def test_a_broker_that_refuses_what_it_allowed_before(base, broker, tmp_path):
     """The twin itself when it comes back, and then what it decides."""
     watch = begun(base, tmp_path / "watch")
     publisher, heard = heard_at(broker, "publisher")
@@ -259,7 +252,7 @@ RIGHTS_PLUGIN = Path("/usr/lib/x86_64-linux-gnu/mosquitto_dynamic_security.so")
 
 
 @pytest.mark.skipif(not RIGHTS_PLUGIN.is_file(), reason="no plugin of mosquitto for rights")
-def test_a_subscription_that_is_refused(base: Watch, broker: Mosquitto, tmp_path: Path) -> None:
+def test_a_subscription_that_is_refused(base, broker, tmp_path):
     given = {"publishClientSend": True, "publishClientReceive": True, "subscribe": False}
     (tmp_path / "rights.json").write_text(json.dumps({"defaultACLAccess": given}))
     broker.further += ["allow_anonymous true", f"plugin {RIGHTS_PLUGIN}"]
@@ -271,9 +264,7 @@ def test_a_subscription_that_is_refused(base: Watch, broker: Mosquitto, tmp_path
         watch.run(feed, feed.decide)
 
 
-def test_a_watch_that_hears_nothing_says_so(
-    base: Watch, broker: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_watch_that_hears_nothing_says_so(base, broker, tmp_path, monkeypatch):
     monkeypatch.setattr("twin_master.watch.mqtt.HEARTBEAT_SECONDS", 0.1)
     watch, heard = soon_quiet(begun(base, tmp_path / "watch")), list[Told]()
 
@@ -323,7 +314,7 @@ def test_a_watch_that_hears_nothing_says_so(
         assert "see whether logger and broker are there" in (copy / "summary.json").read_text()
 
 
-def test_addresses_of_brokers(tmp_path: Path) -> None:
+def test_addresses_of_brokers(tmp_path):
     assert broker_of("mqtt://host/a/b").port == 1883
     assert broker_of("mqtts://me@host:1/a").user == "me"
     assert broker_of("mqtts://me%40work@host:1/a").user == "me@work"

@@ -1,7 +1,5 @@
 """Logs that grow while they are read, rotated by logrotate and by hand: no row is lost or read twice."""
 
-from __future__ import annotations
-
 import logging
 import os
 import shutil
@@ -18,7 +16,6 @@ import pytest
 
 from tests.twin_master.runs import journal
 from tests.twin_master.watch.watches import begun, ran, write_csv
-from twin_master.mission.turns import History
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.growing import RECOGNISED_BY
@@ -118,7 +115,7 @@ def begun_log(base: Watch, tmp_path: Path) -> Begun:
 
 @pytest.mark.parametrize("header", [HEADER, ""], ids=["header", "no header"])
 @pytest.mark.parametrize("rotation", ways(*ROTATIONS))
-def test_no_row_is_lost_in_a_rotation(begun_log: Begun, rotation: str, header: str) -> None:
+def test_no_row_is_lost_in_a_rotation(begun_log, rotation, header):
     rotate, cut = ROTATIONS[rotation], rotation == "copytruncate"
     path, messages = begun_log(0, 1)
     append(path, row(2) + row(3)[:4])  # not read before it is rotated
@@ -140,7 +137,7 @@ def test_no_row_is_lost_in_a_rotation(begun_log: Begun, rotation: str, header: s
 
 
 @pytest.mark.parametrize("way", ways("logging", "copytruncate"))
-def test_a_writer_that_does_not_wait_for_its_reader(begun_log: Begun, way: str) -> None:
+def test_a_writer_that_does_not_wait_for_its_reader(begun_log, way):
     (path, messages), turns = begun_log(), 4000
     handler = RotatingFileHandler(path, maxBytes=2000 if way == "logging" else 0, backupCount=1000)
 
@@ -161,7 +158,7 @@ def test_a_writer_that_does_not_wait_for_its_reader(begun_log: Begun, way: str) 
     assert len(list(path.parent.glob("log.csv.*"))) >= (30 if way == "logging" else 8)
 
 
-def test_columns_of_a_new_file_are_read_again(begun_log: Begun) -> None:
+def test_columns_of_a_new_file_are_read_again(begun_log):
     """Also behind several rotations between two looks."""
     path, messages = begun_log(0)
     for turn in (1, 2, 3):
@@ -174,7 +171,7 @@ def test_columns_of_a_new_file_are_read_again(begun_log: Begun) -> None:
     assert [told.turn for told in turns if isinstance(told, Message)] == [1, 2, 3]
 
 
-def test_half_rows_are_waited_for_and_those_of_a_dead_writer_end_with_their_file(begun_log: Begun) -> None:
+def test_half_rows_are_waited_for_and_those_of_a_dead_writer_end_with_their_file(begun_log):
     path, messages = begun_log()
     for character in row(0)[:-1]:
         append(path, character)
@@ -193,7 +190,7 @@ def test_half_rows_are_waited_for_and_those_of_a_dead_writer_end_with_their_file
         ([*range(3 * RECOGNISED_BY)], [*range(2 * RECOGNISED_BY)]),  # it begins as before: known by its size
     ],
 )
-def test_a_cut_without_a_copy_is_told(begun_log: Begun, turns: list[int], left: list[int]) -> None:
+def test_a_cut_without_a_copy_is_told(begun_log, turns, left):
     path, messages = begun_log(*turns)
     size = path.stat().st_size
     path.write_text(HEADER + "".join(map(row, left)))
@@ -204,7 +201,7 @@ def test_a_cut_without_a_copy_is_told(begun_log: Begun, turns: list[int], left: 
     assert new(messages) == left
 
 
-def test_a_copy_in_the_place_of_a_log_is_read_on(begun_log: Begun) -> None:
+def test_a_copy_in_the_place_of_a_log_is_read_on(begun_log):
     """As rsync does it: another file, which begins with the same rows."""
     path, messages = begun_log(0, 1)
     fresh = path.with_name("fresh")
@@ -214,9 +211,7 @@ def test_a_copy_in_the_place_of_a_log_is_read_on(begun_log: Begun) -> None:
 
 
 @pytest.mark.parametrize("rotation", ways("create", "copytruncate"))
-def test_a_watch_that_was_down_takes_up_a_rotated_log(
-    base: Watch, mission: History, tmp_path: Path, rotation: str
-) -> None:
+def test_a_watch_that_was_down_takes_up_a_rotated_log(base, mission, tmp_path, rotation):
     recorded = write_csv(tmp_path / "m.csv", mission.observed, mission.control_index)
     never, watch = begun(base, tmp_path / "never"), begun(base, tmp_path / "watch")
     ran(never, CsvFeed(recorded, never.scenario), 50)

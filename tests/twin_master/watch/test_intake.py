@@ -1,7 +1,5 @@
 """What a publisher sends: put in its place, or refused; never a change of the past, never an end."""
 
-from __future__ import annotations
-
 import io
 import json
 import random
@@ -77,8 +75,8 @@ def same(first: Twin, second: Twin) -> bool:
 
 
 def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
-    knowledge: Knowledge, strains: np.ndarray, clean: list[bytes], expected: Twin, tmp_path: Path
-) -> None:
+    knowledge, strains, clean, expected, tmp_path
+):
     chance = random.Random(5)
     order = sorted(range(TURNS), key=lambda turn: turn + (chance.random() < 0.2) * chance.randint(1, 15))
     lines: list[bytes] = []
@@ -123,14 +121,7 @@ def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
         ({"unit": 3}, "`unit` is the name of a unit"),
     ],
 )
-def test_what_is_refused_changes_nothing(
-    knowledge: Knowledge,
-    clean: list[bytes],
-    expected: Twin,
-    tmp_path: Path,
-    sent: dict[str, Any],
-    reason: str,
-) -> None:
+def test_what_is_refused_changes_nothing(knowledge, clean, expected, tmp_path, sent, reason):
     line = json.dumps(sent).encode() + b"\n"
     twin, intake = watched(knowledge, [*clean, line], tmp_path / "rejected.jsonl")
     assert same(twin, expected)
@@ -148,7 +139,7 @@ ANYTHING = st.recursive(
 
 @settings(max_examples=150, deadline=None)
 @given(st.binary(max_size=60) | ANYTHING.map(lambda value: json.dumps(value).encode()))
-def test_anything_is_an_observation_or_refused(content: bytes) -> None:
+def test_anything_is_an_observation_or_refused(content):
     reader = MessageReader(load_scenario("level_turns").scenario)
     try:
         found = reader.parse(content)
@@ -159,8 +150,8 @@ def test_anything_is_an_observation_or_refused(content: bytes) -> None:
 
 
 def test_a_flood_and_messages_of_ten_megabytes_are_counted_and_forgotten(
-    knowledge: Knowledge, clean: list[bytes], expected: Twin, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    knowledge, clean, expected, tmp_path, monkeypatch
+):
     monkeypatch.setattr("twin_master.watch.intake.REJECTED_KEPT", 50)
     big = b'{"strain_1": "' + b"x" * 10_000_000 + b'"}\n'
     deep = b'{"strain": ' + b"[" * (LARGEST_MESSAGE // 4) + b"\n"
@@ -193,9 +184,7 @@ RIGHT = [1.7e9 + 0.5 * turn for turn in range(8)]
 @pytest.mark.parametrize(
     "times", [[0.0, *RIGHT[1:]], [1.7e308, *RIGHT[1:]], [1.7e9, 4e9, *RIGHT[2:]]]
 )  # whose clock was not yet set
-def test_a_clock_that_is_set_after_the_first_turn_spoils_none(
-    timed: Knowledge, strains: np.ndarray, clean: list[bytes], times: list[float]
-) -> None:
+def test_a_clock_that_is_set_after_the_first_turn_spoils_none(timed, strains, clean, times):
     lines = [message(row, time=time) for time, row in zip(times, strains, strict=False)]
     twin, intake = watched(timed, lines)
     assert (twin.turns, intake.counts.rejected, intake.counts.missing) == (8, 0, 0)
@@ -211,7 +200,7 @@ def test_a_clock_that_is_set_after_the_first_turn_spoils_none(
     np.testing.assert_array_equal(reading.observed, strains[1])
 
 
-def test_times_stand_for_turns(timed: Knowledge, strains: np.ndarray) -> None:
+def test_times_stand_for_turns(timed, strains):
     times = [1.7e9 + 0.5 * turn + 0.1 * (turn % 3 - 1) for turn in range(10)]
     lines = [message(row, time=time) for time, row in zip(times, strains, strict=False)]
     del lines[4]
@@ -222,7 +211,7 @@ def test_times_stand_for_turns(timed: Knowledge, strains: np.ndarray) -> None:
     assert watched(timed, [*lines, early, endless])[1].counts.rejected == 2
 
 
-def test_units_and_names(knowledge: Knowledge) -> None:
+def test_units_and_names(knowledge):
     reader = MessageReader(knowledge.scenario)
     for name, value in (
         ("strain_3", 8.12e-4),
@@ -239,7 +228,7 @@ def test_units_and_names(knowledge: Knowledge) -> None:
     assert pump.read({f"{next(iter(pump._index))} [k{unit}]": 2.0}).observed[0] == 2000.0
 
 
-def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_path: Path) -> None:
+def test_csv_as_people_write_it(knowledge, strains, tmp_path):
     path = tmp_path / "gauges.csv"
 
     def feed(text: str, scenario: Any = knowledge.scenario) -> feeds.CsvFeed:
@@ -310,9 +299,7 @@ def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_p
         ("1e8", "1e+08; give its unit"),
     ],
 )
-def test_an_unreadable_gauge_is_lost_alone_and_named_once(
-    knowledge: Knowledge, strains: np.ndarray, tmp_path: Path, text: str, shown: str
-) -> None:
+def test_an_unreadable_gauge_is_lost_alone_and_named_once(knowledge, strains, tmp_path, text, shown):
     """As a list, under its name, and as a cell; through a watch that is taken up in the middle of it."""
     lines: dict[str, list[bytes]] = {"list": [], "names": [], "lost": []}
     cells = ["turn,control," + ",".join(NAMES)]

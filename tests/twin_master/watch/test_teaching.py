@@ -1,7 +1,5 @@
 """A watch that is taught: it asks for the cause, tries what is named, and adopts what explains more."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
@@ -24,11 +22,11 @@ from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PowerStiffness
 from tests.command_line import refused
 from tests.discrepancy.rigs import ORIGIN
+from tests.kept import FMU, ROOT, kept_folder
 from tests.twin_master.runs import check_same, journal, text_of, written
 from tests.twin_master.watch.watches import of_gauge, patch_of, ran, viewed, watchful
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
-from twin_master.mission.turns import History
 from twin_master.network.inference import known_control
 from twin_master.viewer.messages import Request, Teller
 from twin_master.viewer.scene import scene_of
@@ -65,9 +63,7 @@ def search(watch: Watch, place: Path, kind: str | None, gain: float, gate: str =
     return Search(watch.folder, 7, (sys.executable, str(script), str(answer), gate))
 
 
-def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
-    base: Watch, mission: History, loose: Path, tmp_path: Path
-) -> None:
+def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, loose, tmp_path):
     (tmp_path / "whole").mkdir()
     watch = watchful(base, tmp_path / "whole" / "watch")
     decisions: list[dict[str, Any]] = []
@@ -106,26 +102,31 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
     check_same(stopped.folder, watch.folder, JOURNAL_NAME)
 
 
-def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(
-    base: Watch, recorded: Path, tmp_path: Path
-) -> None:
+def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(base, recorded, tmp_path):
     """Releases on the ground, of the first mode as one mass, show a cubic spring at the tip."""
-    rig = LumpedModel.load("single_mass_rig")
-    tip = rig.description.port[0].model_copy(update={"name": "tip"})
-    rig = LumpedModel(rig.description.model_copy(update={"port": (tip,)}))
-    plan = plan_for(rig, ("displacement", "leaf_strain"), "mass")
-    hidden = ModelPatch((PowerStiffness("tip", 2.0, 3.0, 0, 0.02),))
-    campaign = example_campaign(rig, "ringdown", 3, replace(plan, duration=0.5 * plan.duration), hidden)
-    few = [item for item in library() if item.identifier in ("cubic_stiffness", "coulomb_friction")]
-    found = investigate(campaign, rig, few)
-    assert found.verdict.kind is VerdictKind.NAMED
-    write_verdict_folder(tmp_path / "verdict", ReportInput(found, ORIGIN))
+
+    def motion_verdict() -> str:
+        rig = LumpedModel.load("single_mass_rig")
+        tip = rig.description.port[0].model_copy(update={"name": "tip"})
+        rig = LumpedModel(rig.description.model_copy(update={"port": (tip,)}))
+        plan = plan_for(rig, ("displacement", "leaf_strain"), "mass")
+        hidden = ModelPatch((PowerStiffness("tip", 2.0, 3.0, 0, 0.02),))
+        campaign = example_campaign(rig, "ringdown", 3, replace(plan, duration=0.5 * plan.duration), hidden)
+        few = [item for item in library() if item.identifier in ("cubic_stiffness", "coulomb_friction")]
+        found = investigate(campaign, rig, few)
+        assert found.verdict.kind is VerdictKind.NAMED
+        write_verdict_folder(folder, ReportInput(found, ORIGIN))
+        return found.verdict.sentence
+
+    folder = tmp_path / "motion_verdict"
+    places = (*FMU, ROOT / "calibration", ROOT / "discrepancy", Path(__file__))
+    sentence = kept_folder(folder, motion_verdict, places)
     watch = watchful(base, tmp_path / "watch")
     ran(watch, CsvFeed(recorded, watch.scenario), 20)
     assert viewed(watch).pictures == []  # turns are no motion
-    given = Patched(tmp_path / "verdict" / "patch.json", 15)
+    given = Patched(folder / "patch.json", 15)
     watch.run(CsvFeed(recorded, watch.scenario), str, turns=25, patched=given)
-    shutil.rmtree(tmp_path / "verdict")
+    shutil.rmtree(folder)
     flight = viewed(watch)
     (picture,) = flight.pictures
     teller = Teller(flight, scene_of(watch.folder, flight.knowledge))
@@ -133,12 +134,12 @@ def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(
     asked = Request(number=1, flight=-1, first=0, end=0, turn=18, shown=-1, count=-1)
     assert json.loads(str(teller.answer(asked)))["picture"] is None  # as was known at the time
     shown = json.loads(str(teller.answer(asked.model_copy(update={"turn": 19}))))["picture"]
-    assert shown["said"] == found.verdict.sentence
+    assert shown["said"] == sentence
     (picture.drawing.parent.parent / "verdict.json").write_text("{}")
     assert viewed(watch).pictures == []
 
 
-def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base: Watch, loose: Path, tmp_path: Path) -> None:
+def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path):
     for kind, gain, sentence in (
         ("named", 0.3, "and is not adopted."),
         ("named", -0.002, "nats of evidence, 3 are needed, and is not adopted."),
@@ -155,7 +156,7 @@ def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base: Watch, loose: Pa
         assert sum("searched for the cause" in text for text in notices) == 2
 
 
-def test_live_turns_do_not_wait_for_the_search(base: Watch, loose: Path, tmp_path: Path) -> None:
+def test_live_turns_do_not_wait_for_the_search(base, loose, tmp_path):
     watch = watchful(base, tmp_path / "watch")
     feed, gate = CsvFeed(loose, watch.scenario), tmp_path / "gate"
     feed.replayable = False  # as a broker
@@ -175,9 +176,7 @@ def test_live_turns_do_not_wait_for_the_search(base: Watch, loose: Path, tmp_pat
     assert verdict["verdict"]["to_turn"] < 35
 
 
-def test_live_turns_do_not_wait_for_the_patched_model(
-    base: Watch, mission: History, loose: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_live_turns_do_not_wait_for_the_patched_model(base, mission, loose, tmp_path, monkeypatch):
     """It is built beside them, and believed behind the turn that the journal says, to the bit."""
     judges: list[Judge] = []
 
@@ -225,7 +224,7 @@ def test_live_turns_do_not_wait_for_the_patched_model(
     assert twins[0].save_state() == twins[1].save_state()
 
 
-def test_a_policy_that_changes_is_told(base: Watch) -> None:
+def test_a_policy_that_changes_is_told(base):
     known = base.models[0].knowledge
     states, sharp = known.model.states, known.scenario.control_names.index("3g")
     z1, z2 = states.coordinates.T
@@ -245,9 +244,7 @@ def test_a_policy_that_changes_is_told(base: Watch) -> None:
         assert trial_sentence({"kind": kind, "from_turn": 3}, outcome, "turn").endswith(f". {sentence}")
 
 
-def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(
-    base: Watch, mission: History, tmp_path: Path
-) -> None:
+def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(base, mission, tmp_path):
     """Gauge 17 is strained most: were its readings the strain, 3g would be left at z1 80 % only."""
     file = of_gauge(tmp_path / "patch.json", -0.12, "g17")
     known, taught = base.models[0].knowledge, patched_model(base.scenario, file, 0).knowledge
@@ -271,7 +268,7 @@ def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[st
     return {"turn": number, "notices": list(alarms), "suspicion": {"log_evidence_none": evidence}}
 
 
-def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns() -> None:
+def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns():
     teaching = Teaching(100.0)
     alarm = {"kind": "alarm", "sentence": "a", "since": 3}
     for number in range(12):
@@ -297,7 +294,7 @@ def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns() -> None:
     assert teaching.question == Question(8, 49)  # the alarm of the new model, and not before it was believed
 
 
-def test_a_second_patch_stands_beside_the_first(tmp_path: Path) -> None:
+def test_a_second_patch_stands_beside_the_first(tmp_path):
     first, second = (of_gauge(tmp_path / channel, -0.1, channel) for channel in ("g5", "g7"))
     both = json.loads(both_patches(first, second))
     assert [effect["primitives"][0]["channel"] for effect in both["effects"]] == ["g5", "g7"]
@@ -305,7 +302,7 @@ def test_a_second_patch_stands_beside_the_first(tmp_path: Path) -> None:
     assert both_patches(None, second) == second.read_bytes()
 
 
-def test_teaching_is_refused_at_the_start_where_nothing_could_look_for_a_cause(tmp_path: Path) -> None:
+def test_teaching_is_refused_at_the_start_where_nothing_could_look_for_a_cause(tmp_path):
     scenario, out = written(tmp_path, text_of("bracket") + "\n[notice]\n"), tmp_path / "w"
     words = ("watch", scenario, "--observations", "-", "--out", out, "--teach")
     assert "this scenario has the role strain under z_heel, z_arm" in refused(*words)

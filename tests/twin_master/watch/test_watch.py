@@ -1,7 +1,5 @@
 """A watch: the same as a mission, killed at any moment, patched on the way, over files and standard input."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -38,7 +36,7 @@ from twin_master.mission.journal import JOURNAL_NAME, line_of, whole_record
 from twin_master.mission.turns import History
 from twin_master.network.estimator import ExactFilter
 from twin_master.report.reading import open_run as stored_run
-from twin_master.scenario.reading import LoadedScenario, load_scenario
+from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import CsvFeed, FolderFeed, JsonLinesFeed, file_feed
 from twin_master.watch.folder import Patched, Watch
 from twin_master.watch.intake import Feed
@@ -72,9 +70,7 @@ def told(whole: Path) -> list[dict[str, Any]]:
     return decisions
 
 
-def test_a_recorded_mission_is_watched_as_it_was_flown(
-    base: Watch, mission: History, whole: Path, told: list[dict[str, Any]], tmp_path: Path
-) -> None:
+def test_a_recorded_mission_is_watched_as_it_was_flown(base, mission, whole, told, tmp_path):
     run = uav_twin.open_run(whole)
     for group, name, found in (
         ("observed", "strain", mission.observed),
@@ -100,9 +96,7 @@ def test_a_recorded_mission_is_watched_as_it_was_flown(
         file_feed(tmp_path, base.scenario)
 
 
-def test_a_program_hands_over_messages_and_is_told_decisions(
-    scenario: LoadedScenario, mission: History, told: list[dict[str, Any]], tmp_path: Path
-) -> None:
+def test_a_program_hands_over_messages_and_is_told_decisions(scenario, mission, told, tmp_path):
     messages = (
         {"turn": turn, "control": ("2g", "3g")[control], "strain": row}
         for turn, (control, row) in enumerate(zip(mission.control_index[:6], mission.observed, strict=False))
@@ -119,9 +113,7 @@ def test_a_program_hands_over_messages_and_is_told_decisions(
     assert not (tmp_path / "none").exists()
 
 
-def test_a_kill_at_any_moment_loses_no_turn(
-    base: Watch, recorded: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_at_any_moment_loses_no_turn(base, recorded, whole, tmp_path, monkeypatch):
     monkeypatch.setattr("twin_master.watch.folder.FLUSH_SECONDS", 0.0)  # so that each line may be the last
     watch = begun(base, tmp_path / "watch")
     feed = CsvFeed(recorded, watch.scenario)
@@ -153,9 +145,8 @@ def test_a_kill_at_any_moment_loses_no_turn(
     ],
 )
 def test_a_watch_that_was_stopped_goes_on_as_if_it_had_never_ended(
-    base: Watch, mission: History, plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    case: str, stops: tuple[int | None, ...], counted: tuple[int, ...],
-) -> None:  # fmt: skip
+    base, mission, plain, tmp_path, monkeypatch, case, stops, counted
+):
     """Also one that learns and gives notice, and is told from turn 10 on of controls that were not flown."""
     given, path, tables = load_scenario("level_turns_learning").scenario, plain, {}
     if case == "gap":
@@ -188,9 +179,7 @@ def test_a_watch_that_was_stopped_goes_on_as_if_it_had_never_ended(
         assert last["filtered"] == found.filtered.tolist()
 
 
-def test_another_file_is_read_from_its_beginning(
-    base: Watch, mission: History, plain: Path, tmp_path: Path
-) -> None:
+def test_another_file_is_read_from_its_beginning(base, mission, plain, tmp_path):
     """A logger that begins a file each day; and the first of them once more, which says nothing new."""
     header, *rows = plain.read_text().splitlines()
     for day, of_day in enumerate(
@@ -209,9 +198,7 @@ def test_another_file_is_read_from_its_beginning(
     assert belief_of(watch) == mission.filtered[-1].tolist()
 
 
-def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(
-    base: Watch, mission: History, plain: Path, tmp_path: Path
-) -> None:
+def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, plain, tmp_path):
     """Into a gap, for which another control was assumed; each line says what was told."""
     controls = mission.control_index.copy()
     controls[20] = 1 - controls[20]
@@ -245,9 +232,7 @@ def counting(seen: list[int], inner: Callable[..., object]) -> Callable[..., obj
     return turn
 
 
-def test_a_long_watch_goes_on_from_its_snapshot(
-    base: Watch, mission: History, plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_watch_goes_on_from_its_snapshot(base, mission, plain, tmp_path, monkeypatch):
     monkeypatch.setattr("twin_master.watch.keeping.SNAPSHOT_TURNS", 16)
     watch, seen = begun(base, tmp_path / "watch"), list[int]()
     monkeypatch.setattr(ExactFilter, "turn", counting(seen, ExactFilter.turn))
@@ -260,9 +245,7 @@ def test_a_long_watch_goes_on_from_its_snapshot(
     np.testing.assert_array_equal(run["smoothed"]["probability"].values, mission.smoothed[30:])
 
 
-def test_a_watch_is_taken_up_from_the_end_of_its_journal(
-    base: Watch, mission: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_watch_is_taken_up_from_the_end_of_its_journal(base, mission, tmp_path, monkeypatch):
     """It costs the same however long it is; what is not read is not missed, and what is read is checked."""
     monkeypatch.setattr("twin_master.watch.keeping.SNAPSHOT_TURNS", 8)
     monkeypatch.setattr("twin_master.watch.keeping.CHECKED", 1)
@@ -295,9 +278,7 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(
         assert file.read_bytes() == b"".join(wrong)
 
 
-def test_the_last_decision_is_read_from_the_journal(
-    base: Watch, whole: Path, told: list[dict[str, Any]], tmp_path: Path
-) -> None:
+def test_the_last_decision_is_read_from_the_journal(base, whole, told, tmp_path):
     watch, file = begun(base, tmp_path / "watch"), tmp_path / "watch" / JOURNAL_NAME
     lines = (whole / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
     again = told[-1] | {"told_again": True}
@@ -318,9 +299,7 @@ def test_the_last_decision_is_read_from_the_journal(
 
 
 @pytest.mark.parametrize("source", ["standard input", "a file that grows"])
-def test_silence_is_told_and_journalled(
-    base: Watch, mission: History, plain: Path, tmp_path: Path, source: str
-) -> None:
+def test_silence_is_told_and_journalled(base, mission, plain, tmp_path, source):
     watch, told = soon_quiet(begun(base, tmp_path / "watch")), list[dict[str, Any]]()
     if source == "standard input":
         read, write = os.pipe()
@@ -362,9 +341,7 @@ def test_silence_is_told_and_journalled(
     assert [turn for turn, notice in watch.told(0) if notice.kind == "quiet"] == [0, 0, 1]
 
 
-def test_a_reader_that_leaves_ends_the_watch_in_order(
-    scenario: LoadedScenario, mission: History, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_reader_that_leaves_ends_the_watch_in_order(scenario, mission, tmp_path, monkeypatch):
     lines = [
         json.dumps({"turn": t, "strain": row}) + "\n" for t, row in enumerate(mission.observed[:4].tolist())
     ]
@@ -392,9 +369,7 @@ def test_a_reader_that_leaves_ends_the_watch_in_order(
         (tmp_path / "watch" / "summary.json").unlink()
 
 
-def test_a_changed_journal_and_other_folders_are_refused(
-    scenario: LoadedScenario, whole: Path, tmp_path: Path
-) -> None:
+def test_a_changed_journal_and_other_folders_are_refused(scenario, whole, tmp_path):
     copy = Path(shutil.copytree(whole, tmp_path / "copy"))
     file = copy / JOURNAL_NAME
     file.write_bytes(file.read_bytes().replace(b'"turn": 9}', b'"turn": 8}', 1))
@@ -415,7 +390,7 @@ def test_a_changed_journal_and_other_folders_are_refused(
         uav_twin.fly(scenario, tmp_path / "run")
 
 
-def test_the_shipped_recording_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
     """The gauge that comes loose at turn 10, and the skin that softens from turn 25 on."""
     monkeypatch.setattr(Watch, "store", lambda *_arguments, **_options: None)
     folder = tmp_path / "a b"
@@ -441,7 +416,7 @@ def test_the_shipped_recording_is_noticed(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.long
-def test_a_patch_is_believed_from_a_stated_turn_on(base: Watch, mission: History, tmp_path: Path) -> None:
+def test_a_patch_is_believed_from_a_stated_turn_on(base, mission, tmp_path):
     observed = mission.observed.copy()
     observed[20:, 4] *= 0.88
     path = write_csv(tmp_path / "m.csv", observed, mission.control_index)
@@ -472,7 +447,7 @@ def test_a_patch_is_believed_from_a_stated_turn_on(base: Watch, mission: History
     assert figures["gap_after_patch_20"] < 0.97 * figures["gap_before_patch_20"]
 
 
-def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole: Path) -> None:
+def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole):
     before = (whole / JOURNAL_NAME).read_bytes()
     with flown(whole, 3, 20, SilentProgress()) as copy:
         assert (copy / "run.nc").is_file()
@@ -485,9 +460,8 @@ def test_a_watch_is_read_up_to_a_turn_while_it_goes_on(whole: Path) -> None:
 
 
 def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
-    scenario: LoadedScenario, mission: History, recorded: Path, whole: Path, told: list[dict[str, Any]],
-    tmp_path: Path,
-) -> None:  # fmt: skip
+    scenario, mission, recorded, whole, told, tmp_path
+):
     folder, decisions, opened = tmp_path / "watch", list[dict[str, object]](), []
 
     def decide(decision: Mapping[str, object]) -> None:
@@ -515,9 +489,7 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
     assert last_line(folder) == last_line(whole)
 
 
-def test_a_slip_of_the_pen_makes_no_folder(
-    scenario: LoadedScenario, recorded: Path, whole: Path, tmp_path: Path
-) -> None:
+def test_a_slip_of_the_pen_makes_no_folder(scenario, recorded, whole, tmp_path):
     """An unknown column is passed over on request."""
     (tmp_path / "run.nc").touch()
     (tmp_path / "lines.jsonl").write_text('{"turn": 0, "strain_1": 1e-4}\n')

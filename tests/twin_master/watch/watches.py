@@ -1,7 +1,5 @@
 """Watches without a calibration of their own, recordings, and a broker."""
 
-from __future__ import annotations
-
 import copy
 import json
 import os
