@@ -6,7 +6,6 @@ of each output (Rozza, Huynh and Patera 2008). The method and what it reaches ar
 """
 
 from bisect import bisect_left
-from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
 from typing import Any
@@ -17,9 +16,10 @@ from fe.full.subspace import FunctionalBasis, Norm, ProjectedBasis
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel, StaticResponse
+from reporting.progress import Stage
 
 from .settings import TOGETHER
-from .terms import ReductionTerms, State, solved_together
+from .terms import ReductionTerms, State
 
 DUAL_TOLERANCE, COMBINED_TOLERANCE = 0.05, 0.01
 """Relative residual of approximate dual solutions at their own states, taken alone and combined."""
@@ -30,7 +30,7 @@ MOST_COLUMNS = 48
 
 
 def dual_solutions(
-    terms: ReductionTerms, norm: Norm, advance: Callable[[int, str], object]
+    terms: ReductionTerms, norm: Norm, stage: Stage
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Solve K psi = l for each output l, roughly: the norms of what that leaves are computed, not assumed.
 
@@ -40,7 +40,7 @@ def dual_solutions(
         The full model.
     norm : Norm
         Energy norm X of one stiffness.
-    advance : callable
+    stage : Stage
         Told one more part, and of what.
 
     Returns
@@ -56,8 +56,8 @@ def dual_solutions(
     for first in range(0, len(states), at_once):
         chosen = states[first : first + at_once]
         tolerance = COMBINED_TOLERANCE if combined else DUAL_TOLERANCE
-        found += solved_together(terms, norm, chosen, terms.outputs, [start] * len(chosen), tolerance)
-        advance(len(chosen), "dual solutions")
+        found += terms.solved_together(norm, chosen, terms.outputs, [start] * len(chosen), tolerance)
+        stage.advance(len(chosen), "dual solutions")
     solutions = np.stack(found)
     del found  # as large as they are
     duals, arrays = (_combined if combined else _nearest)(terms, norm, solutions)
@@ -138,19 +138,14 @@ class StaticReduction:
         What a reduced model holds beside the statics, by the names of its fields.
     modal_basis : (n, Nm) ndarray
         Its modal basis.
-    advance : callable
+    stage : Stage
         Told one more part, and of what.
     """
 
     def __init__(
-        self,
-        terms: ReductionTerms,
-        norm: Norm,
-        fixed: dict[str, Any],
-        modal_basis: FloatArray,
-        advance: Callable[[int, str], object],
+        self, terms: ReductionTerms, norm: Norm, fixed: dict[str, Any], modal_basis: FloatArray, stage: Stage
     ) -> None:
-        self.terms, self.norm, self.modal_basis, self.advance = terms, norm, modal_basis, advance
+        self.terms, self.norm, self.modal_basis, self.stage = terms, norm, modal_basis, stage
         self.least = terms.least(norm)
         n, count = len(terms.loads), len(terms.stiffness_terms)
         self.basis = ProjectedBasis(norm, [terms.stiffness_terms], drop=1e-7)
@@ -158,7 +153,7 @@ class StaticReduction:
         self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
         self.residual_load = self.residual_basis.extend(terms.loads)
         self.residual_stiffness = np.empty((len(self.residual_load), count, 0))
-        products, duals = dual_solutions(terms, norm, advance)
+        products, duals = dual_solutions(terms, norm, stage)
         self.fixed: dict[str, Any] = fixed | duals
         self.dual_products = np.swapaxes(products, 1, 2)
         self.correction = self.dual_products @ self.residual_basis.vectors
@@ -170,7 +165,7 @@ class StaticReduction:
         # a basis vector may be rough, since errors are bounded by residuals; the first one measures rounding
         tolerance = SNAPSHOT_TOLERANCE if self.snapshots else FIRST_TOLERANCE
         starts = [self._galerkin(theta) for theta in thetas]
-        solutions = solved_together(self.terms, self.norm, thetas, self.terms.loads, starts, tolerance)
+        solutions = self.terms.solved_together(self.norm, thetas, self.terms.loads, starts, tolerance)
         (images,) = self.basis.extend(np.concatenate(solutions, axis=1))
         if not images[0].size:
             return False  # rounding is reached; what the search reached is judged after it
@@ -288,7 +283,7 @@ def greedy(
             chosen = _spread(places, bounds, min(TOGETHER, most_snapshots - len(static.snapshots)), wanted)
         if not static.add_snapshots(chosen):
             break
-        static.advance(len(chosen), f"full solution {len(static.snapshots)}")
+        static.stage.advance(len(chosen), f"full solution {len(static.snapshots)}")
     return [*history, float(_bounds(static, states, known, len(states), wanted).max())]
 
 

@@ -7,7 +7,7 @@ reaches are in `docs/reduced_model.md`.
 """
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE
 from fe.structure.affine import AffineStructure, affine_sum, natural_frequencies, static_response
 from fe.wing.operators import AffineWing
-from reporting.progress import Progress, SilentProgress
+from reporting.progress import Progress, SilentProgress, Stage
 from reporting.words import counted
 
 from .certified_basis import StaticReduction, compressed, fewest_directions, greedy
@@ -42,9 +42,9 @@ def eigenmodes(
 
 
 def modal_basis(
-    system: ReductionTerms, norm: Norm, settings: ModalSettings, advance: Callable[[], object]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Make a basis for the first modes of any structure.
+    system: ReductionTerms, norm: Norm, settings: ModalSettings, stage: Stage, followed_load: int | None
+) -> tuple[FloatArray, dict[str, Any]]:
+    """Make a basis (n, Nm) for the first modes of any structure, and the modal fields of `ReducedArrays`.
 
     Parameters
     ----------
@@ -54,23 +54,18 @@ def modal_basis(
         The energy norm of one of its stiffnesses.
     settings : ModalSettings
         Accuracy.
-    advance : callable
-        Called after each sampled state.
-
-    Returns
-    -------
-    basis : (n, Nm) ndarray
-        The basis.
-    stiffness, mass : (T, Nm, Nm), (1 + P, Nm, Nm) ndarray
-        The terms in it.
+    stage : Stage
+        Advances after each sampled state.
+    followed_load : int, optional
+        As of `reduce_structure`.
 
     Raises
     ------
     ReductionError
-        If the modes of a sampled state do not converge, or there are too few unknowns for the modes.
+        If the modes of a sampled state do not converge, there are too few unknowns for the modes, or masses
+        move in too few ways.
     """
-    unknowns = system.stiffness_terms[0].shape[0]
-    count = settings.mode_count + 2  # two more, because modes change places
+    unknowns, count = system.stiffness_terms[0].shape[0], settings.sought
     if unknowns <= 2 * count:
         raise ReductionError(
             f"{settings.mode_count} modes cannot be had from {unknowns} unknowns; ask for fewer or refine."
@@ -83,46 +78,60 @@ def modal_basis(
         vectors = np.linalg.qr(norm.riesz(np.asarray(matrix @ vectors)))[0]
     working.extend(vectors)
     sampled = system.sampled_modes()
-    for first in range(0, len(sampled), TOGETHER):
-        _refine(system, norm, working, sampled[first : first + TOGETHER], count, settings, advance)
-    basis = _compress(working, system.compressed_modes(), count, settings)
+    try:
+        for first in range(0, len(sampled), TOGETHER):
+            for _ in _refined(system, working, sampled[first : first + TOGETHER], settings):
+                stage.advance()
+        directions = _compress(working, system.compressed_modes(), settings)
+    except np.linalg.LinAlgError:
+        raise ReductionError(
+            f"The masses of {system.structure.design.name} move in fewer ways than the {count} modes that "
+            "are looked for; give its materials a density."
+        ) from None
     stiffness, mass = (
         # What rounding made of the symmetry of large entries is averaged out.
         0.5 * (terms + terms.transpose(0, 2, 1))
-        for terms in (basis.T @ inner @ basis for inner in working.inner)
+        for terms in (directions.T @ inner @ directions for inner in working.inner)
     )
-    return working.vectors @ basis, stiffness, mass
+    basis = working.vectors @ directions
+    load, followed = system.loads.T @ basis, np.empty((0, basis.shape[1]))
+    if followed_load is not None:
+        square, shapes = eigenmodes((stiffness, mass), *system.nominal, settings.mode_count)
+        followed = shapes[:, most_moved(load[followed_load], square, shapes)].T
+    output = (system.outputs.T @ basis, system.structure.acceleration_output @ basis)
+    return basis, {
+        "mode_count": settings.mode_count,
+        "modal_stiffness": stiffness,
+        "modal_mass": mass,
+        "modal_load": load,
+        "modal_output": np.concatenate(output),
+        "followed_shapes": followed,
+    }
 
 
-def _refine(
-    system: ReductionTerms,
-    norm: Norm,
-    working: ProjectedBasis,
-    states: list[ModalState],
-    count: int,
-    settings: ModalSettings,
-    advance: Callable[[], object],
-) -> None:
-    """Add Davidson corrections X^-1 (K - omega^2 M) phi until all modes of the states are found well."""
+def _refined(
+    system: ReductionTerms, working: ProjectedBasis, states: list[ModalState], settings: ModalSettings
+) -> Iterator[int]:
+    """Add Davidson corrections X^-1 (K - omega^2 M) phi until all modes are found; yield at each state."""
     open_states = [(*state, system.stiffness(state[0]), system.mass(state[1])) for state in states]
     largest = np.inf
     for _ in range(settings.most_corrections):
         modes = [
-            eigenmodes(working.inner, theta, mass_theta, count) for theta, mass_theta, _, _ in open_states
+            eigenmodes(working.inner, theta, mass_theta, settings.sought)
+            for theta, mass_theta, _, _ in open_states
         ]
         residual = []
         for (_, _, stiffness, mass), (square, coefficients) in zip(open_states, modes, strict=True):
             shape = working.vectors @ coefficients
             residual.append(stiffness @ shape - (mass @ shape) * square)
         residuals = np.concatenate(residual, axis=1)
-        correction = norm.riesz(residuals)
+        correction = working.norm.riesz(residuals)
         # (r, X^-1 r) / (phi, K phi); phi is mass-normalised
         squares = np.concatenate([square for square, _ in modes])
         sizes = np.sqrt(np.einsum("ik,ik->k", residuals, correction) / squares)
         too_large = sizes > settings.residual_tolerance
-        still = too_large.reshape(len(open_states), count).any(axis=1)
-        for _ in range(int(np.sum(~still))):
-            advance()
+        still = too_large.reshape(len(open_states), -1).any(axis=1)
+        yield from range(int(np.sum(~still)))
         if not still.any():
             return
         largest = float(sizes.max())
@@ -134,11 +143,9 @@ def _refine(
     )
 
 
-def _compress(
-    working: ProjectedBasis, states: list[ModalState], count: int, settings: ModalSettings
-) -> FloatArray:
+def _compress(working: ProjectedBasis, states: list[ModalState], settings: ModalSettings) -> FloatArray:
     """Return the fewest singular directions (k, Nm) of many states' modes that keep every frequency."""
-    modes = [eigenmodes(working.inner, *state, count) for state in states]
+    modes = [eigenmodes(working.inner, *state, settings.sought) for state in states]
     kept = settings.mode_count
     snapshots = np.concatenate(
         [shape[:, :kept] / np.linalg.norm(shape[:, :kept], axis=0) for _, shape in modes], axis=1
@@ -216,10 +223,10 @@ def reduce_structure(
     with progress.stage("Factorising the structure"):
         norm = Norm(affine_sum(terms.reference, terms.stiffness_terms))
     with progress.stage("Reducing the modes") as stage:
-        basis, modal = _modes(terms, norm, name, settings.modal, stage.advance, followed_load)
+        basis, modal = modal_basis(terms, norm, settings.modal, stage, followed_load)
     with progress.stage("Reducing the statics") as stage:
-        fixed = {**_named(terms, name), **modal, "mode_count": settings.modal.mode_count}
-        static, states = StaticReduction(terms, norm, fixed, basis, stage.advance), terms.training()
+        fixed, states = _named(terms, name) | modal, terms.training()
+        static = StaticReduction(terms, norm, fixed, basis, stage)
         history = greedy(
             static, states, tolerance=settings.bound_tolerance, most_snapshots=settings.most_snapshots
         )
@@ -239,37 +246,6 @@ def reduce_structure(
         tuple(static.snapshots),
         tuple(history),
     )
-
-
-def _modes(
-    terms: ReductionTerms,
-    norm: Norm,
-    name: str,
-    settings: ModalSettings,
-    advance: Callable[[], object],
-    followed_load: int | None,
-) -> tuple[FloatArray, dict[str, Any]]:
-    """Return the modal basis (n, Nm) and the modal fields of `ReducedArrays`; raises `ReductionError`."""
-    try:
-        basis, stiffness, mass = modal_basis(terms, norm, settings, advance)
-    except np.linalg.LinAlgError:
-        raise ReductionError(
-            f"The masses of {name} move in fewer ways than the {settings.mode_count + 2} modes that are "
-            "looked for; give its materials a density."
-        ) from None
-    load, followed = terms.loads.T @ basis, np.empty((0, basis.shape[1]))
-    if followed_load is not None:
-        square, shapes = eigenmodes((stiffness, mass), *terms.nominal, settings.mode_count)
-        followed = shapes[:, most_moved(load[followed_load], square, shapes)].T
-    return basis, {
-        "modal_stiffness": stiffness,
-        "modal_mass": mass,
-        "modal_load": load,
-        "modal_output": np.concatenate(
-            (terms.outputs.T @ basis, terms.structure.acceleration_output @ basis)
-        ),
-        "followed_shapes": followed,
-    }
 
 
 def _check(terms: ReductionTerms, name: str) -> None:

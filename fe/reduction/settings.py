@@ -34,6 +34,11 @@ class ModalSettings:
     frequency_tolerance: float = 1e-5
     most_corrections: int = 12
 
+    @property
+    def sought(self) -> int:
+        """Modes that are looked for: two more, because modes change places."""
+        return self.mode_count + 2
+
 
 @dataclass(frozen=True)
 class StructureSettings:

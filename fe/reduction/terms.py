@@ -198,21 +198,11 @@ class ReductionTerms:
             found.append(np.where(size < least, np.maximum(least, of_others), least))
         return np.array(found)
 
-
-def solved_together(
-    terms: ReductionTerms,
-    norm: Norm,
-    thetas: list[FloatArray],
-    right: FloatArray,
-    starts: list[FloatArray],
-    tolerance: float,
-) -> list[FloatArray]:
-    """Solve the full model at coefficients (T,) for the same right-hand sides (n, k); returns (n, k) each."""
-    solved = conjugate_gradients(
-        [terms.stiffness(theta) for theta in thetas],
-        norm,
-        np.concatenate([right] * len(thetas), axis=1),
-        np.concatenate(starts, axis=1),
-        tolerance=tolerance,
-    )
-    return np.split(solved, len(thetas), axis=1)
+    def solved_together(
+        self, norm: Norm, at: list[FloatArray], right: FloatArray, starts: list[FloatArray], tolerance: float
+    ) -> list[FloatArray]:
+        """Solve the full model at coefficients (T,) for the same right-hand sides (n, k); (n, k) each."""
+        matrices = [self.stiffness(theta) for theta in at]
+        rights, begin = (np.concatenate(part, axis=1) for part in ([right] * len(at), starts))
+        solved = conjugate_gradients(matrices, norm, rights, begin, tolerance)
+        return np.split(solved, len(at), axis=1)

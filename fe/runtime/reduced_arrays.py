@@ -5,7 +5,7 @@ equations are in `docs/reduced_model.md`. NumPy and relative imports only: this 
 """
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from math import inf, sqrt
@@ -17,7 +17,7 @@ from numpy.linalg import solve
 
 from .arrays import FloatArray, IntArray
 from .kept_arrays import KeptArrays
-from .state import MOST_REGIONS, Losses, losses_of
+from .state import MOST_REGIONS, GivenLosses, Losses, losses_of
 
 MOST_ANCHORS = 16
 """Largest number of approximate dual solutions of a reduced model."""
@@ -35,7 +35,7 @@ class RegionArrays(KeptArrays):
 
     regions: tuple[str, ...]
 
-    def losses(self, stiffness_loss: Mapping[str, float] | Iterable[float]) -> Losses:
+    def losses(self, stiffness_loss: GivenLosses) -> Losses:
         """Return one stiffness loss for each region, in their order; see `fe.runtime.state.losses_of`."""
         return losses_of(stiffness_loss, self.regions)
 

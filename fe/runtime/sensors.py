@@ -110,7 +110,22 @@ def apply_sensors(
         return values, rates
     shown = np.array(values, dtype=np.float64)
     slopes = np.zeros_like(shown) if rates is None else np.array(rates, dtype=np.float64)
-    _rotate(active, record, shown, slopes, transverse, shear)
+    angles = np.zeros(len(record.channels))
+    for item in active:
+        if isinstance(item, SensorRotation):
+            angles[columns_of(item, record.channels)] += item.angle
+    turned = np.flatnonzero(angles)
+    if turned.size:  # eps' = eps cos^2 + eps_t sin^2 + gamma sin cos (strain in a plane)
+        if transverse is None or shear is None:
+            raise InvalidPatchError(
+                "A gauge is turned, but the model gives no transverse and shear strain to turn it in."
+            )
+        cosine, sine = np.cos(angles[turned]), np.sin(angles[turned])
+        across = transverse[:, turned] * sine**2 + shear[:, turned] * (sine * cosine)
+        shown[:, turned] = shown[:, turned] * cosine**2 + across
+        if len(across) > 1 and record.is_dynamic:
+            # A response has no rates of the components; a central difference of this small share will do.
+            slopes[:, turned] = slopes[:, turned] * cosine**2 + np.gradient(across, record.time, axis=0)
     for item in active:
         columns = columns_of(item, record.channels)
         if not columns.size or isinstance(item, SensorRotation):
@@ -149,34 +164,6 @@ def columns_of(item: Primitive, channels: Sequence[tuple[str, str]]) -> NDArray[
         quantity = STRAIN if getattr(item, "of_strain", False) else str(getattr(item, "quantity", ""))
         chosen = [index for index, (_, own) in enumerate(channels) if quantity in ("", own)]
     return np.array(chosen, dtype=np.intp)
-
-
-def _rotate(
-    active: Sequence[Primitive],
-    record: SensorRecord,
-    values: FloatArray,
-    rates: FloatArray,
-    transverse: FloatArray | None,
-    shear: FloatArray | None,
-) -> None:
-    """Turn gauges in place: eps' = eps cos^2 + eps_t sin^2 + gamma sin cos (strain in a plane)."""
-    angles = np.zeros(len(record.channels))
-    for item in active:
-        if isinstance(item, SensorRotation):
-            angles[columns_of(item, record.channels)] += item.angle
-    turned = np.flatnonzero(angles)
-    if not turned.size:
-        return
-    if transverse is None or shear is None:
-        raise InvalidPatchError(
-            "A gauge is turned, but the model gives no transverse and shear strain to turn it in."
-        )
-    cosine, sine = np.cos(angles[turned]), np.sin(angles[turned])
-    across = transverse[:, turned] * sine**2 + shear[:, turned] * (sine * cosine)
-    values[:, turned] = values[:, turned] * cosine**2 + across
-    if len(across) > 1 and record.is_dynamic:
-        # A response has no rates of the components; a central difference of this small share will do.
-        rates[:, turned] = rates[:, turned] * cosine**2 + np.gradient(across, record.time, axis=0)
 
 
 LARGEST_ORDER = 4

@@ -275,12 +275,12 @@ def write_structure_vtu(
     )
 
 
+Data = dict[str, NDArray[Any]]
+"""What is written of points or cells, by name."""
+
+
 def write_vtu(
-    path: Path | str,
-    points: FloatArray,
-    cells: tuple[str, IntArray],
-    point_data: dict[str, FloatArray],
-    cell_data: dict[str, NDArray[Any]],
+    path: Path | str, points: FloatArray, cells: tuple[str, IntArray], point_data: Data, cell_data: Data
 ) -> None:
     """Write a VTU file, whole or not at all; `cells` are their kind in meshio and their nodes."""
     meshio, values = meshio_with_wedges(), {name: [value] for name, value in cell_data.items()}

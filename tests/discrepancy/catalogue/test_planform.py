@@ -33,7 +33,7 @@ def first_mode(setting):
     """Shares of stations, their motion when the mean moves by one, stiffness at the mean, frequency."""
     model = setting.model
     e, servo, pitot, *_ = (item.mean for item in model.parameters)
-    structure = model.wing.structure(e, (0.0, 0.0), servo, pitot)
+    structure = model.wing.at(np.array((e, 0.0, 0.0, servo, pitot, 0.0, 0.0)))
     square, shapes = eigh(structure.stiffness, structure.mass, subset_by_index=[0, 0])
     arrays = model.wing.arrays
     motion = arrays.line_rows[2] @ shapes[:, 0]

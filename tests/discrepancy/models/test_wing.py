@@ -64,7 +64,7 @@ class Wing:
     def matrices(self, *items: Any, loss: Any = (0.0, 0.0), warm: float = 1.0) -> tuple[Any, Any, Any]:
         """Stiffness, mass and damping."""
         e, servo, pitot, alpha, beta = self.means
-        structure = self.wing.structure(warm * e, tuple(loss), servo, pitot, ModelPatch(items))
+        structure = self.wing.at(np.array((warm * e, *loss, servo, pitot, 0.0, 0.0)), ModelPatch(items))
         return structure.stiffness, structure.mass, alpha * structure.mass + beta * structure.stiffness
 
     def static(self, loads: Any, *items: Any, **state: Any) -> FloatArray:
