@@ -113,17 +113,14 @@ class FmuModel(DescribedModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
         description, forces = self.description, bool(self.description.inputs.forces)
-        if primitive in SENSORS or primitive.kind in description.effects:
-            return True
-        if primitive is changes.LoadGain:
-            return forces
-        if primitive is changes.LoadPlace:
-            return forces and description.inputs.bending_moment is not None
-        return (
-            primitive in INTERNAL_FORCES
-            and primitive is not changes.StiffnessDrift
-            and bool(description.port)
-        )
+        carried = {
+            changes.LoadGain: forces,
+            changes.LoadPlace: forces and description.inputs.bending_moment is not None,
+            changes.StiffnessDrift: False,
+        }
+        at_port = primitive in INTERNAL_FORCES and bool(description.port)
+        own = primitive in SENSORS or primitive.kind in description.effects
+        return own or carried.get(primitive, at_port)
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign: those of the file, else what the FMU shows."""

@@ -248,7 +248,7 @@ class FmuMotion(FmuRuns):
                 self._proven = self._confirmed(found, state, part, count, LINEAR)
             if found is None or not self._proven:
                 return None
-            safe = found.fastest * part <= SAFE_TURN
+            safe = np.max(np.abs(np.linalg.eigvals(found.generator).imag)) * part <= SAFE_TURN
             if fixed or (safe and (known or self._confirmed(found, state, 0.5 * part, count, SAME_PACE))):
                 self._parts[step] = parts
                 return found
@@ -308,7 +308,8 @@ class FmuMotion(FmuRuns):
             still = [self.begin(Run(state, step, 0, [(push, force)]))[1][column] for force in (-size, size)]
             stiffness = 2.0 * size / float(still[1] - still[0])
             return stiffness, stiffness
-        at_rest = 1.0 / float(system.gain()[column, number])
+        gain = system.direct - system.outputs @ np.linalg.solve(system.generator, system.push)
+        at_rest = 1.0 / float(gain[column, number])
         frequency, shape = system.most_flexible(column, number) or (1.0, 0.0)
         of_mode = shape / frequency**2
         return (at_rest if of_mode * at_rest < 1e-6 else 1.0 / of_mode), at_rest

@@ -237,9 +237,14 @@ class FmuRuns:
         return found
 
     def open(self, step: float) -> FmiAsset:
-        """Return the instance of a step size [s], as it was left."""
-        binding, isolated = self._binding.with_header(step_size=step), self.description.isolated
-        return self._assets.get(step, lambda: FmiAsset(self._path, binding, isolated=isolated))
+        """Return the instance of a step size [s], as it was left; raises `ModelError`."""
+
+        def opened() -> FmiAsset:
+            binding = self._binding.with_header(step_size=step)
+            return FmiAsset(self._path, binding, isolated=self.description.isolated)
+
+        with self._refusals():
+            return self._assets.get(step, opened)
 
     def close(self) -> None:
         """End all instances; they are opened again when they are needed."""

@@ -42,11 +42,6 @@ class PortSystem:
     direct: FloatArray
     _steps: Memory = field(default_factory=lambda: Memory(KEPT_STEPS), init=False, repr=False)
 
-    @property
-    def fastest(self) -> float:
-        """Largest angular frequency of a mode [rad/s]."""
-        return float(np.max(np.abs(np.linalg.eigvals(self.generator).imag)))
-
     def over(self, step: float) -> tuple[FloatArray, FloatArray]:
         """Return A (n, n) and B (n, P) of s(k+1) = A s(k) + B f(k), f held over steps [s]."""
         system = self.generator, self.push, self.outputs, self.direct
@@ -111,10 +106,6 @@ class PortSystem:
         unit = np.max(np.abs(flat), axis=0)
         unit[unit == 0.0] = 1.0
         return np.asarray(np.linalg.pinv(flat / unit, rcond=1e-14) / unit[:, None])
-
-    def gain(self) -> FloatArray:
-        """Return the outputs (C, P) at rest under constant unit forces."""
-        return np.asarray(self.direct - self.outputs @ np.linalg.solve(self.generator, self.push))
 
     def most_flexible(self, column: int, port: int) -> tuple[float, float] | None:
         """Return the mode that gives an output the most at rest under a port's force; None if none vibrates.

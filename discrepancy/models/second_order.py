@@ -129,9 +129,8 @@ class Motion:
                 along = system.lift[:, item.reaction]
                 values[:, number] -= self.acting.load_at(self.time, along[:, None])[:, 0]
                 if len(self.laws):
-                    values[:, number] += self.port_forces @ (
-                        self.laws.rows({**system.ports, **system.actions}, len(along)) @ along
-                    )
+                    acts = self.laws.rows({**system.ports, **system.actions}, len(along))
+                    values[:, number] += self.port_forces @ (acts @ along)
             for factor, course in item.courses or ():
                 values[:, number] += factor * course.at(self.time)
             if item.reaction is not None or item.courses:
@@ -171,7 +170,7 @@ class SecondOrderSystem(LinearSystem):
             If it begins at rest where there is none, or the release point cannot be moved.
         """
         if acting.release is not None:
-            return self._let_go(*acting.release, acting, laws, refinement)
+            return self._let_go(acting, laws, refinement)
         times, first = acting.sampled, float(acting.time[0])
         begin = self._first(acting, laws)
         found = self._followed(acting, laws, first, times, begin, refinement)
@@ -183,11 +182,10 @@ class SecondOrderSystem(LinearSystem):
             found.port_forces[0, driven & (rows @ begin.v == 0.0) & (laws.of_speed == 1)] = 0.0
         return Motion(self, acting, laws, times, *found[:4])
 
-    def _let_go(
-        self, row: FloatArray, release: Release, acting: Acting, laws: Laws, refinement: int
-    ) -> Motion:
-        """Return the motion of a structure that springs hold after a release at a row (n,)."""
-        times, acts = acting.sampled, laws.act_at(0.0)
+    def _let_go(self, acting: Acting, laws: Laws, refinement: int) -> Motion:
+        """Return the motion of a structure that springs hold after a release."""
+        assert acting.release is not None
+        (row, release), times, acts = acting.release, acting.sampled, laws.act_at(0.0)
         loaded = laws.only(acts) if laws.spans else laws
         begin, holding = self._released(row, release, acting.initial, loaded)
         q, v, memory = begin

@@ -99,14 +99,9 @@ def _by_channels(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
     found: list[Primitive] = []
     for item in sensors:
         output = getattr(item, "channel", EVERY_CHANNEL)
-        if output == EVERY_CHANNEL or output in campaign.channels:
-            found.append(item)
-            continue
-        found += [
-            replace(item, channel=name)  # type: ignore[call-arg]
-            for name, channel in campaign.channels.items()
-            if channel.output == output
-        ]
+        own = output == EVERY_CHANNEL or output in campaign.channels
+        names = [name for name, channel in campaign.channels.items() if channel.output == output]
+        found += [item] if own else [replace(item, channel=name) for name in names]  # type: ignore[call-arg]
     return ModelPatch(tuple(found))
 
 

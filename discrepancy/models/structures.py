@@ -51,6 +51,9 @@ paper, its masses, and the damping of the joint posterior, whose spread holds th
 
 
 ROTATING_PORT = "root"
+Prior = Mapping[str, tuple[float, float]]
+"""Means and standard deviations of calibrated parameters, by the names of `STATE`."""
+Design = WingDesign | None
 
 
 class StructureModel(SystemModel):
@@ -111,20 +114,19 @@ class StructureModel(SystemModel):
         }
         self.port_names = tuple(self.port_rows)
 
-    def _vector(
-        self, parameters: FloatArray, controls: Mapping[str, float], losses: Losses = ()
-    ) -> FloatArray:
+    def _at(self, parameters: FloatArray, controls: Mapping[str, float], losses: Losses = ()) -> FloatArray:
+        """Return the values that the structure is made at; controls that are left out are nominal."""
         names = (*self.model.parameters, *self.model.masses)
         return self.model.vector({**dict(zip(names, parameters.tolist(), strict=True)), **controls}, losses)
+
+    def _pull(self, parameters: FloatArray, controls: Mapping[str, float]) -> FloatArray:
+        """Return the load (n,) under controls."""
+        return np.asarray(self.model.rows[0] @ self.model.load_coefficients(self._at(parameters, controls)))
 
     def _load(self, parameters: FloatArray, control: str) -> FloatArray:
         """Return what one of a control adds to the load (n,)."""
         none = dict.fromkeys(self.model.controls, 0.0)
-        first, second = (
-            self.model.load_coefficients(self._vector(parameters, controls))
-            for controls in (none, {**none, control: 1.0})
-        )
-        return np.asarray(self.model.rows[0] @ (second - first))
+        return self._pull(parameters, none | {control: 1.0}) - self._pull(parameters, none)
 
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
         """Return what outputs show.
@@ -161,8 +163,7 @@ class StructureModel(SystemModel):
     def _always(self, parameters: FloatArray) -> FloatArray:
         """Return the load (n,) of constant loads and of controls that no trial records."""
         recorded = {name: 0.0 for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls}
-        coefficients = self.model.load_coefficients(self._vector(parameters, recorded))
-        return np.asarray(self.model.rows[0] @ coefficients)
+        return self._pull(parameters, recorded)
 
     def constant(self, case: Case) -> FloatArray:
         """Return the load (n,) that always acts at rest; in motion it is in what is shown."""
@@ -178,7 +179,7 @@ class StructureModel(SystemModel):
         """
         parameters, losses, *_ = state
         key = parameters.tobytes(), losses
-        return self._systems.get(key, lambda: self._made(self._vector(parameters, {}, losses)))
+        return self._systems.get(key, lambda: self._made(self._at(parameters, {}, losses)))
 
     def _made(self, vector: FloatArray) -> SecondOrderSystem:
         model, state = self.model, ReducedState(self.model, vector)
@@ -224,15 +225,10 @@ class WingModel(SystemModel):
     reference = LOAD_PLACE
 
     def __init__(
-        self,
-        arrays: PatchArrays,
-        name: str = "wing",
-        prior: dict[str, tuple[float, float]] | None = None,
-        design: WingDesign | None = None,
+        self, arrays: PatchArrays, name: str = "wing", prior: Prior = SHIPPED_PRIOR, design: Design = None
     ) -> None:
         self.design = design
         self.wing = wing = PatchedWing(arrays)
-        prior = prior or SHIPPED_PRIOR
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
         self.name, self.parameters = name, wing_priors(box, **prior)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows

@@ -151,9 +151,8 @@ class SystemModel(Model):
     def case(self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH) -> Case:
         """Return a trial as it is at its begin."""
         losses, warmer = self.losses(trial, conditions.health)[0], float(trial.temperature[0])
-        return Case(
-            trial, conditions, patch, State(conditions.parameters, losses, patch.of(*STRUCTURE), warmer)
-        )
+        state = State(conditions.parameters, losses, patch.of(*STRUCTURE), warmer)
+        return Case(trial, conditions, patch, state)
 
     def acting(self, case: Case) -> Acting:
         """Return what acts in a trial."""
@@ -177,10 +176,8 @@ class SystemModel(Model):
         system = self.system(moving)
         return system, acting if system.basis is None else acting.along(system.basis)
 
-    def moved(
-        self, case: Case, laws: Laws = NO_LAWS, ports: tuple[str, ...] | None = None, *, still: bool = False
-    ) -> Motion:
-        """Return the motion in a dynamic trial, `ports` being those of the laws; `still`: begun at rest.
+    def moved(self, case: Case, laws: Laws = NO_LAWS, ports: tuple[str, ...] | None = None) -> Motion:
+        """Return the motion in a dynamic trial, `ports` being those of the laws unless it is said.
 
         Raises
         ------
@@ -188,8 +185,6 @@ class SystemModel(Model):
             If it cannot begin so, or what acts is not the model's.
         """
         system, acting = self.begun(case, laws.ports if ports is None else ports)
-        if still:
-            acting = replace(acting, begins=Start.STILL)
         try:
             return system.motion(acting, laws, case.conditions.refinement)
         except (ModelError, FiniteElementError) as cause:
@@ -273,8 +268,8 @@ class SystemModel(Model):
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of a state at the begin of a trial: of motion from rest, and of data."""
         parameters = self.prior_mean(campaign)
-        case = self.case(trial, Conditions(parameters))
-        moved = self.moved(case, self.laws(parameters), still=True)
+        case = self.case(replace(trial, begins=Start.STILL), Conditions(parameters))
+        moved = self.moved(case, self.laws(parameters))
         rig = moved.system
         count, moving = len(rig.angular_frequency), rig.moving
         x, v = (np.max(np.abs(item[:, :count]), axis=0) for item in (moved.q, moved.velocity))
@@ -322,7 +317,7 @@ class SystemModel(Model):
             try:
                 motion = self.moved(case, laws)
             except ModelError:
-                motion = self.moved(case, laws, still=True)
+                motion = self.moved(self.case(replace(trial, begins=Start.STILL), conditions), laws)
             if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
                 initial = self.initial_sizes(campaign, trial)
                 motion = self.moved(self.case(trial, replace(conditions, initial=initial)), laws)
