@@ -71,7 +71,7 @@ def modal_basis(
             f"{settings.mode_count} modes cannot be had from {unknowns} unknowns; ask for fewer or refine."
         )
     working = ProjectedBasis(norm, (system.stiffness_terms, system.mass_terms), drop=1e-6)
-    matrix = affine_sum(system.middle_mass, system.mass_terms)
+    matrix = affine_sum([1.0, *(0.5 * (low + high) for low, high in system.masses)], system.mass_terms)
     # inverse iteration on a block; what it leaves is refined below
     vectors = np.random.default_rng(1).normal(size=(unknowns, count + 4))
     for _ in range(START_ITERATIONS):

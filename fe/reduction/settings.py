@@ -99,11 +99,6 @@ class PatchSettings:
     seed: int = 1
 
 
-def default_anchors(regions: int) -> tuple[int, ...]:
-    """Return two approximate dual solutions along each loss, or one where they are combined."""
-    return (2 if regions <= MOST_GRID_REGIONS else 1,) * regions
-
-
 def remaining_levels(loss: Range, count: int) -> FloatArray:
     """Return `count` values of 1 - z in the middle of equal ratios over a range of z, ascending in z."""
     high, low = 1.0 - loss[0], 1.0 - loss[1]

@@ -289,10 +289,6 @@ class WingMesh(CellMesh):
         height = self.height_cells + 1 if upper else 0
         return SurfacePoint(int(self._cell_of[*index, height]), np.array([*local, float(upper)]))
 
-    def skin_cells(self, *, upper: bool) -> IntArray:
-        """Numbers of the cells of the upper or lower skin, defect regions included."""
-        return np.flatnonzero(self.grid_index[:, 2] == (self.height_cells + 1 if upper else 0))
-
 
 def straight_edged(behind: FloatArray, chord: FloatArray, thickness_ratio: float) -> FloatArray:
     """Half thickness (nx + 1, ny + 1) [m] at the mesh lines: the straight edges nearest to the airfoil.
