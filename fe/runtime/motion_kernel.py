@@ -65,9 +65,9 @@ def integrate(
     )  # fmt: skip
     before = Before(np.zeros(modes), np.zeros(modes), np.zeros(2 * modes), none[3], none[4], none[5], none[6])
     h = go.length[go.which[0]]
-    laws.feed[:] = go.feed[0]
-    body.transition[:, :] = go.transition[go.which[0]]
-    body.end[:] = go.begin[0]
+    take(laws.feed, go.feed[0])
+    take_matrix(body.transition, go.transition[go.which[0]])
+    take(body.end, go.begin[0])
     find_routes(laws, acting)
     begin_on_modes(body, laws, acting, moving, known)
     begin_flexible(laws, acting, moving, h, known)
@@ -77,16 +77,14 @@ def integrate(
         if go.which[k] != last:
             last = go.which[k]
             h = go.length[last]
-            body.transition[:, :] = go.transition[last]
+            take_matrix(body.transition, go.transition[last])
             for j in range(count):
                 if acting.route[j] == SPEED:
                     find_answer(body, laws, acting, j)
-        for m in range(modes):
-            body.begin[m] = go.begin[k, m]
-            body.end[m] = go.end[k, m]
-            body.push[m] = go.push[k, m]
-            body.push[modes + m] = go.push[k, modes + m]
-        laws.feed[:] = go.feed[k + 1]
+        take(body.begin, go.begin[k])
+        take(body.end, go.end[k])
+        take(body.push, go.push[k])
+        take(laws.feed, go.feed[k + 1])
         first_half(body, laws, acting, moving, before, go.time[k], h)
         move(body, moving, before.room)
         hold(laws, acting, moving, before, h)
@@ -95,6 +93,18 @@ def integrate(
         if k + 1 == go.sample[sample]:
             record(body, laws, acting, moving, go.time[k + 1], sample, samples)
             sample += 1
+
+
+def take(into: FloatArray, given: FloatArray) -> None:
+    """Copy numbers; numba takes two seconds to compile `into[:] = given`."""
+    for i in range(len(into)):
+        into[i] = given[i]
+
+
+def take_matrix(into: FloatArray, given: FloatArray) -> None:
+    """Copy a matrix, row by row."""
+    for i in range(len(into)):
+        take(into[i], given[i])
 
 
 def find_routes(ports: Ports, acting: Acting) -> None:
