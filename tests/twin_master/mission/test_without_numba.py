@@ -15,7 +15,9 @@ from twin_master.mission.loop import fly
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.scenario.reading import load_scenario
 
-WITHOUT = "import runpy, sys; sys.modules['numba'] = None; runpy.run_path(sys.argv.pop(1), run_name='__main__')"
+WITHOUT = (
+    "import runpy, sys; sys.modules['numba'] = None; runpy.run_path(sys.argv.pop(1), run_name='__main__')"
+)
 
 
 def arrays(library: Path) -> dict[str, np.ndarray]:
