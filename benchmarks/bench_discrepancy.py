@@ -14,7 +14,7 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.models.sensing import observe
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from discrepancy.search.strategy import Search, search
 from discrepancy.sources.examples import example_campaign, wing_plan
 from fe.runtime.patch import ModelPatch, PowerDamping, RootCompliance

@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.measurement import Measurement
-from fe.verification.calculix_job import calculix_program
+from fe.verification.calculix_comparison import calculix_program
 
 REFINEMENT = 1.2
 REPEATS = 3

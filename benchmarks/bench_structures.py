@@ -16,7 +16,7 @@ from math import log
 from pathlib import Path
 
 from benchmarks.measurement import Measurement
-from fe.verification.calculix_job import calculix_program
+from fe.verification.calculix_comparison import calculix_program
 
 DIVISIONS = ((36, 8, 4), (54, 11, 6))
 LARGE = (80, 16, 9)

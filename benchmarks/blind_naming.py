@@ -27,7 +27,7 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.files.verdict import primitive_intervals
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import Investigation, investigate, patch_draws
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness

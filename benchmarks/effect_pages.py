@@ -41,20 +41,24 @@ def range_of(prior: Prior) -> str:
 def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
     """Return the page of an effect."""
     tank = effect.identifier in FLOWS
-    on, what = ("on the tank", "A tank") if tank else ("on the cantilever", "A uniform cantilever")
-    names = {other.identifier: other.name for other in library()}
-    kinds = [name for kind, name in KIND_NAMES.items() if kind in effect.acts_on]
+    what = "Tank" if tank else "Cantilever"
     places = effect.places(setting)
     _, place = picture_patch(effect, setting)
     values = picture_of(effect).values
     rows = [
-        f"| {cell(p.symbol)} | `{p.name}` | {cell(p.description)} | {p.unit} | {range_of(p.prior)} |"
+        f"- {p.symbol} (`{p.name}`, {p.unit}): {p.description}; {range_of(p.prior)}."
         for p in effect.parameters
     ]
+    free = [
+        f"- {s.symbol} (`{s.name}`): {s.description}; {s.canonical:g}, in the family {range_of(s.prior)}."
+        for s in effect.shape
+    ]
+    where = f" Places in the picture: {', '.join(f'`{name}`' for name in places)}." if any(places) else ""
+    shown = ", ".join(f"{name} = {value:g}" for name, value in values.items())
     lines = [
         f"# {effect.name[0].upper()}{effect.name[1:]}",
         "",
-        f"`{effect.identifier}`, family: {effect.family}.",
+        f"`{effect.identifier}`, family: {effect.family}.{where}",
         "",
         text["what"].strip(),
         "",
@@ -62,45 +66,16 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         effect.equation,
         "```",
         "",
-        "## Parameters",
-        "| symbol | name | meaning | unit | prior |",
-        "| --- | --- | --- | --- | --- |",
         *rows,
+        *free,
         "",
-        text["unit"].strip(),
+        *([text["unit"], ""] if text["unit"] else []),
+        f"![{effect.name}](images/{effect.identifier}.png)",
         "",
-    ]
-    if effect.shape:
-        lines += [
-            "Its family frees:",
-            "",
-            "| symbol | name | meaning | in the named effect | prior in the family |",
-            "| --- | --- | --- | --- | --- |",
-            *(
-                f"| {cell(s.symbol)} | `{s.name}` | {cell(s.description)} | {s.canonical:g} "
-                f"| {range_of(s.prior)} |"
-                for s in effect.shape
-            ),
-            "",
-        ]
-    where = f"Acts in trials: {', '.join(kinds)}."
-    if places != ("",):
-        where += f" Places, {on} of the picture: {', '.join(f'`{name}`' for name in places)}."
-    lines.append(where)
-    shown = ", ".join(f"{name} = {value:g}" for name, value in values.items())
-    lines += [
-        "",
-        "## Signature",
-        effect.signature,
-        "",
-        f"![{effect.name} {on}](images/{effect.identifier}.png)".replace(
-            " on the cantilever", " on a cantilever"
-        ),
-        "",
-        f"{what} with {shown}" + (f", place `{place}`." if place else "."),
+        f"{what}: {shown}" + (f", place `{place}`." if place else "."),
         "",
         "## Easily confused with",
-        *(f"- [{names[other]}]({other}.md): {text['tell'][other]}" for other in effect.confusable),
+        *(f"- [`{other}`]({other}.md): {text['tell'][other]}" for other in effect.confusable),
         "",
         "## References",
         *(f"- {reference}" for reference in text["references"]),
@@ -114,14 +89,7 @@ def readme() -> str:
     rows = []
     for effect in library():
         letters = "".join(LETTERS[name] for kind, name in KIND_NAMES.items() if kind in effect.acts_on)
-        parameters = ", ".join(
-            f"{p.symbol} ({p.prior.low:.3g} to {p.prior.high:.3g})" for p in effect.parameters
-        )
-        shape = ", ".join(f"{s.symbol} = {s.canonical:g}" for s in effect.shape) or "-"
-        rows.append(
-            f"| [{effect.name}]({effect.identifier}.md) | {letters} | {cell(parameters)} | {cell(shape)} "
-            f"| {cell(effect.signature)} |"
-        )
+        rows.append(f"| [{effect.name}]({effect.identifier}.md) | {letters} | {cell(effect.signature)} |")
     families = len({effect.family for effect in library()})
     numbers = {"count": len(library()), "families": families, "rows": "\n".join(rows)}
     text: str = paragraphs()["overview"]

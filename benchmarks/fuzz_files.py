@@ -152,5 +152,5 @@ def _reduced(folder: Path) -> None:
     from fe.reduction.model_cache import build_patch_arrays, reduced_model
 
     design = load_design().changed(mesh={"refinement": 0.25})
-    build_patch_arrays(design).save(folder / "patched.npz")
-    reduced_model(design).save(folder / "reduced.npz")
+    (folder / "patched.npz").write_bytes(build_patch_arrays(design).to_bytes())
+    (folder / "reduced.npz").write_bytes(reduced_model(design).to_bytes())

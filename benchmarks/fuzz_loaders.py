@@ -38,7 +38,7 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import read_patch, read_verdict_file
-from discrepancy.models.fmu_file import load_fmu_model
+from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.lumped import LumpedModel
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
@@ -49,8 +49,8 @@ from fmu_asset.door.history_file import read_histories
 from fmu_asset.packing.patch_file import load_patch
 from fmu_asset.ssp.reader import read_ssp
 from scenarios import binding_files
-from twin_master.assets.observation_library import load_observation_library
-from twin_master.assets.strain_library import load_strain_library
+from twin_master.assets.library_source import load_observation_library
+from twin_master.assets.strain_library_source import load_strain_library
 from twin_master.mission.loop import CheckpointFile
 from twin_master.report.reading import read_run as read_record
 from twin_master.run_folder import read_config
@@ -101,7 +101,7 @@ LOADERS: dict[str, Loader] = {
     "campaign": Loader("campaign/campaign.toml", lambda path: read_campaign(path.parent), TEXT),
     "campaign table": Loader("campaign/*.csv", lambda path: read_campaign(path.parent), TEXT),
     "lumped model": Loader("lumped.toml", LumpedModel.load, TEXT),
-    "FMU model": Loader("fmu_model.toml", load_fmu_model, TEXT),
+    "FMU model": Loader("fmu_model.toml", FmuModelDescription.read, TEXT),
     "effects": Loader("effects.toml", lambda path: load_catalogue([path]), TEXT),
     "patch, analysis": Loader("verdict/patch.json", read_patch, TEXT),
     "patch, packing": Loader("verdict/patch.json", load_patch, TEXT),

@@ -2,8 +2,7 @@
 
 from collections.abc import Sequence
 
-from twin_master.assets.asset_source import AssetSource
-from twin_master.assets.interface import Asset, StatelessAsset
+from twin_master.assets.asset_source import Asset, AssetSource, StatelessAsset
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Member
 from twin_master.fleet.reading import Outcomes

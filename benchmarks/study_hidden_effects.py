@@ -51,8 +51,6 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import (
     Overrides,
     asset_source,
-    located_scenario,
-    portable_scenario,
     resolve_scenario,
 )
 from twin_master.fleet.store import in_credible_set
@@ -195,14 +193,14 @@ def fly_mission(
     resolved = resolve_scenario(loaded, Overrides(seed=seed, in_process=True))
     source = asset_source(resolved)
     source.check()
-    portable = portable_scenario(resolved)
+    portable = resolved.portable()
     config = {
         "kind": "uav-twin run", "format": 1, "scenario": portable.to_dict(),
         "scenario_file": {"name": loaded.path.name, "sha256": loaded.content_hash},
     }  # fmt: skip
     create_run_folder(folder, config, source.files())
     source.prepare(folder, SilentProgress())
-    return _fly(folder, located_scenario(portable, folder), source, seed)
+    return _fly(folder, portable.moved(folder), source, seed)
 
 
 def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Flown:

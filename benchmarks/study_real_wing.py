@@ -21,7 +21,7 @@ from discrepancy.campaign.records import Campaign
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import named_effects
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from discrepancy.report.figures import missing_force_figure
 from discrepancy.sources.measured_rigs import SIGNAL, wing_campaign
 from discrepancy.workflow import Investigation, investigate

@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from fe.reduction.reduced_basis import reduce_model, reduce_structure
-from fe.reduction.structure_errors import MeasuredErrors, measured_errors
+from fe.reduction.reduced_basis import MeasuredErrors, measured_errors, reduce_model, reduce_structure
 from fe.runtime.reduced import ReducedModel
 from fe.structure.operators import load_and_assemble
 from fe.wing.design import WingDesign, load_design

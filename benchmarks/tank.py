@@ -18,7 +18,7 @@ from discrepancy.campaign.records import (
 from discrepancy.catalogue.entry import Setting
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import parse_lumped
+from discrepancy.models.lumped_file import LumpedDescription
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
@@ -49,7 +49,7 @@ high = 10.0
 
 def tank_setting() -> Setting:
     """Return a driven trial of a tank as it is, without noise."""
-    model = LumpedModel(parse_lumped(tomllib.loads(MODEL)))
+    model = LumpedModel(LumpedDescription.parse(tomllib.loads(MODEL)))
     time = np.arange(0.0, 300.0, 2.0)
     pump = RecordedInput("pump", Quantity.FLOW, 0.15 * (np.sin(0.04 * time) > 0.0), Hold.ZERO_ORDER)
     trial = Trial.plain(

@@ -18,7 +18,7 @@ from fe.wing.operators import assemble
 from fe.wing.responses import solve_static
 from reporting.files import atomic_write_text
 from scenarios import RECORDING_FOLDER
-from twin_master.assets.interface import AssetReading, StatelessAsset
+from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import prepare_knowledge

@@ -13,7 +13,7 @@ from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.model_choice import ModelChoice, ModelKind, model_of
-from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
+from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
 from discrepancy.sentences import SENTENCES, said
 from discrepancy.verdict import Hypothesis, Verdict, VerdictKind
 from fe.runtime.laws.interface import PortForce
@@ -180,7 +180,7 @@ def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
             name, count = effect.identifier, sum(law["name"].startswith(effect.identifier) for law in laws)
             laws.append({"name": f"{name}_{count + 1}" if count else name, **item.to_mapping()})
     content |= {"law": laws, "name": f"{content['name']} with {', '.join(e.name for e in patch.effects)}"}
-    parse_lumped(content, f"{file} with {patch.sentence}")
+    LumpedDescription.parse(content, f"{file} with {patch.sentence}")
     return f"# {patch.sentence}\n# Laws and parameters: {patch.origin.short_command}\n\n{toml_text(content)}"
 
 

@@ -8,12 +8,10 @@ from discrepancy.document import Origin
 from discrepancy.errors import ModelError, VerdictFileError
 from discrepancy.files.verdict import StoredPatch, read_patch
 from discrepancy.models.fmu import FmuModel
-from discrepancy.models.fmu_runs import binding_file
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
-from discrepancy.models.reduced_structure import StructureModel
-from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
+from discrepancy.models.structures import SHIPPED_PRIOR, StructureModel, WingModel
 from discrepancy.sources import from_run
 from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
@@ -241,7 +239,7 @@ def _fmu(path: Path) -> ModelChoice:
     files = {
         "description": path,
         "fmu": path.parent / model.description.fmu,
-        "binding": binding_file(model.description, path.parent),
+        "binding": model.description.binding_file(path.parent),
     }
     source = hash_record({name: hash_file(file) for name, file in files.items() if file is not None})
     packed = packed_design_hash(files["fmu"] or path)

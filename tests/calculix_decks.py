@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fe.verification.calculix_job import calculix_program, read_frequencies, read_tables, run_calculix
+from fe.verification.calculix_comparison import calculix_program, read_frequencies, read_tables, run_calculix
 
 FloatArray = NDArray[np.float64]
 Point = tuple[float, float, float]

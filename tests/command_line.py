@@ -13,13 +13,15 @@ import pytest
 from uav_twin import cli
 
 
-def call(monkeypatch: pytest.MonkeyPatch, *words: object, main: Callable[[], None] = cli.main) -> int:
-    """Run `uav-twin` in this process and return its exit code; it writes lines of 200 columns.
+def call(
+    monkeypatch: pytest.MonkeyPatch, *words: object, main: Callable[[], None] = cli.main, columns: str = "200"
+) -> int:
+    """Run `uav-twin` in this process and return its exit code; it writes lines of so many columns.
 
     `main` is another command line that is run in its place.
     """
     monkeypatch.setattr(sys, "argv", ["uav-twin", *map(str, words)])
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", columns)
     with pytest.raises(SystemExit) as ended:
         main()
     code = ended.value.code or 0
@@ -27,11 +29,11 @@ def call(monkeypatch: pytest.MonkeyPatch, *words: object, main: Callable[[], Non
     return code
 
 
-def command(*words: object) -> subprocess.CompletedProcess[str]:
+def command(*words: object, columns: str = "200") -> subprocess.CompletedProcess[str]:
     """Run `uav-twin` in this process; return its exit code and what it said."""
     said, complained = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), redirect_stderr(complained):
-        code = call(patch, *words)
+        code = call(patch, *words, columns=columns)
     return subprocess.CompletedProcess(words, code, said.getvalue(), complained.getvalue())
 
 

@@ -11,6 +11,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import gc
 import json
+import shutil
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -20,7 +23,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from tests.kept import FE, ROOT, kept, remove_old
+from tests.kept import FE, ROOT, kept, packed, remove_old
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
@@ -184,24 +187,6 @@ def synthetic_library() -> dict[str, object]:
     }
 
 
-@pytest.fixture
-def die_after_turn() -> Callable[..., None]:
-    """Let runs die when a turn was put on the disk: `die_after_turn(monkeypatch, number of turns, error)`."""
-    from twin_master.mission.loop import CheckpointFile
-
-    def install(patch: pytest.MonkeyPatch, turns: int, error: BaseException | None = None) -> None:
-        keep = CheckpointFile.keep
-
-        def dying(self: CheckpointFile, *turn: Any) -> None:
-            keep(self, *turn)
-            if self.turns == turns:
-                raise error or KeyboardInterrupt
-
-        patch.setattr(CheckpointFile, "keep", dying)
-
-    return install
-
-
 @pytest.fixture(scope="session")
 def library_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Path of a synthetic strain library."""
@@ -289,6 +274,24 @@ def published_library() -> Path:
     if not path.is_file():
         pytest.skip(f"the published strain library is not at {path}")
     return path
+
+
+@pytest.fixture(scope="session")
+def heat_exchanger(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with an FMU of a heat exchanger, its binding and its scenario."""
+    source = ROOT / "tests" / "twin_master" / "assets" / "heat_exchanger"
+    folder = tmp_path_factory.mktemp("heat_exchanger")
+    for path in source.iterdir():
+        if path.is_file():
+            shutil.copy(path, folder)
+    words = [sys.executable, "-m", "pythonfmu", "build", "-f", "HeatExchanger.py"]
+    packed(
+        folder / "HeatExchanger.fmu",
+        lambda: subprocess.run(words, cwd=folder, check=True, capture_output=True),
+        (source / "HeatExchanger.py",),
+        None,
+    )
+    return folder
 
 
 @pytest.fixture(scope="session")

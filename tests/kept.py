@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from fe.reduction.built_once import built_once, cache_folder
-from fe.runtime.kept_arrays import write_bytes_atomically
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.packing.structure_fmu import build_fmu
+from reporting.files import atomic_write_bytes
 
 ROOT = Path(__file__).parents[1]
 FOLDER = cache_folder() / "tests"  # now: tests change where the cache is
@@ -73,7 +73,7 @@ def kept(name: str, build: Callable[[], _Made], places: tuple[Path, ...], inputs
             raise OSError(f"{path} is torn") from error
         return made
 
-    return built_once(path, load, build, lambda made: write_bytes_atomically(path, pickle.dumps(made)))
+    return built_once(path, load, build, lambda made: atomic_write_bytes(path, pickle.dumps(made)))
 
 
 def packed(path: Path, pack: Callable[[], object], places: tuple[Path, ...], inputs: object) -> Path:
@@ -85,6 +85,22 @@ def packed(path: Path, pack: Callable[[], object], places: tuple[Path, ...], inp
 
     path.write_bytes(kept(path.stem, content, places, inputs))
     return path
+
+
+def kept_folder(
+    folder: Path, fill: Callable[[], _Made], places: tuple[Path, ...], inputs: object = None
+) -> _Made:
+    """Return what `fill` returns, which fills a folder unless that is kept; parameters as of `kept`."""
+
+    def filled() -> tuple[_Made, dict[str, bytes]]:
+        told, files = fill(), (path for path in folder.rglob("*") if path.is_file())
+        return told, {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+
+    told, files = kept(folder.name, filled, places, inputs)
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
+    return told
 
 
 def compiled_wing(model: ReducedModel, path: Path, **options: Any) -> Path:

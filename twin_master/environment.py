@@ -14,7 +14,7 @@ import numpy as np
 from fmu_asset.errors import FmuEndedError
 from reporting.arrays import Float
 from reporting.progress import Progress, SilentProgress
-from twin_master.assets.interface import Asset
+from twin_master.assets.asset_source import Asset
 from twin_master.assets.resolution import Overrides, given_overrides, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.fleet.flight import source_of

@@ -231,7 +231,7 @@ def design(
 
 def _between(knowledge: "Knowledge", name: str, level: int) -> str:
     """Return two neighbouring levels of a state in words."""
-    from twin_master.report.view import printed_state
+    from twin_master.scenario.section import printed_state
 
     place = knowledge.scenario.state_names.index(name)
     factor = knowledge.scenario.state[place]

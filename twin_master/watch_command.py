@@ -142,7 +142,7 @@ def _write(text: str, *, flush: bool) -> bool:
 
 def _line(scenario: "Scenario", decision: Mapping[str, Any]) -> str:
     """Return a decision for people: a line of a terminal."""
-    from twin_master.report.view import printed_state
+    from twin_master.scenario.section import printed_state
 
     health = []
     for name, known in decision["health"].items():

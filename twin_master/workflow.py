@@ -4,7 +4,7 @@ import io
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -290,21 +290,16 @@ def _fly(
 ) -> MissionResult:
     scenario = knowledge.scenario
     truth = knowledge.truth(scenario.mission.seed)
-    asset = source.open()
-    try:
-        with loop.CheckpointFile(folder, hash_record(config)) as kept:
-            flight = loop.fly(
-                scenario,
-                knowledge.twin(),
-                knowledge.plant(truth, asset),
-                checkpoint=kept.checkpoint,
-                keep=kept.keep,
-                progress=progress,
-            )
-        units = asset.units
-    finally:
-        asset.close()
-    return MissionResult(scenario, knowledge, flight, truth, units)
+    with closing(source.open()) as asset, loop.CheckpointFile(folder, hash_record(config)) as kept:
+        flight = loop.fly(
+            scenario,
+            knowledge.twin(),
+            knowledge.plant(truth, asset),
+            checkpoint=kept.checkpoint,
+            keep=kept.keep,
+            progress=progress,
+        )
+        return MissionResult(scenario, knowledge, flight, truth, asset.units)
 
 
 def _misfit(knowledge: Knowledge, source: AssetSource) -> Misfit | None:
@@ -312,11 +307,8 @@ def _misfit(knowledge: Knowledge, source: AssetSource) -> Misfit | None:
     # An asset with damage of its own cannot be asked at a state of the twin's choice.
     if not source.origin.differ or knowledge.scenario.truth.kind == "asset":
         return None
-    asset = source.open()
-    try:
+    with closing(source.open()) as asset:
         return find_misfit(knowledge.scenario, knowledge.model, knowledge.sensor_model, asset)
-    finally:
-        asset.close()
 
 
 def _field_writer(source: AssetSource, result: MissionResult) -> Callable[[Path], object]:

@@ -45,24 +45,23 @@ def check(
     json: terminal.Json = False,
 ) -> None:
     """Say what a scenario flies and believes, and what it takes; exit code 1 if anything is wrong with it."""
-    from dataclasses import asdict
-
     from twin_master.assets.resolution import Overrides
     from twin_master.scenario.reading import load_scenario
     from twin_master.scenario_check import check_scenario
 
     found = check_scenario(load_scenario(file), Overrides(calibration=calibration))
     if json:
-        terminal.print_json(asdict(found))
+        terminal.print_json(found)
         return
+    levels = ", ".join(f"{name} ({count} levels)" for name, count in found["levels"].items())
     for line in (
-        f"{found.name}: {found.title}",
-        f"Flown: {found.flown}.",
-        f"Believed: {found.believed}.",
-        f"Uncertain: {found.uncertain}, {found.draws} draws.",
-        f"State: {found.states} states, {', '.join(f'{n} ({c} levels)' for n, c in found.levels.items())}.",
-        f"Controls: {', '.join(found.controls)}. Sensors: {found.sensors}.",
-        f"Mission: {found.turns} {found.step_name}s, {found.prediction_steps} ahead.",
-        f"Memory of the twin: about {found.memory / 2**20:.3g} MiB.",
+        "{name}: {title}",
+        "Flown: {flown}.",
+        "Believed: {believed}.",
+        "Uncertain: {uncertain}, {draws} draws.",
+        f"State: {{states}} states, {levels}.",
+        f"Controls: {', '.join(found['controls'])}. Sensors: {{sensors}}.",
+        "Mission: {turns} {step_name}s, {prediction_steps} ahead.",
+        f"Memory of the twin: about {found['memory'] / 2**20:.3g} MiB.",
     ):
-        terminal.say(line)
+        terminal.say(line.format(**found))

@@ -15,7 +15,7 @@ from uav_twin.options import FmiVersion, Kind, Replace
 from uav_twin.wing import Check, end_with, print_checks
 
 if TYPE_CHECKING:
-    from fe.reduction.structure_errors import MeasuredErrors
+    from fe.reduction.reduced_basis import MeasuredErrors
     from fe.runtime.reduced import ReducedModel
     from fe.structure.affine import AffineStructure
     from fe.structure.operators import Structure
@@ -245,9 +245,8 @@ def verify(
     json: terminal.Json = False,
 ) -> None:
     """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
-    from fe.verification.calculix_comparison import agreement
+    from fe.verification.calculix_comparison import agreement, required_calculix
     from fe.verification.calculix_deck import structure_deck
-    from fe.verification.calculix_job import required_calculix
     from reporting.files import refuse_filled
 
     required_calculix()
@@ -335,7 +334,7 @@ def reduce(
     json: terminal.Json = False,
 ) -> None:
     """Make the reduced model of a structure, keep it in the cache, and measure its errors."""
-    from fe.reduction.structure_errors import measured_errors
+    from fe.reduction.reduced_basis import measured_errors
 
     model, errors = reduced(file, memory_limit), None
     if states:

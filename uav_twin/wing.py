@@ -167,7 +167,7 @@ def verify(
     ] = False,
 ) -> None:
     """Check the finite element model: known answers, balances, convergence, and CalculiX where installed."""
-    from fe.verification.calculix_job import calculix_program
+    from fe.verification.calculix_comparison import calculix_program
     from fe.wing.design import load_design
     from reporting.files import refuse_filled
 
@@ -231,7 +231,7 @@ def all_checks(design: "WingDesign", jobs: Path, progress: "Progress", *, quick:
     quick : bool
         Coarser meshes and a short ring-down.
     """
-    from fe.verification.calculix_job import calculix_program
+    from fe.verification.calculix_comparison import calculix_program
     from fe.wing.operators import assemble
 
     checks: list[Check] = []

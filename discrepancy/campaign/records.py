@@ -47,27 +47,25 @@ class Quantity(StrEnum):
         """The quantity, if it is of a motion, among those that follow one another by derivation."""
         return next((family for family in _MOVING if self in family), ())
 
+    @property
+    def order(self) -> int:
+        """How often a displacement is derived to be this; if it is, it is nought at rest."""
+        return _ORDERS.get(self, 0)
+
     def derivatives_of(self, output: "Quantity") -> int:
         """Return how often an output of a model is derived in time for a channel of this quantity."""
-        moving = self.moving
-        if output not in moving:
-            return 0
-        return max(moving.index(self) - moving.index(output), 0)
+        return max(self.order - output.order, 0) if output in self.moving else 0
 
     def shows(self, output: "Quantity") -> bool:
         """Whether a channel of this quantity can measure what an output of a model is."""
         return self is output or self is Quantity.SIGNAL or self.derivatives_of(output) > 0
-
-    @property
-    def is_rate(self) -> bool:
-        """Whether it is nought at rest."""
-        return self in self.moving[1:]
 
 
 _MOVING = (
     (Quantity.DISPLACEMENT, Quantity.VELOCITY, Quantity.ACCELERATION),
     (Quantity.ANGLE, Quantity.ANGULAR_VELOCITY, Quantity.ANGULAR_ACCELERATION),
 )
+_ORDERS = {quantity: order for family in _MOVING for order, quantity in enumerate(family)}
 
 
 class Hold(StrEnum):

@@ -16,8 +16,7 @@ from discrepancy.campaign.noise import NoiseModel, noise_model
 from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
-from discrepancy.models.interface import Model
-from discrepancy.models.memory import Memory
+from discrepancy.models.interface import Memory, Model
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 

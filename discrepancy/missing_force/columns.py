@@ -33,17 +33,17 @@ SLOW = 0.02
 
 
 def along(
-    number: int, of_speed: bool, law: FloatArray, elements: FloatArray, x: FloatArray, v: FloatArray,
-    memory: FloatArray, found: FloatArray,
+    number: int, of_speed: bool, law: FloatArray, x: FloatArray, v: FloatArray, memory: FloatArray,
+    found: FloatArray,
 ) -> None:  # fmt: skip
     """Fill `found` (F,) with the force of a law at positions and speeds (F,) that follow one another."""
     for k in range(len(x)):
         if of_speed:
             found[k] = steady(number, law, x[k], v[k])
         else:
-            advance(number, law, elements, memory, x[k], FIRST_PARTS if k == 0 else 1)
+            advance(number, law, memory, x[k], FIRST_PARTS if k == 0 else 1)
             memory[1] = x[k]
-            found[k] = pull(number, law, elements, memory, x[k], 1.0, 1)[0]
+            found[k] = pull(number, law, memory, x[k], 1.0, 1)[0]
 
 
 @cache
@@ -64,13 +64,10 @@ def law_course(
     Where a speed may be zero by its deviation `doubt`, a law of the speed that is a force at rest, too, is
     what holds the port, `holding` (F,), up to its own largest.
     """
-    elements = np.asarray(law.elements(), dtype=np.float64)
-    elements = elements if len(elements) else np.zeros(1)
-    values = np.pad(np.array(law.row, dtype=np.float64), (0, PARAMETERS - len(law.row)))
-    found = np.zeros(len(position))
-    memory = np.zeros(HEAD + len(elements))
+    values, found = law.row, np.zeros(len(position))
+    memory = np.zeros(HEAD + max(1, len(values) - PARAMETERS))
     motion = (np.ascontiguousarray(position), np.ascontiguousarray(speed))
-    _compiled_along()(LAWS.index(type(law)), type(law).of_speed, values, elements, *motion, memory, found)
+    _compiled_along()(LAWS.index(type(law)), type(law).of_speed, values, *motion, memory, found)
     if type(law).of_speed and doubt > 0.0:
         slow = max(WIDER * doubt, SLOW * float(np.sqrt(np.mean(speed**2))))
         moves = erf(np.abs(speed) / (np.sqrt(2.0) * slow))

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from math import isfinite, pi
 from typing import ClassVar, NamedTuple
 
@@ -11,8 +11,7 @@ from scipy.interpolate import CubicSpline, PPoly
 
 from discrepancy.campaign.records import FloatArray, Hold, Quantity, Release, Start, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Place
-from discrepancy.models.memory import Memory
+from discrepancy.models.interface import Memory, Place
 from fe.runtime.expression import Expression
 from fe.runtime.patch import LoadGain, LoadPlace, Primitive
 
@@ -59,11 +58,6 @@ class Course:
 
     edges: ClassVar[tuple[float, ...]] = ()
     """Moments at which it jumps between the stamps: none."""
-
-    @property
-    def is_smooth(self) -> bool:
-        """Whether it is a spline."""
-        return self.hold is Hold.SMOOTH
 
     @cached_property
     def _splines(self) -> list[PPoly]:
@@ -112,7 +106,7 @@ class Course:
             held = self.at(0.5 * (time[1:] + time[:-1]))
             return held, held
         found, bend = self.at(time, order), np.diff(time) ** 2 / 12.0
-        curve = self.at(time, order + 2) if self.is_smooth and order < 2 else np.zeros(len(time))
+        curve = self.at(time, order + 2) if self.hold is Hold.SMOOTH and order < 2 else np.zeros(len(time))
         return found[:-1] - bend * curve[:-1], found[1:] - bend * curve[1:]
 
 
@@ -131,7 +125,7 @@ class FormulaCourse:
     formula: Expression
     spans: tuple[tuple[float, float], ...] = ()
 
-    is_smooth: ClassVar[bool] = True
+    hold: ClassVar[Hold] = Hold.SMOOTH
 
     @property
     def edges(self) -> tuple[float, ...]:
@@ -263,15 +257,9 @@ class Shown(NamedTuple):
         return cls(rows)
 
 
-@cache
-def order_of(quantity: Quantity) -> int:
-    """Return how often a displacement is derived to be of a quantity."""
-    return quantity.moving.index(quantity) if quantity.moving else 0
-
-
 def shown_rows(rows: Iterable[FloatArray], outputs: Sequence[tuple[str, Quantity]]) -> list[Shown]:
     """Return what sensors of displacements and their derivatives show at rows (n,)."""
-    return [Shown.of(row, order_of(quantity)) for row, (_, quantity) in zip(rows, outputs, strict=True)]
+    return [Shown.of(row, quantity.order) for row, (_, quantity) in zip(rows, outputs, strict=True)]
 
 
 def place_among(places: Sequence[str], place: Place, what: str, where: str = "a trial") -> str:

@@ -7,7 +7,7 @@ from types import ModuleType
 from typing import Any
 
 from fe.compilation import callable_when_compiled, choose_when_compiled, compiled
-from fe.runtime import flexible_ports, laws, motion_arrays, motion_kernel, static_path
+from fe.runtime import laws, motion_arrays, motion_kernel, static_path
 from fe.runtime.laws import interface
 from fe.runtime.motion import Kernel
 
@@ -15,8 +15,8 @@ SELDOM = (
     motion_kernel.find_routes,
     motion_kernel.begin_on_modes,
     motion_kernel.find_answer,
-    flexible_ports.begin_flexible,
-    flexible_ports.settle_port,
+    motion_kernel.begin_flexible,
+    static_path.settle_port,
 )
 """Functions that are not called at every step; the others become part of their callers."""
 
@@ -43,11 +43,11 @@ def compiled_kernel() -> Kernel:
     The functions of `fe` stay plain; they can be called from compiled ones from then on.
     """
     functions = list(law_functions())
-    for module in (motion_arrays, flexible_ports, motion_kernel):
-        for function in _functions(module):
-            functions.append(function)
-            if function is not motion_kernel.integrate:
-                callable_when_compiled(function, makes_arrays=False, inline=function not in SELDOM)
+    of_static: tuple[Callable[..., Any], ...] = (static_path.pull_of, static_path.settle_port)
+    for function in (*of_static, *_functions(motion_arrays), *_functions(motion_kernel)):
+        functions.append(function)
+        if function is not motion_kernel.integrate:
+            callable_when_compiled(function, makes_arrays=False, inline=function not in SELDOM)
     for function in (static_path.static_forces, static_path.arrive_at_rest):
         callable_when_compiled(function)
     return Kernel(compiled(motion_kernel.integrate, functions), compiled(static_path.static_path, functions))

@@ -12,24 +12,16 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course, LoadChange, place_among, release_of
-from discrepancy.models.fmu_file import FmuModelDescription, load_fmu_model
+from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_laws import FmuLaws
-from discrepancy.models.fmu_motion import FmuMotion, Sampled, sampled
-from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State
-from discrepancy.models.interface import Conditions, Outputs, PortedSystem, Response
-from discrepancy.models.memory import Memory
+from discrepancy.models.fmu_motion import Sampled, sampled
+from discrepancy.models.fmu_runs import Excitation, Run, State
+from discrepancy.models.interface import NO_PATCH, Conditions, Memory, Outputs, PortedSystem, Response
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
-from fe.runtime.motion import NO_LAWS, Laws
-from fe.runtime.patch import (
-    INTERNAL_FORCES,
-    SENSORS,
-    LoadGain,
-    LoadPlace,
-    ModelPatch,
-    Primitive,
-    StiffnessDrift,
-)
+from fe.runtime import patch as changes
+from fe.runtime.motion import NO_LAWS, Laws, laws_of
+from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, Primitive
 from fmu_asset.errors import FmuError
 
 FINER = 2
@@ -38,11 +30,13 @@ KEPT_SHOWN = 16
 """Responses without laws that are kept while laws are tried."""
 
 
-class FmuPatch(NamedTuple):
-    """A patch by what is done with it.
+class Asked(NamedTuple):
+    """What is asked of the FMU: a trial, in conditions and under a patch by what is done with it.
 
     Attributes
     ----------
+    trial, conditions : Trial, Conditions
+        As they come.
     laws : Laws
         Internal forces at ports.
     settings : tuple of (str, float)
@@ -51,17 +45,11 @@ class FmuPatch(NamedTuple):
         Of the recorded force.
     """
 
+    trial: Trial
+    conditions: Conditions
     laws: Laws = NO_LAWS
     settings: tuple[tuple[str, float], ...] = ()
     load: LoadChange = LoadChange()
-
-
-class Asked(NamedTuple):
-    """What is asked of the FMU: a trial, in conditions and under a patch."""
-
-    trial: Trial
-    conditions: Conditions
-    patch: FmuPatch = FmuPatch()
 
 
 class FmuModel(DescribedModel):
@@ -85,91 +73,79 @@ class FmuModel(DescribedModel):
     modes are passed over. `transverse` and `shear` are never known.
     """
 
+    holds_inputs: ClassVar[bool] = True
+    shows_ports: ClassVar[bool] = True
+
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
         self.description: FmuModelDescription = description
-        self.runs = FmuRuns(description, Path(folder))
-        super().__init__(description, self.runs.quantities)
+        self.fmu = fmu = FmuLaws(description, Path(folder))
+        super().__init__(description, fmu.quantities)
         self.length, self.regions = description.scales.length, tuple(description.inputs.regions)
         flies = description.inputs.load_factor is not None
         self.kinds = frozenset(TrialKind) - {TrialKind.DRIVEN, *(() if flies else (TrialKind.FLIGHT,))}
-        self._keys = [self.runs.parameter(item.variable or item.name) for item in description.parameter]
-        self._forces = {place: self.runs.variable(name) for place, name in description.inputs.forces.items()}
-        self._inputs = {
-            item.name: self.runs.variable(item.variable or item.name) for item in description.input
-        }
+        self._keys = [fmu.parameter(item.variable or item.name) for item in description.parameter]
+        self._forces = {place: fmu.variable(name) for place, name in description.inputs.forces.items()}
+        self._inputs = {item.name: fmu.variable(item.variable or item.name) for item in description.input}
         self.load_places = tuple(self._forces)
-        limits = (self.runs.asset.input_range("load", name)[1] for name in self._forces.values())
+        limits = (fmu.asset.input_range("load", name)[1] for name in self._forces.values())
         self.largest_force = 0.5 * min(limits, default=np.inf)
-        self._check_ranges()
-        nominal = self._state(Asked(_any_trial(TrialKind.RINGDOWN, 1.0), Conditions(self.prior_mean())))
+        for key, item in zip(self._keys, description.parameter, strict=True):
+            for end in (item.low, item.high):  # beyond its own range it refuses, and a posterior is cut there
+                try:
+                    fmu.asset.check_parameters({key: end})
+                except FmuError as cause:
+                    raise ModelError(
+                        f"The FMU model {self.name!r}: [[parameter]] {item.name} has the range {item.low:g} "
+                        f"to {item.high:g}, which the FMU {fmu.asset.description.path} cannot have: {cause}"
+                    ) from cause
+        fmu.nominal = self._state(Asked(_any_trial(TrialKind.RINGDOWN, 1.0), Conditions(self.prior_mean())))
         self._shown = Memory(KEPT_SHOWN)
-        self.motion = FmuMotion(self.runs, nominal)
-        self._laws = FmuLaws(self.motion)
 
     @classmethod
     def load(cls, path: Path | str) -> "FmuModel":
         """Return the model of a TOML file; raises `ModelError`."""
-        return cls(load_fmu_model(path), Path(path).parent)
+        return cls(FmuModelDescription.read(path), Path(path).parent)
 
     def close(self) -> None:
         """End the FMU; it is opened again when it is needed."""
-        self.runs.close()
-
-    def _check_ranges(self) -> None:
-        """Refuse ranges of parameters that are wider than those of the FMU."""
-        asset = self.runs.asset
-        for key, item in zip(self._keys, self.description.parameter, strict=True):
-            for end in (item.low, item.high):  # beyond its own range it refuses, and a posterior is cut there
-                try:
-                    asset.check_parameters({key: end})
-                except FmuError as cause:
-                    raise ModelError(
-                        f"The FMU model {self.name!r}: [[parameter]] {item.name} has the range {item.low:g} "
-                        f"to {item.high:g}, which the FMU {asset.description.path} cannot have: {cause}"
-                    ) from cause
-
-    # ------------------------------------------------------------ what it is
-
-    holds_inputs: ClassVar[bool] = True
-    shows_ports: ClassVar[bool] = True
+        self.fmu.close()
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
         description, forces = self.description, bool(self.description.inputs.forces)
-        if primitive in SENSORS or primitive.kind in description.effects:
-            return True
-        if primitive is LoadGain:
-            return forces
-        if primitive is LoadPlace:
-            return forces and description.inputs.bending_moment is not None
-        return primitive in INTERNAL_FORCES and primitive is not StiffnessDrift and bool(description.port)
+        carried = {
+            changes.LoadGain: forces,
+            changes.LoadPlace: forces and description.inputs.bending_moment is not None,
+            changes.StiffnessDrift: False,
+        }
+        at_port = primitive in INTERNAL_FORCES and bool(description.port)
+        own = primitive in SENSORS or primitive.kind in description.effects
+        return own or carried.get(primitive, at_port)
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign: those of the file, else what the FMU shows."""
-        given, conditions = self.description.scales, Conditions(self.prior_mean(campaign))
-        largest = np.zeros(len(self.ports()))
-        for trial in campaign.trials:
+        given, fmu, trials = self.description.scales, self.fmu, campaign.trials
+        conditions, largest = Conditions(self.prior_mean(campaign)), np.zeros(len(self.ports()))
+        for trial in trials:
             if trial.is_dynamic:
-                moved = self.motion.free(self._run(Asked(trial, conditions), 1))
+                moved = fmu.free(self._run(Asked(trial, conditions), 1))
             else:
                 moved = self._at_rest(Asked(trial, replace(conditions, health=trial.health)))
-            largest = np.maximum(largest, np.max(np.abs(moved[:, self.motion.x]), axis=0))
-        ports, frequency, trials = range(len(largest)), given.angular_frequency, campaign.trials
-        moving = next((trial for trial in trials if trial.is_dynamic), None)
+            largest = np.maximum(largest, np.max(np.abs(moved[:, fmu.x]), axis=0))
+        frequency, moving = given.angular_frequency, next((item for item in trials if item.is_dynamic), None)
         if moving is not None:
-            state, step = self._state(Asked(moving, conditions)), self.motion.step(moving)
-            stiffness = [self.motion.stiffness(number, state, step) for number in ports]
-            frequency = frequency or self.motion.measured_frequency(moving, state)
+            state, step = self._state(Asked(moving, conditions)), fmu.step(moving)
+            stiffness = [fmu.stiffness(number, state, step) for number in range(len(largest))]
+            frequency = frequency or fmu.measured_frequency(moving, state)
         else:
             still, interval = trials[0] if trials else _any_trial(TrialKind.STATIC, 1.0), 0.01
-            state = self._state(Asked(still, replace(conditions, health=still.health)))
-            flexible = self.motion.flexibility(state)
-            stiffness = [(1.0 / float(flexible[port, port]),) * 2 for port in ports]
+            flexible = fmu.flexibility(self._state(Asked(still, replace(conditions, health=still.health))))
+            stiffness = [(1.0 / own, 1.0 / own) for own in np.diag(flexible).tolist()]
             for _ in range(0 if trials or given.angular_frequency else 3):  # until the interval suits it
                 trial = _any_trial(TrialKind.RINGDOWN, interval)
-                frequency = self.motion.measured_frequency(trial, self._state(Asked(trial, conditions)))
+                frequency = fmu.measured_frequency(trial, self._state(Asked(trial, conditions)))
                 interval = 0.3 / frequency
-        forces = zip(self.motion.forces, stiffness, strict=True)
+        forces = zip(fmu.forces, stiffness, strict=True)
         pushed = [pair for force, pair in forces if force in self._forces.values()]
         modal, tip = (pushed or stiffness or [(1.0, 1.0)])[0]
         frequency = frequency or 1.0
@@ -192,37 +168,69 @@ class FmuModel(DescribedModel):
 
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero.
         """
-        columns = self._columns(outputs)
-        asked = Asked(trial, conditions, self._parts(patch))
+        asked, (columns, orders) = self._asked(trial, conditions, patch), self._read(outputs)
         if not trial.is_dynamic:
-            if any(quantity.is_rate for _, quantity in outputs):
+            if any(quantity.order > 0 for _, quantity in outputs):
                 raise ModelError(
                     f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
                 )
             return Response(self._at_rest(asked)[:, columns])
-        return Response(*self._moving(asked, columns, self._orders(outputs)))
+        return Response(*self._moving(asked, columns, orders))
+
+    def _read(self, outputs: Outputs) -> tuple[list[int], list[int]]:
+        """Return the columns of outputs, and how often each is derived."""
+        orders = [quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs]
+        return [self.fmu.columns[output] for output, _ in outputs], orders
 
     def _moving(self, asked: Asked, columns: Sequence[int], orders: Sequence[int]) -> Sampled:
         """Return columns of the FMU's outputs in a dynamic trial, derived so many times, and their rates."""
-        trial, conditions, patch = asked
-        excite = partial(self._run, asked)
-        laws, (rate, zero) = patch.laws, conditions.clock
+        (trial, conditions, laws, *_), fmu = asked, self.fmu
+        (rate, zero), excite = conditions.clock, partial(self._run, asked)
         finer = FINER if len(laws) and trial.kind is TrialKind.FORCED else 1
         run = excite(conditions.refinement * finer)
 
         def shown(values: FloatArray, step: float) -> Sampled:
             return sampled(values, step, (1.0 + rate) * trial.time + zero, orders)
 
-        free = self.motion.free(run)
-        added = self._laws.added(laws, run, free, trial, columns) if len(laws) else None
+        free = fmu.free(run)
+        added = fmu.added(laws, run, free, trial, columns) if len(laws) else None
         if len(laws) and added is None:
-            return shown(*self._laws.stepped(laws, excite, trial, conditions.refinement, columns))
+            return shown(*fmu.stepped(laws, excite, trial, conditions.refinement, columns))
         key = (*columns, *orders, rate, zero, trial.time.tobytes(), run.key)
         found = self._shown.get(key, lambda: shown(free[:, columns], run.step))
         if added is None:
             return found
         values, rates = shown(*added)
         return found[0] + values, found[1] + rates
+
+    def _at_rest(self, asked: Asked) -> FloatArray:
+        """Return all outputs (N, C) of a static trial or a flight."""
+        trial, conditions, laws, _, change = asked
+        offsets, given = conditions.offset or (0.0,) * len(trial.inputs), dict[str, FloatArray]()
+        for item, offset in zip(trial.inputs, offsets, strict=True):
+            if item.name not in self._inputs:
+                raise ModelError(
+                    f"The trial {trial.name!r} holds the input {item.name!r}, which the FMU model "
+                    f"{self.name!r} does not have; it has {', '.join(self._inputs) or 'none'}: name it in "
+                    "[[input]]."
+                )
+            variable = self._inputs[item.name]
+            given[variable] = self.fmu.input_factors[variable] * (item.values + offset)
+        if trial.kind is TrialKind.FLIGHT:
+            given = {self.fmu.variable(str(self.description.inputs.load_factor)): trial.load_factor}
+        elif not given or np.any(trial.force):
+            acting = change.changed(trial.force, trial.force)
+            given |= {name: acting * lever for name, lever in self._pushed(asked)}
+        loads = [dict(zip(given, row, strict=True)) for row in np.array([*given.values()]).T.tolist()]
+        states, found = [self._state(asked, row) for row in range(len(loads))], list[FloatArray]()
+        if len(laws):
+            return self.fmu.at_rest_under(laws, trial.name, states, loads)
+        for row, held in enumerate(zip(states, loads, strict=True), start=1):
+            try:
+                found.append(self.fmu.rest(*held))
+            except ModelError as cause:
+                raise ModelError(f"The trial {trial.name!r}, row {row} of its table: {cause}") from cause
+        return np.array(found)
 
     # ------------------------------------------------------------ ports
 
@@ -234,166 +242,105 @@ class FmuModel(DescribedModel):
         ModelError
             If the FMU is not linear, or its answers to forces at the ports do not tell its system.
         """
-        parts, step = self._parts(self.patch), self.motion.step(trial)
-        states = (
-            self._state(Asked(trial, Conditions(values, health=trial.health[:1]), parts))
+        fmu, step = self.fmu, self.fmu.step(trial)
+        base, found = (
+            fmu.system(self._state(self._asked(trial, conditions, self.patch)), step, len(trial.time))
             for values in (self.prior_mean(), parameters)
+            for conditions in [Conditions(values, health=trial.health[:1])]
         )
-        base, found = (self.motion.system(state, step, len(trial.time)) for state in states)
         if base is None or found is None or len(base.push) != len(found.push):
             raise ModelError(
                 f"The FMU model {self.name!r} does not tell by its answers to single forces how its ports "
                 "move; it is not linear, or they are too few or too rough."
             )
         found = found.in_state_of(base)
-        position, speed = np.split(found.of_ports(self.motion.x, self.motion.v).outputs, 2)
-        rows, at_once = found.rows(list(zip(self._columns(outputs), self._orders(outputs), strict=True)))
+        position, speed = np.split(found.of_ports(fmu.x, fmu.v).outputs, 2)
+        rows, at_once = found.rows(list(zip(*self._read(outputs), strict=True)))
         return PortedSystem(found.generator, self.ports(), found.push.T, position, speed, rows, at_once.T)
 
     def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        asked = Asked(trial, conditions, self._parts(self.patch)._replace(laws=NO_LAWS))
-        return self._moving(asked, self.motion.x, [0] * len(self.ports()))
-
-    # ------------------------------------------------------------ rest
-
-    def _at_rest(self, asked: Asked) -> FloatArray:
-        """Return all outputs (N, C) of a static trial or a flight."""
-        trial, _, patch = asked
-        loads = self._loads_at_rest(asked)
-        states = [self._state(asked, row) for row in range(len(loads))]
-        if len(patch.laws):
-            return self._laws.at_rest(trial.name, states, loads, patch.laws)
-        found = list[FloatArray]()
-        for row, held in enumerate(zip(states, loads, strict=True), start=1):
-            try:
-                found.append(self.motion.rest(*held))
-            except ModelError as cause:
-                raise ModelError(f"The trial {trial.name!r}, row {row} of its table: {cause}") from cause
-        return np.array(found)
-
-    # ------------------------------------------------------------ parts
-
-    def _parts(self, patch: ModelPatch) -> FmuPatch:
-        """Return a patch by what is done with it; raises `ModelError` if the file lacks what it needs."""
-        effects, what = self.description.effects, f"The FMU model {self.name!r}"
-        own = [item for item in patch if item.kind in effects]
-        rest = ModelPatch(tuple(item for item in patch if item.kind not in effects))
-        load = LoadChange.of(rest)
-        if load.along_chord and self.description.inputs.torque is None:
-            raise ModelError(f"{what} names no torque in [inputs], so a load cannot move along the chord.")
-        settings: dict[str, float] = {}
-        for item in own:
-            effect = f"effect.{effects[item.kind]}"
-            if f"{effect}.active" in settings:
-                raise ModelError(
-                    f"The patch has two primitives {item.kind!r}, but the FMU model {self.name!r} "
-                    f"carries one ({effect})."
-                )
-            values = {key: value for key, value in item.to_mapping().items() if key != "kind"}
-            settings |= {f"{effect}.{key}": float(value) for key, value in {"active": 1.0, **values}.items()}
-        laws = self.laws_at(rest.of(*INTERNAL_FORCES), self.ports())
-        return FmuPatch(laws, tuple(sorted(settings.items())), load)
-
-    def _columns(self, outputs: Outputs) -> list[int]:
-        return [self.runs.columns[output] for output, _ in outputs]
-
-    def _orders(self, outputs: Outputs) -> list[int]:
-        """Return how often each output is derived."""
-        return [quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs]
+        asked = self._asked(trial, conditions, self.patch)._replace(laws=NO_LAWS)
+        return self._moving(asked, self.fmu.x, [0] * len(self.ports()))
 
     # ------------------------------------------------------------ trials in its names and units
 
+    def _asked(self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH) -> Asked:
+        """Return what is asked under a patch; raises `ModelError` if the file lacks what it needs."""
+        effects, what = self.description.effects, f"the FMU model {self.name!r}"
+        rest = ModelPatch(tuple(item for item in patch if item.kind not in effects))
+        load, settings = LoadChange.of(rest), dict[str, float]()
+        if load.along_chord and self.description.inputs.torque is None:
+            raise ModelError(f"T{what[1:]} names no torque in [inputs], so no load moves along the chord.")
+        for item in (item for item in patch if item.kind in effects):
+            effect = f"effect.{effects[item.kind]}"
+            if f"{effect}.active" in settings:
+                raise ModelError(f"Of the two primitives {item.kind!r} {what} carries one ({effect}).")
+            values = {"active": 1.0, **item.to_mapping()}
+            given = {key: float(value) for key, value in values.items() if key != "kind"}
+            settings |= {f"{effect}.{key}": value for key, value in given.items()}
+        laws = laws_of(rest.of(*INTERNAL_FORCES), self.ports())
+        return Asked(trial, conditions, laws, tuple(sorted(settings.items())), load)
+
     def _run(self, asked: Asked, refinement: int) -> Run:
         """Return the run by which the FMU follows a dynamic trial."""
-        trial, conditions, _ = asked
-        step = self.motion.step(trial, refinement)
-        rate, zero = conditions.clock
+        (trial, conditions, _, _, (gain, tare, *_)), fmu = asked, self.fmu
+        state, step, (rate, zero) = self._state(asked), fmu.step(trial, refinement), conditions.clock
         end = max((1.0 + rate) * float(trial.time[-1]) + zero, float(trial.time[-1]))
         # a little longer, so that a clock that is being fitted does not ask for another run
         steps = ceil(end / step * (1.0 + 2e-9) - 1e-6) + (0 if (rate, zero) == (0.0, 0.0) else 1)
-        run = Run(self._state(asked), step, steps, [])
-        loads = self._release if trial.kind is TrialKind.RINGDOWN else self._forced
-        return run._replace(loads=loads(asked, run))
-
-    def _release(self, asked: Asked, run: Run) -> Loads:
-        (trial, conditions, _), (state, step, *_) = asked, run
+        loads = list[tuple[Excitation, float]]()
+        if trial.kind is not TrialKind.RINGDOWN:
+            course = Course.of(trial.time, trial.force, trial.hold)
+            begins, ends = course.ends(np.linspace(0.0, steps * step, steps + 1))
+            held, first = 0.5 * (begins + ends), float(trial.force[0])
+            on = ((begins != 0.0) | (ends != 0.0)).astype(float)
+            for variable, lever in self._pushed(asked):
+                loads.append((Excitation("input", variable, held, first), (1.0 + gain) * lever))
+                if tare:
+                    loads.append((Excitation("input", variable, on, float(first != 0.0)), tare * lever))
+            return Run(state, step, steps, loads)
         release, way = release_of(trial), self.description.release
         if way is None:
             raise ModelError(
                 f"The FMU model {self.name!r} cannot ring down: state in [release] the FMU's parameter of "
                 f"the release displacement, or the force that holds it."
             )
-        first = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
+        first_mode = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
         if release.at_rest:
-            return [self.motion.let_go(state, step, release.displacement * (1.0 + float(first[0])))]
-        if way.displacement is None or way.velocity is None:
+            loads = [fmu.let_go(state, step, release.displacement * (1.0 + float(first_mode[0])))]
+        elif way.displacement is None or way.velocity is None:
             raise ModelError(
                 f"The ring-down {trial.name!r} does not begin at rest, which the FMU model {self.name!r} "
                 f"can follow only if [release] names parameters of displacement and velocity."
             )
-        at, speed = release.displacement * first * (1.0, self.motion.angular_frequency(trial))
-        moving = Excitation("parameter", self.runs.parameter(way.velocity))
-        return [self.motion.let_go(state, step, float(at)), (moving, float(speed))]
+        else:
+            at, speed = release.displacement * first_mode * (1.0, fmu.angular_frequency(trial))
+            moving = Excitation("parameter", fmu.parameter(way.velocity))
+            loads = [fmu.let_go(state, step, float(at)), (moving, float(speed))]
+        return Run(state, step, steps, loads)
 
-    def _forced(self, asked: Asked, run: Run) -> Loads:
-        (trial, _, patch), (_, step, steps, _) = asked, run
-        course = Course.of(trial.time, trial.force, trial.hold)
-        begins, ends = course.ends(np.linspace(0.0, steps * step, steps + 1))
-        held, first = 0.5 * (begins + ends), float(trial.force[0])
-        on = ((begins != 0.0) | (ends != 0.0)).astype(float)
-        (gain, tare, *_), loads = patch.load, list[tuple[Excitation, float]]()
-        for variable, lever in self._pushed(trial, patch):
-            loads.append((Excitation("input", variable, held, first), (1.0 + gain) * lever))
-            if tare:
-                loads.append((Excitation("input", variable, on, float(first != 0.0)), tare * lever))
-        return loads
-
-    def _pushed(self, trial: Trial, patch: FmuPatch) -> list[tuple[str, float]]:
+    def _pushed(self, asked: Asked) -> list[tuple[str, float]]:
         """Return the inputs that a force at a place of a patch pushes, each with its lever."""
-        inputs = self.description.inputs
-        moments = ((inputs.bending_moment, patch.load.along_span), (inputs.torque, patch.load.along_chord))
+        inputs, trial, load = self.description.inputs, asked.trial, asked.load
+        moments = ((inputs.bending_moment, load.along_span), (inputs.torque, load.along_chord))
         place = place_among([*self._forces], trial.load_place, self.what, f"the trial {trial.name!r}")
-        return [
-            (self._forces[place], 1.0),
-            *((self.runs.variable(name), lever) for name, lever in moments if name is not None and lever),
-        ]
-
-    def _loads_at_rest(self, asked: Asked) -> list[dict[str, float]]:
-        """Return the inputs of each row of a static trial or a flight."""
-        trial, conditions, patch = asked
-        offsets, given = conditions.offset or (0.0,) * len(trial.inputs), dict[str, FloatArray]()
-        for item, offset in zip(trial.inputs, offsets, strict=True):
-            if item.name not in self._inputs:
-                raise ModelError(
-                    f"The trial {trial.name!r} holds the input {item.name!r}, which the FMU model "
-                    f"{self.name!r} does not have; it has {', '.join(self._inputs) or 'none'}: name it in "
-                    "[[input]]."
-                )
-            variable = self._inputs[item.name]
-            given[variable] = self.runs.input_factors[variable] * (item.values + offset)
-        if trial.kind is TrialKind.FLIGHT:
-            given = {self.runs.variable(str(self.description.inputs.load_factor)): trial.load_factor}
-        elif not given or np.any(trial.force):
-            acting = patch.load.changed(trial.force, trial.force)
-            given |= {name: acting * lever for name, lever in self._pushed(trial, patch)}
-        return [dict(zip(given, row, strict=True)) for row in np.array([*given.values()]).T.tolist()]
+        levers = [(self.fmu.variable(name), lever) for name, lever in moments if name is not None and lever]
+        return [(self._forces[place], 1.0), *levers]
 
     def _state(self, asked: Asked, row: int = 0) -> State:
         """Return parameters and constant inputs of a row of a trial."""
-        (trial, conditions, patch), wanted = asked, self.description.inputs
+        (trial, conditions, *_), fmu, wanted = asked, self.fmu, self.description.inputs
         losses = self.losses(trial, conditions.health)
         health = zip(wanted.regions.values(), losses[min(row, len(losses) - 1)], strict=True)
-        inputs = {self.runs.variable(name): value for name, value in health}
+        inputs = {fmu.variable(name): value for name, value in health}
         if wanted.temperature is not None:
-            base = wanted.temperature_reference or 0.0
-            at = 0 if trial.is_dynamic else row
-            inputs[self.runs.variable(wanted.temperature)] = base + float(trial.temperature[at])
+            warm = float(trial.temperature[0 if trial.is_dynamic else row])
+            inputs[fmu.variable(wanted.temperature)] = (wanted.temperature_reference or 0.0) + warm
         table = self.description.motion if trial.is_dynamic else self.description.static
-        parameters = {self.runs.parameter(name): value for name, value in table.parameters.items()}
-        for key, value in zip(self._keys, conditions.parameters, strict=True):
-            parameters[key] = float(value)
-        parameters |= dict(patch.settings)
+        parameters = {fmu.parameter(name): value for name, value in table.parameters.items()}
+        parameters |= dict(zip(self._keys, conditions.parameters.tolist(), strict=True))
+        parameters |= dict(asked.settings)
         return State(tuple(sorted(parameters.items())), tuple(sorted(inputs.items())))
 
 

@@ -1,22 +1,15 @@
 """An FMU as a model, described by a TOML file: which variables are parameters, inputs, outputs and ports."""
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from discrepancy.campaign.records import Quantity
-from discrepancy.errors import ModelError
-from discrepancy.models.model_file import (
-    ModelDescription,
-    NamedSection,
-    ParameterSection,
-    Section,
-    check_unique,
-)
+from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
 from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
-from reporting.section import Name, Number, Positive, checked
-from reporting.toml_file import read_toml
+from reporting.section import Name, Number, Positive
+from scenarios import binding_files
 
 CARRIED = tuple(item.kind for item in (*STRUCTURE, *LOADS, StiffnessDrift))
 """Kinds of primitives that an FMU can carry as its own parameters."""
@@ -127,18 +120,17 @@ class ReleaseOf(Section):
         return self
 
 
-class InputOf(NamedSection):
-    """`[[input]]`: an input that static trials hold in each row; `name` as in the campaign."""
-
-    variable: Name | None = None
-    quantity: Quantity = Quantity.SIGNAL
-
-
 class OutputOf(NamedSection):
     """`[[output]]`: what a channel's `output` names; `{a..b}` stands for all numbers from a to b."""
 
     variable: Name | None = None
     quantity: Quantity = Quantity.DISPLACEMENT
+
+
+class InputOf(OutputOf):
+    """`[[input]]`: an input that static trials hold in each row; `name` as in the campaign."""
+
+    quantity: Quantity = Quantity.SIGNAL
 
 
 class PortOf(NamedSection):
@@ -189,6 +181,7 @@ class FmuModelDescription(ModelDescription):
         Whether the FMU runs in a process of its own.
     """
 
+    what: ClassVar[str] = "an FMU model"
     kind: Literal["fmu"]
     fmu: Name
     binding: Name | None = None
@@ -208,7 +201,7 @@ class FmuModelDescription(ModelDescription):
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         for kind in ("port", "parameter", "output", "input"):
-            check_unique(kind, [item.name for item in getattr(self, kind)])
+            self.check_unique(kind, [item.name for item in getattr(self, kind)])
         for kind in self.effects:
             if kind not in CARRIED:
                 raise ValueError(
@@ -220,14 +213,6 @@ class FmuModelDescription(ModelDescription):
             raise ValueError("temperature_reference needs the input temperature")
         return self
 
-
-def load_fmu_model(path: Path | str) -> FmuModelDescription:
-    """Read an FMU model's file.
-
-    Raises
-    ------
-    ModelError
-        If there is no such file, it is not TOML, or its content is no FMU model.
-    """
-    content = read_toml(path, ModelError, what="FMU model")
-    return checked(FmuModelDescription, content, str(path), ModelError, what="an FMU model")
+    def binding_file(self, folder: Path) -> Path | None:
+        """Return the binding file that is named, a shipped one or one seen from a folder."""
+        return None if self.binding is None else binding_files().get(self.binding, folder / self.binding)

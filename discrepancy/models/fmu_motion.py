@@ -3,14 +3,16 @@
 from collections.abc import Hashable, Mapping, Sequence
 from functools import cached_property
 from math import ceil, log2
+from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
+from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_runs import Excitation, FmuRuns, Loads, Run, State
-from discrepancy.models.memory import Memory
+from discrepancy.models.interface import Memory
 from discrepancy.models.port_system import LINEAR, PortSystem, port_system
 from fmu_asset.door.session import FmiAsset
 
@@ -39,42 +41,35 @@ Sampled = tuple[FloatArray, FloatArray]
 """Values and rates (N, C) at the samples of a trial."""
 
 
-class FmuMotion:
+class FmuMotion(FmuRuns):
     """Rest and motion of an FMU, superposed where it proves to be linear, and what forces at its ports do.
-
-    Parameters
-    ----------
-    runs : FmuRuns
-        The FMU.
-    nominal : State
-        Of motions, at the means of the parameters.
 
     Attributes
     ----------
+    nominal : State
+        Of motions, at the means of the parameters; set by the model.
     forces : list of str
         Inputs of the ports' forces.
     x, v : list of int
         Columns of the ports' displacements and velocities; -1: there is no velocity.
     """
 
-    def __init__(self, runs: FmuRuns, nominal: State) -> None:
-        self.runs, self._nominal, self._description = runs, nominal, runs.description
-        ports = runs.description.port
-        self.forces = [runs.variable(port.force) for port in ports]
-        self.x = [runs.columns[f"port.{port.name}.displacement"] for port in ports]
-        self.v = [runs.columns.get(f"port.{port.name}.velocity", -1) for port in ports]
+    def __init__(self, description: FmuModelDescription, folder: Path) -> None:
+        super().__init__(description, folder)
+        self.nominal, ports = State((), ()), description.port
+        self.forces = [self.variable(port.force) for port in ports]
+        self.x = [self.columns[f"port.{port.name}.displacement"] for port in ports]
+        self.v = [self.columns.get(f"port.{port.name}.velocity", -1) for port in ports]
         self._linear, self._silent = dict[Hashable, bool](), dict[Hashable, bool]()
-        self._units = dict[Hashable, float]()
-        self._resting: tuple[tuple[str, float], ...] | None = None
+        self._units, self._parts = dict[Hashable, float](), dict[float, int]()
         self._quiet = False  # whether it was seen to show nothing without excitation
-        self._parts: dict[float, int] = {}
         self._systems, self._frequencies = Memory(KEPT_SYSTEMS), Memory()
         self._proven: bool | None = None  # whether its ports are those of a linear system
 
     def rest(self, state: State, loads: Mapping[str, float]) -> FloatArray:
         """Return the outputs (C,) at rest under inputs; what is not given is zero."""
         given = [(Excitation("input", name, begin=1.0), value) for name, value in sorted(loads.items())]
-        return self.free(Run(state, self._description.static.step, 0, given))
+        return self.free(Run(state, self.description.static.step, 0, given))
 
     def free(self, run: Run) -> FloatArray:
         """Return the outputs (steps + 1, C) of a motion, of no steps those at rest (C,).
@@ -88,10 +83,10 @@ class FmuMotion:
         def asked(values: Sequence[float]) -> FloatArray:
             given = run._replace(loads=list(zip(parts, values, strict=True)))
             key = tuple((part.key, value) for part, value in given.loads if value != 0.0)
-            answer = self.stepped if run.steps else self._rest
-            return self.runs.remembered((run[:3], key or kind), lambda: answer(given))
+            answer = self.followed if run.steps else self._rest
+            return self.remembered((run[:3], key or kind), lambda: answer(given))
 
-        possible = self._description.superposition and (run.steps or self._description.static.settle)
+        possible = self.description.superposition and (run.steps or self.description.static.settle)
         if not (possible and parts) or self._linear.get(kind) is False:
             return asked(values)
         units = [
@@ -114,25 +109,27 @@ class FmuMotion:
         return np.asarray(zero + np.tensordot(np.array(values) / units, moved, 1))
 
     def _rest(self, run: Run) -> FloatArray:
-        parameters = run.state.parameters
-        inputs = self.runs.inputs(run.state, {part.name: value for part, value in run.loads})
-        if self._description.static.settle:
-            return self.runs.started(run.step, dict(parameters), inputs, settle=True)[1]
-        if self._resting != parameters:  # inputs change from step to step, parameters need a reset
-            self.runs.started(run.step, dict(parameters), inputs, settle=False)
-            self._resting = parameters
-        return self.runs.stepped(self.runs.open(run.step), inputs)
+        parameters, asset = run.state.parameters, self.open(run.step)
+        inputs = self.inputs(run.state, {part.name: value for part, value in run.loads})
+        if self.description.static.settle:
+            return self.started(run.step, dict(parameters), inputs, settle=True)[1]
+        if self.resting != (asset, parameters):  # inputs change from step to step, parameters need a reset
+            self.started(run.step, dict(parameters), inputs, settle=False)
+        self.resting = None
+        values = self.one_step(asset, inputs)
+        self.resting = asset, parameters
+        return values
 
-    def stepped(self, run: Run) -> FloatArray:
+    def followed(self, run: Run) -> FloatArray:
         """Return the outputs (steps + 1, C) of a motion by the FMU itself."""
         asset, first, histories = self.begin(run)
-        return np.vstack((first, self.runs.advanced(asset, histories, run.steps)))
+        return np.vstack((first, self.advanced(asset, histories, run.steps)))
 
     def begin(self, run: Run) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
         """Return an instance at the begin of a motion, its outputs there, and the inputs (steps,) to come."""
         state, step, steps, loads = run
         parameters, held = dict(state.parameters), dict[str, float]()
-        histories = {name: np.full(steps, value) for name, value in self.runs.inputs(state).items()}
+        histories = {name: np.full(steps, value) for name, value in self.inputs(state).items()}
         for part, value in loads:
             if part.kind == "parameter":
                 parameters[part.name] = value
@@ -140,7 +137,7 @@ class FmuMotion:
                 histories[part.name][: len(part.series)] += value * part.series[:steps]
                 held[part.name] = held.get(part.name, 0.0) + value * part.begin
         settle = any(part.begin for part, _ in loads)
-        asset, first = self.runs.started(step, parameters, self.runs.inputs(state, held), settle=settle)
+        asset, first = self.started(step, parameters, self.inputs(state, held), settle=settle)
         return asset, first, histories
 
     def let_go(self, state: State, step: float, displacement: float) -> tuple[Excitation, float]:
@@ -151,19 +148,19 @@ class FmuMotion:
         ModelError
             If there is none.
         """
-        way = self._description.release
+        way = self.description.release
         assert way is not None
-        what, first = Excitation("parameter", self.runs.parameter(str(way.displacement))), displacement
+        what, first = Excitation("parameter", self.parameter(str(way.displacement))), displacement
         if way.hold is not None:
-            what = Excitation("hold", self.runs.variable(way.hold), begin=1.0)
-            first = min(1.0, 0.1 * self.runs.input_limit(way.hold))
+            what = Excitation("hold", self.variable(way.hold), begin=1.0)
+            first = min(1.0, 0.1 * self.input_limit(way.hold))
         if way.output is None or displacement == 0.0:
             return what, displacement
 
         def shown(amount: float) -> float:
             run = Run(state, step, 0, [(what, amount)])
-            found = self.runs.remembered(("begin", run.key), lambda: self.begin(run)[1])
-            return float(found[self.runs.columns["release"]])
+            found = self.remembered(("begin", run.key), lambda: self.begin(run)[1])
+            return float(found[self.columns["release"]])
 
         kind = (False, ((what.kind, what.name),))
         if way.hold is not None and self._linear.get(kind) and self._silent.get(kind):
@@ -183,15 +180,15 @@ class FmuMotion:
             return what, amount
         raise ModelError(
             f"Nothing that [release] names puts {way.output!r} of the FMU model "
-            f"{self._description.name!r} at {displacement:g} m; correct displacement, hold or output there."
+            f"{self.description.name!r} at {displacement:g} m; correct displacement, hold or output there."
         )
 
     # ------------------------------------------------------------ pace
 
     def step(self, trial: Trial, refinement: int = 1) -> float:
         """Return the communication step [s] of a dynamic trial: a whole part of its sampling interval."""
-        if self._description.motion.step is not None:
-            return self._description.motion.step
+        if self.description.motion.step is not None:
+            return self.description.motion.step
         frequency = self.angular_frequency(trial)
         return trial.interval / (ceil(frequency * trial.interval / PHASE[trial.kind]) * refinement)
 
@@ -200,32 +197,31 @@ class FmuMotion:
 
         That of the nominal state, so that steps do not change while parameters are fitted.
         """
-        if self._description.scales.angular_frequency is not None:
-            return self._description.scales.angular_frequency
+        if self.description.scales.angular_frequency is not None:
+            return self.description.scales.angular_frequency
         key = (trial.interval, len(trial.time))
-        return self._frequencies.get(key, lambda: self.measured_frequency(trial, self._nominal))
+        return self._frequencies.get(key, lambda: self.measured_frequency(trial, self.nominal))
 
     def measured_frequency(self, trial: Trial, state: State) -> float:
         """Return what `angular_frequency` does, measured in a state at a trial's interval."""
-        step = self._description.motion.step or trial.interval
+        step = self.description.motion.step or trial.interval
         system = self.system(state, step, len(trial.time))
         mode = None if system is None else system.most_flexible(self.x[0], 0)
         if mode is not None:
             return mode[0]
-        way = self._description.release
+        way = self.description.release
         if way is not None:
             size = trial.release.displacement if trial.release is not None else 1e-3
             loads: Loads = [self.let_go(state, step, size)]
         else:
-            name = self.forces[0] if self.forces else next(iter(self.runs.asset.binding.load))
+            name = self.forces[0] if self.forces else next(iter(self.asset.binding.load))
             loads = [(Excitation("input", name, np.eye(1, len(trial.time)).ravel()), 1.0)]
         values = self.free(Run(state, step, len(trial.time), loads))
         moving = values - values[-len(values) // 4 :].mean(axis=0)
         spectrum = np.abs(np.fft.rfft(moving * np.hanning(len(moving))[:, None], 4 * len(moving), axis=0))
         if not np.any(spectrum):
             raise ModelError(
-                f"The FMU model {self._description.name!r} does not move; state angular_frequency in "
-                "[scales]."
+                f"The FMU model {self.description.name!r} does not move; state angular_frequency in [scales]."
             )
         best = int(np.argmax(spectrum[:, np.argmax(spectrum.max(axis=0))]))
         return 2.0 * np.pi * max(best, 1) / (4 * len(moving) * step)
@@ -237,13 +233,13 @@ class FmuMotion:
 
         Made from answers over steps [s], or over parts of them where a mode turns by half a circle in one.
         """
-        if not (self._description.superposition and self.forces) or self._proven is False:
+        if not (self.description.superposition and self.forces) or self._proven is False:
             return None
-        return self._systems.get((state, step), lambda: self._found(state, step, steps))
+        return self._systems.get((state, step), lambda: self._identified(state, step, steps))
 
-    def _found(self, state: State, step: float, steps: int) -> PortSystem | None:
+    def _identified(self, state: State, step: float, steps: int) -> PortSystem | None:
         count = max(min(steps, RECORD), 64)
-        known, fixed = step in self._parts, self._description.motion.step is not None
+        known, fixed = step in self._parts, self.description.motion.step is not None
         parts = self._parts.get(step, 1)
         while parts <= MOST_PARTS:
             part = step / parts
@@ -252,7 +248,7 @@ class FmuMotion:
                 self._proven = self._confirmed(found, state, part, count, LINEAR)
             if found is None or not self._proven:
                 return None
-            safe = found.fastest * part <= SAFE_TURN
+            safe = np.max(np.abs(np.linalg.eigvals(found.generator).imag)) * part <= SAFE_TURN
             if fixed or (safe and (known or self._confirmed(found, state, 0.5 * part, count, SAME_PACE))):
                 self._parts[step] = parts
                 return found
@@ -262,7 +258,7 @@ class FmuMotion:
     @cached_property
     def sizes(self) -> FloatArray:
         """Forces (P,) at the ports that their inputs can have."""
-        return np.array([min(1.0, 0.1 * self.runs.input_limit(name)) for name in self.forces])
+        return np.array([min(1.0, 0.1 * self.input_limit(name)) for name in self.forces])
 
     def records(self, state: State, step: float, count: int) -> FloatArray:
         """Return the outputs (count, C, P) after unit forces over the first step, less those without."""
@@ -274,10 +270,10 @@ class FmuMotion:
 
     def _moved(self, run: Run) -> FloatArray:
         """Return the outputs (steps + 1, C) of a motion by the FMU itself, less those without loads."""
-        moved, still = self.stepped(run), run._replace(loads=[])
+        moved, still = self.followed(run), run._replace(loads=[])
         if self._quiet:
             return moved
-        zero = self.runs.remembered(("without", still.key), lambda: self.stepped(still))
+        zero = self.remembered(("without", still.key), lambda: self.followed(still))
         self._quiet = not np.any(zero)
         return moved - zero
 
@@ -312,7 +308,8 @@ class FmuMotion:
             still = [self.begin(Run(state, step, 0, [(push, force)]))[1][column] for force in (-size, size)]
             stiffness = 2.0 * size / float(still[1] - still[0])
             return stiffness, stiffness
-        at_rest = 1.0 / float(system.gain()[column, number])
+        gain = system.direct - system.outputs @ np.linalg.solve(system.generator, system.push)
+        at_rest = 1.0 / float(gain[column, number])
         frequency, shape = system.most_flexible(column, number) or (1.0, 0.0)
         of_mode = shape / frequency**2
         return (at_rest if of_mode * at_rest < 1e-6 else 1.0 / of_mode), at_rest
@@ -332,22 +329,18 @@ def sampled(values: FloatArray, step: float, times: FloatArray, derivatives: Seq
     derivatives : sequence of int
         For each column, how often it is derived in the response: 0, 1 or 2.
     """
-    before = times < 0.0
-    index = np.round(times / step)
+    before, index = times < 0.0, np.round(times / step)
+    row = np.clip(index.astype(int), 0, len(values) - 1)
     on_grid = bool(np.all(np.abs(times / step - index) < 1e-6))
     if on_grid and len(values) >= len(SLOPES) and not any(derivatives):
-        at_index = np.clip(index.astype(int), 0, len(values) - 1)
-        first = np.clip(at_index - len(SLOPES) // 2, 0, len(values) - len(SLOPES))
+        first = np.clip(row - len(SLOPES) // 2, 0, len(values) - len(SLOPES))
         around = values[first[:, np.newaxis] + np.arange(len(SLOPES))]
-        rates = np.einsum("nk,nkc->nc", SLOPES[at_index - first] / step, around)
+        rates = np.einsum("nk,nkc->nc", SLOPES[row - first] / step, around)
         rates[before] = 0.0
-        return values[at_index], rates
+        return values[row], rates
     grid = step * np.arange(len(values))
-    curve = CubicSpline(grid, values)
-    at = np.clip(times, 0.0, grid[-1])
-    shown, rates = curve(at), curve(at, 1)
-    if on_grid:
-        shown = values[np.clip(index.astype(int), 0, len(values) - 1)]
+    curve, at = CubicSpline(grid, values), np.clip(times, 0.0, grid[-1])
+    shown, rates = values[row] if on_grid else curve(at), curve(at, 1)
     rates[before] = 0.0
     for column, order in enumerate(derivatives):
         if order > 0:

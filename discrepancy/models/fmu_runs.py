@@ -15,13 +15,12 @@ from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.memory import Memory
+from discrepancy.models.interface import Memory
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import Binding, Input, Parameter, Vector, expand, load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuError
 from reporting.words import counted
-from scenarios import binding_files
 
 MOST_INSTANCES = 8
 """Instances (step sizes) that are open at the same time."""
@@ -33,8 +32,7 @@ SETTLE_CHUNK = 200
 """Steps after which it is asked whether the motion has come to rest."""
 
 
-@dataclass(frozen=True)
-class State:
+class State(NamedTuple):
     """Parameters and constant inputs of a run, sorted by name; by keys of the binding and the FMU's names."""
 
     parameters: tuple[tuple[str, float], ...]
@@ -103,6 +101,8 @@ class FmuRuns:
         Column of each output of the description, and of `port.NAME.displacement` and `.velocity`.
     asset : FmiAsset
         The door to the FMU, for what it declares.
+    resting : (FmiAsset, parameters) or None
+        Instance that a step at rest left so, with its parameters; None once another thing was asked of it.
     input_factors : dict of str to float
         By which an `[[input]]` of the description is multiplied, by the FMU's name: revolutions in a minute
         stand for an angular velocity and have no unit that converts to rad/s.
@@ -118,11 +118,17 @@ class FmuRuns:
         self._path = folder / description.fmu
         self._assets = Memory(MOST_INSTANCES, end=FmiAsset.close)
         self._kept = Memory(KEPT_BYTES, lambda found: found.nbytes)
+        self.resting: tuple[FmiAsset, tuple[tuple[str, float], ...]] | None = None
         with self._refusals():
             self._fmu = read_fmu(self._path)
-            file = binding_file(description, folder)
-            self._base = None if file is None else load_binding(file)
-            self._binding = self._made_binding()
+            file = description.binding_file(folder)
+            self._base = base = None if file is None else load_binding(file)
+            header: dict[str, Any] = {} if base is None else base.binding.model_dump(exclude={"decimation"})
+            header |= {"name": description.name}
+            header["step_size"] = description.motion.step or description.static.step
+            content: dict[str, Any] = {} if base is None else {"limits": base.limits}
+            content |= {"binding": header, "load": self._inputs(), "parameter": self._parameters()}
+            self._binding = Binding.model_validate(content | {"observation": self._observed()})
             self.asset = FmiAsset(self._path, self._binding, isolated=description.isolated)
         self._none = dict.fromkeys(self.asset.binding.load, 0.0)
 
@@ -152,15 +158,6 @@ class FmuRuns:
         if self._base is None or name in self._base.parameter:
             return name
         return next((key for key, item in self._base.parameter.items() if item.variable == name), name)
-
-    def _made_binding(self) -> Binding:
-        given, base = self.description, self._base
-        header: dict[str, Any] = {} if base is None else base.binding.model_dump(exclude={"decimation"})
-        header |= {"name": given.name, "step_size": given.motion.step or given.static.step}
-        content: dict[str, Any] = {"binding": header, "load": self._inputs(), "parameter": self._parameters()}
-        if base is not None:
-            content["limits"] = base.limits
-        return Binding.model_validate(content | {"observation": self._observed()})
 
     def _inputs(self) -> dict[str, Input]:
         given, wanted = self.description, self.description.inputs
@@ -235,22 +232,19 @@ class FmuRuns:
 
     def remembered(self, key: Hashable, make: Callable[[], FloatArray]) -> FloatArray:
         """Return what `make` returned for `key`; the oldest results are forgotten."""
-
-        def made() -> FloatArray:
-            found = make()
-            found.setflags(write=False)
-            return found
-
-        return self._kept.get(key, made)
+        found = self._kept.get(key, make)
+        found.setflags(write=False)
+        return found
 
     def open(self, step: float) -> FmiAsset:
-        """Return the instance of a step size [s], as it was left."""
+        """Return the instance of a step size [s], as it was left; raises `ModelError`."""
 
         def opened() -> FmiAsset:
             binding = self._binding.with_header(step_size=step)
             return FmiAsset(self._path, binding, isolated=self.description.isolated)
 
-        return self._assets.get(step, opened)
+        with self._refusals():
+            return self._assets.get(step, opened)
 
     def close(self) -> None:
         """End all instances; they are opened again when they are needed."""
@@ -283,23 +277,19 @@ class FmuRuns:
             If the FMU refuses, or does not come to rest.
         """
         with self._refusals():
-            asset = self.open(step)
+            asset, rest = self.open(step), self.description.static
+            self.resting = None
             asset.reset(parameters, load=inputs or None)
-            values = np.array(asset.observe().values)
-        return asset, self._settled(asset, step) if settle else values
-
-    def _settled(self, asset: FmiAsset, step: float) -> FloatArray:
-        rest = self.description.static
-        largest = np.zeros(0)
-        waited = 0.0
+            if not settle:
+                return asset, np.array(asset.observe().values)
+        waited, largest = 0.0, np.zeros(len(self._binding.observation_variables))
         while True:
             block = self.advanced(asset, {}, SETTLE_CHUNK)
             waited += SETTLE_CHUNK * step
             high, low = block.max(axis=0), block.min(axis=0)
-            now = np.maximum(np.abs(high), np.abs(low))
-            largest = np.maximum(largest, now) if len(largest) else now
+            largest = np.maximum(largest, np.abs(block).max(axis=0))
             if np.all(high - low <= rest.tolerance * largest):
-                return np.asarray(0.5 * (high + low))
+                return asset, np.asarray(0.5 * (high + low))
             if waited >= rest.limit:
                 worst = int(np.argmax((high - low) / np.where(largest > 0.0, largest, 1.0)))
                 raise ModelError(
@@ -309,14 +299,12 @@ class FmuRuns:
                     "[static], or give the FMU's parameters for a state at rest there."
                 )
 
-    def advanced(
-        self, asset: FmiAsset, histories: Mapping[str, FloatArray | float], steps: int
-    ) -> FloatArray:
+    def advanced(self, asset: FmiAsset, courses: Mapping[str, FloatArray | float], steps: int) -> FloatArray:
         """Return the outputs (steps, C) at the ends of steps, inputs held in each; raises `ModelError`."""
         with self._refusals():
-            return asset.simulate(load=histories, steps=steps).values
+            return asset.simulate(load=courses, steps=steps).values
 
-    def stepped(self, asset: FmiAsset, inputs: Mapping[str, float]) -> FloatArray:
+    def one_step(self, asset: FmiAsset, inputs: Mapping[str, float]) -> FloatArray:
         """Return the outputs (C,) after one step; `ModelError` if the FMU refuses."""
         with self._refusals():
             return asset.step(load=inputs).values
@@ -330,9 +318,3 @@ class FmuRuns:
 def _si(quantity: Quantity) -> str:
     """Return the SI unit of a quantity as FMUs write it."""
     return UNITS[quantity].si.replace(" ", ".")
-
-
-def binding_file(description: FmuModelDescription, folder: Path) -> Path | None:
-    """Return the binding file that a description names, a shipped one or one seen from its folder."""
-    given = description.binding
-    return None if given is None else binding_files().get(given, folder / given)

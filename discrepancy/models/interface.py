@@ -1,21 +1,20 @@
 """What the workflow asks of a model: structural response under a patch, before any sensor touches it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
 
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.memory import Memory
 from discrepancy.models.scales import Scales
-from fe.runtime.errors import InvalidPatchError
-from fe.runtime.motion import NO_LAWS, Laws, laws_of
+from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.state import Losses
 from reporting.words import brief, capital, counted
@@ -23,6 +22,43 @@ from reporting.words import brief, capital, counted
 Place = str | tuple[float, float]
 KEPT = 400
 """Responses that a model keeps; the oldest goes first."""
+_Value = TypeVar("_Value")
+
+
+class Memory:
+    """Results by key, the least recently used forgotten where there are more than `size`.
+
+    `weight` says how much of the size a result takes; one each if it is left out. `end` is called with each
+    that is forgotten.
+    """
+
+    def __init__(
+        self, size: int = 256, weight: Callable[[Any], int] = lambda _: 1,
+        end: Callable[[Any], None] = lambda _: None,
+    ) -> None:  # fmt: skip
+        self._room, self._weight, self._end = size, weight, end
+        self._values: OrderedDict[Hashable, Any] = OrderedDict()
+
+    def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
+        """Return what `make` returned for `key`, calling it if need be."""
+        if key in self._values:
+            self._values.move_to_end(key)
+            return self._values[key]  # type: ignore[no-any-return]
+        value = self._values[key] = make()
+        self._room -= self._weight(value)
+        while self._room < 0 and len(self._values) > 1:
+            self._forget()
+        return value
+
+    def clear(self) -> None:
+        """Forget all results."""
+        while self._values:
+            self._forget()
+
+    def _forget(self) -> None:
+        value = self._values.popitem(last=False)[1]
+        self._room += self._weight(value)
+        self._end(value)
 
 
 @dataclass(frozen=True)
@@ -61,10 +97,8 @@ class Conditions:
     @property
     def key(self) -> tuple[object, ...]:
         """All of it as a value that can be looked up."""
-        return (
-            self.parameters.tobytes(), self.initial.tobytes(), self.clock, self.health.tobytes(), self.offset,
-            self.components, self.refinement,
-        )  # fmt: skip
+        values = vars(self).values()
+        return tuple(item.tobytes() if isinstance(item, np.ndarray) else item for item in values)
 
 
 class Response(NamedTuple):
@@ -182,8 +216,6 @@ class Model(ABC):
         """What it is called in a sentence."""
         return f"the model {self.name!r}"
 
-    # ------------------------------------------------------------ what each model says
-
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is, or None if the model has no such output."""
         return self.quantities.get(output)
@@ -244,9 +276,7 @@ class Model(ABC):
         """Refuse a trial that it cannot follow."""
         name = f"The trial {trial.name!r}"
         if trial.kind is TrialKind.FLIGHT and trial.kind not in self.kinds:
-            raise ModelError(
-                f"{name} is a flight, but {self.what} has no input load_factor: give it one, or leave it out."
-            )
+            raise ModelError(f"{name} is a flight, but {self.what} has no input load_factor: give it one.")
         if trial.kind not in self.kinds and trial.kind is TrialKind.RINGDOWN:
             raise ModelError(
                 f"{name} is a ring-down, which {self.what} cannot begin, since it is free, driven or has "
@@ -270,39 +300,18 @@ class Model(ABC):
         for output, quantity in outputs:
             own = self.output_quantity(output)
             if own is None:
-                raise ModelError(
-                    f"{capital(self.what)} has no output {output!r}; it has {', '.join(self.shown_outputs)}."
-                )
+                known = ", ".join(self.shown_outputs)
+                raise ModelError(f"{capital(self.what)} has no output {output!r}; it has {known}.")
             if not quantity.shows(own):
                 raise ModelError(
                     f"The output {output!r} of {self.what} is a {own.value}, but a channel measures "
                     f"{quantity.value}."
                 )
 
-    def check_carried(self, patch: ModelPatch) -> None:
-        """Refuse a primitive that it cannot carry; those of sensors are not asked for."""
-        for item in patch:
-            at_port = isinstance(item, PortForce) and item.port in self.ports()
-            if not (isinstance(item, SENSORS) or self.supports(type(item)) or at_port):
-                port = " (it has no port)" if isinstance(item, INTERNAL_FORCES) and not self.ports() else ""
-                raise ModelError(f"{capital(self.what)} cannot carry the primitive {item.kind!r}{port}.")
-
-    def laws_at(self, forces: ModelPatch, ports: Collection[str]) -> Laws:
-        """Return the laws of internal forces at ports; raises `ModelError` where one cannot be."""
-        if not len(forces):
-            return NO_LAWS
-        try:
-            return laws_of(forces, ports, in_windows=self.follows_windows)
-        except InvalidPatchError as cause:
-            raise ModelError(str(cause)) from cause
-
     def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
         """Return the losses of its regions in each row from those (N, K) that a trial names.
 
-        Raises
-        ------
-        ModelError
-            If one is of a region that it does not have.
+        Raises `ModelError` if one is of a region that it does not have.
         """
         losses = np.zeros((len(health), len(self.regions)))
         for name, column in zip(trial.regions, health.T, strict=False):
@@ -314,8 +323,6 @@ class Model(ABC):
                     f"has {', '.join(self.regions) or 'none'}."
                 )
         return [tuple(row) for row in losses.tolist()]
-
-    # ------------------------------------------------------------ what all models do alike
 
     @property
     def oscillates(self) -> bool:
@@ -347,29 +354,10 @@ class Model(ABC):
         return self.parameters if self._declared is None else self._declared
 
     def respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
-        """Return the response of a trial; sensor primitives in `patch` are ignored here.
+        """Return the response of a trial without sensors; those in `patch` are ignored here.
 
-        Parameters
-        ----------
-        trial : Trial
-            Inputs and sample times.
-        outputs : tuple of (str, Quantity)
-            Output and the quantity wanted of it (velocity and acceleration are derivatives of displacement;
-            a signal is the output itself).
-        patch : ModelPatch
-            Changes of structure, internal forces and loads.
-        conditions : Conditions
-            The rest.
-
-        Returns
-        -------
-        Response
-            Values without sensors.
-
-        Raises
-        ------
-        ModelError
-            If the model lacks an output or cannot carry a primitive.
+        Velocity and acceleration are derivatives of displacement, and a signal is the output itself. Raises
+        `ModelError` if the model lacks an output or cannot carry a primitive.
         """
 
         def answer() -> tuple[Trial, Response]:  # the trial lives as long, so that its id stays its own
@@ -380,8 +368,16 @@ class Model(ABC):
             whole = (self.patch + patch).in_trial(trial.name)
             self.check(trial)
             self.check_outputs(outputs)
-            self.check_carried(whole)
-            return trial, self._respond(trial, outputs, whole, conditions)
+            ports = self.ports()
+            for item in whole:
+                at_port = isinstance(item, PortForce) and item.port in ports
+                if not (isinstance(item, SENSORS) or self.supports(type(item)) or at_port):
+                    port = " (it has no port)" if isinstance(item, INTERNAL_FORCES) and not ports else ""
+                    raise ModelError(f"{capital(self.what)} cannot carry the primitive {item.kind!r}{port}.")
+            try:
+                return trial, self._respond(trial, outputs, whole, conditions)
+            except FiniteElementError as cause:
+                raise ModelError(str(cause)) from cause
 
         if self._kept is None:
             return answer()[1]
@@ -392,16 +388,11 @@ class Model(ABC):
     def ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, see `PortedSystem`.
 
-        Raises
-        ------
-        ModelError
-            If sensors are built in: what they make of a missing force is not known here.
+        Raises `ModelError` if sensors are built in: what they make of a missing force is not known here.
         """
         self.check_outputs(outputs)
         if len(self.sensors):
-            raise ModelError(
-                f"{self.name} has sensors built in, through which no missing force is seen; leave them out."
-            )
+            raise ModelError(f"{self.name} has sensors built in, which hide a missing force; leave them out.")
         return self._ported(trial, outputs, parameters)
 
     def remembering(self) -> Self:
@@ -413,22 +404,15 @@ class Model(ABC):
     ) -> Self:
         """Return the model with a patch added to every question.
 
-        Parameters
-        ----------
-        patch : ModelPatch
-            What is added; its sensors name channels of a campaign, or outputs of the model, and come before
-            those of a question.
-        calibrated : mapping of str to (float, float)
-            Mean and standard deviation of calibrated parameters, where they are not those of the model.
+        Its sensors name channels of a campaign, or outputs of the model, and come before those of a question.
+        `calibrated` has means and standard deviations of parameters, where they are not those of the model.
         """
-        parameters = tuple(
+        told = tuple(
             replace(item, mean=mean, deviation=deviation)
             for item in self.parameters
             for mean, deviation in [calibrated.get(item.name, (item.mean, item.deviation))]
         )
-        return self._changed(
-            patch=self.patch + patch, parameters=parameters, _declared=self.declared, _kept=None
-        )
+        return self._changed(patch=self.patch + patch, parameters=told, _declared=self.declared, _kept=None)
 
     def apart(self) -> tuple[Self, ModelPatch]:
         """Return the model without laws at its ports, and these at the prior means."""

@@ -17,12 +17,11 @@ from scipy.linalg.lapack import dpotrs
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Shown
+from discrepancy.models.acting import Shown
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import PortedSystem
-from fe.runtime.errors import SolutionError
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import NO_LAWS, Laws, StaticSolution, static_solution
+from fe.runtime.motion import NO_LAWS, Laws, static_solution
 
 HEAVY = 1e12
 """Mass of a prescribed coordinate over the largest of the system."""
@@ -80,7 +79,7 @@ def at_rest(
 
     Raises
     ------
-    ModelError
+    ModelError, SolutionError
         If nothing holds the system, or a law takes more than it has.
     """
     found = resting(np.concatenate((units, rows)))
@@ -91,7 +90,9 @@ def at_rest(
     if not len(laws):
         return amounts @ answers, None
     start = None if before is None else before @ at_ports
-    solution = solved(laws, amounts @ at_ports, compliance, memory, start)
+    solution = static_solution(
+        laws, amounts @ at_ports, compliance, memory=memory, start=start, kernel=compiled_kernel()
+    )
     return amounts @ answers - solution.forces @ flexible, solution.memory
 
 
@@ -146,11 +147,6 @@ class LinearSystem:
         """Displacements n."""
         return len(self.mass) - self.states
 
-    @cached_property
-    def acting_rows(self) -> dict[str, FloatArray]:
-        """Rows (N,) along which laws at the ports act."""
-        return {**self.ports, **self.actions}
-
     # ------------------------------------------------------------ modes
 
     @cached_property
@@ -183,7 +179,7 @@ class LinearSystem:
             square = np.where(np.abs(square) <= ROUNDING * np.max(np.abs(square), initial=0.0), 0.0, square)
         elif square[0] <= 0.0:
             raise ModelError(
-                f"The stiffness matrix must be positive definite, but an eigenvalue is {square[0]:g} 1/s^2."
+                f"The stiffness must be positive definite, but an eigenvalue is {square[0]:g} 1/s^2."
             )
         moving = len(square)
         found = np.zeros((len(self.mass), moving + self.states))
@@ -237,26 +233,21 @@ class LinearSystem:
             damping = diagonal
         ports, actions = (
             {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
-            for rows in (self.ports, self.acting_rows if self.actions else {})
+            for rows in (self.ports, {**self.ports, **self.actions} if self.actions else {})
         )
-        whole = stiffness if loose else None
-        return ModalSystem(frequency, damping, ports, self._left_out, self.relaxation, whole, actions)
+        whole, left_out = stiffness if loose else None, None
+        if self.truncated and ports:
+            rows = np.array(list(self.ports.values()))
+            left_out = np.einsum("pn,np->p", rows, self.residual @ rows.T)
+            all_of_it = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
+            flexible = [name not in self.on_modes for name in ports]
+            left_out = np.where((left_out > 1e-9 * all_of_it) & flexible, left_out, 0.0)  # less is rounding
+        return ModalSystem(frequency, damping, ports, left_out, self.relaxation, whole, actions)
 
     @property
     def _free_shapes(self) -> FloatArray:
         """Shapes (N, M + P) of what is free, and nothing for the drives."""
         return np.pad(self.shapes, ((0, 0), (0, len(self.drives))))
-
-    @cached_property
-    def _left_out(self) -> FloatArray | None:
-        """Flexibility (P,) of the ports that the modes leave out; None if there is none."""
-        if not (self.truncated and self.ports):
-            return None
-        rows = np.array(list(self.ports.values()))
-        left_out = np.einsum("pn,np->p", rows, self.residual @ rows.T)
-        whole = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
-        flexible = [name not in self.on_modes for name in self.ports]
-        return np.where((left_out > 1e-9 * whole) & flexible, left_out, 0.0)  # less is rounding
 
     def port_rows(self, laws: Laws) -> FloatArray:
         """Return the rows (J, N) of the laws' ports."""
@@ -329,14 +320,6 @@ class LinearSystem:
         along, free = self.lift[:, number], self._free_shapes
         return [free.T @ (matrix @ along) for matrix in (self.stiffness, self.damping, self.mass)]
 
-    def forces_at(self, acting: Acting, time: FloatArray) -> FloatArray:
-        """Return the modal forces (T, M + P) of loads and drives at times."""
-        total = acting.load_at(time, self.all_shapes)
-        for number, drive in enumerate(acting.drives.values()):
-            for order, part in enumerate(self.driven(number)):
-                total -= np.outer(drive.at(time, order), part)
-        return total
-
     def by_order(self, shown: Sequence[Shown], shapes: FloatArray) -> FloatArray:
         """Return what outputs show of modal coordinates and their derivatives (4, C, M), in shapes (N, M)."""
         rows = np.array([item.rows for item in shown]).reshape(len(shown), 4, len(shapes))
@@ -354,7 +337,7 @@ class LinearSystem:
         ports, size = tuple(self.ports), len(self.mass)
         sees, acts = (
             np.array([rows[port] for port in ports]).reshape(len(ports), size)
-            for rows in (self.ports, self.acting_rows)
+            for rows in (self.ports, {**self.ports, **self.actions})
         )
         force = np.zeros((len(ports), len(shown)))
         for number, item in enumerate(shown):
@@ -376,17 +359,3 @@ class LinearSystem:
             generator, ports, np.hstack((none[:, :moving], push.T)), np.hstack((sees[:, :moving], none)),
             np.hstack((none[:, :moving], sees)), np.hstack(outputs), push.T @ acceleration.T - force,
         )  # fmt: skip
-
-
-def solved(
-    laws: Laws,
-    linear: FloatArray,
-    compliance: FloatArray,
-    memory: FloatArray | None = None,
-    start: FloatArray | None = None,
-) -> StaticSolution:
-    """Return the static solution by compiled loops; raises `ModelError` where there is none."""
-    try:
-        return static_solution(laws, linear, compliance, memory=memory, start=start, kernel=compiled_kernel())
-    except SolutionError as cause:
-        raise ModelError(str(cause)) from cause

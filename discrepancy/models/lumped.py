@@ -1,86 +1,141 @@
 """A lumped linear structure as a model: masses, springs, dampers with named inputs, outputs and ports."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
+from scipy.linalg import eigh
 
 from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInput, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import (
-    Acting,
-    Course,
-    FormulaCourse,
-    Load,
-    LoadChange,
-    Shown,
-    order_of,
-    place_among,
-)
-from discrepancy.models.interface import NO_PATCH, Outputs, Place
-from discrepancy.models.lumped_file import LumpedDescription, load_lumped
-from discrepancy.models.lumped_rig import Loop, LumpedRig
-from discrepancy.models.lumped_sections import InputSection
-from discrepancy.models.memory import Memory
+from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, LoadChange, Shown, place_among
+from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
+from discrepancy.models.lumped_file import GAINS, ControllerSection, InputSection, LumpedDescription
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
+from fe.runtime import patch as changes
 from fe.runtime.laws import LAWS
-from fe.runtime.patch import (
-    INTERNAL_FORCES,
-    SENSORS,
-    LoadGain,
-    LoadPlace,
-    ModelPatch,
-    ModulusTemperature,
-    PointMass,
-    PortLoad,
-    Primitive,
-    RootCompliance,
-    StiffnessDrift,
-    course_of,
-)
+from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortLoad, Primitive, course_of
 from fe.runtime.state import Losses
 
-KEPT_RIGS = 128
-"""Values of the parameters and structures that are remembered."""
 LEAST_STIFFNESS = 0.05
 """A temperature that leaves less than this share of the stiffness is refused."""
+MOST_MODES = 8
+"""Modes that move of a structure on springs; the others follow without inertia."""
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A controller in a rig of N unknowns, n of them displacements.
+
+    Attributes
+    ----------
+    section : ControllerSection
+        As in the file.
+    gains : sequence of float
+        Proportional, derivative and integral, times their factors.
+    sees : (4, N) ndarray
+        What it measures, as `Shown.rows`.
+    acts : (N,) ndarray
+        Along which it acts.
+    state : int or None
+        Unknown that is the integral of its error; None without an integral gain.
+    """
+
+    section: ControllerSection
+    gains: Sequence[float]
+    sees: FloatArray
+    acts: FloatArray
+    state: int | None
+
+    @property
+    def gives(self) -> FloatArray:
+        """What it gives without a reference, as `Shown.rows`."""
+        proportional, derivative, integral = self.gains
+        rows = -proportional * self.sees - derivative * np.roll(self.sees, 1, axis=0)
+        if self.state is not None:
+            rows[1, self.state] += integral
+        return np.asarray(rows)
+
+    def loads(self, trial: Trial, item: RecordedInput, offset: float) -> list[Load]:
+        """Return what a recorded reference does, as loads; raises `ModelError` if it cannot be followed."""
+        section, time = self.section, trial.time
+        if item.quantity is not section.quantity:
+            raise ModelError(
+                f"The controller {section.name!r} follows {section.quantity.value}, but the trial "
+                f"{trial.name!r} records its reference {item.name!r} as {item.quantity.value}."
+            )
+        course = Course.of(time, item.values + offset, item.hold)
+        found: list[Load] = [(self.gains[0] * self.acts, course)]
+        if self.gains[1] != 0.0 and section.derivative_of == "error":
+            if course.hold is Hold.ZERO_ORDER:
+                raise ModelError(
+                    f"The reference {section.reference!r} of the trial {trial.name!r} goes in steps, which "
+                    f"the controller {section.name!r} cannot differentiate: say derivative_of = "
+                    "'measurement' in the model, or hold = 'linear' in the campaign."
+                )
+            if course.hold is Hold.SMOOTH:
+                slope = Course(time, course.at(time, 1), Hold.SMOOTH)
+            else:
+                slopes = np.diff(course.values) / np.diff(time)
+                slope = Course(time, np.append(slopes, slopes[-1]), Hold.ZERO_ORDER)
+            found.append((self.gains[1] * self.acts, slope))
+        if self.state is not None:
+            found.append((np.eye(len(self.acts))[self.state], course))
+        return found
+
+
+class Rig(NamedTuple):
+    """A lumped model at values of its parameters, under a patch of its structure.
+
+    `factors` of terms by name, `terms` (N, N) by kind and those of parts by name, `constant` (N,), the load
+    that always acts, and `loops`, the controllers by name.
+    """
+
+    factors: Mapping[str, float]
+    terms: Mapping[str, FloatArray]
+    constant: FloatArray
+    loops: dict[str, Loop]
+
+    def along(self, row: FloatArray, through: str | None, name: str) -> FloatArray:
+        """Return a load (N,), through a matrix where it says so, times its own factor."""
+        acting = row if through is None else self.terms[through] @ row
+        return np.asarray(self.factors.get(name, 1.0) * acting)
 
 
 class LumpedModel(DescribedModel, SystemModel):
     """A lumped model (`discrepancy.models.interface.Model`).
 
-    Parameters
-    ----------
-    description : LumpedDescription
-        Content of its file.
-
-    Notes
-    -----
     Damping that is given as modal ratios stays at these ratios when the structure changes. Health (z1, z2)
     has no meaning here and is passed over.
     """
 
+    follows_windows: ClassVar[bool] = True
+
     def __init__(self, description: LumpedDescription) -> None:
-        self.description = description
+        self.description, padded = description, description.padded
         super().__init__(description, {item.name: item.quantity for item in description.output})
         self.load_places = tuple(item.name for item in description.input)
         self.kinds = frozenset(TrialKind) - {TrialKind.FLIGHT}
         if not description.is_plain:
             self.kinds -= {TrialKind.RINGDOWN}
         self.displacements, self.length = description.size, description.characteristic_length
-        self.port_rows = {item.name: description.padded(item.vector) for item in description.port}
+        self.port_rows = {item.name: padded(item.vector) for item in description.port}
+        acts = {item.name: padded(item.acts) for item in description.port if item.acts is not None}
+        self._acts, self._acting_rows = acts, self.port_rows | acts
         self._stations = sorted(place.station for place in description.place)
         self._inputs = {item.name: item for item in description.input}
         self._outputs = {item.name: item for item in description.output}
-        self._rigs = Memory(KEPT_RIGS)
+        self._rigs, self._systems = Memory(), Memory()
 
     @classmethod
     def load(cls, path: Path | str) -> "LumpedModel":
         """Return the model of a TOML file, or a shipped one by name; raises `ModelError`."""
-        return cls(load_lumped(path))
+        return cls(LumpedDescription.read(path))
 
     # ------------------------------------------------------------ what it is
 
@@ -90,32 +145,30 @@ class LumpedModel(DescribedModel, SystemModel):
         if primitive in LAWS and not primitive.of_speed:  # the position of a state's port means nothing
             return bool(ports) and all(np.any(row[: description.size]) for row in ports)
         carried: dict[type[Primitive], bool] = {
-            StiffnessDrift: description.size > 0,
-            ModulusTemperature: True,
-            PointMass: bool(self._stations),
-            RootCompliance: description.root is not None,
-            LoadGain: True,
-            LoadPlace: any(item.station_derivative is not None for item in description.input),
+            changes.StiffnessDrift: description.size > 0,
+            changes.ModulusTemperature: True,
+            changes.PointMass: bool(self._stations),
+            changes.RootCompliance: description.root is not None,
+            changes.LoadGain: True,
+            changes.LoadPlace: any(item.station_derivative is not None for item in description.input),
             PortLoad: bool(ports),
         }
         return carried.get(primitive, primitive in SENSORS or (primitive in INTERNAL_FORCES and bool(ports)))
-
-    follows_windows: ClassVar[bool] = True
 
     def stations(self) -> tuple[float, float] | None:
         """Return the least and largest station [m] of the places, None without places."""
         return (self._stations[0], self._stations[-1]) if self._stations else None
 
+    def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
+        """Return none: health has no meaning here."""
+        return [()]
+
+    @property
+    def oscillates(self) -> bool:
+        """Whether it has a mode that vibrates."""
+        return bool(np.any(self.system(State(self.prior_mean())).angular_frequency > 0.0))
+
     # ------------------------------------------------------------ in a trial
-
-    def own_laws(self, parameters: FloatArray) -> ModelPatch:
-        """Return the laws of ports that it has as it is, each times its factor."""
-        factors = self._factors(parameters)
-        return ModelPatch(tuple(law.scaled(factors.get(law.name, 1.0)) for law in self.description.law))
-
-    def system(self, state: State) -> SecondOrderSystem:
-        """Return the rig, with prescribed motions and controllers as the state says."""
-        return self.rig(state).system(state.drives, closed=state.closed)
 
     def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
         """Return the load (N,) of 1 N, or of what else an input is, at its place."""
@@ -130,23 +183,28 @@ class LumpedModel(DescribedModel, SystemModel):
 
         Every motion that an input can prescribe and that the trial does not record is held at zero, if an
         output is its reaction; else it is free.
-
-        Raises
-        ------
-        ModelError
-            If the trial records an input that the model does not have or that is of another quantity.
         """
         trial, _, patch, state = case
-        rig, change = self.rig(state), LoadChange.of(patch)
+        rig, change, known = self.rig(state), LoadChange.of(patch), self._inputs
         loads = [load for loop in rig.loops.values() for load in self._reference(case, loop)]
         followed = {loop.section.reference for loop in rig.loops.values()}
         reactions = {item.reaction for item in self.description.output}
         still = Course.of(trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, 0)
-        drives = {name: still for name, item in self._inputs.items() if name in reactions}
+        drives = {name: still for name in known if name in reactions}
         for item, offset in self._recorded(case):
             if item.name in followed:
                 continue
-            section = self._section(trial, item)
+            if item.name not in known:
+                raise ModelError(
+                    f"The trial {trial.name!r} records the input {item.name!r}, which {self.what} does "
+                    f"not have; it has {', '.join(known) or 'none'}."
+                )
+            section = known[item.name]
+            if item.quantity is not section.quantity and item.quantity not in section.quantity.moving:
+                raise ModelError(
+                    f"The input {item.name!r} of {self.what} is {section.quantity.value}, but "
+                    f"the trial {trial.name!r} records {item.quantity.value}."
+                )
             values = item.values + offset if offset else item.values
             if section.quantity.moving:
                 if item.hold not in (None, Hold.SMOOTH):
@@ -156,12 +214,20 @@ class LumpedModel(DescribedModel, SystemModel):
                         "`reference` and `hold` out."
                     )
                 values = rig.factors.get(item.name, 1.0) * values
-                drives[item.name] = Course.of(trial.time, values, Hold.SMOOTH, order_of(item.quantity))
+                drives[item.name] = Course.of(trial.time, values, Hold.SMOOTH, item.quantity.order)
                 continue
             if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
                 values = change.changed(values, item.values)
             loads.append((self._moved_row(rig, section, change), Course.of(trial.time, values, item.hold)))
-        loads += [self._at_port(rig, item) for item in patch if isinstance(item, PortLoad)]
+        for load in (item for item in patch if isinstance(item, PortLoad)):
+            if load.port not in self._acting_rows:
+                raise ModelError(
+                    f"A force acts at the port {load.port!r}, which {self.name!r} does not have; it has "
+                    f"{', '.join(self._acting_rows) or 'none'}."
+                )
+            spans = tuple(window.span for window in load.windows)
+            course = FormulaCourse(course_of(load.force, load.kind), spans)
+            loads.append((self._acting_rows[load.port], course))
         return loads, drives
 
     def _recorded(self, case: Case) -> list[tuple[RecordedInput, float]]:
@@ -187,7 +253,7 @@ class LumpedModel(DescribedModel, SystemModel):
         known = [*self._inputs] if place in self._inputs else forces
         return self._inputs[place_among(known, place, self.what)]
 
-    def _moved_row(self, rig: LumpedRig, item: InputSection, change: LoadChange) -> FloatArray:
+    def _moved_row(self, rig: Rig, item: InputSection, change: LoadChange) -> FloatArray:
         """Return the row (N,) along which an input acts, where its place has been moved to."""
         row = np.array(item.vector)
         if change.along_span or change.along_chord:
@@ -199,36 +265,11 @@ class LumpedModel(DescribedModel, SystemModel):
             row = row + change.along_span * np.array(item.station_derivative)
             if item.chord_derivative is not None:
                 row = row + change.along_chord * np.array(item.chord_derivative)
-        return rig.along(row, item.through, item.name)
-
-    def _section(self, trial: Trial, item: RecordedInput) -> InputSection:
-        section = self._inputs.get(item.name)
-        if section is None:
-            raise ModelError(
-                f"The trial {trial.name!r} records the input {item.name!r}, which {self.what} does "
-                f"not have; it has {', '.join(self._inputs) or 'none'}."
-            )
-        if item.quantity is not section.quantity and item.quantity not in section.quantity.moving:
-            raise ModelError(
-                f"The input {item.name!r} of {self.what} is {section.quantity.value}, but "
-                f"the trial {trial.name!r} records {item.quantity.value}."
-            )
-        return section
-
-    def _at_port(self, rig: LumpedRig, load: PortLoad) -> Load:
-        """Return the row and the course of a load at a port."""
-        rows = rig.system().acting_rows
-        if load.port not in rows:
-            raise ModelError(
-                f"A force acts at the port {load.port!r}, which {self.name!r} does not have; it has "
-                f"{', '.join(rows) or 'none'}."
-            )
-        spans = tuple(window.span for window in load.windows)
-        return rows[load.port], FormulaCourse(course_of(load.force, load.kind), spans)
+        return rig.along(self.description.padded(row), item.through, item.name)
 
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
         """Return what each output shows under what acts; None: at rest."""
-        drives = {} if acting is None else acting.drives
+        drives = [] if acting is None else list(acting.drives)
         found, description = [], self.description
         for name, quantity in outputs:
             item = self._outputs[name]
@@ -239,28 +280,26 @@ class LumpedModel(DescribedModel, SystemModel):
                         f"The output {name!r} of {self.name!r} is the reaction of {item.reaction!r}, whose "
                         "motion this trial does not prescribe."
                     )
-                found.append(
-                    Shown.of(description.padded(()))._replace(reaction=list(drives).index(item.reaction))
-                )
+                nothing = np.zeros((4, description.width))
+                found.append(Shown(nothing, reaction=drives.index(item.reaction)))
             elif item.controller is not None:
                 loop = self.rig(case.state).loops[item.controller]
-                found.append(loop.effort([] if acting is None else self._reference(case, loop)))
+                along = loop.acts / float(loop.acts @ loop.acts)
+                loads = [] if acting is None else self._reference(case, loop)
+                courses = [(float(push @ along), course) for push, course in loads if push @ along != 0.0]
+                found.append(Shown(loop.gives, courses=courses))
             else:
-                row, order = description.padded(item.vector or ()), order_of(item.quantity) + further
+                row, order = description.padded(item.vector or ()), item.quantity.order + further
                 seen = Shown.of(row, order, further, description.width - description.size)
                 found.append(seen._replace(constant=item.constant * (not further)))
         return found
 
-    def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
-        """Return none: health has no meaning here."""
-        return [()]
-
-    @property
-    def oscillates(self) -> bool:
-        """Whether it has a mode that vibrates."""
-        return bool(np.any(self.system(State(self.prior_mean())).angular_frequency > 0.0))
-
     # ------------------------------------------------------------ ports
+
+    def own_laws(self, parameters: FloatArray) -> ModelPatch:
+        """Return the laws of ports that it has as it is, each times its factor."""
+        factors = self._factors(parameters)
+        return ModelPatch(tuple(law.scaled(factors.get(law.name, 1.0)) for law in self.description.law))
 
     @property
     def has_law(self) -> bool:
@@ -271,18 +310,15 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the linear model, and the laws that it has beside that, at the prior means."""
         linear, laws = super().apart()
         description = self.description.model_copy(update={"law": []})
-        linear = linear._changed(description=description, _rigs=Memory(KEPT_RIGS))
-        return linear, self.own_laws(self.prior_mean()) + laws
+        return linear._changed(description=description), self.own_laws(self.prior_mean()) + laws
 
     def unit_of_state(self, port: str) -> str:
         """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""
         first = self.description.size
         if not np.any(self.port_rows.get(port, np.zeros(0))[first:]):
             return ""
-        shown = {
-            item.quantity for item in self.description.output if item.vector and any(item.vector[first:])
-        }
-        return UNITS[shown.pop()].si if len(shown) == 1 else "of the state's unit"
+        read = {item.quantity for item in self.description.output if item.vector and any(item.vector[first:])}
+        return UNITS[read.pop()].si if len(read) == 1 else "of the state's unit"
 
     def turns(self, port: str) -> bool | None:
         """Return whether a port turns; None where the model does not say it.
@@ -302,22 +338,7 @@ class LumpedModel(DescribedModel, SystemModel):
         kinds = set().union(*(told.get(int(at), {True, False}) for at in np.flatnonzero(vector)))
         return kinds.pop() if len(kinds) == 1 else None
 
-    # ------------------------------------------------------------ parts
-
-    def rig(self, state: State) -> LumpedRig:
-        """Return the model at values of the parameters and a temperature above the reference [K]."""
-        parameters, _, structure, temperature, *_ = state
-        softening = temperature * sum(
-            (item.coefficient for item in structure if isinstance(item, ModulusTemperature)), 0.0
-        )
-        if 1.0 - softening < LEAST_STIFFNESS:
-            raise ModelError(
-                f"The temperature leaves {1.0 - softening:.2g} of the stiffness, which no structure has."
-            )
-        return self._rigs.get(
-            (parameters.tobytes(), structure.primitives, softening),
-            lambda: LumpedRig(self.description, self._factors(parameters), structure.primitives, softening),
-        )
+    # ------------------------------------------------------------ matrices
 
     def _factors(self, parameters: FloatArray) -> dict[str, float]:
         """Return the factors of the terms at values of the parameters."""
@@ -326,3 +347,87 @@ class LumpedModel(DescribedModel, SystemModel):
             for term in item.terms:
                 factors[term] = factors.get(term, 1.0) * float(value)
         return factors
+
+    def rig(self, state: State) -> Rig:
+        """Return the model at values of the parameters, a structure and a temperature."""
+        parameters, _, structure, temperature, *_ = state
+        softening = temperature * sum(
+            (item.coefficient for item in structure if isinstance(item, changes.ModulusTemperature)), 0.0
+        )
+        if 1.0 - softening < LEAST_STIFFNESS:
+            raise ModelError(
+                f"The temperature leaves {1.0 - softening:.2g} of the stiffness, which none has."
+            )
+        key = (parameters.tobytes(), structure.primitives, softening)
+        return self._rigs.get(key, lambda: self._made(self._factors(parameters), structure, softening))
+
+    def _made(self, factors: dict[str, float], structure: ModelPatch, softening: float) -> Rig:
+        description, n = self.description, self.description.size
+        softened = factors | {"stiffness": factors.get("stiffness", 1.0) * (1.0 - softening)}
+        terms = description.terms(softened)
+        mass, stiffness, damping = (terms[kind][:n, :n] for kind in ("mass", "stiffness", "damping"))
+        for change in structure if n else ():
+            if isinstance(change, changes.PointMass):
+                places = sorted(description.place, key=lambda place: place.station)
+                columns = zip(*(place.vector for place in places), strict=True)
+                row = np.array([np.interp(change.station, self._stations, column) for column in columns])
+                mass += change.mass * np.outer(row, row)
+            elif isinstance(change, changes.RootCompliance) and description.root is not None:
+                # in series: K^-1 + c l l^T, by Sherman and Morrison
+                lever = np.array(description.root.lever)
+                pull = stiffness @ lever
+                share = change.compliance / (1.0 + change.compliance * float(pull @ lever))
+                stiffness -= np.outer(pull, pull) * share
+        if n and (given := description.damping) is not None:
+            own = (given.alpha or 0.0) * mass + (given.beta or 0.0) * stiffness
+            if given.ratios is not None:
+                square, shapes = eigh(stiffness, mass)
+                weighted, w = mass @ shapes, np.sqrt(np.maximum(square, 0.0))
+                own = (weighted * (2.0 * np.array(given.ratios) * w)) @ weighted.T
+            damping += factors.get("damping", 1.0) * own
+        rig = Rig(factors, terms, np.zeros(description.width), {})
+        for load in description.load:
+            rig.constant[:] += rig.along(description.padded(load.vector), load.through, load.name)
+        state = n + description.states
+        for item in description.controller:
+            named = (factors.get(f"{item.name}.{gain}", 1.0) * getattr(item, gain) for gain in GAINS)
+            gains = [factors.get(item.name, 1.0) * gain for gain in named]
+            row, acts = description.padded(item.vector), description.padded(item.acts)
+            sees = Shown.of(row, item.quantity.order, states=description.width - n).rows
+            rig.loops[item.name] = Loop(item, gains, sees, acts, state if item.integral else None)
+            state += item.integral != 0.0
+        return rig
+
+    def system(self, state: State) -> SecondOrderSystem:
+        """Return what moves, with prescribed motions and controllers as the state says."""
+        rig = self.rig(state)
+
+        def made() -> tuple[Rig, SecondOrderSystem]:
+            description, terms, n = self.description, rig.terms, self.description.size
+            own, rest = slice(n, n + description.states), slice(n + description.states, None)
+            mass, damping = terms["mass"] + terms["capacity"], terms["damping"] + terms["conductance"]
+            stiffness = terms["stiffness"].copy()
+            mass[rest, rest] = np.eye(len(mass[rest]))
+            coupling = description.coupling
+            for content, into, rows, columns in (
+                (coupling.force_of_states, damping, slice(n), own),
+                (coupling.flow_of_speeds, damping, own, slice(n)),
+                (coupling.flow_of_displacements, stiffness, own, slice(n)),
+            ):
+                if content is not None:
+                    into[rows, columns] = -np.array(content)
+            for loop in rig.loops.values() if state.closed else ():
+                for into, row, seen in zip((stiffness, damping), loop.gives[:2], loop.sees[:2], strict=True):
+                    into -= np.outer(loop.acts, row)
+                    if loop.state is not None:
+                        into[loop.state] += seen
+            beta = description.damping.beta if description.damping is not None else None
+            drives = [description.padded(self._inputs[name].vector) for name in state.drives]
+            return rig, SecondOrderSystem(  # the rig lives as long, so that its id stays its own
+                mass, damping, stiffness, self.port_rows,
+                mode_count=MOST_MODES if description.is_plain else None,
+                relaxation=rig.factors.get("damping", 1.0) * (beta or 0.0),
+                states=len(mass) - n, drives=np.array(drives), actions=self._acts,
+            )  # fmt: skip
+
+        return self._systems.get((id(rig), state.drives, state.closed), made)[1]

@@ -1,65 +1,237 @@
-"""A lumped model as a TOML file: matrices, named vectors and calibrated parameters, checked strictly."""
+"""A lumped model as a TOML file: matrices, named vectors, laws, controllers and calibrated parameters."""
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import order_of
-from discrepancy.models.lumped_sections import (
-    ControllerSection,
-    CouplingSection,
-    Damping,
-    InputSection,
-    LawSection,
-    LoadSection,
-    Matrix,
-    NamedVector,
-    OutputSection,
-    PartSection,
-    PlaceSection,
-    PortSection,
-    RootSection,
-    ScaledParameter,
-)
-from discrepancy.models.model_file import ModelDescription, check_unique
-from reporting.section import Positive, checked
-from reporting.toml_file import read_toml
+from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
+from fe.runtime.errors import InvalidPatchError
+from fe.runtime.laws import LAWS
+from fe.runtime.laws.interface import PortForce
+from fe.runtime.patch import ModelPatch
+from reporting.section import Name, NotNegative, Number, Positive
 from reporting.words import counted
 
 SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
 """Models that come with the package, by file name without the ending."""
+KINDS = ("mass", "stiffness", "damping", "capacity", "conductance")
+"""Matrices of a lumped model; each can have parts."""
+OF_STATES = KINDS[3:]
+LOOSE = "; a structure that can float away has no static response: say `free = true` if it can"
+GAINS = ("proportional", "derivative", "integral")
+"""Gains of a controller; NAME.proportional is what a parameter scales."""
+
+
+def _listed(value: object) -> list[object] | tuple[object, ...]:
+    """Return one number as a list: with one unknown nobody needs brackets."""
+    return value if isinstance(value, list | tuple) else [value]
+
+
+def _rows(value: object, *, diagonal: bool = False) -> object:
+    """Return a matrix by rows from these, from its `diagonal` or only row, or from one number."""
+    listed = _listed(value)
+    if listed and isinstance(listed[0], list | tuple):
+        return listed
+    if not diagonal:
+        return [listed]
+    count = range(len(listed))
+    return [[listed[row] if row == column else 0.0 for column in count] for row in count]
+
+
+Vector = Annotated[tuple[Number, ...], Field(min_length=1), BeforeValidator(_listed)]
+Rows = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_rows)]
+Matrix = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(partial(_rows, diagonal=True))]
+Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
+"""Share of critical damping; overdamped modes are carried, but far above one a percentage was meant."""
+
+
+class Damping(Section):
+    """`[damping]`: exactly one of modal ratios, a matrix, or Rayleigh coefficients alpha M + beta K."""
+
+    ratios: Annotated[tuple[Ratio, ...], BeforeValidator(_listed)] | None = None
+    matrix: Matrix | None = None
+    alpha: NotNegative | None = None
+    beta: NotNegative | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        rayleigh = self.alpha is not None or self.beta is not None
+        if sum((self.ratios is not None, self.matrix is not None, rayleigh)) != 1:
+            raise ValueError("give exactly one of ratios, matrix, or alpha and beta")
+        return self
+
+
+class PartSection(NamedSection):
+    """`[[mass_part]]` and the like: a part that a parameter can scale, added to the base matrix."""
+
+    matrix: Matrix
+
+
+class NamedVector(NamedSection):
+    """A row of the unknowns with a name."""
+
+    vector: Vector
+
+
+class LoadSection(NamedVector):
+    """`[[load]]`: a constant load; with `through` the part or matrix of that name times the vector."""
+
+    through: Name | None = None
+
+
+class InputSection(LoadSection):
+    """`[[input]]`: what acts along a vector, and how this changes when the place of a force moves [1/m].
+
+    A motion (displacement, velocity, acceleration, of an angle too) is prescribed to vector . u; anything
+    else is a load, vector times its value, or with `through` the part of that name times vector times it.
+    """
+
+    quantity: Quantity = Quantity.FORCE
+    station_derivative: Vector | None = None
+    chord_derivative: Vector | None = None
+
+
+class OutputSection(NamedSection):
+    """`[[output]]`: what can be measured; velocity and acceleration come from a displacement.
+
+    vector . u + constant, or the force by which a prescribed motion is made (`reaction`, an input's name),
+    or what a controller gives (`controller`, its name).
+    """
+
+    vector: Vector | None = None
+    quantity: Quantity = Quantity.DISPLACEMENT
+    reaction: Name | None = None
+    controller: Name | None = None
+    constant: Number = 0.0
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if sum(item is not None for item in (self.vector, self.reaction, self.controller)) != 1:
+            raise ValueError(f"the output {self.name!r} needs one of a vector, a reaction and a controller")
+        if self.reaction is not None and self.quantity not in (Quantity.FORCE, Quantity.TORQUE):
+            raise ValueError(f'output {self.name!r} is a reaction: give it quantity = "force" or "torque"')
+        return self
+
+
+class CouplingSection(Section):
+    """`[coupling]` between n displacements and m states."""
+
+    force_of_states: Rows | None = None
+    flow_of_speeds: Rows | None = None
+    flow_of_displacements: Rows | None = None
+
+
+class PortSection(NamedVector):
+    """`[[port]]`: where an internal force can act, between the structure and the ground or within it.
+
+    A port sees vector . u or vector . x, and a law there acts against it along the same vector, or along
+    `acts`: what flows out of one store by its own level and into the next has vector [1, 0], acts [1, -1].
+    """
+
+    acts: Vector | None = None
+
+
+class LawSection(Section):
+    """`[[law]]`: a law of a port that the model has as it is; other keys are the numbers of its `kind`."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    name: Name
+    kind: Name
+    port: Name
+
+    @model_validator(mode="after")
+    def _is_a_law(self) -> Self:
+        known = [law.kind for law in LAWS]
+        if self.kind not in known:
+            raise ValueError(
+                f"the law {self.name!r} has the kind {self.kind!r}, but known are {', '.join(known)}"
+            )
+        try:
+            self.scaled(1.0).check()
+        except InvalidPatchError as cause:
+            raise ValueError(f"the law {self.name!r}: {cause}") from cause
+        return self
+
+    def scaled(self, factor: float) -> PortForce:
+        """Return the law with the numbers that its force is in proportion to times a factor."""
+        row = {"kind": self.kind, "port": self.port, **(self.model_extra or {})}
+        (law,) = ModelPatch.from_list([row], f"the law {self.name!r}")
+        assert isinstance(law, PortForce)  # the kind is checked
+        return replace(law, **{name: factor * getattr(law, name) for name in law.proportional})
+
+
+class ControllerSection(NamedSection):
+    """`[[controller]]`: acts . (P e + D e' + I s), e = reference - vector . z, s' = e, which closes a loop.
+
+    z are the unknowns, or their speeds where `quantity` is a speed; the reference is an input of the
+    campaign with the controller's `reference` as its name, and zero in a trial that does not record it. With
+    `derivative_of = "measurement"` D acts on -vector . z' alone.
+    """
+
+    vector: Vector
+    acts: Vector
+    quantity: Quantity
+    reference: Name | None = None
+    proportional: Number = 0.0
+    derivative: Number = 0.0
+    integral: Number = 0.0
+    derivative_of: Literal["error", "measurement"] = "error"
+
+    @model_validator(mode="after")
+    def _does_something(self) -> Self:
+        if not (self.proportional or self.derivative or self.integral):
+            raise ValueError(
+                f"controller {self.name!r} has no gain: give proportional, derivative or integral"
+            )
+        if not any(self.vector) or not any(self.acts):
+            raise ValueError(f"vector and acts of the controller {self.name!r} must not be zero")
+        return self
+
+
+class PlaceSection(NamedVector):
+    """`[[place]]`: where a mass can sit; places with a station [m] make a line along the structure."""
+
+    station: Number
+
+
+class RootSection(Section):
+    """`[root]`: motion of the unknowns when the root turns by one radian as a rigid body [m/rad]."""
+
+    lever: Vector
+
+
+class ScaledParameter(ParameterSection):
+    """`[[parameter]]`: a factor of the terms named."""
+
+    terms: Annotated[tuple[Name, ...], BeforeValidator(_listed)]
+    mean: Number = 1.0
+
+    @model_validator(mode="after")
+    def _in_range(self) -> Self:
+        if not 0.0 < self.low <= self.mean <= self.high:
+            raise ValueError("a factor needs 0 < low <= mean <= high")
+        return self
 
 
 class LumpedDescription(ModelDescription):
-    """Content of a lumped model's file; vectors have as many entries as the mass matrix has rows, n.
+    """Content of a lumped model's file, SI; vectors have n + m entries, displacements first.
 
-    Attributes
-    ----------
-    format : int
-        1.
-    name : str
-        For people.
-    mass, stiffness : (n, n) matrix, (n,) vector of a diagonal, or for n = 1 a number
-        SI; left out where there are states only.
-    damping : Damping
-        See there.
-    capacity, conductance : (m, m) matrix, (m,) vector of a diagonal, or for m = 1 a number
-        T and R of the states x, T x' + R x = inputs. Vectors then have n + m entries, displacements first.
-    coupling : CouplingSection
-        F, G, H of M u'' + C u' + K u = F x + ..., T x' + R x = G u' + H u + ...
-    free : bool
-        Whether the structure may float: its stiffness may be singular.
-    characteristic_length : float, optional
-        L [m]; by default the largest station, or 1.
+    `mass` and `stiffness` are matrices (n, n), vectors of a diagonal, or for n = 1 numbers; left out where
+    there are states only. `capacity` T and `conductance` R (m, m) are those of the states x, and `coupling`
+    holds F, G, H: M u'' + C u' + K u = F x + ..., T x' + R x = G u' + H u + ... With `free` the stiffness may
+    be singular. `characteristic_length` [m] is by default the largest station, or 1.
     """
 
+    what: ClassVar[str] = "a lumped model"
     mass: Matrix = ()
     stiffness: Matrix = ()
     damping: Damping | None = None
@@ -83,14 +255,21 @@ class LumpedDescription(ModelDescription):
     controller: tuple[ControllerSection, ...] = ()
     parameter: tuple[ScaledParameter, ...] = ()
 
+    @classmethod
+    def read(cls, path: Path | str) -> Self:
+        """Read a TOML file, or one of those shipped by its name (`single_mass_rig`); raises `ModelError`."""
+        file = Path(path)
+        if not file.suffix and not file.exists():
+            file = SHIPPED_MODELS / f"{path}.toml"
+            if not file.exists():
+                known = ", ".join(sorted(item.stem for item in SHIPPED_MODELS.glob("*.toml")))
+                raise ModelError(f"No lumped model is {str(path)!r}; shipped are {known}, or give a file.")
+        return super().read(file)
+
     @property
     def size(self) -> int:
         """Displacements n."""
         return len(self.mass)
-
-    def unknowns(self, kind: str) -> slice:
-        """Return which of the unknowns the matrix of a kind is of."""
-        return slice(self.size, self.size + self.states) if kind in OF_STATES else slice(self.size)
 
     @property
     def states(self) -> int:
@@ -117,15 +296,38 @@ class LumpedDescription(ModelDescription):
         reads = any(item.reaction or item.constant for item in self.output)
         return not (parts or motion or acts or reads)
 
+    def given(self, kind: str) -> dict[str, Matrix]:
+        """Return the matrix of a kind, empty where there is none, and its parts by name."""
+        base = (self.damping and self.damping.matrix) if kind == "damping" else getattr(self, kind)
+        return {kind: base or ()} | {part.name: part.matrix for part in getattr(self, f"{kind}_part")}
+
+    def terms(self, factors: Mapping[str, float] = MappingProxyType({})) -> dict[str, FloatArray]:
+        """Return the matrices (N, N) by kind, with their parts, and the parts by name, each times its factor.
+
+        The factor of the matrix itself is that of the whole. Damping by modes is left out.
+        """
+        found, n = dict[str, FloatArray](), self.size
+        for kind in KINDS:
+            own = slice(n, n + self.states) if kind in OF_STATES else slice(n)
+            given = self.given(kind)
+            for name, matrix in given.items():
+                found[name] = np.zeros((self.width, self.width))
+                if matrix:
+                    found[name][own, own] = matrix
+                if name != kind:
+                    found[name] *= factors.get(name, 1.0)
+            found[kind] = factors.get(kind, 1.0) * np.sum([found[name] for name in given], axis=0)
+        return found
+
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
+        n = self.size
         self._check_matrices()
         if self.is_plain and not self.input:
             raise ValueError("[[input]] is missing: at least one force must be able to act")
         for kind in ("input", "output", "port", "place", "load", "controller"):
             for item in getattr(self, kind):
                 self._check_vectors(kind, item)
-        n = self.size
         if self.root is not None and (len(self.root.lever) != n or not any(self.root.lever)):
             raise ValueError(f"lever of root needs {counted(n, 'entry', 'entries')}, not all zero")
         if self.damping is not None and self.damping.ratios is not None and len(self.damping.ratios) != n:
@@ -137,6 +339,8 @@ class LumpedDescription(ModelDescription):
     def _check_matrices(self) -> None:
         """Refuse matrices of another size, that are not symmetric, feed energy or leave something loose."""
         n, m = self.size, self.states
+        parts = [part.name for kind in KINDS for part in getattr(self, f"{kind}_part")]
+        self.check_unique("part", [*KINDS, *parts])
         if n == 0 and m == 0:
             raise ValueError("mass is missing (or capacity, of states of first order)")
         if n and not (self.stiffness or self.stiffness_part or self.free):
@@ -144,50 +348,38 @@ class LumpedDescription(ModelDescription):
         if n and self.damping is None and not self.free:
             raise ValueError("'damping' is missing")
         for kind in KINDS:
-            where, content = ("damping.matrix" if kind == "damping" else kind), self._base(kind)
             count, reference = (m, "capacity") if kind in OF_STATES else (n, "mass")
-            parts = [(f"{kind}_part {part.name!r}", part.matrix) for part in self.parts(kind)]
-            if content or (kind == "conductance" and m and not parts):
-                parts.append((where, content))
-            for place, matrix in parts:
+            given = self.given(kind)
+            for name, matrix in given.items():
+                if name == kind and not matrix and not (kind == "conductance" and m and len(given) == 1):
+                    continue
+                base = "damping.matrix" if kind == "damping" else kind
+                place = base if name == kind else f"{kind}_part {name!r}"
                 if not count:
                     raise ValueError(f"{place} is there, but {reference} is missing")
-                _check_matrix(place, matrix, count, reference, symmetric=kind != "conductance")
-            loose, own = _LOOSE if kind == "stiffness" else "", self.unknowns(kind)
-            least, most = np.linalg.eigvalsh(self.whole(kind)[own, own])[[0, -1]] if count else (1.0, 1.0)
-            singular = kind == "stiffness" and self.free and least >= -1e-9 * max(abs(most), 1e-300)
-            if kind in ("mass", "capacity", "stiffness") and least <= 0.0 and not singular:
-                raise ValueError(f"{kind} (with its parts) must be positive definite{loose}")
-        for name, rows, columns in (
-            ("force_of_states", n, m), ("flow_of_speeds", m, n), ("flow_of_displacements", m, n),
-        ):  # fmt: skip
-            content = getattr(self.coupling, name)
+                if [len(row) for row in matrix] != [count] * count:
+                    raise ValueError(
+                        f"{place} must be a {count} x {count} matrix (or {counted(count, 'diagonal value')})"
+                        f", as {reference} has {counted(count, 'row')}"
+                    )
+                full = np.array(matrix)
+                size = float(np.max(np.abs(full)))
+                if kind != "conductance" and np.max(np.abs(full - full.T)) > 1e-9 * size:
+                    raise ValueError(f"{place} must be symmetric")
+                if kind == "damping" and np.min(np.linalg.eigvalsh(full)) < -1e-9 * size:
+                    raise ValueError(f"{place} must not feed energy: it has a negative eigenvalue")
+        for key, content in self.coupling:
+            rows, columns = (n, m) if key == "force_of_states" else (m, n)
             if content is not None and [len(row) for row in content] != [columns] * rows:
-                raise ValueError(f"coupling.{name} must be a {rows} x {columns} matrix by rows")
-
-    def _base(self, kind: str) -> Matrix:
-        """Return the matrix of a kind without its parts, empty where there is none."""
-        if kind == "damping":
-            return (self.damping and self.damping.matrix) or ()
-        found: Matrix = getattr(self, kind)
-        return found
-
-    def whole(self, kind: str, factors: Mapping[str, float] = MappingProxyType({})) -> FloatArray:
-        """Return the matrix (N, N) of a kind with its parts, each times its factor.
-
-        The factor of the matrix itself is that of the whole. Damping by modes is left out.
-        """
-        whole = self.placed(self._base(kind), kind)
-        for part in self.parts(kind):
-            whole += factors.get(part.name, 1.0) * self.placed(part.matrix, kind)
-        return whole * factors.get(kind, 1.0)
-
-    def placed(self, matrix: Matrix, kind: str) -> FloatArray:
-        """Return a matrix of a kind, zero where there is none, among all unknowns (N, N)."""
-        found, own = np.zeros((self.width, self.width)), self.unknowns(kind)
-        if matrix:
-            found[own, own] = matrix
-        return found
+                raise ValueError(f"coupling.{key} must be a {rows} x {columns} matrix by rows")
+        terms = self.terms()
+        for kind in (*(KINDS[:2] if n else ()), *(("capacity",) if m else ())):
+            own = slice(n, n + m) if kind in OF_STATES else slice(n)
+            least, most = np.linalg.eigvalsh(terms[kind][own, own])[[0, -1]]
+            singular = kind == "stiffness" and self.free and least >= -1e-9 * max(abs(most), 1e-300)
+            if least <= 0.0 and not singular:
+                loose = LOOSE if kind == "stiffness" else ""
+                raise ValueError(f"{kind} (with its parts) must be positive definite{loose}")
 
     def _check_vectors(self, kind: str, item: NamedVector | OutputSection | ControllerSection) -> None:
         """Refuse vectors of another length and zero ones, and what sees both displacements and states."""
@@ -203,14 +395,14 @@ class LumpedDescription(ModelDescription):
         if kind in ("port", "controller") and any(row[:n]) and any(row[n:]):
             raise ValueError(f"the {kind} {item.name!r} sees displacements or states, not both")
         if isinstance(item, PortSection) and item.acts is not None:
-            push, capacity = np.array(item.acts), self.whole("capacity")[n : n + m, n : n + m]
+            push, capacity = np.array(item.acts), self.terms()["capacity"][n : n + m, n : n + m]
             of_states = not any(row[:n]) and not any(push[:n])
             if not of_states or row[n:] @ np.linalg.solve(capacity, push[n:]) <= 0.0:
                 raise ValueError(
                     f"`acts` of the port {item.name!r} is for states, and must take from what its vector sees"
                 )
         if isinstance(item, ControllerSection):
-            order, what = order_of(item.quantity), "a state" if any(row[n:]) else "a speed"
+            order, what = item.quantity.order, "a state" if any(row[n:]) else "a speed"
             if order == 2:
                 raise ValueError(f"the controller {item.name!r} cannot follow an acceleration")
             if item.derivative and (any(row[n:]) or order == 1):
@@ -221,27 +413,23 @@ class LumpedDescription(ModelDescription):
 
     def _check_names(self) -> None:
         """Refuse names that are there twice, and those that name nothing."""
-        references = [item.reference for item in self.controller if item.reference]
-        parts = [part.name for kind in KINDS for part in self.parts(kind)]
         names = {
             kind: [item.name for item in getattr(self, kind)]
             for kind in ("output", "port", "place", "load", "controller", "law", "parameter", "input")
         }
+        references = [item.reference for item in self.controller if item.reference]
+        parts = [name for kind in KINDS for name in self.given(kind) if name not in KINDS]
         names["input or reference"] = [*names["input"], *references]
         names["place station"] = [f"{place.station:g}" for place in self.place]
-        names["part"] = [*parts, *KINDS]
         for kind, given in names.items():
-            check_unique(kind, given)
+            self.check_unique(kind, given)
         kinds = (*(KINDS[:3] if self.size else ()), *(OF_STATES if self.states else ()))
         terms, gains = [*kinds, *parts], [f"{name}.{gain}" for name in names["controller"] for gain in GAINS]
         more = ("law",) if self.is_plain else ("input", "load", "law", "controller")
         scaled = list(dict.fromkeys([*terms, *(name for kind in more for name in names[kind]), *gains]))
         driven = [item.name for item in self.input if item.quantity.moving]
-        named = list[tuple[str, str | None, Sequence[str]]]()
-        for pushing in (*self.input, *self.load):
-            named.append((f"{pushing.name!r} acts through", pushing.through, terms))
-        for law in self.law:
-            named.append((f"the law {law.name!r} acts on the port", law.port, names["port"]))
+        named = [(f"{item.name!r} acts through", item.through, terms) for item in (*self.input, *self.load)]
+        named += [(f"the law {law.name!r} acts on the port", law.port, names["port"]) for law in self.law]
         for output in self.output:
             is_ = f"the output {output.name!r} is"
             named.append((f"{is_} the reaction of the prescribed motion", output.reaction, driven))
@@ -251,62 +439,3 @@ class LumpedDescription(ModelDescription):
         for what, name, known in named:
             if name is not None and name not in known:
                 raise ValueError(f"{what} {name!r}, but there are {', '.join(known) or 'none'}")
-
-    def parts(self, kind: str) -> tuple[PartSection, ...]:
-        """Return the parts of the matrix of a kind."""
-        found: tuple[PartSection, ...] = getattr(self, f"{kind}_part")
-        return found
-
-
-KINDS = ("mass", "stiffness", "damping", "capacity", "conductance")
-"""Matrices of a lumped model; each can have parts."""
-OF_STATES = KINDS[3:]
-GAINS = ("proportional", "derivative", "integral")
-"""Gains of a controller; NAME.proportional is what a parameter scales."""
-_LOOSE = (
-    "; a structure that can float away has no static response: say `free = true` if it can, "
-    "as a cart or a falling body"
-)
-
-
-def _check_matrix(where: str, content: Matrix, count: int, reference: str, *, symmetric: bool) -> None:
-    """Refuse a matrix of another size than the reference, that is not symmetric or feeds energy."""
-    if [len(row) for row in content] != [count] * count:
-        raise ValueError(
-            f"{where} must be a {count} x {count} matrix (or {counted(count, 'diagonal value')}), as "
-            f"{reference} has {counted(count, 'row')}"
-        )
-    full = np.array(content)
-    size = float(np.max(np.abs(full)))
-    if symmetric and np.max(np.abs(full - full.T)) > 1e-9 * max(size, 1e-300):
-        raise ValueError(f"{where} must be symmetric")
-    if where.startswith("damping") and np.min(np.linalg.eigvalsh(full)) < -1e-9 * size:
-        raise ValueError(f"{where} must not feed energy: it has a negative eigenvalue")
-
-
-def parse_lumped(content: dict[str, Any], source: str = "the lumped model") -> LumpedDescription:
-    """Check the content of a lumped model's file.
-
-    Raises
-    ------
-    ModelError
-        One sentence that names `source`, the place, what came and what was expected.
-    """
-    return checked(LumpedDescription, content, source, ModelError, what="a lumped model")
-
-
-def load_lumped(path: Path | str) -> LumpedDescription:
-    """Read a lumped model from a TOML file, or one of those shipped by its name (`single_mass_rig`).
-
-    Raises
-    ------
-    ModelError
-        If there is no such file, it is not TOML, or its content is no lumped model.
-    """
-    file = Path(path)
-    if not file.suffix and not file.exists():
-        file = SHIPPED_MODELS / f"{path}.toml"
-        if not file.exists():
-            known = ", ".join(sorted(item.stem for item in SHIPPED_MODELS.glob("*.toml")))
-            raise ModelError(f"There is no lumped model {str(path)!r}; shipped are {known}, or give a file.")
-    return parse_lumped(read_toml(file, ModelError, what="lumped model"), str(file))

@@ -1,14 +1,17 @@
-"""What the TOML files of models share: their tables and kinds of numbers."""
+"""What the TOML files of models share: how they are read, their tables and kinds of numbers."""
 
 from collections.abc import Mapping
-from typing import Literal, Self
+from pathlib import Path
+from typing import ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, model_validator
 
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Quantity
+from discrepancy.errors import ModelError
 from discrepancy.models.interface import Model
-from reporting.section import Name, NotNegative, Number
+from reporting.section import Name, NotNegative, Number, checked
+from reporting.toml_file import read_toml
 
 
 class Section(BaseModel):
@@ -32,11 +35,6 @@ class ParameterSection(NamedSection):
     high: Number
     unit: str = "1"
 
-    @property
-    def calibrated(self) -> ParameterPrior:
-        """The parameter of the model."""
-        return ParameterPrior(self.name, self.unit, self.mean, self.deviation, self.low, self.high)
-
     @model_validator(mode="after")
     def _in_range(self) -> Self:
         if not self.low <= self.mean <= self.high:
@@ -47,10 +45,35 @@ class ParameterSection(NamedSection):
 class ModelDescription(Section):
     """What every description of a model has: version of the format, name for people, parameters, ports."""
 
+    what: ClassVar[str]
+    """What it is, with its article, for sentences."""
     format: Literal[1]
     name: Name
     parameter: tuple[ParameterSection, ...] = ()
     port: tuple[NamedSection, ...] = ()
+
+    @classmethod
+    def parse(cls, content: object, source: str = "the model") -> Self:
+        """Check the content of a file.
+
+        Raises
+        ------
+        ModelError
+            One sentence that names `source`, the place, what came and what was expected.
+        """
+        return checked(cls, content, source, ModelError, what=cls.what)
+
+    @classmethod
+    def read(cls, path: Path | str) -> Self:
+        """Read a file; raises `ModelError` if it is not there, not TOML, or its content is no such model."""
+        return cls.parse(read_toml(path, ModelError, what=cls.what.partition(" ")[2]), str(path))
+
+    @staticmethod
+    def check_unique(kind: str, names: list[str]) -> None:
+        """Refuse a name that is there twice; raises `ValueError`."""
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"there are two of {kind} {name!r}")
 
 
 class DescribedModel(Model):
@@ -66,12 +89,8 @@ class DescribedModel(Model):
 
     def __init__(self, description: ModelDescription, quantities: Mapping[str, Quantity]) -> None:
         self.name, self.quantities = description.name, quantities
-        self.parameters = tuple(item.calibrated for item in description.parameter)
+        self.parameters = tuple(
+            ParameterPrior(item.name, item.unit, item.mean, item.deviation, item.low, item.high)
+            for item in description.parameter
+        )
         self.port_names = tuple(item.name for item in description.port)
-
-
-def check_unique(kind: str, names: list[str]) -> None:
-    """Refuse a name that is there twice; raises `ValueError`."""
-    for name in names:
-        if names.count(name) > 1:
-            raise ValueError(f"there are two of {kind} {name!r}")

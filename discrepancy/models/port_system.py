@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from warnings import catch_warnings, simplefilter
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.linalg import logm
 from scipy.signal import cont2discrete
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.models.memory import Memory
+from discrepancy.models.interface import Memory
 
 KEPT_STEPS = 16
 MOST_STATES = 40
@@ -40,11 +41,6 @@ class PortSystem:
     outputs: FloatArray
     direct: FloatArray
     _steps: Memory = field(default_factory=lambda: Memory(KEPT_STEPS), init=False, repr=False)
-
-    @property
-    def fastest(self) -> float:
-        """Largest angular frequency of a mode [rad/s]."""
-        return float(np.max(np.abs(np.linalg.eigvals(self.generator).imag)))
 
     def over(self, step: float) -> tuple[FloatArray, FloatArray]:
         """Return A (n, n) and B (n, P) of s(k+1) = A s(k) + B f(k), f held over steps [s]."""
@@ -86,10 +82,10 @@ class PortSystem:
 
     def motion(self, forces: FloatArray, step: float) -> FloatArray:
         """Return the outputs (N + 1, C) under forces (N, P) that are held over steps [s], from rest."""
-        states = np.zeros((len(forces) + 1, len(self.generator)))
         transition, drive = self.over(step)
-        for k, force in enumerate(forces):
-            states[k + 1] = transition @ states[k] + drive @ force
+        states = np.vstack((np.zeros(len(transition)), forces @ drive.T))
+        for before, after in pairwise(states):
+            after += transition @ before
         return self.seen(states, forces)
 
     def seen(
@@ -110,10 +106,6 @@ class PortSystem:
         unit = np.max(np.abs(flat), axis=0)
         unit[unit == 0.0] = 1.0
         return np.asarray(np.linalg.pinv(flat / unit, rcond=1e-14) / unit[:, None])
-
-    def gain(self) -> FloatArray:
-        """Return the outputs (C, P) at rest under constant unit forces."""
-        return np.asarray(self.direct - self.outputs @ np.linalg.solve(self.generator, self.push))
 
     def most_flexible(self, column: int, port: int) -> tuple[float, float] | None:
         """Return the mode that gives an output the most at rest under a port's force; None if none vibrates.

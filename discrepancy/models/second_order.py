@@ -5,19 +5,20 @@ it for a `Motion`, which says what outputs show. Between the stamps the linear p
 (`fe.runtime.stepwise`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray, Release, Start
+from discrepancy.campaign.records import FloatArray, Hold, Release, Start
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown
 from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Response
-from discrepancy.models.linear_system import LinearSystem, solved
-from fe.runtime.motion import NO_LAWS, Laws
+from discrepancy.models.linear_system import LinearSystem
+from discrepancy.models.scales import PortScale
+from fe.runtime.motion import NO_LAWS, Laws, static_solution
 from fe.runtime.motion_arrays import Steps
 from fe.runtime.stepwise import Begin, Boundaries, ModalMotion, advance, steps_under, substeps
 
@@ -66,23 +67,16 @@ class Motion:
         pull = self.q @ modal.whole.T
         if self.laws.rate != 0.0:
             pull *= 1.0 + self.laws.rate * self.time[:, None]
-        found = system.forces_at(self.acting, self.time) - pull - self.velocity @ modal.damping.T
+        found = self.acting.load_at(self.time, system.all_shapes) - pull - self.velocity @ modal.damping.T
         if len(self.laws):
             found -= self.port_forces @ self.laws.rows(modal.actions or modal.ports, self.q.shape[1])
-        for number, drive in enumerate(self.acting.drives.values(), len(system.angular_frequency)):
-            found[:, number] = system.heaviness * drive.at(self.time, 2)
+        for number, drive in enumerate(self.acting.drives.values()):
+            moved = [drive.at(self.time, order) for order in range(3)]
+            for amount, part in zip(moved, system.driven(number), strict=True):
+                found -= np.outer(amount, part)
+            found[:, len(system.angular_frequency) + number] = system.heaviness * moved[2]
         found[: self.held] = 0.0
         return found
-
-    def derivative(self, order: int) -> FloatArray:
-        """Return a derivative (N, M + P) of the modal coordinates, up to the third."""
-        if order < 2:
-            return (self.q, self.velocity)[order]
-        if order == 2:
-            return self.acceleration
-        if len(self.time) < 2:
-            return np.zeros_like(self.q)
-        return np.asarray(np.gradient(self.acceleration, self.time, axis=0))
 
     @property
     def at_ports(self) -> tuple[FloatArray, FloatArray]:
@@ -115,11 +109,17 @@ class Motion:
         """Return what outputs show, and the rates; omitted modes are in what is not derived only."""
         system = self.system
         values, rates = np.zeros((2, len(self.time), len(shown)))
-        for order, rows in enumerate(system.by_order(shown, system.all_shapes)):
-            if np.any(rows):
-                values += self.derivative(order) @ rows.T
-                if order < 3:
-                    rates += self.derivative(order + 1) @ rows.T
+        by_order = system.by_order(shown, system.all_shapes)
+        moved, asked = [self.q, self.velocity], np.any(by_order, axis=(1, 2))
+        if asked[1:].any():
+            moved.append(self.acceleration)
+        if asked[2:].any():
+            still = len(self.time) < 2
+            moved.append(0.0 * self.q if still else np.gradient(self.acceleration, self.time, axis=0))
+        for order in np.flatnonzero(asked):
+            values += moved[order] @ by_order[order].T
+            if order < 3:
+                rates += moved[order + 1] @ by_order[order].T
         if system.truncated:
             values += self._left_out(np.array([item.rows[0] for item in shown]))
         for number, item in enumerate(shown):
@@ -129,9 +129,8 @@ class Motion:
                 along = system.lift[:, item.reaction]
                 values[:, number] -= self.acting.load_at(self.time, along[:, None])[:, 0]
                 if len(self.laws):
-                    values[:, number] += self.port_forces @ (
-                        self.laws.rows(system.acting_rows, len(along)) @ along
-                    )
+                    acts = self.laws.rows({**system.ports, **system.actions}, len(along))
+                    values[:, number] += self.port_forces @ (acts @ along)
             for factor, course in item.courses or ():
                 values[:, number] += factor * course.at(self.time)
             if item.reaction is not None or item.courses:
@@ -171,19 +170,22 @@ class SecondOrderSystem(LinearSystem):
             If it begins at rest where there is none, or the release point cannot be moved.
         """
         if acting.release is not None:
-            return self._let_go(*acting.release, acting, laws, refinement)
+            return self._let_go(acting, laws, refinement)
         times, first = acting.sampled, float(acting.time[0])
         begin = self._first(acting, laws)
         found = self._followed(acting, laws, first, times, begin, refinement)
-        if acting.begins is not Start.UNKNOWN and times[0] <= first:
-            self._rest_on_drives(found, begin.v, laws)
+        if acting.begins is not Start.UNKNOWN and times[0] <= first and len(laws) and len(self.drives):
+            # Laws of speed at ports that only drives move are nothing where they begin at rest: the force by
+            # which a drive would be held there, were it a mass, is none that a reading shows.
+            rows = laws.rows(self.modal.ports, len(begin.v))
+            driven = ~np.any(rows[:, : len(self.angular_frequency)], axis=1)
+            found.port_forces[0, driven & (rows @ begin.v == 0.0) & (laws.of_speed == 1)] = 0.0
         return Motion(self, acting, laws, times, *found[:4])
 
-    def _let_go(
-        self, row: FloatArray, release: Release, acting: Acting, laws: Laws, refinement: int
-    ) -> Motion:
-        """Return the motion of a structure that springs hold after a release at a row (n,)."""
-        times, acts = acting.sampled, laws.act_at(0.0)
+    def _let_go(self, acting: Acting, laws: Laws, refinement: int) -> Motion:
+        """Return the motion of a structure that springs hold after a release."""
+        assert acting.release is not None
+        (row, release), times, acts = acting.release, acting.sampled, laws.act_at(0.0)
         loaded = laws.only(acts) if laws.spans else laws
         begin, holding = self._released(row, release, acting.initial, loaded)
         q, v, memory = begin
@@ -210,9 +212,7 @@ class SecondOrderSystem(LinearSystem):
         count, moving, first = len(self.angular_frequency), self.moving, acting.time[:1]
         known = acting.begins is not Start.UNKNOWN and acting.clock[1] == 0.0  # dry friction is zero at rest
         drive = np.array([float(item.at(first, 0)[0]) for item in acting.drives.values()])
-        speeds = [
-            item.first_speed if known else float(item.at(first, 1)[0]) for item in acting.drives.values()
-        ]
+        speeds = [one.first_speed if known else float(one.at(first, 1)[0]) for one in acting.drives.values()]
         (q, v), memory = np.zeros((2, count + len(drive))), None
         if acting.begins is Start.SETTLED:
             load = acting.load_at(first, np.eye(len(self.mass)))
@@ -229,17 +229,6 @@ class SecondOrderSystem(LinearSystem):
         if len(drive):
             q[count:], v[count:] = self.heaviness * drive, self.heaviness * np.array(speeds)
         return Begin(q, v, memory)
-
-    def _rest_on_drives(self, found: ModalMotion, v: FloatArray, laws: Laws) -> None:
-        """Take laws of speed at ports that only drives move as nothing where they begin at rest.
-
-        The force by which a drive would be held there, were it a mass, is none that a reading shows.
-        """
-        if not (len(laws) and len(self.drives)):
-            return
-        rows = laws.rows(self.modal.ports, len(v))
-        driven = ~np.any(rows[:, : len(self.angular_frequency)], axis=1)
-        found.port_forces[0, driven & (rows @ v == 0.0) & (laws.of_speed == 1)] = 0.0
 
     def _released(
         self, row: FloatArray, release: Release, initial: FloatArray, laws: Laws
@@ -264,7 +253,7 @@ class SecondOrderSystem(LinearSystem):
             rows = self.port_rows(laws)
             along = rows @ self.flexibility(row)
             held = rows @ self.flexibility(rows.T) - np.outer(along, along) / compliance
-            solution = solved(laws, (holding * along)[None], held)
+            solution = static_solution(laws, (holding * along)[None], held, kernel=compiled_kernel())
             holding += float(along @ solution.forces[0]) / compliance
             acts, memory = holding * row - solution.forces[0] @ rows, solution.memory
             if self.truncated:  # of the port's position, fades after the release
@@ -298,7 +287,7 @@ class SecondOrderSystem(LinearSystem):
         if free is not None:
             none = np.zeros((len(stamps), 0))
             return ModalMotion(*free, none, none, NO_LAWS.memory())
-        smooth = bool(acting.drives) or any(course.is_smooth for _, course in acting.loads)
+        smooth = bool(acting.drives) or any(course.hold is Hold.SMOOTH for _, course in acting.loads)
         edges = (*laws.edges, *(moment for _, course in acting.loads for moment in course.edges))
         boundaries = substeps(self.modal, laws, stamps, refinement, SMOOTH_PARTS if smooth else 1, edges)
         feed = np.zeros((len(boundaries.time), len(laws)))
@@ -323,3 +312,89 @@ class SecondOrderSystem(LinearSystem):
                 steps.transition[:, coordinate] = 0.0
                 steps.push[:, coordinate] = heaviness * drive.at(time[1:], order)
         return steps
+
+
+FORCES = 5.0
+"""Force scale of a port that no stiffness holds over the rms of the forces there: friction of 1 to 25 % of
+what acts is in the middle of its prior, and drag of as much at the largest speed."""
+TURNS = 1e-3
+"""Share of the largest speed of a port that both directions must reach, for a motion that turns."""
+Rested = tuple[FloatArray, bool]
+"""Where the ports were (N, P) in a trial at rest or after a release, and whether it is fitted."""
+Moved = tuple[Motion, float, bool]
+"""Motion in a trial under recorded inputs, the largest force measured in it [N], and whether it is fitted."""
+
+
+def port_scales(
+    bare: LinearSystem, still: Mapping[str, float], rests: Sequence[Rested], motions: Sequence[Moved]
+) -> dict[str, PortScale]:
+    """Return natural scales of ports under a campaign: what acts and moves where the structure has none.
+
+    Where no stiffness of the structure holds a port (that of a controller is none), its force scale is
+    `FORCES` times the rms of inertia, damping, own laws and loads there, its displacement and speed the
+    largest: effects are measured by what acts and moves. At a port of a state likewise, of flows. Where
+    drives alone move a port, no frequency of the structure says how fast: its force scale is the largest
+    measured force.
+
+    Parameters
+    ----------
+    bare : LinearSystem
+        The system at the prior mean, without controllers.
+    still : mapping of str to float
+        The ports, and the stiffness of each at rest; zero where the modes tell it.
+    rests, motions : sequences of Rested and Moved
+        What the campaign shows. Where all trials are followed in time from known inputs, what was not seen to
+        turn does not.
+    """
+    names, driven_only = list(still), not rests
+    sizes, squares, count = np.zeros((3, len(names))), np.zeros(len(names)), 0
+    turned, follows = np.zeros(len(names), bool), np.ones(len(names), bool)
+    rows = np.array([bare.ports[name] for name in names]).reshape(len(names), len(bare.mass))
+    for position, fitted in rests:
+        x = np.max(np.abs(position), axis=0, initial=0.0)
+        sizes = np.maximum(sizes, (x * fitted, x, 0.0 * x))
+    for motion, measured, fitted in motions:
+        system = motion.system
+        at = [list(system.ports).index(name) for name in names]
+        position, speed = (item[:, at] for item in motion.at_ports)
+        x, v = (np.max(np.abs(item), axis=0, initial=0.0) for item in (position, speed))
+        sizes = np.maximum(sizes, (x * fitted, x, v))
+        least = TURNS * np.max(np.abs(speed), axis=0)
+        turned |= (np.min(speed, axis=0) < -least) & (np.max(speed, axis=0) > least)
+        if system.mode_count is not None:
+            follows[:] = False
+            continue
+        shapes = system.shapes
+        pushed = (
+            motion.acceleration[:, : shapes.shape[1]] @ (system.mass @ shapes).T,
+            motion.velocity[:, : shapes.shape[1]] @ (bare.damping @ shapes).T,
+            motion.acting.load_at(motion.time, np.eye(len(system.mass))),
+        )
+        # modal force along the port, over what a unit force there gives
+        lent = np.sum((rows @ shapes) ** 2, axis=1)
+        along = shapes @ (shapes.T @ rows.T) / np.where(lent > 0.0, lent, 1.0)
+        largest = np.max([np.mean((item @ along) ** 2, axis=0) for item in pushed], axis=0)
+        squares += len(motion.time) * np.where(lent > 0.0, largest, (measured / FORCES) ** 2)
+        count += len(motion.time)
+        follows &= lent == 0.0
+    found, frequency = dict[str, PortScale](), bare.angular_frequency[: bare.moving]
+    for number, (name, row, stiff) in enumerate(zip(names, rows, still.values(), strict=True)):
+        usual, most, pace = sizes[:, number].tolist()
+        weight = (row @ bare.shapes)[: bare.moving] ** 2
+        holds = weight > 1e-6 * float(weight.sum())
+        size, free = usual or most or 1.0, not np.any(frequency[holds] > 0.0)
+        force = FORCES * float(np.sqrt(squares[number] / max(count, 1)))
+        if np.any(holds) and np.all(frequency[holds] > 0.0):
+            stiff = stiff or 1.0 / float(np.sum(weight[holds] / frequency[holds] ** 2))
+            w, of_mode = float(frequency[holds][0]), float(weight[holds][0])
+            if driven_only and follows[number] and force > 0.0 < pace:
+                found[name] = PortScale(size, force / size, pace / size, stiff, most or size, driven=True)
+            else:
+                found[name] = PortScale(size, w**2 / of_mode, w, stiff, most or 1.0)
+            continue
+        found[name] = PortScale(
+            size, (force or 1.0) / size, (pace or 1.0) / size, None, most or size, free=free,
+            turns=bool(turned[number]) or not (free and driven_only and np.any(holds)),
+            of_state=not np.any(row[: bare.displacements]),
+        )  # fmt: skip
+    return found

@@ -13,20 +13,12 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, release_of
 from discrepancy.models.interface import NO_PATCH, Conditions, Model, Outputs, Place, PortedSystem, Response
 from discrepancy.models.linear_system import Resting, at_rest
-from discrepancy.models.natural_scales import PortSizes
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
-from discrepancy.models.second_order import Motion, SecondOrderSystem
+from discrepancy.models.second_order import Motion, Moved, Rested, SecondOrderSystem, port_scales
+from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
-from fe.runtime.motion import NO_LAWS, Laws
-from fe.runtime.patch import (
-    INTERNAL_FORCES,
-    LOADS,
-    STRUCTURE,
-    ModelPatch,
-    ModulusTemperature,
-    PointMass,
-    PortLoad,
-)
+from fe.runtime.motion import NO_LAWS, Laws, laws_of
+from fe.runtime.patch import INTERNAL_FORCES, LOADS, STRUCTURE, ModelPatch, PortLoad
 from fe.runtime.state import Losses
 
 
@@ -126,7 +118,7 @@ class SystemModel(Model):
         loads = patch.of(*LOADS)
         if trial.kind is TrialKind.FLIGHT:
             # where a mass has weight; other zeros are read with it in place
-            rows = self.lift(state, patch.of(*LOADS, PointMass))
+            rows = self.lift(state, patch.of(*LOADS, changes.PointMass))
             amounts = [trial.load_factor, trial.load_factor**2]
         else:
             rows = self.force_row(trial.load_place, state, loads)[None]
@@ -154,14 +146,13 @@ class SystemModel(Model):
     def laws(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> Laws:
         """Return the laws at its ports, its own and those of a patch."""
         forces = self.at_ports(self.own_laws(parameters) + patch.of(*INTERNAL_FORCES))
-        return self.laws_at(forces, self.port_rows)
+        return laws_of(forces, self.port_rows, in_windows=self.follows_windows)
 
     def case(self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH) -> Case:
         """Return a trial as it is at its begin."""
         losses, warmer = self.losses(trial, conditions.health)[0], float(trial.temperature[0])
-        return Case(
-            trial, conditions, patch, State(conditions.parameters, losses, patch.of(*STRUCTURE), warmer)
-        )
+        state = State(conditions.parameters, losses, patch.of(*STRUCTURE), warmer)
+        return Case(trial, conditions, patch, state)
 
     def acting(self, case: Case) -> Acting:
         """Return what acts in a trial."""
@@ -185,10 +176,8 @@ class SystemModel(Model):
         system = self.system(moving)
         return system, acting if system.basis is None else acting.along(system.basis)
 
-    def moved(
-        self, case: Case, laws: Laws = NO_LAWS, ports: tuple[str, ...] | None = None, *, still: bool = False
-    ) -> Motion:
-        """Return the motion in a dynamic trial, `ports` being those of the laws; `still`: begun at rest.
+    def moved(self, case: Case, laws: Laws = NO_LAWS, ports: tuple[str, ...] | None = None) -> Motion:
+        """Return the motion in a dynamic trial, `ports` being those of the laws unless it is said.
 
         Raises
         ------
@@ -196,11 +185,9 @@ class SystemModel(Model):
             If it cannot begin so, or what acts is not the model's.
         """
         system, acting = self.begun(case, laws.ports if ports is None else ports)
-        if still:
-            acting = replace(acting, begins=Start.STILL)
         try:
             return system.motion(acting, laws, case.conditions.refinement)
-        except ModelError as cause:
+        except (ModelError, FiniteElementError) as cause:
             raise ModelError(f"The trial {case.trial.name!r} of {self.name!r}: {cause}") from cause
 
     def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
@@ -210,27 +197,22 @@ class SystemModel(Model):
         dynamic trial the structure is that at its first temperature.
         """
         components = range(self.components if conditions.components else 1)
-        try:
-            laws, case = self.laws(conditions.parameters, patch), self.case(trial, conditions, patch)
-            if not trial.is_dynamic:
-                return self._at_rest(case, outputs, laws, components)
-            motion = self.moved(case, laws)
-            shown = (self.shown(case, outputs, motion.acting, number) for number in components)
-            found, *further = map(motion.seen, shown)
-            return Response(found.values, found.rates, *(part.values for part in further))
-        except FiniteElementError as cause:
-            raise ModelError(str(cause)) from cause
+        laws, case = self.laws(conditions.parameters, patch), self.case(trial, conditions, patch)
+        if not trial.is_dynamic:
+            return self._at_rest(case, outputs, laws, components)
+        motion = self.moved(case, laws)
+        shown = (self.shown(case, outputs, motion.acting, number) for number in components)
+        found, *further = map(motion.seen, shown)
+        return Response(found.values, found.rates, *(part.values for part in further))
 
     def _at_rest(self, case: Case, outputs: Outputs, laws: Laws, components: range) -> Response:
         """Return what is shown at rest; rows of one structure that follow one another go together."""
         trial, conditions, patch, first = case
         if laws.spans or len(patch.of(PortLoad)):
-            raise ModelError(
-                f"The trial {trial.name!r} has no time, which a law or a force in time asks for."
-            )
+            raise ModelError(f"The trial {trial.name!r} has no time, which a law or force in time asks for.")
         count, losses = len(trial.force), self.losses(trial, conditions.health)
         losses = losses * count if len(losses) == 1 else losses
-        warmer = trial.temperature.tolist() if len(patch.of(ModulusTemperature)) else [0.0] * count
+        warmer = trial.temperature.tolist() if len(patch.of(changes.ModulusTemperature)) else [0.0] * count
         values = np.empty((count, len(components) * len(outputs)))
         memory, before, start = None, None, 0
         for (lost, warm), group in groupby(zip(losses, warmer, strict=True)):
@@ -240,7 +222,7 @@ class SystemModel(Model):
             units, amounts = self.acting(case).levels
             n = units.shape[1] if self.displacements is None else self.displacements
             for (_, quantity), item in zip(outputs, shown, strict=False):
-                if np.any(item.rows[2:, n:]) or (quantity.is_rate and np.any(item.rows[1:, :n])):
+                if np.any(item.rows[2:, n:]) or (quantity.order > 0 and np.any(item.rows[1:, :n])):
                     raise ModelError(
                         f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
                         "acceleration."
@@ -251,7 +233,7 @@ class SystemModel(Model):
             rest, given = self.rest(case.state), amounts[rows]
             try:
                 values[rows], memory = at_rest(rest, units, given, laws, ports, memory, before, seen=seen)
-            except ModelError as cause:
+            except (ModelError, FiniteElementError) as cause:
                 raise ModelError(f"The trial {trial.name!r} is at rest, but {cause}") from cause
             values[rows] += [item.constant for item in shown]
             before, start = amounts[rows.stop - 1], rows.stop
@@ -284,8 +266,8 @@ class SystemModel(Model):
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of a state at the begin of a trial: of motion from rest, and of data."""
         parameters = self.prior_mean(campaign)
-        case = self.case(trial, Conditions(parameters))
-        moved = self.moved(case, self.laws(parameters), still=True)
+        case = self.case(replace(trial, begins=Start.STILL), Conditions(parameters))
+        moved = self.moved(case, self.laws(parameters))
         rig = moved.system
         count, moving = len(rig.angular_frequency), rig.moving
         x, v = (np.max(np.abs(item[:, :count]), axis=0) for item in (moved.q, moved.velocity))
@@ -320,21 +302,20 @@ class SystemModel(Model):
         held = system.mode_count is not None and all(
             trial.kind is not TrialKind.DRIVEN and trial.begins is Start.SETTLED for trial in trials
         )
-        driven_only = all(trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN for trial in trials)
-        ports = PortSizes(names, self.system(state._replace(closed=False)), driven_only=driven_only)
         rows = np.array([self.port_rows[name] for name in names])
+        bare = self.system(state._replace(closed=False))
+        rests, motions = list[Rested](), list[Moved]()
         conditions, largest = Conditions(parameters), [0.0, 0.0, 0.0]
         for trial in trials:
             case, fitted = self.case(trial, conditions), trial.is_dynamic and not trial.held_out
             if not trial.is_dynamic or trial.kind is TrialKind.RINGDOWN:
-                if held and names:
-                    position = self._held(case) @ rows.T
-                    ports.see(position, 0.0 * position, fitted)
+                still = self._held(case) @ rows.T if held and names else np.zeros((0, len(names)))
+                rests.append((still, fitted))
                 continue
             try:
                 motion = self.moved(case, laws)
             except ModelError:
-                motion = self.moved(case, laws, still=True)
+                motion = self.moved(self.case(replace(trial, begins=Start.STILL), conditions), laws)
             if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
                 initial = self.initial_sizes(campaign, trial)
                 motion = self.moved(self.case(trial, replace(conditions, initial=initial)), laws)
@@ -343,18 +324,18 @@ class SystemModel(Model):
                 for column, name in enumerate(trial.channels)
                 if campaign.channels[name].quantity in (Quantity.FORCE, Quantity.TORQUE)
             ]
-            ports.add(motion, max(pushes, default=0.0), fitted)
+            motions.append((motion, max(pushes, default=0.0), fitted))
             shapes = motion.system.all_shapes[: self.displacements].T
             loads = motion.acting.load_at(motion.time, np.eye(len(motion.acting.constant)))
             for number, item in enumerate((motion.q @ shapes, motion.velocity @ shapes, loads)):
                 largest[number] = max(largest[number], float(np.max(np.abs(item), initial=0.0)))
         (peak, speed, weight), sizes = largest, campaign_sizes(campaign)
-        shape, still = np.zeros(0), [0.0] * len(names)
+        shape, stiff = np.zeros(0), [0.0] * len(names)
         if held:
             known = [*(trial.load_place for trial in trials), *(self.load_places or ())]
             row, shape = self.force_row(self.reference or known[0], state), system.shapes[:, 0]
             shape = shape if system.basis is None else system.basis @ shape
-            still = [1.0 / float(own @ rest(own[None])[0]) for own in rows]
+            stiff = [1.0 / float(own @ rest(own[None])[0]) for own in rows]
             frequency, participation = float(system.angular_frequency[0]), float(row @ shape) ** 2
             mass = 1.0 / participation if participation else float(np.trace(system.mass))
             stiffness = 1.0 / float(row @ rest(row[None])[0])
@@ -364,7 +345,7 @@ class SystemModel(Model):
             frequency = float(elastic[0]) if len(elastic) else usual
             mass = float(np.trace(system.mass)) / max(len(system.mass), 1)
             stiffness = weight / peak if peak > 0.0 < weight else mass * frequency**2
-        found = {name: ports.scale(number, still[number]) for number, name in enumerate(names)}
+        found = port_scales(bare, dict(zip(names, stiff, strict=True)), rests, motions)
         return Scales(
             **{**sizes, "force": sizes["force"] or weight},
             length=self.length or max(map(abs, self.stations() or (0.0,))) or 1.0,

@@ -92,7 +92,7 @@ def plan_of(model: Model) -> ExamplePlan:
         raise ModelError(
             f"{model.name} has no force, and an example is made by forces: write a campaign of it."
         )
-    outputs = tuple(name for name, quantity in model.quantities.items() if not quantity.is_rate)
+    outputs = tuple(name for name, quantity in model.quantities.items() if quantity.order == 0)
     return plan_for(model, outputs, model.load_places[0], model.largest_force)
 
 

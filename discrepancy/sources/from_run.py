@@ -16,7 +16,7 @@ from calibration.result.file import load_calibration
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.campaign.sampling import FloatArray
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from fmu_asset.door.binding import load_binding
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.paper.procedure import RESULTS_FILE, read_published_results
-from twin_master.assets.strain_library import FILE_NAME, load_strain_library
+from twin_master.assets.strain_library_source import FILE_NAME, load_strain_library
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -13,18 +13,14 @@ from .factorisation import Factorisation
 
 Norm = Factorisation
 """The energy norm of a stiffness is what its factorisation gives."""
+MOST_ITERATIONS = 100
+"""Limit of conjugate gradients."""
 NEARLY_DEPENDENT = 0.1
 """Where less than this fraction of a vector is new, the pair is made to fit together again."""
 
 
 def conjugate_gradients(
-    matrices: Sequence[Any],
-    preconditioner: Norm,
-    right: FloatArray,
-    start: FloatArray,
-    *,
-    tolerance: float,
-    most_iterations: int = 100,
+    matrices: Sequence[Any], preconditioner: Norm, right: FloatArray, start: FloatArray, tolerance: float
 ) -> FloatArray:
     """Return solutions of several systems by preconditioned conjugate gradients.
 
@@ -42,8 +38,6 @@ def conjugate_gradients(
         Starting values.
     tolerance : float
         Residual wanted, relative to the right-hand side, both in the norm dual to the preconditioner.
-    most_iterations : int
-        Limit.
 
     Returns
     -------
@@ -65,7 +59,7 @@ def conjugate_gradients(
     residual = right - product(solution)
     direction = correction = preconditioner.riesz(residual)
     size = np.einsum("ik,ik->k", residual, correction)
-    for _ in range(most_iterations + 1):
+    for _ in range(MOST_ITERATIONS + 1):
         if np.all(size <= wanted):
             return solution
         image = product(direction)
@@ -81,7 +75,7 @@ def conjugate_gradients(
     missed = size > wanted
     reached = tolerance * float(np.sqrt(np.max(size[missed] / wanted[missed])))
     raise SolutionError(
-        f"Conjugate gradients reached {reached:.2g} in {most_iterations} iterations, but {tolerance:g} "
+        f"Conjugate gradients reached {reached:.2g} in {MOST_ITERATIONS} iterations, but {tolerance:g} "
         "is needed; the stiffness terms must be positive semi-definite."
     )
 
@@ -158,7 +152,7 @@ class ProjectedBasis:
     """
 
     def __init__(self, norm: Norm, sums: Sequence[tuple[Any, ...]], *, drop: float) -> None:
-        self._norm, self._sums, self._drop = norm, sums, drop
+        self.norm, self._sums, self._drop = norm, sums, drop
         self.vectors = self._products = np.empty((sums[0][0].shape[0], 0))
         self.inner = [np.empty((len(terms), 0, 0)) for terms in sums]
 
@@ -178,20 +172,20 @@ class ProjectedBasis:
 
     def _new(self, vectors: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         """Return what is new enough in vectors (n, m), orthonormal, with its products."""
-        products = self._norm.product(vectors)
+        products = self.norm.product(vectors)
         length = np.sqrt(np.maximum(np.einsum("ik,ik->k", vectors, products), 0.0))
         used = np.flatnonzero(length > 0.0)
         vectors, products = vectors[:, used] / length[used], products[:, used] / length[used]
         for number in range(2):
             vectors, products = self._outside(vectors, products)
             if number == 0 and self.vectors.size:
-                products = self._norm.product(vectors)
+                products = self.norm.product(vectors)
         kept: list[tuple[FloatArray, FloatArray]] = []
         for vector, product in zip(vectors.T, products.T, strict=True):
             vector, product = _without(kept, *_without(kept, vector, product))
             size = float(vector @ product)
             if size < NEARLY_DEPENDENT**2:
-                vector, product = self._outside(vector, self._norm.product(vector))
+                vector, product = self._outside(vector, self.norm.product(vector))
                 vector, product = _without(kept, vector, product)
                 size = float(vector @ product)
             if size > self._drop**2:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from fe.runtime.errors import ReducedModelFileError, ReductionError
+from reporting.errors import FileNotWrittenError
 
 _logger = logging.getLogger(__name__)
 
@@ -26,7 +27,7 @@ def cache_folder() -> Path:
 
 
 def built_once(
-    path: Path, load: Callable[[], _Kept], build: Callable[[], _Kept], keep: Callable[[_Kept], None]
+    path: Path, load: Callable[[], _Kept], build: Callable[[], _Kept], keep: Callable[[_Kept], object]
 ) -> _Kept:
     """Return what is kept, or build and keep it; of several builders one builds, and the others wait for it.
 
@@ -39,7 +40,7 @@ def built_once(
     build : callable
         Makes it.
     keep : callable
-        Writes it; where that raises `OSError` it is used all the same, with a warning.
+        Writes it; where that raises `FileNotWrittenError` it is used all the same, with a warning.
 
     Raises
     ------
@@ -57,7 +58,7 @@ def built_once(
         built = build()
         try:
             keep(built)
-        except OSError as error:
+        except FileNotWrittenError as error:
             _logger.warning(
                 "What was built could not be kept in %s and will be built again: %s", path.parent, error
             )

@@ -1,10 +1,11 @@
 """Offline: the static part of a reduced model by a certified greedy search (pyMOR), for any affine structure.
 
-The method and what it reaches are in `docs/reduced_model.md`.
+First approximate dual solutions, on which the sharpness of the error bound rests: either the solution at the
+nearest of several anchors is taken, or those at a few states are combined for each state, as a reduced basis
+of each output (Rozza, Huynh and Patera 2008). The method and what it reaches are in `docs/reduced_model.md`.
 """
 
 from bisect import bisect_left
-from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
 from typing import Any
@@ -13,11 +14,105 @@ import numpy as np
 
 from fe.full.subspace import FunctionalBasis, Norm, ProjectedBasis
 from fe.runtime.arrays import FloatArray
+from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel, StaticResponse
+from reporting.progress import Stage
 
-from .dual_solutions import dual_solutions
 from .settings import TOGETHER
-from .terms import ReductionTerms, State, solved_together
+from .terms import ReductionTerms, State
+
+DUAL_TOLERANCE, COMBINED_TOLERANCE = 0.05, 0.01
+"""Relative residual of approximate dual solutions at their own states, taken alone and combined."""
+DEPENDENT = 1e-3
+"""Combinations of the dual solutions of an output that are shorter, relative to the longest, are left out."""
+MOST_COLUMNS = 48
+"""Columns of approximate dual solutions that are iterated together."""
+
+
+def dual_solutions(
+    terms: ReductionTerms, norm: Norm, stage: Stage
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Solve K psi = l for each output l, roughly: the norms of what that leaves are computed, not assumed.
+
+    Parameters
+    ----------
+    terms : ReductionTerms
+        The full model.
+    norm : Norm
+        Energy norm X of one stiffness.
+    stage : Stage
+        Told one more part, and of what.
+
+    Returns
+    -------
+    products : (A or M, n, O) ndarray
+        X times the functions, whitened.
+    arrays : dict of str to ndarray
+        `dual_residual`, `dual_stiffness` and `dual_output` of `ReducedArrays`.
+    """
+    states, combined = terms.dual_states()
+    at_once = max(1, MOST_COLUMNS // terms.outputs.shape[1])
+    start, found = norm.riesz(terms.outputs), []
+    for first in range(0, len(states), at_once):
+        chosen = states[first : first + at_once]
+        tolerance = COMBINED_TOLERANCE if combined else DUAL_TOLERANCE
+        found += terms.solved_together(norm, chosen, terms.outputs, [start] * len(chosen), tolerance)
+        stage.advance(len(chosen), "dual solutions")
+    solutions = np.stack(found)
+    del found  # as large as they are
+    duals, arrays = (_combined if combined else _nearest)(terms, norm, solutions)
+    return np.stack([norm.whitened(norm.product(dual)) for dual in duals]), arrays
+
+
+def _nearest(
+    terms: ReductionTerms, norm: Norm, duals: FloatArray
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Take the solutions (A, n, O) at anchors alone, with the norms of their residuals elsewhere."""
+    factors = []
+    for dual in duals:
+        *varied, constant = (np.asarray(term @ dual) for term in terms.stiffness_terms)
+        functionals = np.stack((terms.outputs - constant, *varied), axis=2)
+        factors.append([_factor(norm, part) for part in functionals.swapaxes(0, 1)])
+    count = terms.outputs.shape[1]
+    none = np.empty((count, len(terms.stiffness_terms), 0, 0))
+    arrays = {"dual_stiffness": none, "dual_output": np.empty((count, 0))}
+    return duals, {"dual_residual": np.array(factors), **arrays}
+
+
+def _combined(
+    terms: ReductionTerms, norm: Norm, solutions: FloatArray
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Make the solutions (M, n, O) at states orthonormal for each output, to be combined."""
+    duals, kept = np.ascontiguousarray(solutions.transpose(2, 1, 0)), 0  # (O, n, M)
+    for dual in duals:
+        square, turn = np.linalg.eigh(dual.T @ norm.product(dual))
+        used = np.flatnonzero(square > DEPENDENT**2 * square[-1])[::-1]
+        basis = dual @ (turn[:, used] / np.sqrt(square[used]))
+        dual[:, : len(used)], dual[:, len(used) :] = basis, 0.0
+        kept = max(kept, len(used))
+    duals = duals[:, :, :kept]
+    stiffness = np.empty((len(duals), len(terms.stiffness_terms), kept, kept))
+    factors = []
+    for dual, output, inner in zip(duals, terms.outputs.T, stiffness, strict=True):
+        images = [np.asarray(term @ dual) for term in terms.stiffness_terms]
+        inner[:] = [dual.T @ image for image in images]
+        factors.append(_factor(norm, np.column_stack((output, *images))))
+    absent = np.asarray(~duals.any(axis=1))
+    stiffness[:, -1] += absent[:, :, np.newaxis] * np.eye(kept)  # a function that is not there gets no part
+    return duals.transpose(2, 1, 0), {
+        "dual_residual": np.array([factors]),
+        "dual_stiffness": stiffness,
+        "dual_output": np.einsum("no,onm->om", terms.outputs, duals),
+    }
+
+
+def _factor(norm: Norm, functionals: FloatArray) -> Any:
+    """Return R (k, k) with |functionals (n, k) @ c| = |R @ c| in the dual norm."""
+    found = np.linalg.qr(norm.whitened(functionals), mode="r")
+    if not np.isfinite(found).all():
+        raise ReductionError("The dual residuals are not finite; the full model holds a value that is not.")
+    return found
+
 
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
@@ -43,19 +138,14 @@ class StaticReduction:
         What a reduced model holds beside the statics, by the names of its fields.
     modal_basis : (n, Nm) ndarray
         Its modal basis.
-    advance : callable
+    stage : Stage
         Told one more part, and of what.
     """
 
     def __init__(
-        self,
-        terms: ReductionTerms,
-        norm: Norm,
-        fixed: dict[str, Any],
-        modal_basis: FloatArray,
-        advance: Callable[[int, str], object],
+        self, terms: ReductionTerms, norm: Norm, fixed: dict[str, Any], modal_basis: FloatArray, stage: Stage
     ) -> None:
-        self.terms, self.norm, self.modal_basis, self.advance = terms, norm, modal_basis, advance
+        self.terms, self.norm, self.modal_basis, self.stage = terms, norm, modal_basis, stage
         self.least = terms.least(norm)
         n, count = len(terms.loads), len(terms.stiffness_terms)
         self.basis = ProjectedBasis(norm, [terms.stiffness_terms], drop=1e-7)
@@ -63,7 +153,7 @@ class StaticReduction:
         self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
         self.residual_load = self.residual_basis.extend(terms.loads)
         self.residual_stiffness = np.empty((len(self.residual_load), count, 0))
-        products, duals = dual_solutions(terms, norm, advance)
+        products, duals = dual_solutions(terms, norm, stage)
         self.fixed: dict[str, Any] = fixed | duals
         self.dual_products = np.swapaxes(products, 1, 2)
         self.correction = self.dual_products @ self.residual_basis.vectors
@@ -75,7 +165,7 @@ class StaticReduction:
         # a basis vector may be rough, since errors are bounded by residuals; the first one measures rounding
         tolerance = SNAPSHOT_TOLERANCE if self.snapshots else FIRST_TOLERANCE
         starts = [self._galerkin(theta) for theta in thetas]
-        solutions = solved_together(self.terms, self.norm, thetas, self.terms.loads, starts, tolerance)
+        solutions = self.terms.solved_together(self.norm, thetas, self.terms.loads, starts, tolerance)
         (images,) = self.basis.extend(np.concatenate(solutions, axis=1))
         if not images[0].size:
             return False  # rounding is reached; what the search reached is judged after it
@@ -193,7 +283,7 @@ def greedy(
             chosen = _spread(places, bounds, min(TOGETHER, most_snapshots - len(static.snapshots)), wanted)
         if not static.add_snapshots(chosen):
             break
-        static.advance(len(chosen), f"full solution {len(static.snapshots)}")
+        static.stage.advance(len(chosen), f"full solution {len(static.snapshots)}")
     return [*history, float(_bounds(static, states, known, len(states), wanted).max())]
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from fe.elements.cells import CellMesh
 from fe.elements.kinds import HEXAHEDRA_20
 from fe.runtime.arrays import FloatArray, IntArray
-from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.reduced import ReducedModel
 from fe.structure.operators import write_vtu
 
@@ -55,9 +54,7 @@ class WingFields(ReducedModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.cells.min() < 0 or self.cells.max() >= len(self.points):
-            raise ReducedModelFileError(
-                "The cells of a field basis have nodes that are not there; build the basis anew."
-            )
+            self.refuse("has cells with nodes that are not there")
 
     @property
     def model(self) -> ReducedModel:

@@ -18,6 +18,7 @@ from fe.structure.design import load_structure, structure_hash
 from fe.structure.operators import assemble_structure
 from fe.wing.design import WingDesign, load_design
 from fe.wing.operators import AffineOperators, assemble
+from reporting.files import atomic_write_bytes
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_bytes, hash_tree
 
@@ -57,11 +58,8 @@ def _once(
             raise ReducedModelFileError(f"{path} holds {kind.what} of another design; delete it.")
         return arrays
 
-    def built() -> _Kept:
-        with threadpool_limits(1):
-            return build()
-
-    return built_once(path, load, built, lambda made: made.save(path))
+    built: Callable[[], _Kept] = threadpool_limits.wrap(limits=1)(build)
+    return built_once(path, load, built, lambda made: atomic_write_bytes(path, made.to_bytes()))
 
 
 def reduced_model(

@@ -194,11 +194,12 @@ def _patched_state(wing: PatchedWing, shares: FloatArray, *, plain: bool) -> Pat
     damaged, *changed = (shares[: len(TAKEN)] < TAKEN) & (not plain)
     start, length, loss, compliance, mass, station, *shares = shares[len(TAKEN) :].tolist()
     low, high = arrays.validity_box[:-2].T  # all but the loads
-    e, *losses, servo, pitot = (low + (high - low) * (0.5 if plain else np.array(shares))).tolist()
+    values = low + (high - low) * (0.5 if plain else np.array(shares))
+    values[1:-2] *= damaged
     changes = (
         LocalStiffnessLoss(loss**0.5 * arrays.largest_loss, start * span, (0.02 + 0.28 * length) * span),
         RootCompliance(compliance * arrays.largest_compliance),
         PointMass(mass * arrays.largest_mass, (0.1 + 0.9 * station) * span),
     )
     patch = ModelPatch(tuple(change for change, taken in zip(changes, changed, strict=True) if taken))
-    return wing.structure(e, tuple(losses) if damaged else (), servo, pitot, patch)
+    return wing.at(np.append(values, (0.0, 0.0)), patch)

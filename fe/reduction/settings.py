@@ -34,6 +34,11 @@ class ModalSettings:
     frequency_tolerance: float = 1e-5
     most_corrections: int = 12
 
+    @property
+    def sought(self) -> int:
+        """Modes that are looked for: two more, because modes change places."""
+        return self.mode_count + 2
+
 
 @dataclass(frozen=True)
 class StructureSettings:
@@ -92,11 +97,6 @@ class PatchSettings:
     compliance_share: float = 0.4
     largest_mass: float = 0.25
     seed: int = 1
-
-
-def default_anchors(regions: int) -> tuple[int, ...]:
-    """Return two approximate dual solutions along each loss, or one where they are combined."""
-    return (2 if regions <= MOST_GRID_REGIONS else 1,) * regions
 
 
 def remaining_levels(loss: Range, count: int) -> FloatArray:

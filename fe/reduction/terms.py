@@ -11,7 +11,7 @@ from fe.full.subspace import Norm, conjugate_gradients
 from fe.runtime.arrays import FloatArray
 from fe.structure.affine import AffineStructure, AffineSum
 
-from .settings import MOST_GRID_REGIONS, default_anchors, remaining_levels
+from .settings import MOST_GRID_REGIONS, remaining_levels
 
 State = tuple[float, ...]
 """Parameters and losses."""
@@ -82,7 +82,8 @@ class ReductionTerms:
         self.parameters = [structure.ranges[name] for name in parameters]
         self.losses = [structure.ranges[name] for name in regions]
         self.masses = [structure.ranges[name] for name in masses]
-        self.counts = default_anchors(len(regions))
+        # two approximate dual solutions along each loss, or one where they are combined
+        self.counts = (2 if len(regions) <= MOST_GRID_REGIONS else 1,) * len(regions)
         self.reference = self._coefficients(
             np.array([np.mean(ends) for ends in self.parameters]),
             np.array([remaining_levels(ends, 1)[0] for ends in self.losses]),
@@ -158,14 +159,6 @@ class ReductionTerms:
         inside = zip(self.inside(points[:, :varied]), low + (high - low) * points[:, varied:], strict=True)
         return [(self.theta(state), np.array((1.0, *chosen))) for state, chosen in (*corners, *inside)]
 
-    def largest_loads(self) -> FloatArray:
-        """Largest coefficient (L,) of each load."""
-        controls, masses = (
-            np.abs([(1.0, 1.0), *(self.structure.ranges[name] for name in names)]).max(axis=1)
-            for names in (self.structure.controls, self.structure.masses)
-        )
-        return np.asarray(controls[self.load_factors[:, 0]] * masses[self.load_factors[:, 1]])
-
     def farthest(self) -> FloatArray:
         """Largest distance (T,) of each coefficient from its reference."""
         factor = np.array([(1.0, 1.0), *self.parameters])[self.stiffness_factors[:, 0]]
@@ -180,14 +173,14 @@ class ReductionTerms:
         masses = np.array((1.0, *self.structure.masses.values()))
         return self._coefficients(parameters, np.ones(len(self.losses))), masses
 
-    @property
-    def middle_mass(self) -> FloatArray:
-        """Coefficients (1 + P,) of the mass terms in the middle."""
-        return np.array([1.0, *(np.mean(span) for span in self.masses)])
-
     def least(self, norm: Norm) -> FloatArray:
         """Return the outputs (groups, L) below which a load is not seen; see `LEAST_COSINE`."""
-        largest, seen = self.largest_loads(), np.abs(self.outputs.T @ norm.riesz(self.loads))
+        controls, masses = (
+            np.abs([(1.0, 1.0), *(self.structure.ranges[name] for name in names)]).max(axis=1)
+            for names in (self.structure.controls, self.structure.masses)
+        )
+        largest = controls[self.load_factors[:, 0]] * masses[self.load_factors[:, 1]]  # coefficients
+        seen = np.abs(self.outputs.T @ norm.riesz(self.loads))
         loads, outputs = (
             np.linalg.norm(norm.whitened(columns), axis=0) for columns in (self.loads, self.outputs)
         )
@@ -198,21 +191,11 @@ class ReductionTerms:
             found.append(np.where(size < least, np.maximum(least, of_others), least))
         return np.array(found)
 
-
-def solved_together(
-    terms: ReductionTerms,
-    norm: Norm,
-    thetas: list[FloatArray],
-    right: FloatArray,
-    starts: list[FloatArray],
-    tolerance: float,
-) -> list[FloatArray]:
-    """Solve the full model at coefficients (T,) for the same right-hand sides (n, k); returns (n, k) each."""
-    solved = conjugate_gradients(
-        [terms.stiffness(theta) for theta in thetas],
-        norm,
-        np.concatenate([right] * len(thetas), axis=1),
-        np.concatenate(starts, axis=1),
-        tolerance=tolerance,
-    )
-    return np.split(solved, len(thetas), axis=1)
+    def solved_together(
+        self, norm: Norm, at: list[FloatArray], right: FloatArray, starts: list[FloatArray], tolerance: float
+    ) -> list[FloatArray]:
+        """Solve the full model at coefficients (T,) for the same right-hand sides (n, k); (n, k) each."""
+        matrices = [self.stiffness(theta) for theta in at]
+        rights, begin = (np.concatenate(part, axis=1) for part in ([right] * len(at), starts))
+        solved = conjugate_gradients(matrices, norm, rights, begin, tolerance)
+        return np.split(solved, len(at), axis=1)

@@ -10,7 +10,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import lru_cache, reduce
 from types import CodeType
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -77,15 +77,11 @@ class Expression:
 
     def _tree(self) -> ast.expr:
         if len(self.text) > LONGEST:
-            raise InvalidPatchError(
-                f"{self.where} must have at most {LONGEST} characters, but has {len(self.text)}."
-            )
+            self._refuse(f" must have at most {LONGEST} characters, but has {len(self.text)}")
         try:
             return _parsed(self.text.strip())
-        except (SyntaxError, ValueError, RecursionError, MemoryError) as cause:
-            raise InvalidPatchError(
-                f"{self.where} is not an arithmetic expression: {self.text!r}."
-            ) from cause
+        except (SyntaxError, ValueError, RecursionError, MemoryError):
+            self._refuse(f" is not an arithmetic expression: {self.text!r}")
 
     def _check(self, node: ast.expr) -> None:
         match node:
@@ -93,9 +89,8 @@ class Expression:
                 return
             case ast.Name(id=name):
                 if name not in self.names:
-                    known = ", ".join(sorted(self.names))
-                    raise InvalidPatchError(
-                        f"{self.where} uses the unknown name {name!r}; known are {known}."
+                    self._refuse(
+                        f" uses the unknown name {name!r}; known are {', '.join(sorted(self.names))}"
                     )
             case ast.BinOp(left=left, op=op, right=right) if isinstance(op, _OPERATORS):
                 self._check(left)
@@ -104,14 +99,17 @@ class Expression:
                 self._check(operand)
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in _FUNCTIONS and args:
                 if name not in ("min", "max") and len(args) != 1:
-                    raise InvalidPatchError(f"{self.where}: {name} takes one argument, but has {len(args)}.")
+                    self._refuse(f": {name} takes one argument, but has {len(args)}")
                 for argument in args:
                     self._check(argument)
             case _:
-                raise InvalidPatchError(
-                    f"{self.where} may hold numbers, names, + - * / **, brackets and "
-                    f"{', '.join(_FUNCTIONS)}, but holds {ast.unparse(node)!r}."
+                self._refuse(
+                    f" may hold numbers, names, + - * / **, brackets and {', '.join(_FUNCTIONS)}, but holds "
+                    f"{ast.unparse(node)!r}"
                 )
+
+    def _refuse(self, fault: str) -> NoReturn:
+        raise InvalidPatchError(f"{self.where}{fault}.")
 
     def value(self, values: Mapping[str, float]) -> float:
         """Return the value for values of the names.
@@ -134,13 +132,11 @@ class Expression:
                 # `_check` lets pass nothing but numbers, the known names and functions, and operators
                 result = eval(_compiled(self.text.strip()), _KNOWN, dict(values))
         except NameError as cause:
-            raise InvalidPatchError(
-                f"{self.where}: {self.text!r} needs {cause.name!r}, which has no value at this place."
-            ) from cause
+            self._refuse(f": {self.text!r} needs {cause.name!r}, which has no value at this place")
         except (ArithmeticError, ValueError, TypeError) as cause:
-            raise InvalidPatchError(f"{self.where}: {self.text!r} cannot be evaluated ({cause}).") from cause
+            self._refuse(f": {self.text!r} cannot be evaluated ({cause})")
         if np.iscomplexobj(result) or not np.isfinite(result).all():
-            raise InvalidPatchError(f"{self.where}: {self.text!r} is not a finite number{when}.")
+            self._refuse(f": {self.text!r} is not a finite number{when}")
         return result
 
     def used(self) -> frozenset[str]:

@@ -1,19 +1,17 @@
 """Records of arrays that live in one `.npz` file: checked where they are made, read back to the last bit.
 
-The file has reproducible bytes, is written whole or not at all, and nothing in it is pickled.
+The file has reproducible bytes, and nothing in it is pickled.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
 import io
-import os
-import tempfile
 import zipfile
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
 from math import isfinite
 from pathlib import Path
-from typing import Any, ClassVar, Self, get_args
+from typing import Any, ClassVar, NoReturn, Self, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -111,34 +109,6 @@ def require_arrays(arrays: Mapping[str, npt.NDArray[Any]], where: str, wanted: I
         raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it anew.")
 
 
-def write_bytes_atomically(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all: a reader never sees half of it, whatever happens meanwhile.
-
-    Parameters
-    ----------
-    path : Path
-        The file; its folder must exist.
-    content : bytes
-        What it is to hold.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written; an older file of that name is then untouched.
-    """
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
 @dataclass(frozen=True, repr=False)
 class KeptArrays:
     """Arrays and plain numbers that were made of one design; a kind of record is a subclass with its fields.
@@ -176,19 +146,20 @@ class KeptArrays:
             if number is float:
                 low, high = map(float, axes)
                 if not (isfinite(array) and low <= array <= high):
-                    raise ReducedModelFileError(
-                        f"The {item.name} of {self.what} must lie between {low:.2g} and {high:g}, but is "
-                        f"{array!r}; build it anew."
-                    )
+                    self.refuse(f"must have a {item.name} between {low:.2g} and {high:g}, but has {array!r}")
                 continue
             (kind,) = get_args(get_args(number)[1])
             lengths = {**dict(zip(axes, array.shape, strict=False)), **lengths}
             expected = tuple(axis if isinstance(axis, int) else lengths.get(axis, 0) for axis in axes)
             if array.shape != expected or array.dtype != kind or not np.isfinite(array).all():
-                raise ReducedModelFileError(
-                    f"The array {item.name} of {self.what} must hold finite numbers in the shape "
-                    f"{expected}, but it has shape {array.shape} and type {array.dtype}; build it anew."
+                self.refuse(
+                    f"must hold finite numbers in shape {expected} in its array {item.name}, but that has "
+                    f"shape {array.shape} and type {array.dtype}"
                 )
+
+    def refuse(self, fault: str) -> NoReturn:
+        """Refuse a record that cannot be: `fault` says what is wrong with it."""
+        raise ReducedModelFileError(f"{self.what[0].upper()}{self.what[1:]} {fault}; build it anew.")
 
     def _lengths(self) -> dict[str | int, int]:
         """Return the lengths of axes that follow from others or from names."""
@@ -238,11 +209,7 @@ class KeptArrays:
                 f"{where} does not hold the arrays of {cls.what} ({cause}); build it anew."
             ) from cause
 
-    def save(self, path: str | Path) -> None:
-        """Write one `.npz` file, whole or not at all; `OSError` if that fails."""
-        write_bytes_atomically(Path(path), self.to_bytes())
-
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what `save` wrote; raises `FileNotFoundError` or `ReducedModelFileError`."""
+        """Read a file of `to_bytes`; raises `FileNotFoundError` or `ReducedModelFileError`."""
         return cls.from_bytes(Path(path).read_bytes(), str(path))

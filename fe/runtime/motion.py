@@ -5,7 +5,7 @@ copied into the FMU. The loops run as plain Python here; `discrepancy.models.com
 functions compiled, to be given as `kernel`.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import isfinite
@@ -80,10 +80,8 @@ class Laws:
         Port of each law, J of them.
     numbers : (J,) ndarray of int
         Which of `fe.runtime.laws.LAWS` each is.
-    values : (J, 5) ndarray
-        Parameters.
-    elements : (J, E) ndarray
-        Parameters of hysteretic elements.
+    values : (J, 5 + E) ndarray
+        Parameters, then those of hysteretic elements.
     rate : float
         Stiffness drift of the whole structure [1/s].
     spans : tuple of tuple of (float, float)
@@ -93,7 +91,6 @@ class Laws:
     ports: tuple[str, ...]
     numbers: IntArray
     values: FloatArray
-    elements: FloatArray
     rate: float = 0.0
     spans: tuple[tuple[tuple[float, float], ...], ...] = ()
 
@@ -124,7 +121,7 @@ class Laws:
     def only(self, chosen: BoolArray) -> "Laws":
         """Return some of the laws, as they are while they act."""
         names = tuple(name for name, taken in zip(self.ports, chosen, strict=True) if taken)
-        return Laws(names, self.numbers[chosen], self.values[chosen], self.elements[chosen], self.rate)
+        return Laws(names, self.numbers[chosen], self.values[chosen], self.rate)
 
     def filled(self, memory: FloatArray, chosen: BoolArray) -> FloatArray:
         """Return the memory of all laws from that of `only` some of them; the others were never loaded."""
@@ -134,7 +131,7 @@ class Laws:
 
     def alike(self, other: "Laws") -> bool:
         """Return whether these are the same laws at the same ports, whose memory then stays."""
-        same = self.ports == other.ports and self.elements.shape == other.elements.shape
+        same = self.ports == other.ports and self.values.shape == other.values.shape
         return same and bool(np.array_equal(self.numbers, other.numbers))
 
     @cached_property
@@ -143,31 +140,16 @@ class Laws:
         return np.array([LAWS[number].of_speed for number in self.numbers], dtype=np.int64)
 
     def memory(self) -> FloatArray:
-        """Return the memory (J, 5 + E) of laws that have never been loaded."""
-        return np.zeros((len(self), HEAD + self.elements.shape[1]))
+        """Return the memory (J, 5 + E) of laws that have never been loaded, E at least 1."""
+        return np.zeros((len(self), HEAD + max(1, self.values.shape[1] - PARAMETERS)))
 
-    def at(
-        self,
-        rows: FloatArray,
-        flexibility: FloatArray | None = None,
-        relaxation: float = 0.0,
-        acts: FloatArray | None = None,
-    ) -> Ports:
-        """Return the laws at ports, for the loops; what is given is that of `Ports`."""
-        return Ports(
-            rows,
-            self.numbers,
-            self.of_speed,
-            self.values,
-            self.elements,
-            np.zeros(len(self)) if flexibility is None else flexibility,
-            float(relaxation),
-            np.zeros(len(self)),
-            rows if acts is None else acts,
-        )
+    def at(self, rows: FloatArray) -> Ports:
+        """Return the laws at ports (J, M), for the loops; modes hold all that the ports yield."""
+        none, feed = np.zeros((2, len(self)))
+        return Ports(rows, self.numbers, self.of_speed, self.values, none, 0.0, feed, rows, self.rate)
 
 
-NO_LAWS = Laws((), np.zeros(0, dtype=np.int64), np.zeros((0, PARAMETERS)), np.zeros((0, 1)))
+NO_LAWS = Laws((), np.zeros(0, dtype=np.int64), np.zeros((0, PARAMETERS)))
 """The linear structure."""
 
 
@@ -210,22 +192,10 @@ def laws_of(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = Fal
     if not forces:
         return NO_LAWS if rate == 0.0 else replace(NO_LAWS, rate=rate)
     spans = tuple(tuple(window.span for window in item.windows) for item in forces)
-    return Laws(
-        tuple(item.port for item in forces),
-        np.array([LAWS.index(type(item)) for item in forces], dtype=np.int64),
-        _padded([item.row for item in forces], PARAMETERS),
-        _padded([item.elements() for item in forces], 1),
-        rate,
-        spans if any(spans) else (),
-    )
-
-
-def _padded(rows: Sequence[Sequence[float] | FloatArray], least: int) -> FloatArray:
-    """Return rows as an array, zeros after shorter ones, at least so wide."""
-    found = np.zeros((len(rows), max(least, *map(len, rows))))
-    for own, row in zip(found, rows, strict=True):
-        own[: len(row)] = row
-    return found
+    numbers = np.array([LAWS.index(type(item)) for item in forces], dtype=np.int64)
+    rows = [item.row for item in forces]
+    values = np.array([np.pad(row, (0, max(map(len, rows)) - len(row))) for row in rows])
+    return Laws(tuple(item.port for item in forces), numbers, values, rate, spans if any(spans) else ())
 
 
 LEAST_FLEXIBLE = 0.1

@@ -16,9 +16,6 @@ Unnamed = tuple[Any, ...]
 FIRST_PARTS = 400
 """Parts in which the way from a law's last position to the first one of a motion is followed."""
 
-STILL, SPEED, POSITION, FLEXIBLE = 0, 1, 2, 3
-"""How a law acts: not, its port being still; on the modes, by speed or position; on what they leave out."""
-
 
 class Steps(NamedTuple):
     """K steps, M modes, J laws; boundary k is the begin of step k.
@@ -41,6 +38,10 @@ class Steps(NamedTuple):
         Of the boundaries [s].
     sample : (N,) ndarray of int
         Boundary of each sample, the first at 0.
+    stiffness : (M,) ndarray
+        Squared angular frequencies [1/s^2].
+    damping : (M, M) ndarray
+        D [1/s].
     """
 
     transition: FloatArray
@@ -52,6 +53,8 @@ class Steps(NamedTuple):
     feed: FloatArray
     time: FloatArray
     sample: IntArray
+    stiffness: FloatArray
+    damping: FloatArray
 
     def between(self, first: int, last: int) -> "Steps":
         """Return the steps between two boundaries, each of which is a sample."""
@@ -60,33 +63,6 @@ class Steps(NamedTuple):
             which=self.which[steps], push=self.push[steps], begin=self.begin[steps], end=self.end[steps],
             feed=self.feed[boundaries], time=self.time[boundaries], sample=np.arange(last - first + 1),
         )  # fmt: skip
-
-
-class Linear(NamedTuple):
-    """The linear structure, and its exact motion in the step that is taken.
-
-    Attributes
-    ----------
-    stiffness : (M,) ndarray
-        Squared angular frequencies [1/s^2].
-    damping : (M, M) ndarray
-        D [1/s].
-    coupled : bool
-        Whether `transition` couples modes.
-    rate : float
-        Stiffness drift r [1/s].
-    transition, push, begin, end : (2M, 2M), (2M,), (M,), (M,) ndarray
-        Those of the step in `Steps`.
-    """
-
-    stiffness: FloatArray
-    damping: FloatArray
-    coupled: bool
-    rate: float
-    transition: FloatArray
-    push: FloatArray
-    begin: FloatArray
-    end: FloatArray
 
 
 class Ports(NamedTuple):
@@ -100,7 +76,7 @@ class Ports(NamedTuple):
         Laws.
     of_speed : (J,) ndarray of int
         1 for a law of speed.
-    values, elements : (J, 5), (J, E) ndarray
+    values : (J, 5 + E) ndarray
         Their parameters, and those of their elements.
     flexibility : (J,) ndarray
         R: position of each law's port by a unit force there that the modes do not hold; laws with the same
@@ -111,17 +87,19 @@ class Ports(NamedTuple):
         What loads add to the ports' positions beyond the modes, at the end of the step that is taken.
     acts : (J, M) ndarray
         Row along which each law acts; that of its port, but for flows from one store into another.
+    rate : float
+        Stiffness drift r of the whole structure [1/s].
     """
 
     rows: FloatArray
     numbers: IntArray
     of_speed: IntArray
     values: FloatArray
-    elements: FloatArray
     flexibility: FloatArray
     relaxation: float
     feed: FloatArray
     acts: FloatArray
+    rate: float
 
 
 class State(NamedTuple):
@@ -134,12 +112,12 @@ class State(NamedTuple):
 
 
 class Acting(NamedTuple):
-    """How the laws act on the modes.
+    """How the laws act on the modes, and what is kept of the begin of a step.
 
     Attributes
     ----------
     route : (J,) ndarray of int
-        `STILL`, `SPEED`, `POSITION` or `FLEXIBLE`.
+        `STILL`, `SPEED`, `POSITION` or `FLEXIBLE` of `motion_kernel`.
     leader : (J,) ndarray of int
         The first law at the same flexible port; -1 elsewhere.
     springs : (J,) ndarray of int
@@ -154,6 +132,16 @@ class Acting(NamedTuple):
         Change of the modes for one unit of change at the port.
     answer : (J, 2M) ndarray
         State after a step to a unit kick at its begin.
+    q, v : (M,) ndarray
+        State at the begin.
+    room : (2M,) ndarray
+        For a new state.
+    forces : (J,) ndarray
+        Forces of the laws at the begin.
+    speed, lost : (J,) ndarray
+        Speed of the port of a law of speed at the begin, and what its first half kick took of it.
+    freed : (J,) ndarray
+        1 where friction let go in this step.
     """
 
     route: IntArray
@@ -164,25 +152,6 @@ class Acting(NamedTuple):
     give: FloatArray
     pull: FloatArray
     answer: FloatArray
-
-
-class Before(NamedTuple):
-    """What is kept of the begin of a step.
-
-    Attributes
-    ----------
-    q, v : (M,) ndarray
-        State.
-    room : (2M,) ndarray
-        For a new state.
-    forces : (J,) ndarray
-        Forces of the laws.
-    speed, lost : (J,) ndarray
-        Speed of the port of a law of speed, and what its first half kick took of it.
-    freed : (J,) ndarray
-        1 where friction let go in this step.
-    """
-
     q: FloatArray
     v: FloatArray
     room: FloatArray

@@ -6,7 +6,12 @@ symmetrically (Strang 1968): laws of speed, laws of position, linear motion, law
 Laws of speed have a closed form. Where friction turns over inside a step, the impulse and its first moment
 are corrected for the moment of the turn; where it holds, the port is held in place by the impulses that this
 needs, as long as friction can give them. What a law is `fe.runtime.laws.interface` says; none is known here.
-Laws on flexibility that the modes leave out are those of `fe.runtime.flexible_ports`.
+
+Last laws at ports that lie on flexibility R which the modes leave out: x = p . q - R D + e, where D is the
+force of the laws there after a lag, beta D' + D = F (the lag of damping in proportion to the stiffness;
+backward Euler), and e what loads add. The force of a law is that at the step's end, where it obeys the law at
+its own position: a monotone equation in one unknown. Dry friction is then an elasto-plastic element of
+stiffness 1/R.
 
 Written in the subset of Python that numba compiles too. NumPy and relative imports only: this file is copied
 into the FMU. `discrepancy.models.compiled_motion` has the same compiled.
@@ -14,84 +19,57 @@ into the FMU. `discrepancy.models.compiled_motion` has the same compiled.
 
 import numpy as np
 
-from .flexible_ports import begin_flexible, carry_flexible, pull_of
-from .laws import (
-    advance,
-    crossing,
-    dry,
-    holding_limit,
-    holds,
-    kick,
-    share,
-    steady,
-    strength,
-)
-from .motion_arrays import (
-    FIRST_PARTS,
-    FLEXIBLE,
-    POSITION,
-    SPEED,
-    STILL,
-    Acting,
-    Before,
-    FloatArray,
-    Linear,
-    Ports,
-    Samples,
-    State,
-    Steps,
-    Unnamed,
-    add,
-    at_port,
-)
+from . import laws
+from .arrays import FloatArray
+from .motion_arrays import FIRST_PARTS, Acting, Ports, Samples, State, Steps, Unnamed, add, at_port
+from .static_path import pull_of, settle_port
+
+STILL, SPEED, POSITION, FLEXIBLE = 0, 1, 2, 3
+"""How a law acts: not, its port being still; on the modes, by speed or position; on what they leave out."""
 
 
 def integrate(
-    steps: Unnamed, linear: Unnamed, known: bool, ports: Unnamed, state: Unnamed, out: Unnamed
+    steps: Unnamed, coupled: bool, known: bool, at_ports: Unnamed, begin: Unnamed, out: Unnamed
 ) -> None:
     """Integrate over steps; the state is changed in place, `out` is filled.
 
-    Given are the fields of `Steps`, `Linear`, `Ports`, `State` and `Samples` without their names: numba takes
-    three times as long for a tuple with names as for one without. `known`: the memory is that of a state;
-    otherwise each law is loaded from zero to its first position.
+    Given are the fields of `Steps`, `Ports`, `State` and `Samples` without their names: numba takes three
+    times as long for a tuple with names as for one without. `coupled`: steps couple modes. `known`: the
+    memory is that of a state; otherwise each law is loaded from zero to its first position.
     """
-    go, body, samples = Steps(*steps), Linear(*linear), Samples(*out)
-    laws, moving = Ports(*ports), State(*state)
-    modes, count = len(moving.q), len(laws.numbers)
-    none, whole = np.zeros((7, count)), np.zeros((3, count), dtype=np.int64)
+    go, ports, state, samples = Steps(*steps), Ports(*at_ports), State(*begin), Samples(*out)
+    modes, count = len(state.q), len(ports.numbers)
+    none, whole, still = np.zeros((7, count)), np.zeros((3, count), dtype=np.int64), np.zeros((2, modes))
     acting = Acting(
         whole[0], whole[1], whole[2], none[0], none[1], none[2], np.zeros((count, modes)),
-        np.zeros((count, 2 * modes)),
+        np.zeros((count, 2 * modes)), still[0], still[1], np.zeros(2 * modes), none[3], none[4], none[5],
+        none[6],
     )  # fmt: skip
-    before = Before(np.zeros(modes), np.zeros(modes), np.zeros(2 * modes), none[3], none[4], none[5], none[6])
-    h = go.length[go.which[0]]
-    take(laws.feed, go.feed[0])
-    take_matrix(body.transition, go.transition[go.which[0]])
-    take(body.end, go.begin[0])
-    find_routes(laws, acting)
-    begin_on_modes(body, laws, acting, moving, known)
-    begin_flexible(laws, acting, moving, h, known)
-    record(body, laws, acting, moving, go.time[0], 0, samples)
-    sample, last = 1, go.which[0]
+    last = go.which[0]
+    take(ports.feed, go.feed[0])
+    find_routes(ports, acting)
+    begin_on_modes(go, ports, acting, state, known)
+    begin_flexible(ports, acting, state, go.length[last], known)
+    record(go, ports, acting, state, go.begin[0], 0, samples)
+    sample = 1
     for k in range(len(go.which)):
         if go.which[k] != last:
             last = go.which[k]
-            h = go.length[last]
-            take_matrix(body.transition, go.transition[last])
             for j in range(count):
                 if acting.route[j] == SPEED:
-                    find_answer(body, laws, acting, j)
-        take(body.begin, go.begin[k])
-        take(body.end, go.end[k])
-        take(body.push, go.push[k])
-        take(laws.feed, go.feed[k + 1])
-        first_half(body, laws, acting, moving, before, go.time[k], h)
-        move(body, moving, before.room)
-        hold(laws, acting, moving, before, h)
-        carry_flexible(laws, acting, moving, h)
-        second_half(body, laws, acting, moving, before, go.time[k], h)
+                    find_answer(go, last, ports, acting, j)
+        h = go.length[last]
+        take(ports.feed, go.feed[k + 1])
+        first_half(go, k, ports, acting, state, h)
+        if coupled:
+            move(go, k, state, acting.room)
+        else:
+            move_alone(go, k, state)
+        hold(ports, acting, state, h)
+        carry_flexible(ports, acting, state, h)
+        second_half(go, k, ports, acting, state, h)
         if k + 1 == go.sample[sample]:
-            record(body, laws, acting, moving, go.time[k + 1], sample, samples)
+            record(go, ports, acting, state, go.end[k], sample, samples)
             sample += 1
 
 
@@ -99,12 +77,6 @@ def take(into: FloatArray, given: FloatArray) -> None:
     """Copy numbers; numba takes two seconds to compile `into[:] = given`."""
     for i in range(len(into)):
         into[i] = given[i]
-
-
-def take_matrix(into: FloatArray, given: FloatArray) -> None:
-    """Copy a matrix, row by row."""
-    for i in range(len(into)):
-        take(into[i], given[i])
 
 
 def find_routes(ports: Ports, acting: Acting) -> None:
@@ -133,17 +105,17 @@ def find_routes(ports: Ports, acting: Acting) -> None:
             acting.route[j] = SPEED if ports.of_speed[j] == 1 else POSITION
 
 
-def find_answer(linear: Linear, ports: Ports, acting: Acting, j: int) -> None:
-    """Set what a unit kick at the port of a law of speed does in a step."""
+def find_answer(go: Steps, which: int, ports: Ports, acting: Acting, j: int) -> None:
+    """Set what a unit kick at the port of a law of speed does in a step of a length."""
     modes = ports.rows.shape[1]
     for m in range(2 * modes):
         acting.answer[j, m] = 0.0
         for k in range(modes):
-            acting.answer[j, m] += linear.transition[m, modes + k] * ports.acts[j, k]
+            acting.answer[j, m] += go.transition[which, m, modes + k] * ports.acts[j, k]
     acting.give[j] = at_port(ports.rows, j, acting.answer[j, :modes])
 
 
-def begin_on_modes(linear: Linear, ports: Ports, acting: Acting, state: State, known: bool) -> None:
+def begin_on_modes(go: Steps, ports: Ports, acting: Acting, state: State, known: bool) -> None:
     """Take the laws that act on the modes, and those of speed on flexible ports, to the first sample."""
     for j in range(len(ports.numbers)):
         if acting.route[j] == STILL:
@@ -153,95 +125,89 @@ def begin_on_modes(linear: Linear, ports: Ports, acting: Acting, state: State, k
             if ports.of_speed[j] == 1 and known:
                 state.current[j] = state.memory[j, 4]
             elif ports.of_speed[j] == 1:  # moving steadily
-                state.current[j] = steady(ports.numbers[j], ports.values[j], x, speed)
+                state.current[j] = laws.steady(ports.numbers[j], ports.values[j], x, speed)
                 state.memory[j, 2] = state.current[j]
         elif acting.route[j] == SPEED:
-            acting.strength[j] = strength(ports.numbers[j], ports.values[j], acting.weight[j])
-            find_answer(linear, ports, acting, j)
-            if holds(ports.numbers[j], ports.values[j]) and speed == 0.0 and acting.strength[j] > 0.0:
+            acting.strength[j] = laws.strength(ports.numbers[j], ports.values[j], acting.weight[j])
+            find_answer(go, go.which[0], ports, acting, j)
+            if laws.holds(ports.numbers[j], ports.values[j]) and speed == 0.0 and acting.strength[j] > 0.0:
                 state.memory[j, 0] = 1.0
                 state.memory[j, 1] = x
         else:
-            advance(ports.numbers[j], ports.values[j], ports.elements[j], state.memory[j], x, FIRST_PARTS)
+            laws.advance(ports.numbers[j], ports.values[j], state.memory[j], x, FIRST_PARTS)
             state.current[j], _ = pull_of(ports, state, j, x, 1.0, 1)
 
 
-def first_half(
-    linear: Linear, ports: Ports, acting: Acting, state: State, before: Before, time: float, h: float
-) -> None:
+def first_half(go: Steps, k: int, ports: Ports, acting: Acting, state: State, h: float) -> None:
     """Give the modes the first half of the impulse of the internal forces."""
     half = 0.5 * h
     modes, count = len(state.q), len(ports.numbers)
     for j in range(count):
-        before.forces[j] = state.current[j]
+        acting.forces[j] = state.current[j]
     for m in range(modes):
-        before.q[m] = state.q[m]
-        before.v[m] = state.v[m]
+        acting.q[m] = state.q[m]
+        acting.v[m] = state.v[m]
     for j in range(count):
         if acting.route[j] != SPEED:
             continue
-        before.freed[j] = 0.0
-        before.lost[j] = 0.0
+        acting.freed[j] = 0.0
+        acting.lost[j] = 0.0
         speed, x = at_port(ports.rows, j, state.v), at_port(ports.rows, j, state.q)
-        before.speed[j] = speed
+        acting.speed[j] = speed
         if state.memory[j, 0] == 1.0:
             continue
-        now = acting.strength[j] * share(ports.numbers[j], ports.values[j], x)
+        now = acting.strength[j] * laws.share(ports.numbers[j], ports.values[j], x)
         # dry friction is not stopped at zero: the turn is looked for after the step
-        before.lost[j] = speed - kick(ports.numbers[j], ports.values[j], speed, now, half, True)
-        add(state.v, acting.pull[j], -before.lost[j], 1.0)
+        acting.lost[j] = speed - laws.kick(ports.numbers[j], ports.values[j], speed, now, half, True)
+        add(state.v, acting.pull[j], -acting.lost[j], 1.0)
     for j in range(count):
         if state.current[j] != 0.0:
             add(state.v, ports.acts[j], -state.current[j], half)
-    if linear.rate != 0.0:
+    if ports.rate != 0.0:
         for m in range(modes):
-            state.v[m] -= half * linear.rate * time * linear.stiffness[m] * state.q[m]
+            state.v[m] -= half * ports.rate * go.time[k] * go.stiffness[m] * state.q[m]
 
 
-def move(linear: Linear, state: State, new: FloatArray) -> None:
+def move(go: Steps, k: int, state: State, new: FloatArray) -> None:
     """Move the linear structure; exact."""
-    modes = len(state.q)
-    if linear.coupled:
+    modes, step = len(state.q), go.which[k]
+    for i in range(2 * modes):
+        total = go.push[k, i]
         for m in range(modes):
-            i = modes + m
-            total_q, total_v = linear.push[m], linear.push[i]
-            for k in range(modes):
-                total_q += linear.transition[m, k] * state.q[k] + linear.transition[m, modes + k] * state.v[k]
-                total_v += linear.transition[i, k] * state.q[k] + linear.transition[i, modes + k] * state.v[k]
-            new[m] = total_q
-            new[i] = total_v
-        for m in range(modes):
-            state.q[m] = new[m]
-            state.v[m] = new[modes + m]
-    else:
-        for m in range(modes):
-            i = modes + m
-            total_q = linear.transition[m, m] * state.q[m] + linear.transition[m, i] * state.v[m]
-            total_v = linear.transition[i, m] * state.q[m] + linear.transition[i, i] * state.v[m]
-            state.q[m] = total_q + linear.push[m]
-            state.v[m] = total_v + linear.push[i]
+            total += go.transition[step, i, m] * state.q[m] + go.transition[step, i, modes + m] * state.v[m]
+        new[i] = total
+    for m in range(modes):
+        state.q[m] = new[m]
+        state.v[m] = new[modes + m]
 
 
-def hold(ports: Ports, acting: Acting, state: State, before: Before, h: float) -> None:
+def move_alone(go: Steps, k: int, state: State) -> None:
+    """Move the linear structure whose modes move each by itself; exact."""
+    modes, step = len(state.q), go.which[k]
+    for m in range(modes):
+        i, q, v = modes + m, state.q[m], state.v[m]
+        state.q[m] = go.transition[step, m, m] * q + go.transition[step, m, i] * v + go.push[k, m]
+        state.v[m] = go.transition[step, i, m] * q + go.transition[step, i, i] * v + go.push[k, i]
+
+
+def hold(ports: Ports, acting: Acting, state: State, h: float) -> None:
     """Keep the ports that friction holds in place, by an impulse at the begin of the step."""
     modes = len(state.q)
     for j in range(len(ports.numbers)):
         if acting.route[j] != SPEED or state.memory[j, 0] != 1.0:
             continue
-        now = acting.strength[j] * share(ports.numbers[j], ports.values[j], state.memory[j, 1])
-        limit = holding_limit(ports.numbers[j], ports.values[j], now, 0.5 * h)
+        now = acting.strength[j] * laws.share(ports.numbers[j], ports.values[j], state.memory[j, 1])
+        limit = laws.holding_limit(ports.numbers[j], ports.values[j], now, 0.5 * h)
         impulse = (state.memory[j, 1] - at_port(ports.rows, j, state.q)) / acting.give[j]
         if abs(impulse) * acting.weight[j] > limit:
             state.memory[j, 0] = 0.0
-            before.freed[j] = 1.0
+            acting.freed[j] = 1.0
             impulse = (limit if impulse > 0.0 else -limit) / acting.weight[j]
         add(state.q, acting.answer[j], impulse, 1.0)
         add(state.v, acting.answer[j, modes:], impulse, 1.0)
 
 
-def second_half(
-    linear: Linear, ports: Ports, acting: Acting, state: State, before: Before, time: float, h: float
-) -> None:  # fmt: skip
+def second_half(go: Steps, k: int, ports: Ports, acting: Acting, state: State, h: float) -> None:
     """Give the modes the second half of the impulse; look for friction that turned over."""
     half = 0.5 * h
     modes, count = len(state.q), len(ports.numbers)
@@ -249,32 +215,32 @@ def second_half(
         if acting.route[j] != POSITION:
             continue
         x = at_port(ports.rows, j, state.q)
-        advance(ports.numbers[j], ports.values[j], ports.elements[j], state.memory[j], x, 1)
+        laws.advance(ports.numbers[j], ports.values[j], state.memory[j], x, 1)
         state.current[j], _ = pull_of(ports, state, j, x, 1.0, 1)
         add(state.v, ports.acts[j], -state.current[j], half)
-    if linear.rate != 0.0:
+    if ports.rate != 0.0:
         for m in range(modes):
-            state.v[m] -= half * linear.rate * (time + h) * linear.stiffness[m] * state.q[m]
+            state.v[m] -= half * ports.rate * (go.time[k] + h) * go.stiffness[m] * state.q[m]
     for j in range(count - 1, -1, -1):
         if acting.route[j] != SPEED:
             continue
         x, speed = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
         if state.memory[j, 0] == 1.0:
-            now = acting.strength[j] * share(ports.numbers[j], ports.values[j], state.memory[j, 1])
-            limit = holding_limit(ports.numbers[j], ports.values[j], now, half)
+            now = acting.strength[j] * laws.share(ports.numbers[j], ports.values[j], state.memory[j, 1])
+            limit = laws.holding_limit(ports.numbers[j], ports.values[j], now, half)
             taken = speed
             if abs(speed) > limit:
                 taken = limit if speed > 0.0 else -limit
                 state.memory[j, 0] = 0.0
             add(state.v, acting.pull[j], -taken, 1.0)
             continue
-        now = acting.strength[j] * share(ports.numbers[j], ports.values[j], x)
-        end = speed - before.lost[j]
-        can_hold = holds(ports.numbers[j], ports.values[j])
-        if can_hold and before.freed[j] == 0.0 and before.speed[j] != 0.0 and before.speed[j] * end <= 0.0:
-            turn_over(linear, ports, acting, state, before, j, now, time, h)
+        now = acting.strength[j] * laws.share(ports.numbers[j], ports.values[j], x)
+        end = speed - acting.lost[j]
+        can_hold = laws.holds(ports.numbers[j], ports.values[j])
+        if can_hold and acting.freed[j] == 0.0 and acting.speed[j] != 0.0 and acting.speed[j] * end <= 0.0:
+            turn_over(go, k, ports, acting, state, j, now, h)
         else:
-            after = kick(ports.numbers[j], ports.values[j], speed, now, half, False)
+            after = laws.kick(ports.numbers[j], ports.values[j], speed, now, half, False)
             if after == 0.0 and can_hold and now > 0.0:
                 state.memory[j, 0] = 1.0
                 state.memory[j, 1] = x
@@ -282,39 +248,37 @@ def second_half(
 
 
 def acceleration(
-    linear: Linear, ports: Ports, q: FloatArray, v: FloatArray, forces: FloatArray, push: float, time: float,
-    m: int,
-) -> float:  # fmt: skip
+    go: Steps, ports: Ports, q: FloatArray, v: FloatArray, forces: FloatArray, push: float, t: float, m: int
+) -> float:
     """Return the acceleration of a mode under a push and the forces of laws; those of speed have none."""
-    total = push - linear.stiffness[m] * (1.0 + linear.rate * time) * q[m]
+    total = push - go.stiffness[m] * (1.0 + ports.rate * t) * q[m]
     for k in range(len(q)):
-        total -= linear.damping[m, k] * v[k]
+        total -= go.damping[m, k] * v[k]
     for k in range(len(forces)):
         total -= ports.acts[k, m] * forces[k]
     return float(total)
 
 
 def turn_over(
-    linear: Linear, ports: Ports, acting: Acting, state: State, before: Before, j: int, now: float,
-    time: float, h: float,
-) -> None:  # fmt: skip
+    go: Steps, k: int, ports: Ports, acting: Acting, state: State, j: int, now: float, h: float
+) -> None:
     """Correct speed and position of a port whose friction turned over within a step."""
-    at_begin = -2.0 * before.lost[j] / h  # acceleration at both ends, as friction of the first sign has it
+    at_begin = -2.0 * acting.lost[j] / h  # acceleration at both ends, as friction of the first sign has it
     at_end = at_begin
     for m in range(len(state.q)):
-        first = acceleration(linear, ports, before.q, before.v, before.forces, linear.begin[m], time, m)
-        last = acceleration(linear, ports, state.q, state.v, state.current, linear.end[m], time + h, m)
+        first = acceleration(go, ports, acting.q, acting.v, acting.forces, go.begin[k, m], go.time[k], m)
+        last = acceleration(go, ports, state.q, state.v, state.current, go.end[k, m], go.time[k] + h, m)
         at_begin += ports.rows[j, m] * first
         at_end += ports.rows[j, m] * last
     speed = at_port(ports.rows, j, state.v)
-    change, way, held = crossing(
-        ports.numbers[j], ports.values[j], before.speed[j], speed - before.lost[j], (at_begin, at_end),
-        before.lost[j], now, h,
+    change, way, held = laws.crossing(
+        ports.numbers[j], ports.values[j], acting.speed[j], speed - acting.lost[j], (at_begin, at_end),
+        acting.lost[j], now, h,
     )  # fmt: skip
     if held == 1.0:
         change = -speed
         x = at_port(ports.rows, j, state.q)
-        way += at_port(ports.rows, j, before.q) - x
+        way += at_port(ports.rows, j, acting.q) - x
         state.memory[j, 0] = 1.0
         state.memory[j, 1] = x + way
     add(state.q, acting.pull[j], way, 1.0)
@@ -322,10 +286,10 @@ def turn_over(
 
 
 def record(
-    linear: Linear, ports: Ports, acting: Acting, state: State, time: float, sample: int, out: Samples
-) -> None:  # fmt: skip
-    """Write state and forces at a sample."""
-    modes, count = len(state.q), len(ports.numbers)
+    go: Steps, ports: Ports, acting: Acting, state: State, push: FloatArray, sample: int, out: Samples
+) -> None:
+    """Write state and forces at a sample, where modal forces push."""
+    modes, count, time = len(state.q), len(ports.numbers), go.time[go.sample[sample]]
     for m in range(modes):
         out.q[sample, m] = state.q[m]
         out.v[sample, m] = state.v[m]
@@ -335,14 +299,86 @@ def record(
         if acting.route[j] != SPEED:
             continue
         x, speed = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
-        out.forces[sample, j] = steady(ports.numbers[j], ports.values[j], x, speed)
+        out.forces[sample, j] = laws.steady(ports.numbers[j], ports.values[j], x, speed)
         if state.memory[j, 0] == 1.0:  # what it takes to hold the port
             need = 0.0
             for m in range(modes):
-                push = acceleration(linear, ports, state.q, state.v, state.current, linear.end[m], time, m)
-                need += ports.rows[j, m] * push / acting.weight[j]
-            if dry(ports.numbers[j], ports.values[j]):
-                most = acting.strength[j] * share(ports.numbers[j], ports.values[j], x) / acting.weight[j]
-                need = min(max(need, -most), most)
+                own = acceleration(go, ports, state.q, state.v, state.current, push[m], time, m)
+                need += ports.rows[j, m] * own / acting.weight[j]
+            if laws.dry(ports.numbers[j], ports.values[j]):
+                most = acting.strength[j] * laws.share(ports.numbers[j], ports.values[j], x)
+                need = min(max(need, -most / acting.weight[j]), most / acting.weight[j])
             out.forces[sample, j] = need
         out.lagged[sample, j] = out.forces[sample, j]
+
+
+# ---------------------------------------------------------------- on what the modes leave out
+
+
+def begin_flexible(ports: Ports, acting: Acting, state: State, h: float, known: bool) -> None:
+    """Take the laws on flexible ports to the first sample; without a known memory they follow at once."""
+    count = len(ports.numbers)
+    at_once = 1.0 if ports.relaxation == 0.0 or not known else 0.0
+    for port in range(count):
+        if acting.leader[port] != port:  # one law for each flexible port
+            continue
+        y = ports.feed[port] + state.memory[port, 3]
+        y += at_port(ports.rows, port, state.q)
+        springs = -1
+        for j in range(count):
+            acting.springs[j] = -1
+            if acting.leader[j] != port:
+                continue
+            damped = ports.of_speed[j] == 1
+            y -= ports.flexibility[port] * state.memory[j, 2] * (1.0 if damped else 1.0 - at_once)
+            if not damped:
+                springs = j if springs < 0 else springs
+                acting.springs[j] = springs
+                last = state.memory[j, 1]
+                state.current[j], _ = pull_of(ports, state, j, last, h, FIRST_PARTS)
+        x = y
+        if springs >= 0:
+            r = at_once * ports.flexibility[port]
+            x = settle_port(springs, acting.springs, ports, state, y, r, h, FIRST_PARTS)
+        for j in range(count):
+            if acting.leader[j] != port:
+                continue
+            if ports.of_speed[j] == 0:
+                arrive(ports, state, j, x, FIRST_PARTS)
+                if at_once == 1.0:
+                    state.memory[j, 2] = state.current[j]
+            elif not known:
+                state.memory[j, 1] = x
+
+
+def arrive(ports: Ports, state: State, j: int, x: float, least: int) -> None:
+    """Carry the memory of a law of position to `x`, where its force is known."""
+    laws.advance(ports.numbers[j], ports.values[j], state.memory[j], x, least)
+    state.memory[j, 1] = x
+
+
+def carry_flexible(ports: Ports, acting: Acting, state: State, h: float) -> None:
+    """Carry the laws on flexible ports to the step's end, and give the second half of their impulse."""
+    count = len(ports.numbers)
+    keep = ports.relaxation / (ports.relaxation + h)
+    ease = 1.0 - keep
+    for port in range(count):
+        if acting.leader[port] != port:
+            continue
+        y = ports.feed[port] + keep * state.memory[port, 3]
+        y += at_port(ports.rows, port, state.q)
+        for j in range(count):
+            if acting.leader[j] == port:
+                y -= ports.flexibility[port] * keep * state.memory[j, 2]
+        x = settle_port(port, acting.leader, ports, state, y, ease * ports.flexibility[port], h, 1)
+        for j in range(count):
+            if acting.leader[j] != port:
+                continue
+            if ports.of_speed[j] == 1:
+                state.memory[j, 1] = x
+                state.memory[j, 4] = state.current[j]
+            else:
+                arrive(ports, state, j, x, 1)
+            state.memory[j, 2] = keep * state.memory[j, 2] + ease * state.current[j]
+            state.memory[j, 3] *= keep
+            add(state.v, ports.rows[j], -state.current[j], 0.5 * h)

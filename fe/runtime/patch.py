@@ -6,10 +6,14 @@ primitives; which physical effect a set of them stands for is not known here (`d
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
+from math import pi, sqrt
 from typing import Annotated, Any, ClassVar
 
+import numpy as np
+
+from .arrays import FloatArray
 from .errors import InvalidPatchError
 from .laws import LAWS
 from .laws.bouc_wen import BoucWen as BoucWen
@@ -68,7 +72,6 @@ class StiffnessDrift(Primitive):
 
 
 # ---------------------------------------------------------------- internal forces
-#
 # The laws of `fe.runtime.laws` act against the motion x of a port (displacement [m] or rotation [rad]): -F on
 # x, F in N or N m. Ports of the wing: "root" (flapping rotation of the root), "tip" (upward displacement of
 # the tip's load point), "span" (upward displacement of all stations, weighted by the share of planform area;
@@ -116,11 +119,57 @@ class PortLoad(Primitive):
 
 
 # ---------------------------------------------------------------- what is read
-#
 # `channel` is a channel's name, or `EVERY_CHANNEL` for all of `quantity` ("" for all quantities).
 
 
-class SensorGain(Primitive):
+@dataclass(frozen=True)
+class SensorRecord:
+    """The record that sensors show.
+
+    Attributes
+    ----------
+    channels : sequence of (str, str)
+        Name and quantity of each column.
+    kind : str
+        "static", "flight", "ringdown", "forced" or "driven".
+    time : (N,) ndarray
+        Dynamic: since the trial's start [s]. Static, flight: since the campaign's start [s].
+    start : float
+        Of a dynamic trial since the campaign's start [s].
+    temperature : (N,) ndarray
+        Less the reference temperature [K].
+    run : str
+        Label of the run.
+    release : float
+        Release amplitude of a ring-down [m or the signal's unit].
+    """
+
+    channels: Sequence[tuple[str, str]]
+    kind: str
+    time: FloatArray
+    start: float
+    temperature: FloatArray
+    run: str = ""
+    release: float = 1.0
+
+    @property
+    def is_dynamic(self) -> bool:
+        """Whether the rows are samples of a motion."""
+        return self.kind in ("ringdown", "forced", "driven")
+
+
+class Sensor(Primitive):
+    """A primitive that changes what is read, not what happens."""
+
+    of_strain: ClassVar[bool] = False
+    """Whether it is for strain gauges alone."""
+
+    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
+        """Return what it adds at each sample of a record, and the rate of that."""
+        return 0.0, 0.0
+
+
+class SensorGain(Sensor):
     """A channel shows (1 + `gain`) times what it should."""
 
     in_windows: ClassVar[bool] = True
@@ -129,7 +178,7 @@ class SensorGain(Primitive):
     quantity: str = ""
 
 
-class SensorDrift(Primitive):
+class SensorDrift(Sensor):
     """A channel's zero moves by `amplitude` (t / `time`)^`exponent`, t since the campaign's start [s]."""
 
     in_windows: ClassVar[bool] = True
@@ -139,8 +188,21 @@ class SensorDrift(Primitive):
     exponent: Annotated[float, "1"] = 1.0
     quantity: str = ""
 
+    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
+        """Return what it adds at each sample, and the rate of that."""
+        if self.time <= 0.0:
+            raise InvalidPatchError(f"The time of a sensor's drift must be positive, but is {self.time} s.")
+        since = record.time + (record.start if record.is_dynamic else 0.0)
+        share = np.maximum(since, 0.0) / self.time
+        if self.exponent == 1.0:
+            return self.amplitude * share, np.full_like(share, self.amplitude / self.time)
+        moving = share > 0.0  # before and at the start there is no drift yet, whatever the exponent
+        safe = np.where(moving, share, 1.0)
+        value = np.where(moving, self.amplitude * safe**self.exponent, 0.0)
+        return value, np.where(moving, self.exponent * value / (safe * self.time), 0.0)
 
-class ChannelOffset(Primitive):
+
+class ChannelOffset(Sensor):
     """A channel shows `offset` more, a formula in `time` [s] of the trial, in the channel's unit."""
 
     in_windows: ClassVar[bool] = True
@@ -149,23 +211,34 @@ class ChannelOffset(Primitive):
     offset: str
     quantity: str = ""
 
+    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
+        """Return what it adds at each sample, and the rate of that."""
+        course = course_of(self.offset, self.kind).course(record.time, {"pi": pi})
+        return course, np.gradient(course, record.time) if record.is_dynamic else 0.0
 
-class SensorRotation(Primitive):
+
+class SensorRotation(Sensor):
     """A strain gauge is turned by `angle` [rad] in the skin, from spanwise towards the tip's rear."""
 
+    of_strain: ClassVar[bool] = True
     channel: str
     angle: Annotated[float, "rad"]
 
 
-class ThermalStrain(Primitive):
+class ThermalStrain(Sensor):
     """Strain channels show `coefficient` [1/K] times (T - T_ref) more."""
 
+    of_strain: ClassVar[bool] = True
     in_windows: ClassVar[bool] = True
     channel: str
     coefficient: Annotated[float, "1/K"]
 
+    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
+        """Return what it adds at each sample, and the rate of that."""
+        return self.coefficient * record.temperature, 0.0
 
-class HighPass(Primitive):
+
+class HighPass(Sensor):
     """Channels pass through `order` equal first-order high-pass filters s tau / (1 + s tau), tau [s].
 
     They had settled at the value before the record's first sample.
@@ -177,14 +250,14 @@ class HighPass(Primitive):
     quantity: str = ""
 
 
-class Clock(Primitive):
+class Clock(Sensor):
     """A sample that is stamped t was taken at (1 + `rate`) t + `zero` [s]."""
 
     rate: Annotated[float, "1"]
     zero: Annotated[float, "s"]
 
 
-class LoggerClock(Primitive):
+class LoggerClock(Sensor):
     """The clock of a logger: what it stamps t, readings and recorded inputs alike, was at (1 + `rate`) t.
 
     `logger` is the name of a logger of the campaign, or `EVERY_CHANNEL` where one logger records everything.
@@ -194,7 +267,7 @@ class LoggerClock(Primitive):
     rate: Annotated[float, "1"]
 
 
-class Line(Primitive):
+class Line(Sensor):
     """A line at `frequency` [Hz] is added: cosine cos + sine sin (2 pi f t), t since the trial's start.
 
     Amplitudes in the channel's unit. It is in the noise record too.
@@ -207,8 +280,16 @@ class Line(Primitive):
     sine: Annotated[float, CHANNEL_UNIT]
     quantity: str = ""
 
+    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
+        """Return what it adds at each sample, and the rate of that."""
+        if not record.is_dynamic:
+            return 0.0, 0.0
+        omega = 2.0 * pi * self.frequency
+        c, s = np.cos(omega * record.time), np.sin(omega * record.time)
+        return self.cosine * c + self.sine * s, omega * (self.sine * c - self.cosine * s)
 
-class DecayingLine(Primitive):
+
+class DecayingLine(Sensor):
     """A mode that the model does not have, e^(-zeta w t) (cosine cos w_d t + sine sin w_d t), in ring-downs.
 
     t since the trial's start; amplitudes in the channel's unit per unit of the trial's release amplitude.
@@ -221,14 +302,31 @@ class DecayingLine(Primitive):
     sine: Annotated[float, PER_RELEASE]
     quantity: str = ""
 
+    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
+        """Return what it adds at each sample, and the rate of that."""
+        if record.kind != "ringdown":
+            return 0.0, 0.0
+        omega, zeta = 2.0 * pi * self.frequency, self.damping_ratio
+        if not -1.0 < zeta < 1.0:
+            raise InvalidPatchError(f"The damping ratio of a decaying line must be below one, but is {zeta}.")
+        damped = omega * sqrt(1.0 - zeta**2)
+        envelope = record.release * np.exp(-zeta * omega * record.time)
+        c, s = np.cos(damped * record.time), np.sin(damped * record.time)
+        value = envelope * (self.cosine * c + self.sine * s)
+        return value, -zeta * omega * value + envelope * damped * (self.sine * c - self.cosine * s)
 
-class RunOffset(Primitive):
+
+class RunOffset(Sensor):
     """Static readings of the trials labelled `run` have this `offset` (channel's unit): seating of a run."""
 
     run: str
     offset: Annotated[float, CHANNEL_UNIT]
     channel: str = EVERY_CHANNEL
     quantity: str = "displacement"
+
+    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
+        """Return what it adds at each sample, and the rate of that."""
+        return self.offset if record.kind == "static" and record.run == self.run else 0.0, 0.0
 
 
 STRUCTURE = (PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature)

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from .arrays import FloatArray, IntArray
-from .errors import ReducedModelFileError
 from .reduced_arrays import RegionArrays
 from .state import wing_names
 
@@ -121,13 +120,9 @@ class PatchArrays(RegionArrays):
             and self.strip_of.max() < strips
             and set(self.term_of) <= set(range(len(self.regions) + 1))
         ):
-            raise ReducedModelFileError(
-                "The strips of a wing for patches do not fit its strip lines; build it anew."
-            )
+            self.refuse("has strips that do not fit its strip lines")
         if np.any(np.diff(self.stations) <= 0.0) or np.any(np.diff(self.strip_lines) <= 0.0):
-            raise ReducedModelFileError(
-                "The stations of a wing for patches must rise from the root to the tip; build it anew."
-            )
+            self.refuse("must have stations that rise from the root to the tip")
 
     def _lengths(self) -> dict[str | int, int]:
         size, chords = self.stiffness.shape[-1], len(self.line_chord)

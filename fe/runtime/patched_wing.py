@@ -157,31 +157,19 @@ class PatchedWing(WingRows):
             stiffness += lower + np.tril(lower, -1).T
         return np.asarray(stiffness)
 
-    def structure(
-        self,
-        young_modulus_factor: float,
-        stiffness_loss: Losses,
-        servo_mass: float,
-        pitot_mass: float,
-        patch: ModelPatch = EMPTY,
-        temperature_difference: float = 0.0,
+    def at(
+        self, vector: FloatArray, patch: ModelPatch = EMPTY, temperature_difference: float = 0.0
     ) -> "PatchedState":
-        """Return the wing at a state under a patch; see `stiffness` and `mass`.
+        """Return the wing at all that can be chosen, (V,), under a patch; see `stiffness` and `mass`.
 
         Raises
         ------
         InvalidPatchError
             If the wing cannot carry the patch.
         """
-        stiffness = self.stiffness(young_modulus_factor, stiffness_loss, patch, temperature_difference)
-        return PatchedState(self, stiffness, self.mass(servo_mass, pitot_mass, patch), patch)
-
-    def at(
-        self, vector: FloatArray, patch: ModelPatch = EMPTY, temperature_difference: float = 0.0
-    ) -> "PatchedState":
-        """Return it at values (V,) of all that can be chosen; raises as `structure`."""
         e, *losses, servo, pitot = vector[:-2].tolist()
-        return self.structure(e, tuple(losses), servo, pitot, patch, temperature_difference)
+        stiffness = self.stiffness(e, tuple(losses), patch, temperature_difference)
+        return PatchedState(self, stiffness, self.mass(servo, pitot, patch), patch)
 
 
 class PatchedState:

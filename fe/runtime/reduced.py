@@ -4,7 +4,7 @@ NumPy and relative imports only: this file is copied into the FMU. The equations
 `docs/reduced_model.md`, the offline part is `fe.reduction.reduced_basis`.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import sqrt
@@ -15,8 +15,8 @@ from numpy.linalg import solve
 
 from .arrays import FloatArray
 from .errors import OutsideModelError
-from .online import OnlineArrays
-from .reduced_arrays import ReducedArrays
+from .reduced_arrays import OnlineArrays, ReducedArrays
+from .state import GivenLosses
 
 Values = Mapping[str, float] | FloatArray
 """What is chosen: by name, or all of it (V,) in the order of `ReducedArrays.chosen`."""
@@ -161,10 +161,7 @@ class ReducedModel(ReducedArrays):
         return dict(zip(self.chosen, map(tuple, self.validity_box.tolist()), strict=True))
 
     def vector(
-        self,
-        values: Values | None = None,
-        stiffness_loss: Mapping[str, float] | Iterable[float] = (),
-        **named: float,
+        self, values: Values | None = None, stiffness_loss: GivenLosses = (), **named: float
     ) -> FloatArray:
         """Return all that can be chosen, (V,), of the values that are given; the others are nominal.
 
@@ -279,7 +276,7 @@ class ReducedModel(ReducedArrays):
     def static_response(
         self,
         values: Values | None = None,
-        stiffness_loss: Mapping[str, float] | Iterable[float] = (),
+        stiffness_loss: GivenLosses = (),
         *,
         load: FloatArray | None = None,
         **named: float,
@@ -332,9 +329,7 @@ class ReducedModel(ReducedArrays):
         coordinates = solve(stiffness.reshape(-1, *self._online.square), load[:, :, np.newaxis])[:, :, 0]
         return np.asarray(coordinates @ self.static_output.T)
 
-    def tip_stiffness(
-        self, young_modulus_factor: float, stiffness_loss: Mapping[str, float] | Iterable[float] = ()
-    ) -> float:
+    def tip_stiffness(self, young_modulus_factor: float, stiffness_loss: GivenLosses = ()) -> float:
         """Return the tip stiffness of a wing [N/m]: the tip force over the displacement of its point.
 
         Kapteyn et al. 2021, eq. (14), where it is a straight line in e. Errors as of `static_response`.
@@ -343,12 +338,7 @@ class ReducedModel(ReducedArrays):
         tip = np.array((0.0, 1.0))
         return float(1.0 / (self.static_load[1] @ self.static_response(vector, load=tip).coordinates))
 
-    def modes(
-        self,
-        values: Values | None = None,
-        stiffness_loss: Mapping[str, float] | Iterable[float] = (),
-        **named: float,
-    ) -> Modes:
+    def modes(self, values: Values | None = None, stiffness_loss: GivenLosses = (), **named: float) -> Modes:
         """Return the first undamped modes, Kapteyn et al. 2021, eq. (16).
 
         Parameters and errors are those of `static_response`.

@@ -9,33 +9,17 @@ NumPy and relative imports only: this file is copied into the FMU.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import islice
-from math import exp, expm1, factorial, pi, sqrt
+from math import exp, expm1, factorial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import BoolArray, FloatArray
 from .errors import InvalidPatchError
-from .patch import (
-    EVERY_CHANNEL,
-    SENSORS,
-    ChannelOffset,
-    Clock,
-    DecayingLine,
-    HighPass,
-    Line,
-    LoggerClock,
-    ModelPatch,
-    Primitive,
-    RunOffset,
-    SensorDrift,
-    SensorGain,
-    SensorRotation,
-    ThermalStrain,
-    course_of,
-)
+from .patch import EVERY_CHANNEL, Clock, HighPass, LoggerClock, ModelPatch, Sensor, SensorGain, SensorRotation
+from .patch import SensorRecord as SensorRecord
+from .primitive import Primitive
 
 Filter = Callable[[HighPass, "SensorRecord", FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
@@ -43,45 +27,9 @@ STRAIN = "strain"
 """Quantity of a strain gauge."""
 
 
-@dataclass(frozen=True)
-class SensorRecord:
-    """The record that sensors show.
-
-    Attributes
-    ----------
-    channels : sequence of (str, str)
-        Name and quantity of each column.
-    kind : str
-        "static", "flight", "ringdown", "forced" or "driven".
-    time : (N,) ndarray
-        Dynamic: since the trial's start [s]. Static, flight: since the campaign's start [s].
-    start : float
-        Of a dynamic trial since the campaign's start [s].
-    temperature : (N,) ndarray
-        Less the reference temperature [K].
-    run : str
-        Label of the run.
-    release : float
-        Release amplitude of a ring-down [m or the signal's unit].
-    """
-
-    channels: Sequence[tuple[str, str]]
-    kind: str
-    time: FloatArray
-    start: float
-    temperature: FloatArray
-    run: str = ""
-    release: float = 1.0
-
-    @property
-    def is_dynamic(self) -> bool:
-        """Whether the rows are samples of a motion."""
-        return self.kind in ("ringdown", "forced", "driven")
-
-
 def needs_structure(patch: ModelPatch) -> bool:
     """Return whether a patch needs more than what its sensors make of the readings of the plain structure."""
-    return any(isinstance(item, SensorRotation) or not isinstance(item, SENSORS) for item in patch)
+    return any(isinstance(item, SensorRotation) or not isinstance(item, Sensor) for item in patch)
 
 
 def clock_of(patch: ModelPatch) -> tuple[float, float]:
@@ -108,7 +56,7 @@ def check_channels(patch: ModelPatch, channels: Sequence[tuple[str, str]]) -> No
                 f"The primitive {item.kind!r} names the channel {name!r}, which does not exist; there are "
                 f"{', '.join(quantities)}."
             )
-        if isinstance(item, SensorRotation | ThermalStrain) and quantities[name] != STRAIN:
+        if getattr(item, "of_strain", False) and quantities[name] != STRAIN:
             raise InvalidPatchError(
                 f"The primitive {item.kind!r} is for strain gauges, but the channel {name!r} measures "
                 f"{quantities[name]}."
@@ -156,13 +104,28 @@ def apply_sensors(
         is not positive.
     """
     active = [
-        item for item in patch if isinstance(item, SENSORS) and not isinstance(item, Clock | LoggerClock)
+        item for item in patch if isinstance(item, Sensor) and not isinstance(item, Clock | LoggerClock)
     ]
     if not active:
         return values, rates
     shown = np.array(values, dtype=np.float64)
     slopes = np.zeros_like(shown) if rates is None else np.array(rates, dtype=np.float64)
-    _rotate(active, record, shown, slopes, transverse, shear)
+    angles = np.zeros(len(record.channels))
+    for item in active:
+        if isinstance(item, SensorRotation):
+            angles[columns_of(item, record.channels)] += item.angle
+    turned = np.flatnonzero(angles)
+    if turned.size:  # eps' = eps cos^2 + eps_t sin^2 + gamma sin cos (strain in a plane)
+        if transverse is None or shear is None:
+            raise InvalidPatchError(
+                "A gauge is turned, but the model gives no transverse and shear strain to turn it in."
+            )
+        cosine, sine = np.cos(angles[turned]), np.sin(angles[turned])
+        across = transverse[:, turned] * sine**2 + shear[:, turned] * (sine * cosine)
+        shown[:, turned] = shown[:, turned] * cosine**2 + across
+        if len(across) > 1 and record.is_dynamic:
+            # A response has no rates of the components; a central difference of this small share will do.
+            slopes[:, turned] = slopes[:, turned] * cosine**2 + np.gradient(across, record.time, axis=0)
     for item in active:
         columns = columns_of(item, record.channels)
         if not columns.size or isinstance(item, SensorRotation):
@@ -171,7 +134,7 @@ def apply_sensors(
         if isinstance(item, SensorGain):
             read = (1.0 + item.gain) * signal, (1.0 + item.gain) * slope
         elif not isinstance(item, HighPass):
-            added, rate = _added(item, record)
+            added, rate = item.added(record)
             read = signal + np.reshape(added, (-1, 1)), slope + np.reshape(rate, (-1, 1))
         elif record.is_dynamic:
             read = filtered(item, record, signal, slope)
@@ -198,83 +161,9 @@ def columns_of(item: Primitive, channels: Sequence[tuple[str, str]]) -> NDArray[
     if name != EVERY_CHANNEL:
         chosen = [index for index, (channel, _) in enumerate(channels) if channel == name]
     else:
-        quantity = (
-            STRAIN if isinstance(item, SensorRotation | ThermalStrain) else str(getattr(item, "quantity", ""))
-        )
+        quantity = STRAIN if getattr(item, "of_strain", False) else str(getattr(item, "quantity", ""))
         chosen = [index for index, (_, own) in enumerate(channels) if quantity in ("", own)]
     return np.array(chosen, dtype=np.intp)
-
-
-def _rotate(
-    active: Sequence[Primitive],
-    record: SensorRecord,
-    values: FloatArray,
-    rates: FloatArray,
-    transverse: FloatArray | None,
-    shear: FloatArray | None,
-) -> None:
-    """Turn gauges in place: eps' = eps cos^2 + eps_t sin^2 + gamma sin cos (strain in a plane)."""
-    angles = np.zeros(len(record.channels))
-    for item in active:
-        if isinstance(item, SensorRotation):
-            angles[columns_of(item, record.channels)] += item.angle
-    turned = np.flatnonzero(angles)
-    if not turned.size:
-        return
-    if transverse is None or shear is None:
-        raise InvalidPatchError(
-            "A gauge is turned, but the model gives no transverse and shear strain to turn it in."
-        )
-    cosine, sine = np.cos(angles[turned]), np.sin(angles[turned])
-    across = transverse[:, turned] * sine**2 + shear[:, turned] * (sine * cosine)
-    values[:, turned] = values[:, turned] * cosine**2 + across
-    if len(across) > 1 and record.is_dynamic:
-        # A response has no rates of the components; a central difference of this small share will do.
-        rates[:, turned] = rates[:, turned] * cosine**2 + np.gradient(across, record.time, axis=0)
-
-
-def _added(item: Primitive, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-    """Return what a primitive adds at each sample, and the rate of that."""
-    if isinstance(item, SensorDrift):
-        return _drift(item, record)
-    if isinstance(item, ChannelOffset):
-        added = course_of(item.offset, item.kind).course(record.time, {"pi": pi})
-        return added, np.gradient(added, record.time) if record.is_dynamic else 0.0
-    if isinstance(item, ThermalStrain):
-        return item.coefficient * record.temperature, 0.0
-    if isinstance(item, Line) and record.is_dynamic:
-        omega = 2.0 * pi * item.frequency
-        c, s = np.cos(omega * record.time), np.sin(omega * record.time)
-        return item.cosine * c + item.sine * s, omega * (item.sine * c - item.cosine * s)
-    if isinstance(item, DecayingLine) and record.kind == "ringdown":
-        return _decaying_line(item, record)
-    if isinstance(item, RunOffset) and record.kind == "static" and item.run == record.run:
-        return item.offset, 0.0
-    return 0.0, 0.0
-
-
-def _drift(item: SensorDrift, record: SensorRecord) -> tuple[FloatArray, FloatArray]:
-    if item.time <= 0.0:
-        raise InvalidPatchError(f"The time of a sensor's drift must be positive, but is {item.time} s.")
-    since = record.time + (record.start if record.is_dynamic else 0.0)
-    share = np.maximum(since, 0.0) / item.time
-    if item.exponent == 1.0:
-        return item.amplitude * share, np.full_like(share, item.amplitude / item.time)
-    moving = share > 0.0  # before and at the start there is no drift yet, whatever the exponent
-    safe = np.where(moving, share, 1.0)
-    value = np.where(moving, item.amplitude * safe**item.exponent, 0.0)
-    return value, np.where(moving, item.exponent * value / (safe * item.time), 0.0)
-
-
-def _decaying_line(item: DecayingLine, record: SensorRecord) -> tuple[FloatArray, FloatArray]:
-    omega, zeta = 2.0 * pi * item.frequency, item.damping_ratio
-    if not -1.0 < zeta < 1.0:
-        raise InvalidPatchError(f"The damping ratio of a decaying line must be below one, but is {zeta}.")
-    damped = omega * sqrt(1.0 - zeta**2)
-    envelope = record.release * np.exp(-zeta * omega * record.time)
-    c, s = np.cos(damped * record.time), np.sin(damped * record.time)
-    value = envelope * (item.cosine * c + item.sine * s)
-    return value, -zeta * omega * value + envelope * damped * (item.sine * c - item.cosine * s)
 
 
 LARGEST_ORDER = 4

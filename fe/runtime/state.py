@@ -12,6 +12,8 @@ from .errors import InvalidStateError
 Losses = tuple[float, ...]
 """Stiffness losses of the damage regions, in their order."""
 
+GivenLosses = Mapping[str, float] | Iterable[float]
+"""The same by name, or in their order."""
 MOST_REGIONS = 8
 """Largest number of damage regions of a structure."""
 
@@ -33,7 +35,7 @@ def wing_names(regions: tuple[str, ...]) -> tuple[str, ...]:
     return ("young_modulus_factor", *regions, "servo_mass", "pitot_mass", "load_factor", "tip_force")
 
 
-def losses_of(stiffness_loss: Mapping[str, float] | Iterable[float], regions: tuple[str, ...]) -> Losses:
+def losses_of(stiffness_loss: GivenLosses, regions: tuple[str, ...]) -> Losses:
     """Return one stiffness loss for each region, in their order.
 
     Parameters

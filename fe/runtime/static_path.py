@@ -1,4 +1,4 @@
-"""Static path of ports with laws, load level after load level: x + C F(x) = x_linear.
+"""Where ports with laws rest, load level after load level: x + C F(x) = x_linear; or one in motion.
 
 Written in the subset of Python that numba compiles too. NumPy and relative imports only: this file is copied
 into the FMU.
@@ -6,8 +6,8 @@ into the FMU.
 
 import numpy as np
 
-from .laws import advance, parts, pull
-from .motion_arrays import FloatArray, IntArray, Ports, Unnamed
+from . import laws
+from .motion_arrays import FloatArray, IntArray, Ports, State, Unnamed
 
 
 def static_forces(
@@ -21,8 +21,9 @@ def static_forces(
     forces, slopes = np.zeros(len(x)), np.zeros(len(x))
     for j in range(len(x)):
         if ports.of_speed[j] == 0:
-            number, values, elements = ports.numbers[j], ports.values[j], ports.elements[j]
-            forces[j], slopes[j] = pull(number, values, elements, memory[j], x[j], 1.0, least[j])
+            forces[j], slopes[j] = laws.pull(
+                ports.numbers[j], ports.values[j], memory[j], x[j], 1.0, least[j]
+            )
     return forces, slopes
 
 
@@ -32,7 +33,7 @@ def arrive_at_rest(
     """Carry the memory to positions `x` (J,) where the laws rest with `forces` (J,)."""
     for j in range(len(x)):
         if ports.of_speed[j] == 0:
-            advance(ports.numbers[j], ports.values[j], ports.elements[j], memory[j], x[j], least[j])
+            laws.advance(ports.numbers[j], ports.values[j], memory[j], x[j], least[j])
         memory[j, 1] = x[j]
         memory[j, 2] = forces[j]
         memory[j, 3] = 0.0
@@ -40,7 +41,7 @@ def arrive_at_rest(
 
 
 def static_path(
-    linear: FloatArray, compliance: FloatArray, laws: Unnamed, memory: FloatArray, start: FloatArray,
+    linear: FloatArray, compliance: FloatArray, at_ports: Unnamed, memory: FloatArray, start: FloatArray,
     positions: FloatArray, forces: FloatArray,
 ) -> int:  # fmt: skip
     """Solve x + C F(x) = x_linear for load levels one after the other; `memory` is advanced in place.
@@ -53,7 +54,7 @@ def static_path(
         Positions of the ports without internal forces.
     compliance : (J, J) ndarray
         C, positions of the ports under unit forces at them.
-    laws : tuple
+    at_ports : tuple
         The fields of `Ports`; what they do to modes is not used.
     memory : (J, 5 + E) ndarray
         State at the start.
@@ -67,7 +68,7 @@ def static_path(
     int
         -1, or the number of the level that has no solution.
     """
-    ports = Ports(*laws)
+    ports = Ports(*at_ports)
     levels, count = linear.shape
     old = start.copy()
     x = memory[:, 1].copy()
@@ -78,7 +79,7 @@ def static_path(
         while done < 1.0:
             goal = old + (linear[level] - old) * min(done + step, 1.0)
             for j in range(count):  # fixed during the iteration, so that the force is a smooth function
-                least[j] = parts(ports.numbers[j], ports.values[j], abs(goal[j] - x[j]))
+                least[j] = laws.parts(ports.numbers[j], ports.values[j], abs(goal[j] - x[j]))
             guess = x.copy()
             own, slopes = static_forces(guess, ports, memory, least)
             yielded = compliance @ own  # what a law that pulls without a load moves
@@ -119,3 +120,73 @@ def static_path(
             positions[level, j] = x[j]
             forces[level, j] = own[j]
     return -1
+
+
+def pull_of(ports: Ports, state: State, j: int, x: float, h: float, least: int) -> tuple[float, float]:
+    """Return force and slope of a law at `x`, its memory left as it is."""
+    return laws.pull(ports.numbers[j], ports.values[j], state.memory[j], x, h, least)  # type: ignore[no-any-return]
+
+
+def settle_port(
+    port: int, leader: IntArray, ports: Ports, state: State, y: float, r: float, h: float, least: int
+) -> float:
+    """Return the position x of a port with laws, x + r sum F(x) = y; their forces go to `state.current`.
+
+    The laws are those whose `leader` is `port`; of those of position, `state.current` has the forces at the
+    last position. Dry friction first: where it can hold the port, it does. The memories are left as they are.
+    """
+    count = len(ports.numbers)
+    last = state.memory[port, 1]
+    start, level, tolerance = 0.0, 0.0, 1e-12
+    for j in range(count):
+        if leader[j] != port:
+            continue
+        if ports.of_speed[j] == 0:
+            start += state.current[j]
+            continue
+        tolerance = 1e-15  # a speed is a small difference of positions
+        state.current[j] = 0.0
+        if laws.dry(ports.numbers[j], ports.values[j]):
+            own, _ = pull_of(ports, state, j, last, h, least)
+            level += own
+    push = y - last - r * start
+    if level > 0.0 and abs(push) <= r * level:
+        for j in range(count):
+            if leader[j] == port and laws.dry(ports.numbers[j], ports.values[j]):
+                own, _ = pull_of(ports, state, j, last, h, least)
+                state.current[j] = push / r * own / level
+        return float(last)
+    sign = 1.0 if push > 0.0 else -1.0
+    # the root lies that way from the last position, if the structure is stable
+    low, high = last, last + sign * 1e300
+    x, rest, steep = last + sign * max(abs(push) - r * level, 0.0), 0.0, port
+    at = x
+    for _ in range(80):
+        total, slope, steepest = 0.0, 1.0, -1.0
+        for j in range(count):
+            if leader[j] != port:
+                continue
+            own, change = pull_of(ports, state, j, x, h, least)
+            if laws.dry(ports.numbers[j], ports.values[j]):
+                own, change = sign * own, sign * change
+            state.current[j] = own
+            total += own
+            slope += r * change
+            if change > steepest:
+                steep, steepest = j, change
+        rest, at = x + r * total - y, x
+        if abs(rest) <= 1e-13 * abs(push) + tolerance * (abs(x) + abs(y)):
+            return float(x)
+        low, high = (low, x) if sign * rest > 0.0 else (x, high)
+        if abs(high - low) <= 1e-15 * abs(x):
+            break
+        step = x - rest / slope if slope > 1e-6 else high
+        if sign * (step - low) > 0.0 and sign * (high - step) > 0.0:
+            x = step
+        elif abs(high) < 1e299:  # nearer to where the way begins: a force of speed may rise steeply there
+            x = low + 0.1 * (high - low)
+        else:
+            x += sign * abs(rest)
+    if r > 0.0:  # a force that rises within rounding gives what is missing
+        state.current[steep] -= rest / r
+    return float(at)

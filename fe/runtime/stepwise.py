@@ -15,7 +15,7 @@ import numpy as np
 from .arrays import BoolArray, FloatArray, IntArray
 from .modal_system import ModalSystem
 from .motion import PLAIN, Kernel, Laws, port_flexibility
-from .motion_arrays import Linear, Samples, State, Steps
+from .motion_arrays import Samples, State, Steps
 
 SLOWEST_PHASE, FASTEST_PHASE = 0.05, 0.4
 """Longest substep with laws: radians of the slowest and of the fastest mode that it may span."""
@@ -105,7 +105,10 @@ def steps_under(
         if forces.any():
             push += forces @ part[0].T if len(lengths) == 1 else np.einsum("knm,km->kn", part[which], forces)
     moments, sample = boundaries.time, boundaries.sample
-    return Steps(transition, lengths, which, push, begin, end, feed, moments, sample)
+    damping = np.ascontiguousarray(system.damping)
+    return Steps(
+        transition, lengths, which, push, begin, end, feed, moments, sample, system.stiffness, damping
+    )
 
 
 class ModalMotion(NamedTuple):
@@ -144,15 +147,12 @@ def advance(
     state = State(np.array(q, dtype=float), np.array(v, dtype=float), kept, np.zeros(count))
     rows = laws.rows(system.ports, modes)
     acts = laws.rows(system.actions, modes) if system.actions else rows
-    flexibility, size = port_flexibility(system, laws), 2 * modes
-    linear = Linear(
-        system.stiffness, np.ascontiguousarray(system.damping), system.coupled, laws.rate,
-        np.empty((size, size)), np.empty(size), np.empty(modes), np.empty(modes),
-    )  # fmt: skip
-    before = np.ones(count, dtype=bool)
+    flexibility, before = port_flexibility(system, laws), np.ones(count, dtype=bool)
     for first, last, acting in _sections(laws, steps.time):
         now = acting[:, None]
-        ports = laws.at(rows * now, flexibility, system.relaxation, acts * now)
+        ports = laws.at(rows * now)._replace(
+            flexibility=flexibility, relaxation=float(system.relaxation), acts=acts * now
+        )
         for j in np.flatnonzero(acting & ~before):
             state.memory[j] = 0.0
             if laws.of_speed[j]:
@@ -163,8 +163,8 @@ def advance(
             own = steps.between(first, last)
             part = Samples(*(item[first : last + 1] for item in out))
         known = memory is not None or first > 0
-        given = (np.ascontiguousarray(item) for item in own)
-        kernel.integrate(tuple(given), tuple(linear), known, tuple(ports), tuple(state), tuple(part))
+        given = tuple(map(np.ascontiguousarray, own))
+        kernel.integrate(given, system.coupled, known, tuple(ports), tuple(state), tuple(part))
         before = acting
     if laws.spans:
         out = Samples(*(item[steps.sample] for item in out))

@@ -12,18 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from . import patch as primitives
 from .arrays import FloatArray, IntArray
 from .errors import InvalidPatchError
 from .motion import STATION_COUNT, STATION_PORTS, at_stations
-from .patch import (
-    INTERNAL_FORCES,
-    InertiaRelief,
-    LoadPlace,
-    LocalStiffnessLoss,
-    ModelPatch,
-    PointMass,
-    Washout,
-)
 from .patch_arrays import PatchArrays
 
 TIP_OFFSET = 1.02
@@ -53,7 +45,7 @@ class RemainingSkin(NamedTuple):
     of_strips: FloatArray
 
 
-def remaining_skin(patch: ModelPatch, lines: FloatArray) -> RemainingSkin | None:
+def remaining_skin(patch: primitives.ModelPatch, lines: FloatArray) -> RemainingSkin | None:
     """Return what the skin keeps under the local losses of a patch; None where there are none.
 
     Losses multiply where they overlap. A strip keeps the harmonic mean of its pieces, since they bend one
@@ -72,7 +64,7 @@ def remaining_skin(patch: ModelPatch, lines: FloatArray) -> RemainingSkin | None
     InvalidPatchError
         If nothing is left somewhere.
     """
-    boxes = [item for item in patch if isinstance(item, LocalStiffnessLoss) and item.loss != 0.0]
+    boxes = [item for item in patch if isinstance(item, primitives.LocalStiffnessLoss) and item.loss != 0.0]
     if not boxes:
         return None
     edges = [edge for box in boxes for edge in (box.start, box.start + box.length)]
@@ -106,7 +98,7 @@ _DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
 
 STANDARD_GRAVITY = 9.80665
 """[m/s^2]; that of `fe.wing.turn_load`, which is not copied into the FMU."""
-EMPTY = ModelPatch()
+EMPTY = primitives.ModelPatch()
 
 
 def strain_gauge(output: str) -> int:
@@ -186,7 +178,7 @@ class WingRows:
         rows = self.arrays.line_rows[2:]
         return np.asarray(along @ ((1.0 - share) * rows[first] + share * rows[last]))
 
-    def force_row(self, place: Place, patch: ModelPatch = EMPTY) -> FloatArray:
+    def force_row(self, place: Place, patch: primitives.ModelPatch = EMPTY) -> FloatArray:
         """Return the load (n,) of 1 N at a place; as a row, the displacement there.
 
         Parameters
@@ -212,7 +204,9 @@ class WingRows:
         else:
             y, chord = place
             row = self.displacement_row(y, chord)
-        moves = [(item.along_span, item.along_chord) for item in patch if isinstance(item, LoadPlace)]
+        moves = [
+            (item.along_span, item.along_chord) for item in patch if isinstance(item, primitives.LoadPlace)
+        ]
         along_span, along_chord = np.sum([(0.0, 0.0), *moves], axis=0).tolist()
         if along_span == 0.0 and along_chord == 0.0:
             return row
@@ -227,7 +221,7 @@ class WingRows:
         # the clamp grips the same two lines wherever it pulls, else the response had a kink at each web
         return row + self.displacement_row(moved, moved_chord, chord) - self.displacement_row(y, chord)
 
-    def load_parts(self, patch: ModelPatch = EMPTY) -> FloatArray:
+    def load_parts(self, patch: primitives.ModelPatch = EMPTY) -> FloatArray:
         """Return the loads (2, n) of a turn that go with the load factor and with its square [N].
 
         Washout, relief by weight and point masses of the patch act.
@@ -235,16 +229,16 @@ class WingRows:
         arrays = self.arrays
         parts = np.stack((arrays.load_lift, np.zeros(self.size)))
         for item in patch:
-            if isinstance(item, Washout):
+            if isinstance(item, primitives.Washout):
                 if item.exponent < 0.0:
                     raise InvalidPatchError(
                         f"The exponent of a washout must not be negative, but is {item.exponent:g}."
                     )
                 eta = np.clip(arrays.stations / arrays.semi_span, 0.0, 1.0) ** item.exponent
                 parts[1] -= item.coefficient * (eta @ arrays.lift_rows)
-            elif isinstance(item, InertiaRelief):
+            elif isinstance(item, primitives.InertiaRelief):
                 parts[0] += item.fraction * arrays.weight
-            elif isinstance(item, PointMass):
+            elif isinstance(item, primitives.PointMass):
                 parts[0] -= STANDARD_GRAVITY * item.mass * (self._along(item.station) @ arrays.line_rows[2])
         return parts
 
@@ -253,9 +247,9 @@ class WingRows:
         """Stations of forces that are spread over the planform, and their shares."""
         return planform_stations(self.span, self.arrays.root_chord, self.arrays.tip_chord)
 
-    def internal_forces(self, patch: ModelPatch) -> ModelPatch:
+    def internal_forces(self, patch: primitives.ModelPatch) -> primitives.ModelPatch:
         """Return the internal forces of a patch by ports of `port_rows`, of the planform by station."""
-        return at_stations(patch.of(*INTERNAL_FORCES), self.planform[1])
+        return at_stations(patch.of(*primitives.INTERNAL_FORCES), self.planform[1])
 
     @cached_property
     def port_rows(self) -> dict[str, FloatArray]:
@@ -307,7 +301,7 @@ class WingRows:
         )
         return np.asarray((1.0 - whole / less) / (1.0 - softer[0]))
 
-    def strain_factors(self, patch: ModelPatch) -> FloatArray | None:
+    def strain_factors(self, patch: primitives.ModelPatch) -> FloatArray | None:
         """Return factors (G,) on the strain rows, by where the edges of local losses lie in their strips.
 
         The structure has a loss smeared over the strip that the edge of its box parts; what a gauge there

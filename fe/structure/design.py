@@ -21,47 +21,36 @@ from fe.runtime.state import MOST_REGIONS
 from reporting.section import checked
 from reporting.toml_file import read_toml
 
-from .tables import (
-    MOTIONS,
-    ChosenMass,
-    Commanded,
-    Direction,
-    Given,
-    Modulus,
-    Name,
-    Named,
-    Part,
-    Region,
-    StructureDesign,
-    Vector,
-)  # fmt: skip
+from . import tables
 
 LEAST_SINE = 1e-3
 """Two axes whose angle has a smaller sine do not span a plane."""
 
 
-class Spot(Part):
+class Spot(tables.Part):
     """Where a gauge lies: its strain is the mean over `length` along its direction and `width` across it."""
 
-    point: Vector
+    point: tables.Vector
     length: float = Field(default=0.0, ge=0.0)
     width: float = Field(default=0.0, ge=0.0)
 
 
-class Gauge(Named, Spot):
+class Gauge(tables.Named, Spot):
     """Strain gauge on the surface: mean strain along `direction`, positive in tension."""
 
-    direction: Direction
+    direction: tables.Direction
 
 
-def _span_a_plane(axes: tuple[Direction, Direction]) -> tuple[Direction, Direction]:
+def _span_a_plane(
+    axes: tuple[tables.Direction, tables.Direction],
+) -> tuple[tables.Direction, tables.Direction]:
     sizes = np.linalg.norm(axes[0]) * np.linalg.norm(axes[1])
     if np.linalg.norm(np.cross(*axes)) <= LEAST_SINE * sizes:
         raise ValueError("the two axes must not be parallel, and must point in two directions")
     return axes
 
 
-Axes = Annotated[tuple[Direction, Direction], AfterValidator(_span_a_plane)]
+Axes = Annotated[tuple[tables.Direction, tables.Direction], AfterValidator(_span_a_plane)]
 """Axis 1 is along the first vector; axis 2 lies in the plane of both, at right angles to it."""
 
 
@@ -82,7 +71,7 @@ class Rosette(Spot):
         return found
 
 
-class Gauged(Part):
+class Gauged(tables.Part):
     """Gauges; those of rosettes come behind the others."""
 
     gauge: tuple[Gauge, ...] = ()
@@ -99,17 +88,17 @@ Poisson = Annotated[float, Field(gt=-1.0, lt=0.5)]
 Spring = Annotated[float, Field(ge=0.0, le=1e15, description="N/m")]
 
 
-def unit_vector(vector: Vector) -> FloatArray:
+def unit_vector(vector: tables.Vector) -> FloatArray:
     """Vector (3,) of length one."""
     return np.asarray(np.asarray(vector) / np.linalg.norm(vector), dtype=np.float64)
 
 
-class NamedSet(Part):
+class NamedSet(tables.Part):
     """Set of the nodes, or of the cells whose centres, lie in a box: two corners [unit of length]."""
 
     name: SetName
     of: Literal["nodes", "cells"]
-    box: tuple[Vector, Vector]
+    box: tuple[tables.Vector, tables.Vector]
 
     @model_validator(mode="after")
     def _box_is_a_box(self) -> "NamedSet":
@@ -118,23 +107,23 @@ class NamedSet(Part):
         return self
 
 
-class Material(Given):
+class Material(tables.Given):
     """Material of the cells of a set: isotropic, or orthotropic in axes given by two vectors.
 
     An orthotropic material gives three moduli along its axes 1, 2 and 3, Poisson's ratios 12, 13 and 23
     (ratio ij is the contraction along j under tension along i) and shear moduli 12, 13 and 23.
     """
 
-    name: Name
+    name: tables.Name
     set: SetName = "all"
     density: float = Field(ge=0.0, le=3e4, description="kg/m^3")
-    young_modulus: Modulus | None = None
+    young_modulus: tables.Modulus | None = None
     poisson_ratio: Poisson | None = None
-    young_moduli: tuple[Modulus, Modulus, Modulus] | None = None
-    poisson_ratios: Vector | None = None
-    shear_moduli: tuple[Modulus, Modulus, Modulus] | None = None
+    young_moduli: tuple[tables.Modulus, tables.Modulus, tables.Modulus] | None = None
+    poisson_ratios: tables.Vector | None = None
+    shear_moduli: tuple[tables.Modulus, tables.Modulus, tables.Modulus] | None = None
     axes: Axes | None = None
-    scaled_by: Name | None = None
+    scaled_by: tables.Name | None = None
     ways = (
         ("young_modulus", "poisson_ratio"),
         ("young_moduli", "poisson_ratios", "shear_moduli", "axes"),
@@ -167,7 +156,7 @@ class Material(Given):
         return np.asarray(rotate_elasticity(local[None], axes_of(*self.axes)[None])[0])
 
 
-class Support(Part):
+class Support(tables.Part):
     """Nodes of a set: directions that are held, or springs [N/m], shared equally among the nodes.
 
     With `rigid_about`, a point, the nodes move together as a rigid body, such as a stiff flange: `hold` may
@@ -180,12 +169,12 @@ class Support(Part):
     springs: tuple[Spring, Spring, Spring] | tuple[Spring, Spring, Spring, Spring, Spring, Spring] | None = (
         None
     )
-    rigid_about: Vector | None = None
+    rigid_about: tables.Vector | None = None
 
     @model_validator(mode="after")
     def _holds_something(self) -> "Support":
         springs = self.springs or ()
-        turns = len(springs) > 3 or any(name not in MOTIONS[:3] for name in self.hold)
+        turns = len(springs) > 3 or any(name not in tables.MOTIONS[:3] for name in self.hold)
         if self.rigid_about is None and (turns or bool(self.hold) == any(springs)):
             raise ValueError(
                 'either hold = ["x", "y", "z"] or springs = [x, y, z] in N/m is expected; what turns, '
@@ -193,13 +182,13 @@ class Support(Part):
             )
         if not self.hold and not any(springs):
             raise ValueError("a rigid set needs hold, springs or both")
-        for name, spring in zip(MOTIONS, springs, strict=False):
+        for name, spring in zip(tables.MOTIONS, springs, strict=False):
             if spring and name in self.hold:
                 raise ValueError(f"the motion {name} is held, so that no spring can act on it")
         return self
 
 
-class Load(Given, Commanded):
+class Load(tables.Given, tables.Commanded):
     """A load, constant or times the value of a control.
 
     Either a `force` [N] on a set (shared by area where it holds faces, else equally among its nodes) or at a
@@ -208,33 +197,33 @@ class Load(Given, Commanded):
     """
 
     set: SetName | None = None
-    point: Vector | None = None
-    force: Direction | None = None
+    point: tables.Vector | None = None
+    force: tables.Direction | None = None
     pressure: float | None = None
 
     ways = (("force", "set"), ("force", "point"), ("pressure", "set"), ("acceleration",))
 
 
-class Damage(Region):
+class Damage(tables.Region):
     """Region of the cells of a set."""
 
     set: SetName
 
 
-class PointMass(ChosenMass):
+class PointMass(tables.ChosenMass):
     """Mass at a point of the structure."""
 
-    point: Vector
+    point: tables.Vector
 
 
-class PointOutput(Named):
+class PointOutput(tables.Named):
     """Displacement, or acceleration, of a point along a direction."""
 
-    point: Vector
-    direction: Direction
+    point: tables.Vector
+    direction: tables.Direction
 
 
-class MeshDesign(StructureDesign, Gauged):
+class MeshDesign(tables.StructureDesign, Gauged):
     """A structure from a mesh."""
 
     mesh: str = Field(min_length=1)
@@ -263,14 +252,14 @@ Files = Annotated[tuple[FileName, ...], Field(min_length=1)]
 Node = Annotated[int, Field(ge=0)]
 
 
-class MatrixSupport(Part):
+class MatrixSupport(tables.Part):
     """Motions of nodes that are held: `rx`, `ry`, `rz` are the components 4, 5 and 6."""
 
     nodes: Annotated[tuple[Node, ...], Field(min_length=1)]
     hold: Annotated[tuple[Literal["x", "y", "z", "rx", "ry", "rz"], ...], Field(min_length=1)]
 
 
-class StiffnessPart(Given):
+class StiffnessPart(tables.Given):
     """Share of the stiffness that a parameter scales, a region may lose, or both.
 
     Either its own `matrix`, or that of the whole structure, `changed` by making the part's modulus `times`
@@ -280,23 +269,23 @@ class StiffnessPart(Given):
     matrix: FileName | None = None
     changed: FileName | None = None
     times: float | None = Field(default=None, ge=0.0, lt=1.0)
-    scaled_by: Name | None = None
-    damage: Name | None = None
+    scaled_by: tables.Name | None = None
+    damage: tables.Name | None = None
 
     ways = (("matrix",), ("changed", "times"))
 
 
-class MatrixLoad(Given, Commanded):
+class MatrixLoad(tables.Given, tables.Commanded):
     """A load: a `vector` of its own, a `force` [N] at a node, or an `acceleration` [m/s^2] of all mass."""
 
     vector: FileName | None = None
     node: Node | None = None
-    force: Direction | None = None
+    force: tables.Direction | None = None
 
     ways = (("vector",), ("node", "force"), ("acceleration",))
 
 
-class MatrixMass(Given, ChosenMass):
+class MatrixMass(tables.Given, tables.ChosenMass):
     """Mass at a `node`, or times the `matrix` of 1 kg."""
 
     node: Node | None = None
@@ -305,28 +294,28 @@ class MatrixMass(Given, ChosenMass):
     ways = (("node",), ("matrix",))
 
 
-class Extension(Given, Named):
+class Extension(tables.Given, tables.Named):
     """Strain: a `vector` of its own, or how far two nodes move apart along a direction, over a length."""
 
     vector: FileName | None = None
     nodes: tuple[Node, Node] | None = None
-    direction: Direction | None = None
+    direction: tables.Direction | None = None
     length: float | None = Field(default=None, gt=0.0)
 
     ways = (("vector",), ("nodes", "direction", "length"))
 
 
-class NodeOutput(Given, Named):
+class NodeOutput(tables.Given, tables.Named):
     """Displacement, or acceleration: a `vector` of its own, or of a node along a direction."""
 
     vector: FileName | None = None
     node: Node | None = None
-    direction: Direction | None = None
+    direction: tables.Direction | None = None
 
     ways = (("vector",), ("node", "direction"))
 
 
-class MatrixDesign(StructureDesign):
+class MatrixDesign(tables.StructureDesign):
     """A structure from matrices.
 
     `stiffness_matrix` and `mass_matrix` are those of the whole structure, undamaged and with nominal
@@ -340,7 +329,7 @@ class MatrixDesign(StructureDesign):
     part: tuple[StiffnessPart, ...] = ()
     support: tuple[MatrixSupport, ...] = ()
     load: tuple[MatrixLoad, ...] = ()
-    damage: tuple[Region, ...] = Field(default=(), max_length=MOST_REGIONS)
+    damage: tuple[tables.Region, ...] = Field(default=(), max_length=MOST_REGIONS)
     mass: tuple[MatrixMass, ...] = ()
     gauge: tuple[Extension, ...] = ()
     displacement: tuple[NodeOutput, ...] = ()
@@ -409,7 +398,7 @@ def load_structure(path: Path | str) -> MeshDesign | MatrixDesign:
     return parse_structure(read_toml(file, DesignFileError, what="structure file"), source=str(file))
 
 
-def structure_hash(design: StructureDesign, folder: Path) -> str:
+def structure_hash(design: tables.StructureDesign, folder: Path) -> str:
     """SHA-256 of the design and of the bytes of its files in a folder, 64 hexadecimal digits.
 
     Raises

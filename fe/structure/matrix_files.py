@@ -21,8 +21,8 @@ from fe.runtime.errors import MeshError
 from reporting.text_file import read_text
 
 from .deck import fail
+from .decks import cards
 from .design import file_of
-from .nastran_file import cards
 
 Place = tuple[int, int]
 """Node and component: 1, 2, 3 along x, y, z, then 4, 5, 6 about them."""

@@ -21,10 +21,9 @@ from fe.runtime.arrays import IntArray
 from fe.runtime.errors import MeshError
 from reporting.memory import memory_left
 
-from .abaqus_file import read_abaqus
 from .deck import FLAT, Deck
+from .decks import read_abaqus, read_nastran
 from .mesh import StructureMesh
-from .nastran_file import read_nastran
 
 _READERS: dict[str, Callable[[Path], Deck]] = {
     ".inp": read_abaqus, ".bdf": read_nastran, ".nas": read_nastran, ".fem": read_nastran,

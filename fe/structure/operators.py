@@ -18,9 +18,8 @@ from .affine import AffineStructure, StiffnessTerm, designed, static_response
 from .design import Damage, Material, MatrixDesign, MeshDesign, load_structure, structure_hash, unit_vector
 from .location import gauge_rows, nodal_load, point_shares
 from .matrices import assemble_matrices
-from .mesh import StructureMesh
+from .mesh import StructureMesh, SupportedUnknowns, supported
 from .mesh_file import check_memory, read_mesh
-from .supports import SupportedUnknowns, supported
 
 
 @dataclass(frozen=True)
@@ -276,12 +275,12 @@ def write_structure_vtu(
     )
 
 
+Data = dict[str, NDArray[Any]]
+"""What is written of points or cells, by name."""
+
+
 def write_vtu(
-    path: Path | str,
-    points: FloatArray,
-    cells: tuple[str, IntArray],
-    point_data: dict[str, FloatArray],
-    cell_data: dict[str, NDArray[Any]],
+    path: Path | str, points: FloatArray, cells: tuple[str, IntArray], point_data: Data, cell_data: Data
 ) -> None:
     """Write a VTU file, whole or not at all; `cells` are their kind in meshio and their nodes."""
     meshio, values = meshio_with_wedges(), {name: [value] for name, value in cell_data.items()}

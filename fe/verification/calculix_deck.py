@@ -1,4 +1,4 @@
-"""A structure, or the wing, as input for CalculiX; `fe.verification.calculix_job` runs it and reads results.
+"""A structure, or the wing, as input for CalculiX, which `calculix_comparison` runs.
 
 CalculiX (`ccx`, Debian package calculix-ccx) is an independent finite element code. It gets nodes, cells,
 local material constants with their orientations, supports and springs, rigid sets as equations on two
@@ -25,16 +25,9 @@ from fe.runtime.state import DigitalState
 from fe.structure.affine import AffineStructure
 from fe.structure.design import Load
 from fe.structure.location import point_shares
+from fe.structure.mesh import SupportedUnknowns
 from fe.structure.operators import Structure
-from fe.structure.supports import SupportedUnknowns
-from fe.wing.operators import (
-    AffineOperators,
-    cell_axes,
-    cell_density,
-    cell_elasticity,
-    point_mass_weights,
-    root_support,
-)
+from fe.wing import operators as wing
 from fe.wing.responses import wing_values
 
 NOT_COMPARABLE = (WEDGES_6,)
@@ -297,7 +290,7 @@ def _load_step(structure: Structure, load: Load) -> Step:
     return Step(structure.load(load.name), lines, load.force is not None)
 
 
-def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
+def wing_deck(operators: wing.AffineOperators, state: DigitalState) -> CalculixDeck:
     """Return the wing in one state; it reads the gauges, the displacement at the tip, then at the test load.
 
     The root is a rigid set about the straight chord line, which moves in heave, flap and yaw on its springs.
@@ -308,7 +301,7 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
         PointBlock(
             state.servo_mass if place.kind == "servo" else state.pitot_mass,
             np.array([0.0, place.station * plan.semi_span, 0.0]),  # where it is drawn
-            point_mass_weights(mesh, place),
+            wing.point_mass_weights(mesh, place),
         )
         for place in design.point_masses
     )
@@ -323,7 +316,7 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
         operators,
         wing_values(operators, stiffness_loss=state.stiffness_loss, **state.values),
         mesh,
-        root_support(mesh),
+        wing.root_support(mesh),
         tuple(_wing_materials(operators, state)),
         tuple(masses),
         {"tip force": Step(operators.turn(0.0, TEST_FORCE)), "lift": Step(operators.turn(lift.load_factor))},
@@ -335,14 +328,14 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
     )
 
 
-def _wing_materials(operators: AffineOperators, state: DigitalState) -> Iterator[CellMaterial]:
+def _wing_materials(operators: wing.AffineOperators, state: DigitalState) -> Iterator[CellMaterial]:
     mesh, skin = operators.wing_mesh, operators.wing_mesh.design.skin
-    axes = cell_axes(mesh)
+    axes = wing.cell_axes(mesh)
     # Constants in the cell's own axes; CalculiX turns them by the orientation.
-    local = rotate_elasticity(cell_elasticity(mesh), np.swapaxes(axes, 1, 2))
+    local = rotate_elasticity(wing.cell_elasticity(mesh), np.swapaxes(axes, 1, 2))
     parameters = {"young_modulus_factor": state.young_modulus_factor}
     factor = operators.theta(parameters, state.stiffness_loss)[mesh.stiffness_term]
-    constants, density = factor[:, None] * local[:, *ORTHOTROPIC], cell_density(mesh)
+    constants, density = factor[:, None] * local[:, *ORTHOTROPIC], wing.cell_density(mesh)
     # Whether Young's modulus changes inside a cell.
     graded = (mesh.web < 0) & (mesh.rib < 0) & bool(skin.stations)
     if graded.any():

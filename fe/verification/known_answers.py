@@ -17,8 +17,7 @@ from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.structure.affine import static_response
 from fe.structure.location import face_areas
-from fe.structure.mesh import Surface
-from fe.structure.supports import rigid_motions
+from fe.structure.mesh import Surface, rigid_motions
 from fe.wing.design import WingDesign
 from fe.wing.operators import AffineOperators, assemble, cell_density, root_support
 from fe.wing.responses import eigenmodes

@@ -14,17 +14,11 @@ from typing import Any, Self
 import numpy as np
 from scipy import sparse
 
-from fe.elements.cells import (
-    isotropic_compliance,
-    jacobians,
-    orthotropic_compliance,
-    point_jacobians,
-    rotate_elasticity,
-)
+from fe.elements import cells as elements
 from fe.elements.kinds import gauss_points
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.structure.affine import AffineStructure, StiffnessTerm, designed
-from fe.structure.supports import RigidSet, SupportedUnknowns, rigid_motions
+from fe.structure.mesh import RigidSet, SupportedUnknowns, rigid_motions
 
 from .design import WingDesign, wing_structure
 from .mesh import WingMesh, build_mesh
@@ -78,7 +72,7 @@ def gauge_output(mesh: WingMesh, turned: float = 0.0) -> sparse.csr_array:
 
 def _in_skin(mesh: WingMesh, cells: IntArray, local: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Find the unit directions (p, 3) along span and chord in the skin, at one point of each of p cells."""
-    jacobian = point_jacobians(mesh.kind, mesh.nodes[cells], local)
+    jacobian = elements.point_jacobians(mesh.kind, mesh.nodes[cells], local)
     normal = np.cross(jacobian[:, :, 0], jacobian[:, :, 1])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     direction = np.array([0.0, 1.0, 0.0]) - normal[:, 1:2] * normal
@@ -186,7 +180,7 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
     local = np.empty((len(mesh.cells), 6, 6))
     across, along = skin.transverse_shear_ratio, skin.in_plane_shear_ratio
     unit, wall = (
-        np.linalg.inv(orthotropic_compliance(1.0, skin.poisson_ratio, shears))
+        np.linalg.inv(elements.orthotropic_compliance(1.0, skin.poisson_ratio, shears))
         for shears in ((along, across, across), (across, across, along))
     )
     station = mesh.centres[:, 1] / design.planform.semi_span
@@ -194,20 +188,22 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
     shell = (mesh.web < 0) & (mesh.rib < 0)
     local[shell] = np.where(mesh.leading_edge[shell, None, None], wall, unit) * modulus[shell, None, None]
     for index, web in enumerate(design.webs):
-        compliance = orthotropic_compliance(web.young_modulus, web.poisson_ratio, web.shear_modulus)
+        compliance = elements.orthotropic_compliance(web.young_modulus, web.poisson_ratio, web.shear_modulus)
         local[mesh.web == index] = np.linalg.inv(compliance)
     for index, rib in enumerate(design.ribs):
-        local[mesh.rib == index] = np.linalg.inv(isotropic_compliance(rib.young_modulus, rib.poisson_ratio))
+        local[mesh.rib == index] = np.linalg.inv(
+            elements.isotropic_compliance(rib.young_modulus, rib.poisson_ratio)
+        )
     for rod in design.rods:
         inside = (mesh.web == rod.web) & (station < rod.reach)
         second_moment = design.webs[rod.web].thickness * _web_height(mesh)[inside] ** 3 / 12.0
         local[inside, 1, 1] += rod.bending_stiffness / second_moment
-    return rotate_elasticity(local, cell_axes(mesh))
+    return elements.rotate_elasticity(local, cell_axes(mesh))
 
 
 def cell_axes(mesh: WingMesh) -> FloatArray:
     """Local material axes (nc, 3, 3): rows chordwise, spanwise and across the surface of the cell."""
-    jacobian = jacobians(mesh.kind, mesh.nodes, np.array([[0.5, 0.5, 0.5]]))[:, 0]
+    jacobian = elements.jacobians(mesh.kind, mesh.nodes, np.array([[0.5, 0.5, 0.5]]))[:, 0]
     across = np.cross(jacobian[:, :, 0], jacobian[:, :, 1])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     along = jacobian[:, :, 1] / np.linalg.norm(jacobian[:, :, 1], axis=1, keepdims=True)

@@ -15,16 +15,8 @@ from scipy import sparse
 
 from fe.runtime.arrays import FloatArray
 
+from . import operators as full
 from .design import WingDesign
-from .operators import (
-    AffineOperators,
-    gauge_output,
-    nodal_weight,
-    section_displacement,
-    stiffness_parts,
-    turn_load,
-    upward,
-)
 
 LEAST_LINE_DISTANCE = 0.1
 """Least distance between lines of a section, as a fraction of the chord."""
@@ -45,7 +37,7 @@ class PatchOperators(NamedTuple):
         Parts of the stiffness terms of the skin that lie in the strips.
     """
 
-    operators: AffineOperators
+    operators: full.AffineOperators
     rows: dict[str, Any]
     plain: dict[str, Any]
     strips: tuple[sparse.csr_array, ...]
@@ -82,7 +74,7 @@ def strip_edges(lines: FloatArray, count: int) -> FloatArray:
     return np.asarray(lines[np.unique(nearest)])
 
 
-def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) -> PatchOperators:
+def assemble_patch_operators(operators: full.AffineOperators, strip_count: int = 64) -> PatchOperators:
     """Assemble the operators of the primitives for a wing.
 
     Parameters
@@ -99,11 +91,11 @@ def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) 
     plan, chords = design.planform, section_lines(design)
 
     def rows(chord: float, component: int) -> sparse.csr_array:
-        nodal = np.array([section_displacement(mesh, place, chord) for place in stations])
+        nodal = np.array([full.section_displacement(mesh, place, chord) for place in stations])
         return sparse.csr_array(sparse.csr_array(nodal) @ expansion[component::3])
 
-    weight = -upward(nodal_weight(mesh))
-    lift = turn_load(mesh)
+    weight = -full.upward(full.nodal_weight(mesh))
+    lift = full.turn_load(mesh)
     if design.lift.inertia_relief:  # the load holds the weight
         lift = lift - weight
     node_station = np.abs(mesh.points[:, 1:2] - stations).argmin(axis=1)
@@ -112,14 +104,14 @@ def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) 
     ).tocsr()
 
     along = operators.gauge_output
-    across, diagonal = (gauge_output(mesh, angle) @ expansion for angle in (0.5 * np.pi, 0.25 * np.pi))
+    across, diagonal = (full.gauge_output(mesh, angle) @ expansion for angle in (0.5 * np.pi, 0.25 * np.pi))
     edges = strip_edges(lines, strip_count)
     strips = np.searchsorted(edges, mesh.centres[:, 1]) - 1
     skin = np.flatnonzero(mesh.stiffness_term <= len(design.regions))
     found, part_of = np.unique(
         np.stack((strips, mesh.stiffness_term), axis=1)[skin], axis=0, return_inverse=True
     )
-    parts = (skin[part_of == number] for number in range(len(found)))
+    parts = full.stiffness_parts(mesh, (skin[part_of == number] for number in range(len(found))))
     flap = np.zeros(operators.unknowns)
     flap[-2] = 1.0
     return PatchOperators(
@@ -150,7 +142,5 @@ def assemble_patch_operators(operators: AffineOperators, strip_count: int = 64) 
             "gauge_stations": np.array([place for place, _ in design.gauges.positions]),
             "gauge_length": design.gauges.averaging_spanwise,
         },
-        strips=tuple(
-            sparse.csr_array(restriction @ (matrix @ expansion)) for matrix in stiffness_parts(mesh, parts)
-        ),
+        strips=tuple(sparse.csr_array(restriction @ (part @ expansion)) for part in parts),
     )

@@ -102,7 +102,7 @@ def lift_load(mesh: WingMesh) -> FloatArray:
     face, weight = gauss_points(4, 2)
     load = np.zeros(len(mesh.points))
     for upper in (True, False):
-        cells = mesh.skin_cells(upper=upper)
+        cells = np.flatnonzero(mesh.grid_index[:, 2] == (mesh.height_cells + 1 if upper else 0))
         local = np.column_stack([face, np.full(len(face), 1.0 if upper else 0.0)])
         values, _ = mesh.kind.shape_functions(local)
         place = mesh.positions(cells, local)

@@ -16,7 +16,7 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
 from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import parse_lumped
+from discrepancy.models.lumped_file import LumpedDescription
 from fe.runtime.patch import BoucWen, FreePlay, ModelPatch, Overflow, PowerDamping, PowerStiffness, Primitive
 
 SAMPLES = 40
@@ -43,7 +43,9 @@ def test_equations_and_model_files_agree(name: str, tmp_path: Path) -> None:
     bench = small(name)
     write(tmp_path / "case", bench, Truth(bench.factors), "plain", (1, 2))
     campaign = read_campaign(tmp_path / "case")
-    model = LumpedModel(parse_lumped(tomllib.loads((tmp_path / "case/model.toml").read_text("utf-8"))))
+    model = LumpedModel(
+        LumpedDescription.parse(tomllib.loads((tmp_path / "case/model.toml").read_text("utf-8")))
+    )
     outputs = tuple((channel.output, channel.quantity) for channel in campaign.channels.values())
     factors = np.array([bench.factors[item.name] for item in model.parameters])
     law, size, primitive = LAWS[name]

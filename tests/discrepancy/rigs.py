@@ -7,43 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from discrepancy.campaign.records import Campaign, FloatArray
+from discrepancy.campaign.records import Campaign
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.document import Origin
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import parse_lumped
+from discrepancy.models.lumped_file import LumpedDescription
 from discrepancy.sources.examples import example_campaign, plan_for
-from fe.runtime.patch import (
-    ModelPatch,
-)
+from fe.runtime.patch import ModelPatch
 from reporting.provenance import collect_provenance
 from tests.refusals import Inputs
-
-
-def sensitivity(jacobian: FloatArray, covariance: FloatArray, noise_deviation: FloatArray) -> FloatArray:
-    """Return S = J L / s0 with L L^T the posterior covariance, so that S S^T holds the leverages.
-
-    Parameters
-    ----------
-    jacobian : (N, C, P) ndarray
-        Derivatives of the predictions of one trial by all fitted parameters [channel's unit].
-    covariance : (P, P) ndarray
-        Posterior covariance of the parameters at the scale of the noise records.
-    noise_deviation : (C,) ndarray
-        s0 [channel's unit].
-
-    Returns
-    -------
-    (N, C, P) ndarray
-        Dimensionless.
-    """
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    root = vectors * np.sqrt(np.clip(values, 0.0, None))
-    return np.asarray((jacobian @ root) / noise_deviation[:, np.newaxis])
-
 
 MODEL = "single_mass_rig"
 INPUTS = Inputs(Path(__file__).with_name("models"))
@@ -54,7 +27,7 @@ ORIGIN = Origin("Rig", MODEL, "ab" * 32, "cd" * 32, "uav-twin discrepancy run ri
 
 def model_of(text: str) -> LumpedModel:
     """Return the lumped model that a text says."""
-    return LumpedModel(parse_lumped(tomllib.loads(text)))
+    return LumpedModel(LumpedDescription.parse(tomllib.loads(text)))
 
 
 def fmu_rig(folder: Path, fmu: object, *changes: tuple[str, str]) -> Path:
@@ -68,7 +41,9 @@ def one_mass(**terms: Any) -> LumpedModel:
     """Return a mass of 2 kg and what holds it; the force on it is `push`, its place `x`, its port `slide`."""
     ends = {"input": "push", "output": "x", "port": "slide"}
     rows = {key: [{"name": name, "vector": 1.0}] for key, name in ends.items()}
-    return LumpedModel(parse_lumped({"format": 1, "name": "One mass", "mass": 2.0, **rows, **terms}, "here"))
+    return LumpedModel(
+        LumpedDescription.parse({"format": 1, "name": "One mass", "mass": 2.0, **rows, **terms}, "here")
+    )
 
 
 def measured(hidden: str = "", value: float = 0.0, kind: str = "laboratory") -> tuple[Campaign, LumpedModel]:

@@ -1,12 +1,9 @@
 """The way back: a campaign, its verdict, the model patched by it, and the campaign once more."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import shutil
 import tomllib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +12,8 @@ import pytest
 
 import uav_twin
 from discrepancy.application import _again, apply_verdict, gives
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity
-from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
+from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
 from discrepancy.document import Origin
 from discrepancy.errors import ModelError, VerdictFileError
@@ -24,17 +21,17 @@ from discrepancy.files.verdict import read_patch
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
-from discrepancy.model_choice import ModelChoice, choose_model
-from discrepancy.models.interface import Conditions, Model
+from discrepancy.model_choice import choose_model
+from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import SHIPPED_MODELS, parse_lumped
+from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
 from discrepancy.models.sensing import observe
 from discrepancy.report.figures import ReportInput
 from discrepancy.search.strategy import search
 from discrepancy.sources.examples import example_campaign, plan_of, write_example
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
-from discrepancy.workflow import Investigation, investigate
+from discrepancy.workflow import investigate
 from fe.runtime.patch import LoadGain, ModelPatch, PowerDamping, PowerStiffness, SensorGain
 from fmu_asset.archive.fmu_file import read_fmu
 from reporting.errors import FileNotWrittenError
@@ -42,30 +39,29 @@ from reporting.provenance import collect_provenance
 from tests import command_line
 from tests.discrepancy.rigs import fmu_rig
 
+
+def run(*words, failed=False):
+    """Return what a command says, on the stream where it says it."""
+    done = command_line.command("discrepancy", *words)
+    assert (done.returncode == 1) is failed, done.stderr
+    return done.stderr if failed else done.stdout
+
+
 CATALOGUE = load_catalogue()
 SPRING = ("cubic_stiffness", "seating_offset", "load_cell")
 CUBIC = {"stiffening": 0.15}
 
 
-def named(*identifiers: str) -> tuple[Effect, ...]:
+def named(*identifiers):
     return tuple(effect_by_identifier(name, CATALOGUE) for name in identifiers)
 
 
-def hidden(
-    model: Model, campaign: Campaign, identifier: str, values: dict[str, float], place: str
-) -> ModelPatch:
+def hidden(model, campaign, identifier, values, place):
     setting = Setting(campaign, model, model.scales(campaign))
     return effect_by_identifier(identifier, CATALOGUE).patch(setting, values, place)
 
 
-def verdict_of(
-    choice: ModelChoice,
-    campaign: Campaign,
-    effects: tuple[Effect, ...],
-    folder: Path,
-    *,
-    replace_it: bool = False,
-) -> Investigation:
+def verdict_of(choice, campaign, effects, folder, *, replace_it=False):
     """Investigate, and write the folder of the verdict without its report."""
     found = investigate(campaign, choice.model, effects, thorough=False)
     origin = Origin(
@@ -76,83 +72,63 @@ def verdict_of(
     return found
 
 
+def example(choice, kind, seed, folder, effect, values, place):
+    """Write an example that hides an effect."""
+    plan = plan_of(choice.model)
+    patch = hidden(choice.model, example_campaign(choice.model, kind, seed, plan), effect, values, place)
+    return write_example(choice.model, folder, kind, seed, plan, patch)
+
+
 # ---------------------------------------------------------------- round trips
 
 
 @pytest.fixture(scope="module")
-def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def laboratory(tmp_path_factory):
     """A folder with a lumped model, a campaign with a cubic spring hidden in it, and its verdict."""
     folder = tmp_path_factory.mktemp("laboratory")
     shutil.copy(SHIPPED_MODELS / "single_mass_rig.toml", folder / "rig.toml")
+    spring = ("--seed", 3, "--effect", "cubic_stiffness@slide=0.15")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        words = (
-            "static",
-            "lab",
-            "--model",
-            "rig.toml",
-            "--seed",
-            3,
-            "--effect",
-            "cubic_stiffness@slide=0.15",
-        )
-        assert command_line.command("discrepancy", "example", *words).returncode == 0
-        done = command_line.command(
-            "discrepancy", "run", "lab", "--model", "rig.toml", "--out", "verdict", "--no-report"
-        )
-        assert done.returncode == 0, done.stderr
-        assert "Verdict: named" in done.stdout
-        assert done.stdout.rstrip().endswith("Next: uav-twin discrepancy apply verdict")
+        run("example", "static", "lab", "--model", "rig.toml", *spring)
+        said = run("run", "lab", "--model", "rig.toml", "--out", "verdict", "--no-report")
+    assert "Verdict: named" in said
+    assert said.rstrip().endswith("Next: uav-twin discrepancy apply verdict")
     return folder
 
 
-def test_there_and_back_by_the_command_line(
-    laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_there_and_back_by_the_command_line(laboratory, tmp_path, monkeypatch):
     """Run, apply, run again, each in another folder: nothing is missing any more."""
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(laboratory / "verdict", "verdicts/lab")
-    done = command_line.command("discrepancy", "apply", "verdicts/lab")
-    assert done.returncode == 0, done.stderr
-    first, then = done.stdout.splitlines()
+    shutil.copytree(laboratory / "verdict", "verdicts/copy")
+    first, then = run("apply", "verdicts/copy").splitlines()
     assert first == "rig_patched.toml: Geometric (cubic) stiffness at slide, named."
     text = (tmp_path / "rig_patched.toml").read_text(encoding="utf-8")
     assert text.startswith("# Geometric (cubic) stiffness at slide, named.")
     content = tomllib.loads(text)
     (law,) = content["law"]
     assert (law["kind"], law["port"]) == ("power_stiffness", "slide")
-    found = uav_twin.read_verdict(laboratory / "verdict").verdict
+    stored = uav_twin.read_verdict(laboratory / "verdict")
     assert [(row["name"], row["mean"], row["deviation"]) for row in content["parameter"]] == [
-        (item.name, item.mean, item.deviation) for item in found.parameters
+        (item.name, item.mean, item.deviation) for item in stored.verdict.parameters
     ]
-    assert found.parameters[0].deviation < 0.02  # the prior's
-    words = shlex.split(then.removeprefix("Next: uav-twin "))
+    assert stored.verdict.parameters[0].deviation < 0.02  # the prior's
+    words = shlex.split(then.removeprefix("Next: uav-twin discrepancy "))
     assert words[-4:] == ["--model", "rig_patched.toml", "--out", "verdicts/lab_rig_patched"]
-    done = command_line.command(*words, "--no-report")
-    assert done.returncode == 0, done.stderr
-    assert "Verdict: nothing missing" in done.stdout
-    assert "apply" not in done.stdout
-    done = command_line.command("discrepancy", "apply", words[-1], "--out", "more.json")
-    assert done.returncode == 1
-    assert "nothing is missing, and the model stands as it is" in done.stderr
+    said = run(*words, "--no-report")
+    assert "Verdict: nothing missing" in said
+    assert "apply" not in said
+    assert "nothing is missing, and the model stands as it is" in run(
+        "apply", words[-1], "--out", "more.json", failed=True
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rig_patched.toml", "verdicts"]
-
-
-def test_the_command_repeats_the_run_in_any_folder(
-    laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    command = uav_twin.read_verdict(laboratory / "verdict").origin.command
-    done = command_line.command(*shlex.split(command)[1:], "--no-report")
-    assert done.returncode == 0, done.stderr
+    # the command of a verdict repeats the run in any folder
+    run(*shlex.split(stored.origin.command)[2:], "--no-report")
     once, again = (
         json.loads((folder / "verdict.json").read_text(encoding="utf-8"))
         for folder in (laboratory / "verdict", tmp_path / "verdicts" / "lab")
     )
     assert once == again
-
-
-def test_the_next_command_of_a_mission_has_a_folder_of_its_own() -> None:
     command = "uav-twin discrepancy run --from-run /flights/m1 --to-turn 3 --model own.toml --seed 0"
     assert _again(command, Path("two/one.json")) == (
         "uav-twin discrepancy run --from-run /flights/m1 --to-turn 3 --seed 0 --model two/one.json "
@@ -160,30 +136,19 @@ def test_the_next_command_of_a_mission_has_a_folder_of_its_own() -> None:
     )
 
 
-def static_campaign(choice: ModelChoice, folder: Path) -> Campaign:
-    """Write a static campaign with a cubic spring hidden at the port of the load."""
-    model, plan = choice.model, plan_of(choice.model)
-    bare = example_campaign(model, "static", 3, plan)
-    port = "tip" if "tip" in model.ports() else model.ports()[0]
-    return write_example(
-        model, folder, "static", 3, plan, hidden(model, bare, "cubic_stiffness", CUBIC, port)
-    )
-
-
 @pytest.mark.parametrize("kind", ["FMU", "structure", "wing"])
-def test_there_and_back_from_python(
-    kind: str, foreign_fmu: Callable[[str], Path], write_beam: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_there_and_back_from_python(kind, foreign_fmu, write_beam, tmp_path):
     """A patch beside the model's own file is a model itself, refused once that file has changed."""
     file = tmp_path / "rig.toml"
     if kind == "FMU":
         shutil.copy(foreign_fmu("rig2"), tmp_path / "rig.fmu")
         file = fmu_rig(tmp_path, "rig.fmu")
     elif kind == "structure":
-        changes = {'set = "end", force': "point = [100, 10, 5], force"}
-        file = write_beam(tmp_path, changes, cells=2)
+        file = write_beam(tmp_path, {'set = "end", force': "point = [100, 10, 5], force"}, cells=2)
     choice = choose_model(None if kind == "wing" else file)
-    campaign = static_campaign(choice, tmp_path / "campaign")
+    ports = choice.model.ports()
+    port = "tip" if "tip" in ports else ports[0]
+    campaign = example(choice, "static", 3, tmp_path / "campaign", "cubic_stiffness", CUBIC, port)
     found = verdict_of(choice, campaign, named(*SPRING), tmp_path / "verdict")
     assert found.verdict.kind is VerdictKind.NAMED, found.verdict.sentence
     applied = uav_twin.apply_verdict(tmp_path / "verdict", tmp_path / "patched.json")
@@ -209,9 +174,7 @@ def test_there_and_back_from_python(
             ("young_modulus_factor", calibrated["young_modulus_factor"]),
             ("damping.alpha", calibrated["damping_alpha"]),
         ):
-            variable = packed.variable(name)
-            assert variable is not None
-            assert float(str(variable.start)) == wanted
+            assert float(str(packed.variable(name).start)) == wanted
         return
     old, new = ("density = 2700", "density = 2710") if kind == "structure" else ("high = 1.3", "high = 1.4")
     file.write_text(file.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
@@ -220,59 +183,42 @@ def test_there_and_back_from_python(
             call()
 
 
-# ---------------------------------------------------------------- what is no name
+def test_of_a_group_one_member_is_applied(tmp_path, monkeypatch):
+    """Of a static campaign that cannot tell a compliant root from a crack: the leading one, or another.
 
-
-@pytest.fixture(scope="module")
-def group(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The verdict of a static campaign that cannot tell a compliant root from a crack."""
-    folder = tmp_path_factory.mktemp("group")
-    choice = choose_model("three_mass_chain")
-    plan = plan_of(choice.model)
-    bare = example_campaign(choice.model, "static", 3, plan)
-    values = {"compliance_share": 0.11}
-    patch = hidden(choice.model, bare, "root_compliance", values, "")
-    campaign = write_example(choice.model, folder / "campaign", "static", 3, plan, patch)
-    found = verdict_of(choice, campaign, named("root_compliance", "breathing_crack"), folder / "verdict")
-    assert found.verdict.kind is VerdictKind.GROUP, found.verdict.sentence
-    assert set(found.verdict.group) == {"root_compliance", "breathing_crack"}
-    return folder
-
-
-def test_of_a_group_one_member_is_applied(
-    group: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The leading one unless another is asked for; both say that they are no name, and close the gap."""
+    Both say that they are no name, and close the gap.
+    """
     monkeypatch.chdir(tmp_path)
-    verdict = uav_twin.read_verdict(group / "verdict").verdict
+    choice = choose_model("three_mass_chain")
+    effects = named("root_compliance", "breathing_crack")
+    share = {"compliance_share": 0.11}
+    campaign = example(choice, "static", 3, tmp_path / "campaign", "root_compliance", share, "")
+    verdict = verdict_of(choice, campaign, effects, tmp_path / "verdict").verdict
+    assert verdict.kind is VerdictKind.GROUP, verdict.sentence
+    assert set(verdict.group) == {"root_compliance", "breathing_crack"}
     leading, other = verdict.group
     for words, member in (((), leading), (("--member", other), other)):
         out = tmp_path / f"{member}.json"
-        done = command_line.command("discrepancy", "apply", group / "verdict", "--out", out, *words)
-        assert done.returncode == 0, done.stderr
-        said = f"one of a group that the data cannot tell apart: no name (of {leading}, {other})."
-        assert said in done.stdout
+        told = run("apply", tmp_path / "verdict", "--out", out, *words)
+        assert f"one of a group that the data cannot tell apart: no name (of {leading}, {other})." in told
         stored = read_patch(out)
         assert stored.verdict is VerdictKind.GROUP
-        assert stored.sentence.startswith(done.stdout.splitlines()[0].split(": ", 1)[1])
+        assert stored.sentence.startswith(told.splitlines()[0].split(": ", 1)[1])
         assert [effect.identifier for effect in stored.effects] == [member]
         (fitted,) = [item for item in verdict.hypotheses if item.identifiers == (member,)]
         assert stored.parameters == fitted.parameters
-        campaign = uav_twin.read_campaign(group / "campaign")
-        again = investigate(campaign, out, named(leading, other), thorough=False).verdict
+        again = investigate(
+            uav_twin.read_campaign(tmp_path / "campaign"), out, effects, thorough=False
+        ).verdict
         assert again.kind is VerdictKind.NOTHING_MISSING, again.sentence
-    done = command_line.command("discrepancy", "apply", group / "verdict", "--member", "overflow")
-    assert done.returncode == 1
-    assert f"which has '{leading}', '{other}'" in done.stderr
+    refused = run("apply", tmp_path / "verdict", "--member", "overflow", failed=True)
+    assert f"which has '{leading}', '{other}'" in refused
 
 
-def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path: Path) -> None:
+def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path):
     """A hardening spring with nothing but a stiffness that drifts to explain it."""
     choice = choose_model("single_mass_rig")
-    plan = plan_of(choice.model)
-    bare = example_campaign(choice.model, "ringdown", 3, plan)
-    patch = hidden(choice.model, bare, "cubic_stiffness", CUBIC, "slide")
-    campaign = write_example(choice.model, tmp_path / "campaign", "ringdown", 3, plan, patch)
+    campaign = example(choice, "ringdown", 3, tmp_path / "campaign", "cubic_stiffness", CUBIC, "slide")
     found = verdict_of(choice, campaign, named("stiffness_drift"), tmp_path / "verdict")
     assert found.verdict.kind is VerdictKind.UNEXPLAINED, found.verdict.sentence
     assert gives(found.verdict)
@@ -292,12 +238,10 @@ def test_the_best_hypothesis_for_an_unexplained_gap_is_marked(tmp_path: Path) ->
 # ---------------------------------------------------------------- files
 
 
-def test_files_are_not_taken_from_their_owner(
-    laboratory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_are_not_taken_from_their_owner(laboratory, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    verdict = laboratory / "verdict"
-    (tmp_path / "there.toml").write_text("mine", encoding="utf-8")
+    there = tmp_path / "there.toml"
+    there.write_text("mine", encoding="utf-8")
     for words, message in (
         (("--out", "there.toml"), "there.toml exists: choose another --out or give --replace"),
         (("--out", str(laboratory / "rig.toml"), "--replace"), "is what the patched model is made of"),
@@ -305,59 +249,61 @@ def test_files_are_not_taken_from_their_owner(
         (("--out", "model.fmu"), "only a wing is packed with its effects"),
         (("--member", "free_play"), "has no group: leave it out"),
     ):
-        done = command_line.command("discrepancy", "apply", verdict, *words)
-        assert done.returncode == 1
-        assert message in done.stderr
-        assert len(done.stderr.strip().splitlines()) == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["there.toml"]
-    assert (tmp_path / "there.toml").read_text(encoding="utf-8") == "mine"
-    done = command_line.command("discrepancy", "apply", verdict, "--out", "there.toml", "--replace")
-    assert done.returncode == 0
+        said = run("apply", laboratory / "verdict", *words, failed=True)
+        assert message in said
+        assert len(said.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == [there]
+    assert there.read_text(encoding="utf-8") == "mine"
+    run("apply", laboratory / "verdict", "--out", "there.toml", "--replace")
     assert uav_twin.load_model("there.toml").name.endswith("with geometric (cubic) stiffness")
 
 
-def test_a_model_is_found_beside_its_patch(laboratory: Path, tmp_path: Path) -> None:
+def rewritten(file, change):
+    """Write a JSON file anew with its content changed."""
+    content = json.loads(file.read_text(encoding="utf-8"))
+    change(content)
+    file.write_text(json.dumps(content), encoding="utf-8")
+
+
+def test_a_model_is_found_beside_its_patch(laboratory, tmp_path):
     """Files that moved together are a model still; one without its base is not."""
-    moved = tmp_path / "moved"
-    shutil.copytree(laboratory, tmp_path / "there")
-    content = json.loads((tmp_path / "there" / "verdict" / "verdict.json").read_text(encoding="utf-8"))
-    content["model_file"] = str(tmp_path / "there" / "rig.toml")
-    (tmp_path / "there" / "verdict" / "verdict.json").write_text(json.dumps(content), encoding="utf-8")
-    apply_verdict(tmp_path / "there" / "verdict", tmp_path / "there" / "patched.json")
-    (tmp_path / "there").rename(moved)
+    there, moved = shutil.copytree(laboratory, tmp_path / "there"), tmp_path / "moved"
+    own = str(there / "rig.toml")
+    rewritten(there / "verdict" / "verdict.json", lambda content: content.update(model_file=own))
+    apply_verdict(there / "verdict", there / "patched.json")
+    there.rename(moved)
     assert len(uav_twin.load_model(moved / "patched.json").patch)
     (moved / "rig.toml").unlink()
     with pytest.raises(ModelError, match="is gone: put it back there, or beside patched"):
         uav_twin.load_model(moved / "patched.json")
 
 
-def test_a_verdict_of_an_earlier_version_asks_for_another_run(laboratory: Path, tmp_path: Path) -> None:
+def test_a_verdict_of_an_earlier_version_asks_for_another_run(laboratory, tmp_path):
     """It is read, but does not say where its model is."""
-    folder = tmp_path / "verdict"
-    shutil.copytree(laboratory / "verdict", folder)
-    for name, schema in (("verdict.json", "uav-twin verdict 2"), ("patch.json", "uav-twin patch 1")):
-        content = json.loads((folder / name).read_text(encoding="utf-8"))
-        content["schema"] = schema
+    folder = shutil.copytree(laboratory / "verdict", tmp_path / "verdict")
+
+    def older(content):
+        is_patch = "patch" in content["schema"]
+        content["schema"] = "uav-twin patch 1" if is_patch else "uav-twin verdict 2"
         del content["model_file"]
         for table in (content, content["verdict"]):
-            if isinstance(table, dict):
-                table.pop("parameters", None)
-                table.pop("force", None)
-        for row in content["verdict"]["hypotheses"] if name == "verdict.json" else ():
+            for key in ("parameters", "force") if isinstance(table, dict) else ():
+                table.pop(key, None)
+        for row in () if is_patch else content["verdict"]["hypotheses"]:
             del row["parameters"]
-        (folder / name).write_text(json.dumps(content), encoding="utf-8")
+
+    for name in ("verdict.json", "patch.json"):
+        rewritten(folder / name, older)
     stored = uav_twin.read_verdict(folder)
     assert stored.verdict.parameters == ()
     assert stored.patch == uav_twin.read_verdict(laboratory / "verdict").patch
-    for call in (
-        lambda: apply_verdict(folder, tmp_path / "x.toml"),
-        lambda: choose_model(folder / "patch.json"),
-    ):
+    patch = folder / "patch.json"
+    for call in (lambda: apply_verdict(folder, tmp_path / "x.toml"), lambda: choose_model(patch)):
         with pytest.raises(VerdictFileError, match="was left by an earlier version"):
             call()
 
 
-def test_effects_are_applied_upon_each_other(laboratory: Path, tmp_path: Path) -> None:
+def test_effects_are_applied_upon_each_other(laboratory, tmp_path):
     """What a patched model lacks goes into one file with what it had."""
     first = choose_model(apply_verdict(laboratory / "verdict", tmp_path / "first.json").path)
     assert len(first.model.patch)
@@ -380,55 +326,47 @@ def test_effects_are_applied_upon_each_other(laboratory: Path, tmp_path: Path) -
     assert uav_twin.load_model(tmp_path / "both.json").parameters == uav_twin.load_model(second).parameters
 
 
-# ---------------------------------------------------------------- models
+def rig_conditions(model, *values):
+    return Conditions(np.array(values or np.ones(len(model.parameters))), np.zeros((1, 2)))
 
 
-def test_a_law_in_the_file_is_the_law_of_a_patch() -> None:
+def test_a_law_in_the_file_is_the_law_of_a_patch():
     """To the last bit, in motion and at rest, with the law times the factor of a parameter."""
     content = tomllib.loads((SHIPPED_MODELS / "single_mass_rig.toml").read_text(encoding="utf-8"))
     law = PowerStiffness("slide", 3.0, 3.0, 0, 0.008)
     factor = {"name": "law", "terms": "spring", "deviation": 0.1, "low": 0.5, "high": 4.0}
     more = {"law": [{"name": "spring", **law.to_mapping()}], "parameter": [*content["parameter"], factor]}
-    own, plain = LumpedModel(parse_lumped(content | more)), LumpedModel(parse_lumped(content))
-    plan = plan_of(plain)
-    campaign = example_campaign(plain, "laboratory", 3, plan)
+    own, plain = (LumpedModel(LumpedDescription.parse(item)) for item in (content | more, content))
+    campaign = example_campaign(plain, "laboratory", 3, plan_of(plain))
     for trial in campaign.trials:
         for size in (1.0, 2.0):
             patch = ModelPatch((replace(law, coefficient=3.0 * size),))
-            values = np.array([1.02, 0.9])
-            start = np.zeros((1, 2))
-            one = observe(
-                own, campaign, trial, ModelPatch(), Conditions(np.append(values, size), start)
-            ).values
-            other = observe(plain, campaign, trial, patch, Conditions(values, start)).values
-            np.testing.assert_array_equal(one, other)
+            one = observe(own, campaign, trial, ModelPatch(), rig_conditions(own, 1.02, 0.9, size))
+            other = observe(plain, campaign, trial, patch, rig_conditions(plain, 1.02, 0.9))
+            np.testing.assert_array_equal(one.values, other.values)
 
 
-def test_a_built_in_sensor_is_that_of_its_channel() -> None:
+def test_a_built_in_sensor_is_that_of_its_channel():
     """Of two channels that measure one output, the one that the effect was found on."""
     model = uav_twin.load_model("single_mass_rig")
     noise = NoiseRecord(1e-5, 50.0)
     channels = tuple(
         Channel(name, Quantity.DISPLACEMENT, "displacement", noise) for name in ("laser", "transducer")
     )
-    plan = replace(plan_of(model), channels=channels)
-    campaign = example_campaign(model, "static", 0, plan)
-    trial = campaign.trials[0]
+    campaign = example_campaign(model, "static", 0, replace(plan_of(model), channels=channels))
     patched = model.patched(ModelPatch((SensorGain("laser", 0.1),)))
-    conditions = Conditions(np.ones(len(model.parameters)))
-    seen = observe(patched, campaign, trial, ModelPatch(), conditions).values
+    seen = observe(patched, campaign, campaign.trials[0], ModelPatch(), rig_conditions(model)).values
     np.testing.assert_allclose(seen[:, 0], 1.1 * seen[:, 1], rtol=1e-12)
     assert np.abs(seen[:, 1]).max() > 0.0
 
 
-def test_friction_in_the_model_is_fitted_from_the_beginnings() -> None:
+def test_friction_in_the_model_is_fitted_from_the_beginnings():
     """A motion that friction ends has many optima; from the prior means the fit ends far off in one."""
     model = uav_twin.load_model("single_mass_rig")
     plan = plan_of(model)
     bare = example_campaign(model, "ringdown", 1, plan)
     patch = hidden(model, bare, "coulomb_friction", {"friction_ratio": 0.04}, "slide")
-    campaign = example_campaign(model, "ringdown", 1, plan, patch)
-    patched = model.patched(patch)
+    campaign, patched = example_campaign(model, "ringdown", 1, plan, patch), model.patched(patch)
     problem = Problem(campaign, patched, Setting(campaign, patched, patched.scales(campaign)))
     count = problem.counts.sum()
     assert fit(problem, Candidate(), problem.start(Candidate())).chi_square > 10.0 * count
@@ -436,17 +374,16 @@ def test_friction_in_the_model_is_fitted_from_the_beginnings() -> None:
 
 
 @pytest.mark.parametrize("kind", ["lumped", "FMU"])
-def test_gains_of_a_load_act_one_upon_the_other(
-    kind: str, foreign_fmu: Callable[[str], Path], tmp_path: Path
-) -> None:
+def test_gains_of_a_load_act_one_upon_the_other(kind, foreign_fmu, tmp_path):
     """A tare of 0.5 N that a second gain of 10 % doubles up on is 0.55 N."""
     shutil.copy(foreign_fmu("rig2"), tmp_path / "rig.fmu")
     fmu_rig(tmp_path, "rig.fmu")
     model = uav_twin.load_model("single_mass_rig" if kind == "lumped" else tmp_path / "rig.toml")
-    twice = ModelPatch((LoadGain(0.2, 0.5), LoadGain(0.1, 0.0)))
-    once = ModelPatch((LoadGain(0.32, 0.55),))
     trial = example_campaign(model, "static", 0, plan_of(model)).trials[0]
-    outputs = (("displacement", Quantity.DISPLACEMENT),)
-    conditions = Conditions(np.ones(len(model.parameters)))
-    seen, wanted = (model.respond(trial, outputs, patch, conditions).values for patch in (twice, once))
+    seen, wanted = (
+        model.respond(
+            trial, (("displacement", Quantity.DISPLACEMENT),), ModelPatch(gains), rig_conditions(model)
+        ).values
+        for gains in ((LoadGain(0.2, 0.5), LoadGain(0.1, 0.0)), (LoadGain(0.32, 0.55),))
+    )
     np.testing.assert_allclose(seen, wanted, rtol=1e-9, atol=1e-15)

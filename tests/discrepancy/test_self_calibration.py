@@ -1,9 +1,6 @@
 """The workflow tried on simulated campaigns of a rig."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +10,7 @@ from scipy.stats import norm
 
 from discrepancy.catalogue.library import library
 from discrepancy.errors import FitError
-from discrepancy.self_calibration import (
-    NOTHING,
-    outcome_of,
-    self_calibrate,
-    wilson,
-    write_self_calibration,
-)
+from discrepancy.self_calibration import NOTHING, outcome_of, self_calibrate, wilson, write_self_calibration
 from discrepancy.sources.simulated_campaigns import Simulator
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
@@ -43,15 +34,13 @@ from tests.discrepancy.rigs import FEW, ORIGIN, measured
         ("a", VerdictKind.UNEXPLAINED, (), (), "unexplained"),
     ],
 )
-def test_how_verdicts_count(
-    hidden: str, kind: VerdictKind, named: tuple[str, ...], group: tuple[str, ...], outcome: str
-) -> None:
+def test_how_verdicts_count(hidden, kind, named, group, outcome):
     assert outcome_of(hidden, kind, named, group) == outcome
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 60), st.integers(1, 60))
-def test_wilson_intervals_solve_their_equation(count: int, total: int) -> None:
+def test_wilson_intervals_solve_their_equation(count, total):
     count = min(count, total)
     found = wilson(count, total)
     z = norm.ppf(0.95)
@@ -61,10 +50,10 @@ def test_wilson_intervals_solve_their_equation(count: int, total: int) -> None:
     assert wilson(0, 0).total == 0
 
 
-def test_simulated_campaigns_have_the_noise_and_the_nuisances_of_the_real_one() -> None:
+def test_simulated_campaigns_have_the_noise_and_the_nuisances_of_the_real_one():
     campaign, model = measured()
     simulator = Simulator(campaign, model)
-    squares: list[float] = []
+    squares = []
     for seed in range(12):
         drawn = simulator.simulate(None, np.random.default_rng(seed))
         assert [trial.name for trial in drawn.trials] == [trial.name for trial in campaign.trials]
@@ -79,9 +68,9 @@ def test_simulated_campaigns_have_the_noise_and_the_nuisances_of_the_real_one() 
     assert np.mean(squares) == pytest.approx(1.0, abs=0.12)
 
 
-def test_the_workflow_tried_on_its_own_geometry(tmp_path: Path) -> None:
+def test_the_workflow_tried_on_its_own_geometry(tmp_path):
     campaign, model = measured(kind="static")
-    steps: list[int] = []
+    steps = []
     found = self_calibrate(campaign, model, FEW, 9, seed=2, workers=1, advance=lambda: steps.append(1))
     assert len(steps) == len(found.cases) == 9
     assert [case.hidden == NOTHING for case in found.cases] == [True, False, False] * 3

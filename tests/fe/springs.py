@@ -1,7 +1,5 @@
 """Springs in a row as a wing: a small affine system of which everything can be solved directly."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

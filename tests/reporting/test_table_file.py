@@ -50,6 +50,21 @@ def test_what_is_no_number_in_plain_digits_is_refused(text: str) -> None:
         table.numbers("load", "the test")
 
 
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", "is empty"),
+        ("load,x\n", "has a header line but no rows"),
+        ("load;x\n1;2\n", "is not separated by commas"),
+        ("load,load\n1,2\n", "more than one column 'load'"),
+        ("load,x\n1,2\n1,2,3\n", "line 3: 3 cells came, and the header has 2 columns"),
+    ],
+)
+def test_what_is_no_table_is_refused(text: str, sentence: str) -> None:
+    with pytest.raises(LayoutError, match=sentence):
+        parse_table(text, "loads.csv", ERRORS)
+
+
 def test_values_that_none_can_have() -> None:
     table = parse_table("load,x\n1,inf\n0,1e999\n-1,2\n", "loads.csv", ERRORS)
     with pytest.raises(ValueRefusedError, match=r"line 2: column 'x' holds inf, and a finite number is"):

@@ -1,18 +1,74 @@
-"""Runs that are cut off, and run folders that are compared."""
+"""What tests of missions share: scenarios with changes, twins of a strain library, runs cut off."""
 
+import json
+import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from scenarios import scenario_files
+from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
+from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.mission.loop import CheckpointFile
+from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+
+
+def edited(text: str, *changes: tuple[str, str]) -> str:
+    """Return a text in which pieces, that it must have, are exchanged once."""
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    return text
+
+
+def text_of(name: str, *changes: tuple[str, str]) -> str:
+    """Return the text of a shipped scenario in which pieces are exchanged."""
+    return edited(scenario_files()[name].read_text(encoding="utf-8"), *changes)
+
+
+def written(folder: Path, text: str, *changes: tuple[str, str], name: str = "mine.toml") -> Path:
+    """Write a text in which pieces are exchanged into a folder."""
+    path = folder / name
+    path.write_text(edited(text, *changes), encoding="utf-8")
+    return path
+
+
+def table_of(name: str) -> dict[str, Any]:
+    return tomllib.loads(text_of(name))
+
+
+def loaded_from(table: dict[str, Any], name: str) -> LoadedScenario:
+    """Return a scenario that stands where a shipped one does."""
+    return LoadedScenario(parse_scenario(table, name), scenario_files()[name], "0" * 64)
+
+
+def of_library(
+    name: str, library: Path, seed: int = 3, **sections: Any
+) -> tuple[Knowledge, StrainLibrarySource]:
+    """Return what a twin knows of the wing of a strain library, and that wing; with other sections."""
+    scenario = load_scenario(name).scenario.model_copy(update=sections)
+    source = StrainLibrarySource(scenario, load_strain_library(library), "h")
+    return prepare_knowledge(scenario, source, seed), source
+
+
+def figures_of(folder: Path) -> dict[str, Any]:
+    """Return the figures in the summary of a run."""
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    return {figure["key"]: figure["value"] for figure in summary["figures"]}
+
+
+def journal(folder: Path) -> list[dict[str, Any]]:
+    """Return the records of the journal of a run or watch."""
+    return [record for record, *_ in records(folder / JOURNAL_NAME)]
 
 
 @contextmanager
-def cut_off_after(turns: int) -> Iterator[None]:
-    """Let the run within die, as it must, once so many turns are on the disk."""
+def cut_off_after(turns: int, *, ends: bool = True) -> Iterator[None]:
+    """Let the run within die once so many turns are kept; it must, unless a command line tells it."""
     keep = CheckpointFile.keep
 
     def dying(self: CheckpointFile, *turn: Any) -> None:
@@ -22,7 +78,7 @@ def cut_off_after(turns: int) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(CheckpointFile, "keep", dying)
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(KeyboardInterrupt) if ends else nullcontext():
             yield
 
 

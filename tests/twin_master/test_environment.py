@@ -1,7 +1,5 @@
 """A scenario as an environment of gymnasium: its checker, and the mission that our own policy flies in it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -26,11 +24,11 @@ def environment(request: pytest.FixtureRequest, library_file: Path) -> Iterator[
 
 
 @pytest.mark.filterwarnings("ignore:.*Box observation space:UserWarning", "ignore:.*render:UserWarning")
-def test_it_passes_the_checker_of_gymnasium(environment: ScenarioEnvironment) -> None:
+def test_it_passes_the_checker_of_gymnasium(environment):
     check_env(environment)
 
 
-def test_our_policy_flies_the_mission_of_the_loop(environment: ScenarioEnvironment) -> None:
+def test_our_policy_flies_the_mission_of_the_loop(environment):
     """To the last bit, with the seed of the mission; rewards by enumeration."""
     scenario, knowledge = environment.scenario, environment.knowledge
     plant = knowledge.plant(knowledge.truth(3), asset_source(scenario).open())
@@ -60,7 +58,7 @@ def test_our_policy_flies_the_mission_of_the_loop(environment: ScenarioEnvironme
         environment.step(0)
 
 
-def test_wrong_use_is_refused(library_file: Path) -> None:
+def test_wrong_use_is_refused(library_file):
     environment = ScenarioEnvironment("level_turns", {"strain_library": library_file})
     with pytest.raises(gymnasium.error.ResetNeeded):
         environment.step(0)
@@ -73,7 +71,7 @@ def test_wrong_use_is_refused(library_file: Path) -> None:
         environment.reset()
 
 
-def test_without_gymnasium_there_is_a_sentence() -> None:
+def test_without_gymnasium_there_is_a_sentence():
     program = "import sys; sys.modules['gymnasium'] = None; import uav_twin; uav_twin.ScenarioEnvironment"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode != 0

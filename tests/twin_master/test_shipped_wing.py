@@ -1,11 +1,8 @@
 """The paper's mission on our own wing: the policy, the reliability over many seeds, and the whole chain."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,7 +30,7 @@ def wing() -> ReducedModel:
     return reduced_model()
 
 
-def test_the_papers_policy(wing: ReducedModel) -> None:
+def test_the_papers_policy(wing):
     scenario = load_scenario("paper_level_turns").scenario
     knowledge = prepare_knowledge(scenario, ReducedModelSource(scenario, wing), 0)
     z1 = knowledge.model.states.coordinates[:, 0]
@@ -42,7 +39,7 @@ def test_the_papers_policy(wing: ReducedModel) -> None:
     assert knowledge.draws.standard_deviation == pytest.approx(0.0103, abs=0.001)
 
 
-def test_reliability(wing: ReducedModel) -> None:
+def test_reliability(wing):
     """Bars of 300 missions, widened for 80; `benchmarks/study_level_turns.py` flies as many as wanted."""
     scenario = load_scenario("paper_level_turns").scenario
     study = fly_seeds(scenario, ReducedModelSource(scenario, wing), range(80))
@@ -51,7 +48,7 @@ def test_reliability(wing: ReducedModel) -> None:
     assert np.all([study.rms(0).value <= 0.045, study.rms(1).value <= 0.13])
 
 
-def test_the_whole_chain_and_its_resumption(wing: ReducedModel, tmp_path: Path) -> None:
+def test_the_whole_chain_and_its_resumption(wing, tmp_path):
     loaded = load_scenario("paper_level_turns")
     outcome = new_run(loaded, tmp_path / "whole")
     figures = {figure.key: figure for figure in outcome.figures}
@@ -71,9 +68,7 @@ def test_the_whole_chain_and_its_resumption(wing: ReducedModel, tmp_path: Path) 
 
 
 @pytest.mark.long
-def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(
-    wing: ReducedModel, tmp_path: Path
-) -> None:
+def test_the_mission_is_the_same_with_the_compiled_wing_and_without_a_worker(wing, tmp_path):
     loaded = load_scenario("paper_level_turns")
 
     def arrays(name: str, overrides: Overrides, packed: str = "python") -> dict[str, np.ndarray]:

@@ -1,13 +1,14 @@
-"""`uav-twin calibrate campaign` as a user calls it."""
+"""`uav-twin calibrate campaign` and `calibrate ringdown` as a user calls them."""
 
+import csv
 import json
-from collections.abc import Callable
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from calibration.result.file import load_calibration, save_calibration
-from calibration.result.record import Calibration
 from scenarios import structure_files
 from tests.command_line import refused, said
 
@@ -15,14 +16,9 @@ MODEL = """format = 1
 name = "spring"
 mass = 2.0
 stiffness = 1000.0
-[damping]
-ratios = [0.01]
-[[input]]
-name = "end"
-vector = 1.0
-[[output]]
-name = "sag"
-vector = 1.0
+damping.ratios = [0.01]
+input = [{ name = "end", vector = 1.0 }]
+output = [{ name = "sag", vector = 1.0 }]
 [[parameter]]
 name = "factor"
 terms = "stiffness"
@@ -33,16 +29,13 @@ high = 1.5
 """
 CAMPAIGN = """format = 1
 name = "spring test"
+trial = [{ name = "up", kind = "static", file = "up.csv" }]
 [[channel]]
 name = "tip"
 quantity = "displacement"
 unit = "mm"
 output = "sag"
 noise = { standard_deviation = 0.5 }
-[[trial]]
-name = "up"
-kind = "static"
-file = "up.csv"
 """
 
 
@@ -51,18 +44,25 @@ def lab(tmp_path: Path) -> Path:
     """A folder with a campaign of a spring of 0.88 times its stiffness, and the model beside."""
     folder = tmp_path / "lab"
     folder.mkdir()
-    forces = (10.0, 20.0, 30.0, 40.0)
-    noise = (0.3, -0.4, 0.1, 0.2)
-    rows = [f"{f},{f / 0.88 + n}" for f, n in zip(forces, noise, strict=True)]
+    noise = {10.0: 0.3, 20.0: -0.4, 30.0: 0.1, 40.0: 0.2}
+    rows = [f"{force},{force / 0.88 + off}" for force, off in noise.items()]
     (folder / "up.csv").write_text("force,tip\n" + "\n".join(rows))
     (folder / "campaign.toml").write_text(CAMPAIGN)
     (tmp_path / "model.toml").write_text(MODEL)
     return folder
 
 
-def test_a_campaign_gives_a_file_a_report_and_a_table(lab: Path) -> None:
-    model, out = lab.parent / "model.toml", lab.parent / "out"
-    shown = said("calibrate", "campaign", lab, "--model", model, "--out", out, "--asset", "spring 7")
+def words(lab: Path, *more: object) -> tuple[object, ...]:
+    return ("calibrate", "campaign", lab, "--model", lab.parent / "model.toml", *more)
+
+
+def to(lab: Path, asset: str) -> tuple[object, ...]:
+    return words(lab, "--out", lab.parent / "out", "--asset", asset)
+
+
+def test_a_campaign_gives_a_file_a_report_and_a_table(lab):
+    out = lab.parent / "out"
+    shown = said(*to(lab, "spring 7"))
     assert "factor" in shown
     assert "1.00 ± 0.19" in shown  # 0.20, cut off at 0.5 and 1.5
     found = load_calibration(out / "calibration.nc")
@@ -72,100 +72,103 @@ def test_a_campaign_gives_a_file_a_report_and_a_table(lab: Path) -> None:
     assert "Calibration of spring 7" in page
     assert page.count("<figure") == 2
     first = (out / "calibration.nc").read_bytes()
-    said("calibrate", "campaign", lab, "--model", model, "--out", out, "--asset", "spring 7", "--no-report")
+    said(*to(lab, "spring 7"), "--no-report")
     assert (out / "calibration.nc").read_bytes() == first
     assert [path.name for path in out.iterdir()] == ["calibration.nc"]  # no page of other figures beside it
-    assert "is the calibration of spring 7, not of spring 8" in refused(
-        "calibrate", "campaign", lab, "--model", model, "--out", out, "--asset", "spring 8", code=None
-    )
-
-
-def test_a_report_of_something_else_stays(lab: Path) -> None:
-    out = lab.parent / "out"
-    (out / "figures").mkdir(parents=True)
-    for name in ("report.html", "figures/posterior.svg"):
-        (out / name).write_text("mine")
-    said("calibrate", "campaign", lab, "--model", lab.parent / "model.toml", "--out", out, "--no-report")
-    assert [(out / n).read_text() for n in ("report.html", "figures/posterior.svg")] == ["mine", "mine"]
-
-
-def test_a_calibration_of_the_other_kind_is_not_overwritten(
-    lab: Path, make_calibration: Callable[..., Calibration]
-) -> None:
-    """A wing's by a campaign's and a campaign's by a wing's, of the same and of another asset."""
-    model, out = lab.parent / "model.toml", lab.parent / "out"
-    kept = save_calibration(make_calibration(), out / "calibration.nc")
-    before, wing = kept.read_bytes(), make_calibration().asset
-    for asset, words in (
-        (wing, f"is the calibration of {wing} from the laboratory of a wing (`uav-twin calibrate`), and one "
-               "from a campaign (`uav-twin calibrate campaign`) was asked for: choose another --out"),
-        ("spring 7", f"is the calibration of {wing}, not of spring 7: choose another --out"),
-    ):  # fmt: skip
-        assert words in refused(
-            "calibrate", "campaign", lab, "--model", model, "--out", out, "--asset", asset
-        )
-        assert kept.read_bytes() == before
-    kept.write_bytes(before[:200])  # what nobody can read is replaced
-    said("calibrate", "campaign", lab, "--model", model, "--out", out, "--asset", "spring 7", "--no-report")
-    before = kept.read_bytes()
-    assert load_calibration(kept).design is None
-    for asset, words in (
-        (
-            "spring 7",
-            "is the calibration of spring 7 from a campaign (`uav-twin calibrate campaign`), and one",
-        ),
-        ("UAV 1", "is the calibration of spring 7, not of UAV 1: choose another --out"),
-    ):
-        assert words in refused("calibrate", "--out", out, "--asset", asset, "--no-report")
-        assert kept.read_bytes() == before
-
-
-def test_json_has_the_same_figures(lab: Path) -> None:
-    record = json.loads(said("calibrate", "campaign", lab, "--model", lab.parent / "model.toml", "--json"))
+    assert "is the calibration of spring 7, not of spring 8" in refused(*to(lab, "spring 8"), code=None)
+    record = json.loads(said(*words(lab, "--json")))
     (parameter,) = record["parameters"]
     assert parameter["name"] == "factor"
     assert parameter["interval_90"][0] < 0.88 < parameter["interval_90"][1]
     assert parameter["prior_left"] < 0.15
-    assert record["explained"] is True
-    assert record["procedure"] == "quadrature"
+    assert (record["explained"], record["procedure"]) == (True, "quadrature")
+
+
+def test_a_report_of_something_else_stays(lab):
+    kept = [lab.parent / "out" / name for name in ("report.html", "figures/posterior.svg")]
+    kept[1].parent.mkdir(parents=True)
+    for file in kept:
+        file.write_text("mine")
+    said(*words(lab, "--out", lab.parent / "out", "--no-report"))
+    assert [file.read_text() for file in kept] == ["mine", "mine"]
+
+
+def test_a_calibration_of_the_other_kind_is_not_overwritten(lab, make_calibration):
+    """A wing's by a campaign's and a campaign's by a wing's, of the same and of another asset."""
+    out, wing = lab.parent / "out", make_calibration().asset
+    kept = save_calibration(make_calibration(), out / "calibration.nc")
+    before = kept.read_bytes()
+    for asset, sentence in (
+        (wing, f"is the calibration of {wing} from the laboratory of a wing (`uav-twin calibrate`), and one "
+               "from a campaign (`uav-twin calibrate campaign`) was asked for: choose another --out"),
+        ("spring 7", f"is the calibration of {wing}, not of spring 7: choose another --out"),
+    ):  # fmt: skip
+        assert sentence in refused(*to(lab, asset))
+        assert kept.read_bytes() == before
+    kept.write_bytes(before[:200])  # what nobody can read is replaced
+    said(*to(lab, "spring 7"), "--no-report")
+    before = kept.read_bytes()
+    assert load_calibration(kept).design is None
+    for asset, sentence in (
+        ("spring 7", "of spring 7 from a campaign (`uav-twin calibrate campaign`), and one"),
+        ("UAV 1", "is the calibration of spring 7, not of UAV 1: choose another --out"),
+    ):
+        assert sentence in refused("calibrate", "--out", out, "--asset", asset, "--no-report")
+        assert kept.read_bytes() == before
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("old", "new", "sentence"),
     [
-        (("[[parameter]]", "[[place]]"), "'place[1].high' are not keys of a lumped model"),
-        (('unit = "mm"', 'unit = "m"'), "1000"),
-        (("mean = 1.0", "mean = 1.6"), "a factor needs 0 < low <= mean <= high"),
-        (('unit = "mm"', 'unit = "N"'), "unit"),
-        ((".", ","), "line 2: 4 cells came, and the header has 2 columns. A decimal comma makes two cells"),
+        ("[[parameter]]", "[[place]]", "'place[1].high' are not keys of a lumped model"),
+        ('unit = "mm"', 'unit = "m"', "1000"),
+        ("mean = 1.0", "mean = 1.6", "a factor needs 0 < low <= mean <= high"),
+        ('unit = "mm"', 'unit = "N"', "unit"),
+        (MODEL[MODEL.index("[[parameter]]") :], "", "has no parameter to calibrate: it lists none"),
+        (".", ",", "line 2: 4 cells came, and the header has 2 columns. A decimal comma makes two cells"),
     ],
 )
-def test_what_is_wrong_is_one_sentence_and_nothing_is_written(
-    lab: Path, change: tuple[str, str], words: str
-) -> None:
-    changed = (lab / "up.csv",) if change[0] == "." else (lab / "campaign.toml", lab.parent / "model.toml")
-    for file in changed:
-        file.write_text(file.read_text().replace(*change))
-    out = lab.parent / "out"
-    said = refused(
-        "calibrate", "campaign", lab, "--model", lab.parent / "model.toml", "--out", out, code=None
-    ).strip()
-    assert words in " ".join(said.split())
-    assert "Traceback" not in said
-    assert not out.exists()
+def test_what_is_wrong_is_one_sentence_and_nothing_is_written(lab, old, new, sentence):
+    for file in (lab / "up.csv",) if old == "." else (lab / "campaign.toml", lab.parent / "model.toml"):
+        file.write_text(file.read_text().replace(old, new))
+    assert sentence in refused(*words(lab, "--out", lab.parent / "out"), code=None)
+    assert not (lab.parent / "out").exists()
 
 
-def test_a_structure_without_its_mesh_is_refused(lab: Path) -> None:
+def test_a_structure_without_its_mesh_is_refused(lab):
     own = lab.parent / "my_part.toml"
     own.write_text(structure_files()["bracket"].read_text(encoding="utf-8"))
-    said = refused("calibrate", "campaign", lab, "--model", own, code=None).strip()
-    assert "bracket.inp" in said
-    assert len(said.splitlines()) == 1
+    assert "bracket.inp" in refused("calibrate", "campaign", lab, "--model", own, code=None)
 
 
-def test_a_model_without_parameters_is_refused(lab: Path) -> None:
-    model = lab.parent / "model.toml"
-    model.write_text(MODEL.split("[[parameter]]")[0])
-    assert "has no parameter to calibrate: it lists none" in refused(
-        "calibrate", "campaign", lab, "--model", model, code=None
+@pytest.fixture
+def plots(tmp_path: Path) -> Path:
+    """Three records read off a plot, in the authors' layout."""
+    folder, width = tmp_path / "data" / "step3", 0.0081
+    folder.mkdir(parents=True)
+    fine = np.arange(0.0, 6.4, width / 32.0)
+    signal = sum(
+        amplitude * np.exp(-rate * fine) * np.cos(2.0 * math.pi * frequency * fine + 1.0)
+        for frequency, rate, amplitude in ((5.65, 1.0, 0.0115), (29.9, 13.0, 0.018))
     )
+    columns = fine.size // 32
+    table = np.asarray(signal)[: 32 * columns].reshape(columns, 32)
+    low, high = table.min(axis=1) - 2e-4, table.max(axis=1) + 2e-4
+    rows = np.column_stack([width * (np.arange(columns) + 0.5), low, 0.5 * (low + high), high])
+    for trial in (1, 2, 3):
+        file = folder / f"ringdown_trial{trial}_digitised.csv"
+        np.savetxt(file, rows, delimiter=",", header="t_s,V_low,V_mid,V_high  (drawn)")
+    return tmp_path / "data"
+
+
+@pytest.mark.parametrize("options", [(), ("--extremes",), ("--fitted",)])
+def test_ringdown(plots, tmp_path, options):
+    out = tmp_path / "out"
+    said("calibrate", "ringdown", "--data", plots, "--out", out, *options)
+    with (out / "ringdown.csv").open(encoding="utf-8", newline="") as stream:
+        found = {row["figure"]: float(row["found"]) for row in csv.DictReader(stream)}
+    assert all(len(str(value)) > 8 for value in found.values())  # the console has five digits
+    assert found["mode 1, natural frequency"] == pytest.approx(5.65, rel=5e-3)
+    assert found["mode 2, natural frequency"] == pytest.approx(29.9, rel=2e-2)
+    assert {path.name for path in (out / "figures").iterdir()} >= {"ringdown.svg", "ringdown.png"}
+    assert "does not exist" in refused("calibrate", "ringdown", "--data", tmp_path / "nothing")

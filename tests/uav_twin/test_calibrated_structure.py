@@ -1,10 +1,7 @@
 """From a structure file to a twin with calibrated parameters: model file, campaign, calibration, mission."""
 
-from __future__ import annotations
-
 import os
 import shutil
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -16,29 +13,17 @@ from fe.full.factorisation import Factorisation
 from fe.structure.operators import load_and_assemble
 from fmu_asset.archive.fmu_file import packed_design_hash
 from reporting.progress import SilentProgress
-from scenarios import scenario_files, structure_files
-from tests import command_line
+from scenarios import structure_files
+from tests.command_line import said
+from tests.twin_master.runs import loaded_from, table_of
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.network.twin import build_graphical_model
-from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.scenario.reading import LoadedScenario
 from twin_master.watch.opening import begin_watch
 from twin_master.workflow import fly as new_run
 
 TRUTH = {"e": 0.96}
-BRACKET = scenario_files()["bracket"]
-CHANNEL = """
-[[channel]]
-name = "{name}"
-quantity = "{quantity}"
-unit = "{unit}"
-output = "{name}"
-noise = {{ standard_deviation = {noise} }}
-"""
-
-
-def call(monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
-    assert command_line.call(monkeypatch, *words) == 0
 
 
 def write_campaign(folder: Path, structure: Path) -> None:
@@ -53,12 +38,10 @@ def write_campaign(folder: Path, structure: Path) -> None:
     lines = [",".join(map(repr, [n, *row])) for n, row in zip(factors.tolist(), rows.tolist(), strict=True)]
     (folder / "loads.csv").write_text(f"load_factor,{','.join(names)}\n" + "\n".join(lines))
     text = 'format = 1\nname = "loads"\n[parameters.pump]\nmean = 2.5\ndeviation = 0.01\n'
-    for name in names:
-        sag = name == "sag"
-        text += CHANNEL.format(
-            name=name, quantity="displacement" if sag else "strain", unit="mm" if sag else "microstrain",
-            noise=0.005 if sag else 4.0,
-        )  # fmt: skip
+    for name, deviation in zip(names, noise.tolist(), strict=True):
+        quantity, unit = ("displacement", "mm") if name == "sag" else ("strain", "microstrain")
+        text += f'[[channel]]\nname = "{name}"\noutput = "{name}"\nquantity = "{quantity}"\nunit = "{unit}"\n'
+        text += f"noise = {{ standard_deviation = {deviation} }}\n"
     (folder / "campaign.toml").write_text(
         text + '[[trial]]\nname = "loads"\nkind = "flight"\nfile = "loads.csv"\n'
     )
@@ -72,33 +55,31 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for file in (source, source.with_suffix(".inp")):
         shutil.copy(file, folder)
     write_campaign(folder / "lab", folder / source.name)
-    with pytest.MonkeyPatch.context() as patch:
-        call(patch, "structure", "fmu", folder / source.name, "--rig", folder / "model.toml")
-        call(
-            patch, "calibrate", "campaign", folder / "lab", "--model", folder / "model.toml", "--asset",
-            "bracket 7", "--out", folder / "out", "--no-report",
-        )  # fmt: skip
-    return folder / "out" / "calibration.nc"
+    model, out = folder / "model.toml", folder / "out"
+    said("structure", "fmu", folder / source.name, "--rig", model)
+    words = ("--model", model, "--asset", "bracket 7", "--out", out, "--no-report")
+    said("calibrate", "campaign", folder / "lab", *words)
+    return out / "calibration.nc"
 
 
 def mission(**calibration: object) -> LoadedScenario:
     """The shipped mission in six shifts, of an asset whose parameters are not named."""
-    table = tomllib.loads(BRACKET.read_text(encoding="utf-8"))
+    table = table_of("bracket")
     table["mission"] |= {"steps": 6, "prediction_steps": 2}
     table["asset"] = {"kind": "structure", "structure": "bracket", "isolated": False}
     table["truth"]["gains"] = []
     table["calibration"] |= calibration
-    return LoadedScenario(parse_scenario(table, "mission"), BRACKET, "0" * 64)
+    return loaded_from(table, "bracket")
 
 
-def test_the_campaign_tells_the_modulus_and_not_the_mass(calibrated: Path) -> None:
+def test_the_campaign_tells_the_modulus_and_not_the_mass(calibrated):
     found = load_calibration(calibrated)
     assert abs(found.mean("e") - TRUTH["e"]) < 3.0 * found.standard_deviation("e") < 0.03
     assert found.explained is True
     assert any("does not tell pump" in sentence for sentence in found.findings)
 
 
-def test_the_twin_flies_with_it(calibrated: Path, tmp_path: Path) -> None:
+def test_the_twin_flies_with_it(calibrated, tmp_path):
     """Its draws are those of the file; what flies stands at the means; the mass follows the modulus."""
     found = load_calibration(calibrated)
     said: list[str] = []
@@ -130,7 +111,7 @@ def test_the_twin_flies_with_it(calibrated: Path, tmp_path: Path) -> None:
 
     scenario = resolve_scenario(mission(draws=3), Overrides(calibration=calibrated))
     source = asset_source(scenario)
-    source.prepare(tmp_path, _silent())
+    source.prepare(tmp_path, SilentProgress())
     drawn = source.draws(scenario.mission.seed)
     assert dict(drawn.others).keys() == {"pump"}
     table = source.observation_table(drawn, build_graphical_model(scenario))
@@ -151,11 +132,7 @@ class _Noted(SilentProgress):
         self._said.append(message)
 
 
-def _silent() -> object:
-    return SilentProgress()
-
-
-def test_what_the_calibration_does_not_fit_is_refused(calibrated: Path, tmp_path: Path) -> None:
+def test_what_the_calibration_does_not_fit_is_refused(calibrated, tmp_path):
     with pytest.raises(Exception, match="has no samples of `pomp`; it has e, pump"):
         new_run(mission(parameter="pomp"), tmp_path / "run", Overrides(calibration=calibrated), report=False)
     source = structure_files()["bracket"]
@@ -171,10 +148,10 @@ def test_what_the_calibration_does_not_fit_is_refused(calibrated: Path, tmp_path
     ):
         (tmp_path / "other.toml").write_text(text.replace(*change), encoding="utf-8")
         own = {name: table[name] | {"structure": str(tmp_path / "other.toml")} for name in tables}
-        other = LoadedScenario(parse_scenario(table | own, "mission"), BRACKET, "0" * 64)
+        other = loaded_from(table | own, "bracket")
         with pytest.raises(MissionInputError, match=words):
             new_run(other, tmp_path / "run", Overrides(calibration=calibrated), report=False)
         assert not (tmp_path / "run").exists()
     own = {"asset": table["asset"] | {"structure": str(tmp_path / "other.toml")}}  # the truth may be another
-    other = LoadedScenario(parse_scenario(table | own, "mission"), BRACKET, "0" * 64)
+    other = loaded_from(table | own, "bracket")
     asset_source(resolve_scenario(other, Overrides(calibration=calibrated))).check()

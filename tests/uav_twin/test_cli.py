@@ -1,20 +1,25 @@
-"""The command line: what it says, and how it ends when something is wrong."""
-
-from __future__ import annotations
+"""The command line: `run`, `scenario check` and `wing verify`, and how it ends when something is wrong."""
 
 import json
 import os
 import subprocess
 import sys
-from pathlib import Path
+from importlib.metadata import version
 
 import pytest
 
 from benchmarks import command_page
+from fe.wing.design import load_design
+from fe.wing.operators import assemble
 from reporting import terminal
-from tests.command_line import call, refused, said
-from twin_master.errors import ScenarioError
-from uav_twin import cli
+from scenarios import scenario_files
+from tests.command_line import command, refused, said
+from tests.twin_master.runs import text_of, written
+from twin_master.errors import MissionInputError, ScenarioError
+from twin_master.scenario.reading import load_scenario
+from twin_master.scenario_check import check_scenario
+from uav_twin import cli, wing
+from uav_twin.wing import Check
 
 
 @pytest.fixture
@@ -22,101 +27,86 @@ def no_report(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("twin_master.workflow._report", lambda folder: (folder / "report.html").touch())
 
 
-def test_commands_are_listed() -> None:
+def leaves(command: object, *words: str) -> list[tuple[tuple[str, ...], object]]:
+    """Return every command with the words that call it."""
+    found = [(words, command)]
+    for name, inner in getattr(command, "commands", {}).items():
+        found += leaves(inner, *words, name)
+    return found
+
+
+def test_commands_options_and_scenarios_are_listed():
     text = said("--help")
-    for command in ("run", "wing", "calibrate", "scenarios", "fmu"):
-        assert command in text
+    assert all(word in text for word in ("run", "wing", "calibrate", "scenarios", "fmu"))
     text = said("run", "--help")
-    for option in (
-        "--out",
-        "--seed",
-        "--resume",
-        "--replace",
-        "--fmu",
-        "--binding",
-        "--strain-library",
-        "--in-process",
-    ):
-        assert option in text
-
-
-def test_scenarios() -> None:
+    options = ("out", "seed", "resume", "replace", "fmu", "binding", "strain-library", "in-process")
+    assert all(f"--{option}" in text for option in options)
     text = said("scenarios")
-    for name in ("level_turns", "growing_damage", "failing_gauges", "model_mismatch"):
-        assert name in text
+    assert all(name in text for name in ("level_turns", "growing_damage", "failing_gauges", "model_mismatch"))
+    assert said("--version") == f"uav-twin {version('uav-twin')}\n"
+    everything = leaves(terminal.with_common_options(cli.app))
+    assert len(everything) > 25
+    for words, leaf in everything:
+        given = [option for parameter in leaf.params for option in parameter.opts]  # type: ignore[attr-defined]
+        for option in ("--quiet", "-q", "--verbose", "-v"):
+            assert given.count(option) == 1, (words, option)
+        assert leaf.help, words  # type: ignore[attr-defined]
 
 
 @pytest.mark.usefixtures("no_report")
-def test_run_prints_figures_and_report(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, library_file: Path
-) -> None:
+def test_run_prints_figures_and_report(tmp_path, library_file):
     out = tmp_path / "run"
-    arguments = ["run", "level_turns", "--out", str(out), "--strain-library", str(library_file)]
-    text = said(*arguments, "--seed", "3")
-    assert "filtered rms error of z1" in text
-    assert "60 % (1)" in text
-    assert "(1) Kapteyn et al. 2021\n" in text
-    assert f"Report: {out / 'report.html'}" in text
-    error = refused(*arguments)
-    assert "holds a run already" in error
-    assert len(error.strip().splitlines()) == 1
-    said(*arguments, "--replace", "--quiet")
-    captured = capsys.readouterr()
-    assert captured.out == captured.err == ""
-    said("run", "--resume", str(out), "--quiet")
+    words = ("run", "level_turns", "--out", out, "--strain-library", library_file)
+    text = said(*words, "--seed", "3")
+    figures = ("filtered rms error of z1", "60 % (1)", "(1) Kapteyn et al. 2021\n")
+    assert all(part in text for part in (*figures, f"Report: {out / 'report.html'}"))
+    assert "holds a run already" in refused(*words)
+    done = command(*words, "--replace", "--quiet")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    said("run", "--resume", out, "--quiet")
     (out / "report.html").unlink(missing_ok=True)
-    record = json.loads(said(*arguments, "--replace", "--json", "--no-report"))
-    assert record["folder"] == str(out)
-    assert record["report"] is None
-    assert record["scenario"] == "level_turns"
+    record = json.loads(said(*words, "--replace", "--json", "--no-report"))
+    assert (record["folder"], record["report"], record["scenario"]) == (str(out), None, "level_turns")
     assert {figure["key"] for figure in record["figures"]} >= {"fallback_delay", "policy_switch_damage"}
     assert not (out / "report.html").exists()
-
-
-@pytest.mark.usefixtures("no_report")
-def test_a_scenario_without_references_has_no_column_for_them(tmp_path: Path, library_file: Path) -> None:
-    arguments = ["--out", str(tmp_path / "run"), "--strain-library", str(library_file)]
-    text = said("run", "growing_damage", *arguments)
+    text = said("run", "growing_damage", "--out", tmp_path / "other", "--strain-library", library_file)
     assert "filtered rms error of z1" in text
-    assert "reference" not in text
+    assert "reference" not in text  # the scenario has none, and no column for them
 
 
-def test_usage_errors_end_with_2(tmp_path: Path) -> None:
-    for arguments in (
-        ["run"],
-        ["run", "level_turns", "--nonsense"],
-        ["run", "level_turns", "--seed", "-1"],
-        ["run", "--resume", str(tmp_path), "--seed", "3"],
-        ["run", "--resume", str(tmp_path), "--out", str(tmp_path)],
-        ["nonsense"],
+def test_what_is_wrong_is_one_sentence_with_its_exit_code(tmp_path):
+    broken = written(tmp_path, "format = 3", name="broken.toml")
+    for words, sentence, code in (
+        (["run"], "", 2),
+        (["run", "level_turns", "--nonsense"], "", 2),
+        (["run", "level_turns", "--seed", "-1"], "", 2),
+        (["run", "--resume", tmp_path, "--seed", "3"], "", 2),
+        (["run", "--resume", tmp_path, "--out", tmp_path], "", 2),
+        (["nonsense"], "", 2),
+        (["wing", "nonsense"], "", 2),
+        (["wing", "--design", tmp_path / "no.toml", "verify"], "behind the command", 2),
+        (["scenario", "check", "level_turns", "-q", "-v"], "exclude each other", 2),
+        (["run", "no_such_scenario"], "no_such_scenario", 1),
+        (["run", broken], "format", 1),
+        (["run", "--resume", tmp_path / "nothing"], "no run folder", 1),
+        (["run", "level_turns", "--out", tmp_path / "x", "--strain-library", tmp_path], "UAVconfig.json", 1),
+        (["fmu", "info", tmp_path / "no.fmu"], "no.fmu", 1),
+        (["fmu", "info", broken], "broken.toml", 1),
+        (["fmu", "check", tmp_path / "no.fmu"], "no.fmu", 1),
+        (["wing", "--design", tmp_path / "no.toml"], "no.toml", 1),
+        (["wing", "verify", "--design", tmp_path / "no.toml"], "no.toml", 1),
+        (["calibrate", "ringdown", "--data", tmp_path / "no.csv"], "no.csv", 1),
+        (["scenario", "check", "level_turns", "--calibration", "no_such.nc"], "no_such.nc", 1),
     ):
-        assert "Traceback" not in refused(*arguments, code=2)
-
-
-def test_errors_of_the_packages_are_one_sentence_and_1(tmp_path: Path) -> None:
-    broken = tmp_path / "broken.toml"
-    broken.write_text("format = 3", encoding="utf-8")
-    for arguments, word in (
-        (["run", "no_such_scenario"], "no_such_scenario"),
-        (["run", str(broken)], "format"),
-        (["run", "--resume", str(tmp_path / "nothing")], "no run folder"),
-        (
-            ["run", "level_turns", "--out", str(tmp_path / "x"), "--strain-library", str(tmp_path)],
-            "UAVconfig.json",
-        ),
-        (["fmu", "info", str(tmp_path / "no.fmu")], "no.fmu"),
-        (["fmu", "info", str(broken)], "broken.toml"),
-        (["fmu", "check", str(tmp_path / "no.fmu")], "no.fmu"),
-        (["wing", "--design", str(tmp_path / "no.toml")], "no.toml"),
-        (["calibrate", "ringdown", "--data", str(tmp_path / "no.csv")], "no.csv"),
-    ):
-        error = refused(*arguments)
-        assert word in error.replace("\n", " ")
-        assert "Traceback" not in error
+        assert sentence in refused(*words, code=code)
     assert not (tmp_path / "x").exists()
+    sentence = refused("scenario", "check", "nowhere")
+    told = command("scenario", "check", "nowhere", "-v").stderr
+    assert "Traceback" in told
+    assert told.strip().endswith(sentence)
 
 
-def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch):
     def broken() -> None:
         raise ZeroDivisionError
 
@@ -127,46 +117,122 @@ def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch: pytest.MonkeyPatch
     assert issubclass(ScenarioError, ValueError)
 
 
-def test_ctrl_c_says_how_to_go_on(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, library_file: Path
-) -> None:
+def test_ctrl_c_ends_every_command_alike_and_says_how_to_go_on(monkeypatch, tmp_path, library_file):
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("twin_master.workflow._fly", interrupted)
-    out = tmp_path / "run"
-    code = call(
-        monkeypatch, "run", "level_turns", "--out", str(out), "--strain-library", str(library_file), "-q"
-    )
-    assert code == 130
-    assert f"--resume {out}" in capsys.readouterr().err
+    monkeypatch.setattr("fe.wing.design.load_design", interrupted)
+    words = ("run", "level_turns", "--out", tmp_path / "run", "--strain-library", library_file, "-q")
+    assert f"--resume {tmp_path / 'run'}" in refused(*words, code=130)
+    assert refused("wing", code=130) == "Interrupted."
 
 
-def test_the_master_script_is_the_same_command(tmp_path: Path, library_file: Path) -> None:
-    environment = os.environ | {"COLUMNS": "200"}
-    for module, arguments in (("twin_master", []), ("uav_twin", ["run"])):
-        result = subprocess.run(
-            [sys.executable, "-m", module, *arguments, "--resume", str(tmp_path / "nothing")],
-            capture_output=True, text=True, check=False, env=environment,
-        )  # fmt: skip
-        assert result.returncode == 1
-        assert "there is no run folder" in result.stderr
+def test_the_master_script_is_the_same_command(tmp_path):
+    for module, words in (("twin_master", []), ("uav_twin", ["run"])):
+        line = [sys.executable, "-m", module, *words, "--resume", str(tmp_path / "nothing")]
+        environment = os.environ | {"COLUMNS": "200"}
+        done = subprocess.run(line, capture_output=True, text=True, check=False, env=environment)
+        assert done.returncode == 1
+        assert "there is no run folder" in done.stderr
 
 
-def test_start_up_is_lazy() -> None:
+def test_start_up_is_lazy():
     """`--help` must not import what only a flight needs."""
-    code = (
-        "import sys, uav_twin.cli\n"
-        "heavy = {'numpy', 'scipy', 'skfem', 'pymor', 'fmpy', 'xarray', 'matplotlib', 'numba', 'pydantic'}\n"
-        "heavy |= {'pint', 'openpyxl'}\n"
-        "print(sorted(heavy & set(sys.modules)))"
-    )
+    heavy = "numpy scipy skfem pymor fmpy xarray matplotlib numba pydantic pint openpyxl"
+    code = f"import sys, uav_twin.cli\nprint(sorted(set('{heavy}'.split()) & set(sys.modules)))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 
 
-def test_the_page_of_commands_is_that_of_the_commands() -> None:
+def test_the_page_of_commands_is_that_of_the_commands():
     """If this fails: python -m benchmarks.command_page."""
     text = command_page.PAGE.read_text(encoding="utf-8")
     assert command_page.page(text) == text
     assert command_page.page(text.replace("uav-twin scenarios\n", "")) == text
+
+
+def test_a_scenario_is_described():
+    text = said("scenario", "check", "level_turns")
+    for part in (
+        "Flown: FMU of the reduced model of the design UAV wing.",
+        "Believed: reduced model of the design UAV wing.",
+        "25 states, z1 (5 levels), z2 (5 levels)",
+        "50 turns, 10 ahead",
+    ):
+        assert part in text
+    record = json.loads(said("scenario", "check", "level_turns", "--json", "-q"))
+    assert (record["states"], record["turns"], record["sensors"]) == (25, 50, 24)
+    # at least predictions (E, S, U, G), transitions (U, S, S) and beliefs of 60 steps
+    assert record["memory"] > 8 * (100 * 25 * 2 * 24 + 2 * 25**2 + 25 * 60)
+    assert said("scenario", "check", "level_turns", "-q") == ""
+
+
+@pytest.mark.parametrize("name", sorted(scenario_files()))
+def test_every_shipped_scenario_is_sound_or_says_what_it_needs(name):
+    if name == "model_mismatch":  # it names no strain library of its own
+        with pytest.raises(MissionInputError, match="--strain-library FILE"):
+            check_scenario(load_scenario(name))
+        return
+    found = check_scenario(load_scenario(name))
+    assert found["name"] == name
+    assert found["memory"] > 0
+
+
+ASSUMED = "standard_deviation_microstrain = 125"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ('role = "strain"', 'role = "stress"', "The binding uav_wing has no observation 'stress'"),
+        (
+            ASSUMED,
+            f'unit = "percent"\n{ASSUMED}',
+            "gives value 1 of `strain` in 1, and `observation.unit` of the scenario says percent",
+        ),
+        ('design = "uav_wing"', 'design = "my_wing.toml"', "my_wing.toml cannot be read"),
+        ('binding = "uav_wing"', 'binding = "my_binding.toml"', "my_binding.toml cannot be read"),
+        ("steps = 50", "steps = -1", "steps"),
+        (ASSUMED, "standard_deviation = 125", "write `observation.standard_deviation_microstrain = 125`"),
+    ],
+)
+def test_a_fault_is_one_sentence(old, new, sentence, tmp_path):
+    path = written(tmp_path, text_of("level_turns").replace(old, new))
+    done = command("scenario", "check", path)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert sentence in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_checks_of_a_wing_are_listed_and_kept(monkeypatch, tmp_path):
+    nan, out = float("nan"), tmp_path / "out"
+    checks = [Check("patch test", "strain", 1e-15, 1e-12), Check("mesh", "order", nan)]
+    monkeypatch.setattr(wing, "all_checks", lambda *_, **__: checks)
+    text = said("wing", "verify", "--out", out)
+    assert "patch test" in text
+    assert "kept" in text
+    record = json.loads((out / "verification.json").read_text())
+    assert [check["passed"] for check in record["checks"]] == [True, True]
+    assert record["checks"][1]["value"] is None
+    assert record["design_hash"] == load_design().hash
+    assert "not an empty folder" in refused("wing", "verify", "--out", out)
+    checks[:] = [Check("wing", "mass", 1e-3, 1e-10), Check("wing", "energy", nan, 1e-5)]
+    done = command("wing", "verify")
+    assert (done.returncode, done.stdout.count("BROKEN")) == (1, 2)
+    assert "2 of 2 checks broke their limit: wing, mass; wing, energy." in done.stderr
+
+
+def test_every_check_of_a_coarse_wing_is_kept_and_convergence_names_every_gauge():
+    design = load_design().changed(mesh={"refinement": 0.25})
+    checks = [*wing.element_checks(), *wing.balance_checks(assemble(design))]
+    groups = {"patch test", "unsupported body", "cantilever", "MacNeal-Harder", "wing"}
+    assert {check.group for check in checks} == groups
+    assert all(check.limit is not None for check in checks)
+    assert [check.name for check in checks if not check.passed] == []
+    # Three coarse meshes: the names and the kind of figures, not their size.
+    checks = list(wing.convergence_checks(design, (0.25, 0.3, 0.36), limited=False))
+    names = [check.name for check in checks]
+    assert names[:3] == ["tip stiffness", "first bending", "second bending"]
+    assert [name for name in names if name.startswith("gauge ")] == [f"gauge {n}" for n in range(1, 25)]
+    assert all("order" in check.note or "monotone" in check.note for check in checks[:3])

@@ -1,7 +1,5 @@
 """`uav-twin discrepancy` as a user calls it: example, check, run, and what goes wrong."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -22,7 +20,7 @@ def campaign(tmp_path: Path) -> Path:
     return folder
 
 
-def test_from_an_example_to_a_verdict(campaign: Path, tmp_path: Path) -> None:
+def test_from_an_example_to_a_verdict(campaign, tmp_path):
     table = (campaign / "campaign.toml").read_text(encoding="utf-8")
     (campaign / "campaign.toml").write_text(table.replace("held_out = true", "held_out = false"), "utf-8")
     shown = said("discrepancy", "check", str(campaign), *RIG)
@@ -52,7 +50,7 @@ def test_from_an_example_to_a_verdict(campaign: Path, tmp_path: Path) -> None:
     assert not (out / "self_calibration.json").exists()
 
 
-def test_faults_of_the_data_end_with_a_sentence_and_a_report(campaign: Path, tmp_path: Path) -> None:
+def test_faults_of_the_data_end_with_a_sentence_and_a_report(campaign, tmp_path):
     text = (campaign / "campaign.toml").read_text(encoding="utf-8")
     assert 'unit = "mm"' in text
     (campaign / "campaign.toml").write_text(text.replace('unit = "mm"', 'unit = "m"', 1), encoding="utf-8")
@@ -68,7 +66,7 @@ def test_faults_of_the_data_end_with_a_sentence_and_a_report(campaign: Path, tmp
     assert sorted(path.name for path in (tmp_path / "v").iterdir()) == ["report.html", "verdict.json"]
 
 
-def test_the_catalogue() -> None:
+def test_the_catalogue():
     shown = said("discrepancy", "effects")
     assert "coulomb_friction" in shown
     assert "ζ_eq(A)" in shown
@@ -98,9 +96,7 @@ def test_the_catalogue() -> None:
         (("example", "static", "{new}", *RIG, "--effect", "washout"), "cannot be hidden"),
     ],
 )
-def test_bad_input_is_one_sentence(
-    arguments: tuple[str, ...], message: str, campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_input_is_one_sentence(arguments, message, campaign, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     before = sorted(path.name for path in tmp_path.iterdir())
     filled = [word.format(campaign=campaign, new=tmp_path / "new") for word in arguments]

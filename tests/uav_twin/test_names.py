@@ -1,7 +1,5 @@
 """The one name to import: what it hands on, that it does so lazily, and whose files may hide ours."""
 
-from __future__ import annotations
-
 import ast
 import pydoc
 import subprocess
@@ -28,7 +26,7 @@ def python(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_every_name_is_there_and_documented() -> None:
+def test_every_name_is_there_and_documented():
     assert 15 <= len(uav_twin.__all__) <= 45
     assert set(uav_twin.__all__) <= set(dir(uav_twin))
     # The import of a module of the command line would take the place of a name like it.
@@ -41,7 +39,7 @@ def test_every_name_is_there_and_documented() -> None:
         assert f"`{name}`" in page, name
 
 
-def test_every_name_of_the_list_is_read_and_found_under_its_own_name() -> None:
+def test_every_name_of_the_list_is_read_and_found_under_its_own_name():
     tree = ast.parse(Path(uav_twin.__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
     told = {}
     for line in tree.body[1:]:
@@ -52,24 +50,26 @@ def test_every_name_of_the_list_is_read_and_found_under_its_own_name() -> None:
     assert told == _HOMES
     for name in uav_twin.__all__:
         assert getattr(uav_twin, name).__name__ == name
-        assert (
-            f"class {name}" in (text := pydoc.plaintext.document(getattr(uav_twin, name)))
-            or f"{name}(" in text
-        )
+        text = pydoc.plaintext.document(getattr(uav_twin, name))
+        assert f"class {name}" in text or f"{name}(" in text
 
 
-def test_the_import_is_lazy_and_an_unknown_name_is_refused(tmp_path: Path) -> None:
+def test_the_import_is_lazy_and_an_unknown_name_is_refused(tmp_path):
     found = python("import sys, uav_twin\nprint('numpy' in sys.modules, 'fe' in sys.modules)", tmp_path)
     assert found.stdout.split() == ["False", "False"], found.stderr
     with pytest.raises(AttributeError, match=r"no attribute 'simulate_fmu'.*load_design"):
         uav_twin.simulate_fmu  # noqa: B018
 
 
-@pytest.mark.parametrize("hidden", ["fe.py", "reporting.py", "scenarios", "scenarios/__init__.py"])
+TAKEN = "import uav_twin; uav_twin.load_design()"
+FROM = "from uav_twin import load_design; load_design()"
+
+
 @pytest.mark.parametrize(
-    "use", ["import uav_twin; uav_twin.load_design()", "from uav_twin import load_design; load_design()"]
+    ("hidden", "use"),
+    [("fe.py", TAKEN), ("reporting.py", FROM), ("scenarios", FROM), ("scenarios/__init__.py", TAKEN)],
 )
-def test_a_file_that_hides_a_package_is_named(hidden: str, use: str, tmp_path: Path) -> None:
+def test_a_file_that_hides_a_package_is_named(hidden, use, tmp_path):
     """A folder without `__init__.py` hides ours in editable installs only; else it is left in peace."""
     if hidden.endswith(".py"):
         (tmp_path / hidden).parent.mkdir(exist_ok=True)
@@ -87,22 +87,21 @@ def test_a_file_that_hides_a_package_is_named(hidden: str, use: str, tmp_path: P
     assert "rename it" in last
 
 
-def test_the_command_names_it_too(tmp_path: Path) -> None:
+def test_the_command_names_it_too(tmp_path):
     (tmp_path / "fe.py").write_text("", encoding="utf-8")
-    found = subprocess.run(
-        [sys.executable, "-m", "uav_twin", "wing"], cwd=tmp_path, check=False, capture_output=True, text=True
-    )
+    line = [sys.executable, "-m", "uav_twin", "wing"]
+    found = subprocess.run(line, cwd=tmp_path, check=False, capture_output=True, text=True)
     assert found.returncode == 1
     assert found.stdout == ""
     assert found.stderr.count("\n") == 1
     assert f"{tmp_path / 'fe.py'} hides the package `fe` of uav-twin" in found.stderr
 
 
-def test_records_show_themselves_in_a_few_words(library_file: Path) -> None:
+def test_records_show_themselves_in_a_few_words(library_file):
     from calibration.wing.calibrate import WingCalibration
     from discrepancy.models.fmu import FmuModel
     from discrepancy.models.interface import Model
-    from discrepancy.models.wing import WingModel
+    from discrepancy.models.structures import WingModel
     from discrepancy.verdict import Verdict, VerdictKind
     from discrepancy.workflow import Investigation
 
@@ -133,7 +132,7 @@ def test_records_show_themselves_in_a_few_words(library_file: Path) -> None:
     assert FmuModel.__repr__ is WingModel.__repr__ is Model.__repr__
 
 
-def test_a_model_from_tables_is_the_same_as_from_its_parts() -> None:
+def test_a_model_from_tables_is_the_same_as_from_its_parts():
     from twin_master.errors import InvalidModelError
     from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
     from twin_master.network.transition import TransitionModel
@@ -157,7 +156,7 @@ def test_a_model_from_tables_is_the_same_as_from_its_parts() -> None:
 
 
 @pytest.mark.usefixtures("no_report_drawn")
-def test_a_policy_of_ones_own_is_flown_kept_and_resumed(tmp_path: Path, library_file: Path) -> None:
+def test_a_policy_of_ones_own_is_flown_kept_and_resumed(tmp_path, library_file):
     from twin_master.errors import NotResumableError
 
     flown = {"strain_library": library_file}
@@ -182,11 +181,11 @@ def test_a_policy_of_ones_own_is_flown_kept_and_resumed(tmp_path: Path, library_
         uav_twin.resume(folder, report=False)
 
 
-def test_a_policy_of_another_shape_costs_no_folder(tmp_path: Path, library_file: Path) -> None:
+def test_a_policy_of_another_shape_costs_no_folder(tmp_path, library_file):
     from twin_master.errors import InvalidModelError, MissionInputError
 
     folder = tmp_path / "run"
-    with pytest.raises(InvalidModelError, match="policy: expected shape"):
+    with pytest.raises(InvalidModelError, match="expected a policy of shape"):
         uav_twin.fly("level_turns", folder, {"strain_library": library_file}, policy=np.ones((3, 1)))
     with pytest.raises(MissionInputError, match="sead came"):
         uav_twin.fly("level_turns", folder, {"sead": 1})

@@ -1,15 +1,12 @@
 """`uav-twin structure` as a user calls it."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import meshio
 import pytest
 
-from fe.verification.calculix_job import calculix_program
+from fe.verification.calculix_comparison import calculix_program
 from tests.command_line import command, refused, said
 
 DECK = """*NODE
@@ -34,8 +31,11 @@ STRUCTURE = """
 name = "bar"
 mesh = "bar.inp"
 length_unit = "mm"
-[[parameter]]
-name = "e"
+parameter = [{ name = "e" }]
+support = [{ set = "ROOT", hold = ["x", "y", "z"] }]
+load = [{ name = "pull", set = "END", force = [2000, 0, 0] }]
+gauge = [{ name = "top", point = [50, 5, 10], direction = [1, 0, 0] }]
+displacement = [{ name = "end", point = [100, 5, 5], direction = [1, 0, 0] }]
 [[material]]
 name = "steel"
 set = "BAR"
@@ -43,21 +43,6 @@ density = 7800
 young_modulus = 2e11
 poisson_ratio = 0.0
 scaled_by = "e"
-[[support]]
-set = "ROOT"
-hold = ["x", "y", "z"]
-[[load]]
-name = "pull"
-set = "END"
-force = [2000, 0, 0]
-[[gauge]]
-name = "top"
-point = [50, 5, 10]
-direction = [1, 0, 0]
-[[displacement]]
-name = "end"
-point = [100, 5, 5]
-direction = [1, 0, 0]
 """
 
 
@@ -68,7 +53,7 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "bar.toml"
 
 
-def test_info_says_what_a_structure_is(file: Path) -> None:
+def test_info_says_what_a_structure_is(file):
     record = json.loads(said("structure", "info", file, "--modes", "2", "--quiet", "--json"))
     assert record["mass"] == pytest.approx(7800 * 0.1 * 0.01**2)
     assert record["centre_of_gravity"] == pytest.approx([50, 5, 5])
@@ -92,7 +77,7 @@ def test_info_says_what_a_structure_is(file: Path) -> None:
 
 
 @pytest.mark.skipif(calculix_program() is None, reason="CalculiX (ccx) is not installed")
-def test_verify_compares_with_calculix(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verify_compares_with_calculix(file, tmp_path, monkeypatch):
     out = tmp_path / "jobs"
     text = said("structure", "verify", file, "--modes", "2", "--out", out)
     assert text.count("kept") == 4
@@ -111,7 +96,7 @@ def test_verify_compares_with_calculix(file: Path, tmp_path: Path, monkeypatch: 
     )
 
 
-def test_a_fault_ends_in_one_sentence(file: Path) -> None:
+def test_a_fault_ends_in_one_sentence(file):
     assert "24 unknowns would take about" in refused("structure", "info", file, "--memory-limit", "0.1")
     assert "12 free unknowns gives at most 11" in refused("structure", "info", file, "--modes", "12")
     file.write_text(STRUCTURE.replace('"ROOT"', '"WALL"'))
@@ -119,18 +104,14 @@ def test_a_fault_ends_in_one_sentence(file: Path) -> None:
     assert "none.toml" in refused("structure", "info", str(file.parent / "none.toml"))
 
 
-def test_a_shipped_structure_goes_by_its_name_and_nothing_moves_without_mass(
-    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_shipped_structure_goes_by_its_name_and_nothing_moves_without_mass(file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert "HEEL" in said("structure", "info", "bracket", "--modes", "1")
     file.write_text(STRUCTURE.replace("density = 7800", "density = 0"))
     assert "No modes: nothing has mass." in said("structure", "info", file, "--modes", "3")
 
 
-def test_a_structure_is_reduced_and_compared(
-    write_beam: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_structure_is_reduced_and_compared(write_beam, tmp_path, monkeypatch):
     """`structure reduce` says ranges and measured errors; a second call finds the model in the cache."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     file = str(write_beam(tmp_path))
@@ -145,7 +126,7 @@ def test_a_structure_is_reduced_and_compared(
     assert "largest_loss" in refused("structure", "reduce", file, code=None)
 
 
-def test_the_field_is_written_for_paraview(file: Path, tmp_path: Path) -> None:
+def test_the_field_is_written_for_paraview(file, tmp_path):
     """A bar under 20 MPa: 100 microstrain along, none across, and by 1 / e more of all."""
     out = tmp_path / "bar.vtu"
     said("structure", "field", file, "--out", out, "--at", "e=0.9")
@@ -163,7 +144,7 @@ def test_the_field_is_written_for_paraview(file: Path, tmp_path: Path) -> None:
     assert out.read_bytes() == before
 
 
-def test_fmu_build_packs_a_structure_too(tmp_path: Path) -> None:
+def test_fmu_build_packs_a_structure_too(tmp_path):
     """`fmu build --design` gives the bytes of `structure fmu`; what is for wings alone is refused."""
     target, other = tmp_path / "one.fmu", tmp_path / "two.fmu"
     said("structure", "fmu", "bracket", "--out", str(target))
@@ -172,7 +153,7 @@ def test_fmu_build_packs_a_structure_too(tmp_path: Path) -> None:
     assert "are for wings" in refused("fmu", "build", "--design", "bracket", "--activate", code=2)
 
 
-def test_a_file_beside_an_fmu_is_neither_the_fmu_nor_the_structure(file: Path) -> None:
+def test_a_file_beside_an_fmu_is_neither_the_fmu_nor_the_structure(file):
     """Refused before anything is built, with --replace, too."""
     out = file.with_suffix(".fmu")
     for path, words in ((out, "is the FMU: choose another --binding"), (file, "is the structure file")):

@@ -1,7 +1,5 @@
 """From matrices that CalculiX stored to an FMU, a calibration and a twin: a stiffened skin of shells."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -11,10 +9,10 @@ import xarray as xr
 from fmpy.validation import validate_fmu
 
 from calibration.result.file import load_calibration
-from fe.reduction.structure_errors import measured_errors
+from fe.reduction.reduced_basis import measured_errors
 from reporting.toml_file import parse_toml
-from tests import command_line
 from tests.calculix_decks import needs_calculix, solved, stiffened_skin, write_structure
+from tests.command_line import refused, said
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.workflow import fly as new_run
 from uav_twin import assemble_structure, reduced_structure
@@ -49,62 +47,41 @@ alpha = 2.0
 beta = 1e-5
 """
 )
-MISSION = """format = 2
+MISSION = """
+format = 2
+state = [{ name = "z1", title = "loss", levels_percent = [0, 20, 40, 60, 80], prior = [1, 0, 0, 0, 0] }]
+control = [{ name = "soft", values = { push = 400.0 } }, { name = "hard", values = { push = 900.0 } }]
+transition = { kind = "independent_worsening", probability = { soft = 0.05, hard = 0.1 } }
+planner = { gamma = 0.8 }
+asset = { kind = "structure", structure = "structure.toml", parameters = { e = 1.03 } }
+belief = { kind = "structure", structure = "structure.toml" }
+calibration = { parameter = "e", source = "normal", mean = 1.0, standard_deviation = 0.02, draws = 20 }
 [mission]
 name = "skin"
-title = "A patch of a skin"
 steps = 8
 prediction_steps = 2
 first_control = "hard"
 seed = 3
 step_name = "shift"
-[[state]]
-name = "z1"
-title = "stiffness loss of the patch"
-levels_percent = [0, 20, 40, 60, 80]
-prior = [1, 0, 0, 0, 0]
-[[control]]
-name = "soft"
-values = { push = 400.0 }
-[[control]]
-name = "hard"
-values = { push = 900.0 }
 [observation]
 role = "strain"
 count = 2
 titles = ["patch", "skin"]
 standard_deviation_microstrain = 3
-[transition]
-kind = "independent_worsening"
-probability = { soft = 0.05, hard = 0.1 }
 [rewards]
 health_limit_microstrain = 400
 control = { soft = -0.1, hard = 0.1 }
 control_weight = 2.5
 error_scale_microstrain = 10
-[planner]
-gamma = 0.8
-[asset]
-kind = "structure"
-structure = "structure.toml"
-parameters = { e = 1.03 }
-[belief]
-kind = "structure"
-structure = "structure.toml"
-[calibration]
-parameter = "e"
-source = "normal"
-mean = 1.0
-standard_deviation = 0.02
-draws = 20
 [truth]
 kind = "scripted"
 gains = [{ state = "z1", first_step = 2, last_step = 3, gain_percent = 20 }]
-[truth.noise]
-standard_deviation_microstrain = 3
+noise = { standard_deviation_microstrain = 3 }
 """
-CAMPAIGN = """format = 1
+CAMPAIGN = """
+format = 1
 name = "pushed"
+trial = [{ name = "pushes", kind = "static", file = "pushes.csv" }]
 [[channel]]
 name = "patch"
 quantity = "strain"
@@ -117,10 +94,6 @@ quantity = "displacement"
 unit = "mm"
 output = "corner"
 noise = { standard_deviation = 0.02 }
-[[trial]]
-name = "pushes"
-kind = "static"
-file = "pushes.csv"
 """
 
 
@@ -142,7 +115,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @needs_calculix
-def test_the_reduced_model_is_calculixs_within_its_bound(file: Path, tmp_path: Path) -> None:
+def test_the_reduced_model_is_calculixs_within_its_bound(file, tmp_path):
     model = reduced_structure(file)
     for e, loss in ((1.0, 0.0), (1.05, 0.55)):
         strain, corner = calculix(tmp_path, e, loss)
@@ -159,27 +132,23 @@ def test_the_reduced_model_is_calculixs_within_its_bound(file: Path, tmp_path: P
 
 
 @needs_calculix
-def test_every_command_takes_it(file: Path, tmp_path: Path) -> None:
+def test_every_command_takes_it(file, tmp_path):
     """Info, reduce and fmu as of a mesh; FMPy finds nothing; what needs a mesh says so."""
-    info = command_line.command("structure", "info", file, "--modes", "2")
-    assert info.returncode == 0, info.stderr
-    assert "725 free" in info.stdout
-    assert "whole.sti, whole.mas, whole.dof" in info.stdout
-    assert command_line.command("structure", "reduce", file, "--states", "2").returncode == 0
+    info = said("structure", "info", file, "--modes", "2")
+    assert "725 free" in info
+    assert "whole.sti, whole.mas, whole.dof" in info
+    said("structure", "reduce", file, "--states", "2")
     for kind in ("python", "compiled"):
         target = tmp_path / f"{kind}.fmu"
-        made = command_line.command("structure", "fmu", file, "--out", target, "--kind", kind)
-        assert made.returncode == 0, made.stderr
+        said("structure", "fmu", file, "--out", target, "--kind", kind)
         assert validate_fmu(str(target)) == []
-    assert command_line.command("fmu", "build", "--design", file, "--out", tmp_path / "b.fmu").returncode == 0
+    said("fmu", "build", "--design", file, "--out", tmp_path / "b.fmu")
     for words in (("verify", file), ("field", file, "--out", tmp_path / "field.vtu")):
-        refused = command_line.command("structure", *words)
-        assert refused.returncode == 1
-        assert "is a structure from matrices: without a mesh" in refused.stderr
+        assert "is a structure from matrices: without a mesh" in refused("structure", *words)
 
 
 @needs_calculix
-def test_a_campaign_tells_its_parameter_and_that_nothing_is_missing(file: Path, tmp_path: Path) -> None:
+def test_a_campaign_tells_its_parameter_and_that_nothing_is_missing(file, tmp_path):
     """What CalculiX answers with 0.96 times the modulus, read with noise."""
     strain, corner = calculix(tmp_path, 0.96, 0.0)
     random = np.random.default_rng(7)
@@ -193,23 +162,19 @@ def test_a_campaign_tells_its_parameter_and_that_nothing_is_missing(file: Path, 
     (lab / "pushes.csv").write_text("\n".join(["force,patch,corner", *lines]) + "\n", encoding="utf-8")
     (lab / "campaign.toml").write_text(CAMPAIGN, encoding="utf-8")
     rig = tmp_path / "rig.toml"
-    assert (
-        command_line.command("structure", "fmu", file, "--out", tmp_path / "s.fmu", "--rig", rig).returncode
-        == 0
-    )
+    said("structure", "fmu", file, "--out", tmp_path / "s.fmu", "--rig", rig)
     words = ("--model", rig, "--asset", "skin 1", "--out", tmp_path / "out", "--no-report")
-    done = command_line.command("calibrate", "campaign", lab, *words)
-    assert done.returncode == 0, done.stderr
+    said("calibrate", "campaign", lab, *words)
     found = load_calibration(tmp_path / "out" / "calibration.nc")
     assert abs(found.mean("e") - 0.96) < 3.0 * found.standard_deviation("e") < 0.01
-    words = ("--model", file, "--out", tmp_path / "verdict", "--no-report", "--json")
-    done = command_line.command("discrepancy", "run", lab, *words)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["verdict"]["kind"] == "nothing missing"
+    told = said(
+        "discrepancy", "run", lab, "--model", file, "--out", tmp_path / "verdict", "--no-report", "--json"
+    )
+    assert json.loads(told)["verdict"]["kind"] == "nothing missing"
 
 
 @needs_calculix
-def test_a_twin_finds_the_patch_that_calculix_weakened(file: Path, tmp_path: Path) -> None:
+def test_a_twin_finds_the_patch_that_calculix_weakened(file, tmp_path):
     """The strains flown are CalculiX' with that patch."""
     table = parse_toml(MISSION, "mission", ValueError)
     scenario = LoadedScenario(parse_scenario(table, "mission"), file.with_name("mission.toml"), "0" * 64)

@@ -1,14 +1,17 @@
-"""Where an asset and the twin's predicted observations of it come from.
+"""What flies: an asset under control; and a source, which prepares it, or what the twin expects of it.
 
-A mission knows a source only by its protocol. What a user may name stands in the files beside this one whose
+An asset is told the control and its true health, and returns the noise-free observation; or it carries damage
+and sensors of its own, and tells of them beside. It is driven by the `Plant`; the twin never meets it.
+
+A mission knows a source only by `AssetSource`. What a user may name stands in the files of this folder whose
 names end in `_source`: each holds the tables of its kinds and what is made of them.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +19,104 @@ from numpy.typing import NDArray
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.interface import Asset
 from twin_master.assets.parameter import ParameterDraws, draw_parameter
 from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.scenario.asset import BeliefSection, FileSection
+from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
 
 Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class InnerTruth:
+    """What an asset with damage and sensors of its own tells for scoring; never for the twin.
+
+    Attributes
+    ----------
+    state : dict of str to float
+        True value of each state factor, SI.
+    sensed : (G,)
+        What its sensors say, SI; NaN where one is lost.
+    """
+
+    state: Mapping[str, float]
+    sensed: Float
+
+
+@dataclass(frozen=True)
+class AssetReading:
+    """What an asset returns for one step.
+
+    Attributes
+    ----------
+    values : (G,)
+        Noise-free observation in its SI unit.
+    monitors : dict of str to float
+        Further figures that the asset reports of itself, such as a certified error bound.
+    inner : InnerTruth or None
+        What the asset tells of its own damage and sensors, where it carries them.
+    """
+
+    values: Float
+    monitors: Mapping[str, float] = field(default_factory=dict)
+    inner: InnerTruth | None = None
+
+
+class Asset:
+    """An asset under control; one that inherits from this has no state unless it says so."""
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units of control inputs and monitors by name; those that are missing are dimensionless."""
+        return {}
+
+    def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        """Fly one step with the given control inputs and true health (SI)."""
+        raise NotImplementedError
+
+    def save_state(self) -> bytes:
+        """Return the state as bytes; empty if the asset has none."""
+        return b""
+
+    def restore_state(self, state: bytes) -> None:
+        """Continue from a saved state, also in another process."""
+
+    def close(self) -> None:
+        """Let go of what the asset holds."""
+
+
+Told = Callable[[Mapping[str, float], Mapping[str, float]], Float]
+"""Returns what is shown (G,) under control inputs in a state, both by name."""
+
+
+class StatelessAsset(Asset):
+    """An asset whose observation depends on nothing but the control and the health of the step.
+
+    Parameters
+    ----------
+    observe
+        Returns the reading for control inputs and health.
+    """
+
+    def __init__(self, observe: Callable[[Mapping[str, float], Mapping[str, float]], AssetReading]) -> None:
+        self._observe = observe
+
+    def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        """Return the observation under the given control inputs and health."""
+        return self._observe(control, health)
+
+
+def asked_table(
+    names: Sequence[str], states: Float, controls: Iterable[Mapping[str, float]], ask: Told
+) -> Float:
+    """Ask what is shown in every state (S, F) of named factors under every control: (S, U, G)."""
+    settings = list(controls)
+    rows = (dict(zip(names, levels, strict=True)) for levels in states.tolist())
+    return np.array([[ask(values, health) for values in settings] for health in rows])
 
 
 @dataclass(frozen=True)
@@ -78,49 +168,10 @@ def calibrated_with(
     return f"Calibrated was the model {record['model']}; {flown}. {same}"
 
 
-class AssetSource(Protocol):
-    """Everything that a mission needs to know of its asset.
+class AssetSource:
+    """Everything that a mission needs to know of what is flown, or of what its twin believes.
 
-    It may have `structural_table(draws, model)`, which returns like `observation_table` what is there at the
-    sensors where its model knows that they do not show it, else None: limits are of the structure.
-    What most sources have in common is `Source`.
-    """
-
-    @property
-    def origin(self) -> FlownAndBelieved:
-        """What is flown and what the twin believes, in words."""
-
-    def check(self) -> None:
-        """Look at what is given before anything is made; raise what is wrong with it."""
-
-    def files(self) -> dict[str, bytes]:
-        """Return the files to copy into the run folder, by their paths in it."""
-
-    def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
-        """Make ready what is flown, in the folder of the run; return the hashes of what went in."""
-
-    def draws(self, seed: int) -> ParameterDraws:
-        """Return draws of the uncertain parameter of the model."""
-
-    def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the predicted observations (E, S, U, G)."""
-
-    def open(self) -> Asset:
-        """Return the asset at its start."""
-
-    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
-        """Write the asset's field under an estimated state and a control; return whether it has one."""
-
-
-def structural_table(source: AssetSource, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
-    """Return what is there at the sensors (E, S, U, G); None where they show it, see `AssetSource`."""
-    own = getattr(source, "structural_table", None)
-    found: Float | None = None if own is None else own(draws, model)
-    return found
-
-
-class Source:
-    """What sources have in common: files that are kept in the run folder, and draws of a calibration.
+    Most have in common that files are kept in the run folder, and that draws are those of a calibration.
 
     Parameters
     ----------
@@ -137,13 +188,14 @@ class Source:
 
     def __init__(self, scenario: Scenario, section: FileSection | None = None) -> None:
         self._scenario = scenario
-        self._files = section
+        self.section = section
+        self._means: dict[str, float] = {}
         self._folder: Path | None = None
 
     @cached_property
     def places(self) -> dict[str, Path]:
         """What the table names, and the calibration file, by the places of their copies in a run folder."""
-        own = {} if self._files is None else self._files.all_files()
+        own = {} if self.section is None else self.section.all_files()
         return {**own, **self._scenario.calibration.all_files()}
 
     def path(self, copy: str) -> Path:
@@ -169,7 +221,7 @@ class Source:
         return FlownAndBelieved(self.words, self.words)
 
     def check(self) -> None:
-        """Accept what was read already."""
+        """Look at what is given before anything is made; raise what is wrong with it."""
 
     def files(self) -> dict[str, bytes]:
         """Return what the files hold, by the places of their copies.
@@ -204,14 +256,24 @@ class Source:
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the calibrated parameter."""
-        return draw_parameter(self._scenario.calibration, seed, self.model)
+        found = draw_parameter(self._scenario.calibration, seed, self.model)
+        self._means[found.name] = found.mean
+        return found
+
+    def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
+        """Return the predicted observations (E, S, U, G)."""
+        raise NotImplementedError
 
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
-        """Return what is there at the sensors (E, S, U, G) where they do not show it, else None."""
+        """Return what is there at the sensors (E, S, U, G), None where they show it: limits are of that."""
         return None
 
+    def open(self) -> Asset:
+        """Return the asset at its start."""
+        raise NotImplementedError
+
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
-        """Write nothing: there is no mesh."""
+        """Write the field under an estimated state and a control; return whether there is one."""
         return False
 
 
@@ -225,7 +287,7 @@ class AssetBelief(BeliefSection):
         return flown
 
 
-class PairedSource:
+class PairedSource(AssetSource):
     """The asset of one source; everything that the twin knows from another.
 
     Parameters
@@ -273,7 +335,7 @@ class PairedSource:
 
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
         """Return what is there at the sensors by the twin's model; None where they show it."""
-        return structural_table(self._model, draws, model)
+        return self._model.structural_table(draws, model)
 
     def open(self) -> Asset:
         """Return the asset at its start."""
@@ -282,6 +344,28 @@ class PairedSource:
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write the field of the twin's model."""
         return self._model.write_field(path, state, control)
+
+
+class WatchedSection(AssetSection):
+    """A scenario without `[asset]`: it is watched, and not flown."""
+
+    kind: Literal["watched"] = "watched"
+
+    def source(self, scenario: Scenario) -> "WatchedSource":
+        """Return what can be watched only."""
+        return WatchedSource()
+
+
+class WatchedSource:
+    """What stands for a real asset; whatever a flight would ask of it ends in one sentence."""
+
+    def __getattr__(self, name: str) -> NoReturn:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise MissionInputError(
+            "this scenario has no `[asset]`: it is for a real one, whose observations `uav-twin watch` takes "
+            "in, and its `belief` must be a model of its own."
+        )
 
 
 FLOWN_DESIGN_HASH = "flown_design"

@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
+from fe.wing.design import load_design
 from fmu_asset.companions import COMPANION_NAMES
+from fmu_asset.coupling.structure import (
+    Component,
+    Connector,
+    Setting,
+    SystemStructure,
+    expand_connection,
+)
+from fmu_asset.door.binding import Binding, expand
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
@@ -18,11 +27,8 @@ from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Count, Flag, Number, Positive, Section, short
 
 if TYPE_CHECKING:
-    from fmu_asset.coupling.asset import CoupledAsset
-    from fmu_asset.coupling.structure import Setting, SettingValue, SystemStructure
     from fmu_asset.coupling.wiring import Wiring
-    from fmu_asset.door.binding import Binding
-    from twin_master.assets.flown_fmu import Session
+    from twin_master.assets.fmu_source import Session
 
 SSP_COPY = "asset/system.ssp"
 COMPONENT_FOLDER = "asset/components"
@@ -141,26 +147,15 @@ class SeveralSource(FmuSource):
         """Return the system as it is flown, once prepared."""
         raise NotImplementedError
 
-    def _fitted(self, binding: "Binding", folder: Path) -> "Binding":
-        """Join what needs no packing first."""
-        from fmu_asset.folders import scratch_folder
-
-        with scratch_folder() as extracted:
-            self._check_system(binding, extracted)
-        return binding
-
-    def _check_system(self, binding: "Binding", folder: Path) -> None:
-        raise NotImplementedError
-
-    def _join(self, wiring: "Wiring", binding: "Binding") -> "CoupledAsset":
+    def _session(
+        self, binding: Binding, parameters: Mapping[str, float], wiring: "Wiring | None" = None
+    ) -> "Session":
+        """Join the system as it is flown, or another one."""
         from fmu_asset.coupling.asset import CoupledAsset
 
         keys = ("algorithm", "iterations", "tolerance", "isolated", "step_timeout")
-        said = {key: getattr(self._section, key) for key in keys}
-        return CoupledAsset(wiring, binding, parameters=self.parameters(), **said)
-
-    def _session(self) -> "Session":
-        return self._join(self.wiring(), self.binding())
+        said = {key: getattr(self.section, key) for key in keys}
+        return CoupledAsset(wiring or self.wiring(), binding, parameters=parameters, **said)
 
 
 class SspSource(SeveralSource):
@@ -175,7 +170,7 @@ class SspSource(SeveralSource):
 
         return join_ssp(read_ssp(self.path(SSP_COPY), self.path(COMPONENT_FOLDER)))
 
-    def _check_system(self, binding: "Binding", folder: Path) -> None:
+    def _fitted(self, binding: Binding, folder: Path) -> Binding:
         from fmu_asset.ssp.check import join_ssp, left_out_sentence
         from fmu_asset.ssp.reader import read_ssp
 
@@ -183,49 +178,51 @@ class SspSource(SeveralSource):
         wiring = join_ssp(read_ssp(file, folder))
         if sentence := left_out_sentence(wiring, file):
             raise MissionInputError(sentence)
-        self._join(wiring, binding)
+        self._session(binding, self.parameters(), wiring)
+        return binding
 
     def _make(self, progress: Progress) -> dict[str, str]:
-        self._session().close()  # what does not fit is said before anything is flown
+        # What does not fit is said before anything is flown.
+        self._session(self.binding(), self.parameters()).close()
         return {"ssp": hash_file(self.path(SSP_COPY))}
 
 
 class CoupledSource(SeveralSource):
     """The FMUs that the scenario joins."""
 
-    _section: CoupledSection
+    section: CoupledSection
 
     @property
     def words(self) -> str:
         """How many there are."""
-        return f"{len(self._section.component)} coupled FMUs"
+        return f"{len(self.section.component)} coupled FMUs"
 
-    def _check_system(self, binding: "Binding", folder: Path) -> None:
-        from fe.wing.design import load_design
+    def _fitted(self, binding: Binding, folder: Path) -> Binding:
         from fmu_asset.coupling.wiring import Wiring
 
-        components = self._section.component
+        components = self.section.component
         for component in components:
             if component.design not in (None, CALIBRATED_DESIGN_NAME):
                 load_design(component.design_path)
         if all(component.design is None for component in components):
             files = {component.name: _given_fmu(component, folder) for component in components}
-            self._join(Wiring(self._structure(files)), binding)
+            self._session(binding, self.parameters(), Wiring(self._structure(files)))
         else:
             self._structure({component.name: folder for component in components})
+        return binding
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Pack what is not an FMU yet."""
         hashes = {}
         with progress.stage("Packing the FMUs"):
-            for component in self._section.component:
+            for component in self.section.component:
                 hashes[f"fmu_{component.name}"] = hash_file(self._packed(component, progress))
-        self._session().close()  # what does not fit is said before anything is flown
+        # What does not fit is said before anything is flown.
+        self._session(self.binding(), self.parameters()).close()
         return hashes
 
     def _packed(self, component: ComponentSection, progress: Progress) -> Path:
         """Return the FMU of a component in the run folder; packed if it is not there."""
-        from fe.wing.design import load_design
         from fmu_asset.packing.wing_packing import pack_wing
 
         target = self.path(component.copies()["fmu"])
@@ -249,14 +246,12 @@ class CoupledSource(SeveralSource):
         """Return the system as it is flown, once prepared."""
         from fmu_asset.coupling.wiring import Wiring
 
-        files = {component.name: component.copies()["fmu"] for component in self._section.component}
+        files = {component.name: component.copies()["fmu"] for component in self.section.component}
         return Wiring(self._structure({name: self.path(copy) for name, copy in files.items()}))
 
-    def _structure(self, fmus: Mapping[str, Path]) -> "SystemStructure":
+    def _structure(self, fmus: Mapping[str, Path]) -> SystemStructure:
         """Return the system of the scenario's components and connections."""
-        from fmu_asset.coupling.structure import Component, Connector, SystemStructure, expand_connection
-
-        asset = self._section
+        asset = self.section
         names = [component.name for component in asset.component]
         connections = tuple(
             connection
@@ -282,23 +277,16 @@ def _given_fmu(component: ComponentSection, folder: Path) -> Path:
     return atomic_write_bytes(folder / f"{component.name}.fmu", companion_bytes(component.fmu))
 
 
-def _settings(component: ComponentSection) -> "dict[str, Setting]":
-    from fmu_asset.coupling.structure import Setting
-    from fmu_asset.door.binding import expand
-
+def _settings(component: ComponentSection) -> dict[str, Setting]:
     settings: dict[str, Setting] = {}
-    values: Mapping[str, SettingValue] = component.parameters
-    for pattern, value in values.items():
+    where = f"the component `{component.name}`"
+    for pattern, value in component.parameters.items():
         try:
             names = expand(pattern)
         except ValueError as error:
-            raise MissionInputError(
-                f"the parameters of the component `{component.name}` cannot be read: {error}."
-            ) from error
+            raise MissionInputError(f"the parameters of {where} cannot be read: {error}.") from error
         for name in names:
             if name in settings:
-                raise MissionInputError(
-                    f"the component `{component.name}` is given `{name}` twice: keep one of the two."
-                )
+                raise MissionInputError(f"{where} is given `{name}` twice: keep one of the two.")
             settings[name] = Setting(value)
     return settings

@@ -1,12 +1,15 @@
 """A wing: its design, or the design inside a calibration file, packed as the asset or believed as a model."""
 
 from collections.abc import Mapping
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fe.wing.design import WingDesign, load_design, wing_structure
+from fmu_asset.door.binding import Binding
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.assets.asset_source import (
@@ -15,21 +18,18 @@ from twin_master.assets.asset_source import (
     MODEL_PATCH_COPY,
     PATCH_COPY,
     AssetSource,
-    Source,
+    asked_table,
 )
 from twin_master.assets.fmu_source import FmuSection, FmuSource
 from twin_master.assets.parameter import OWN_OF_WING, ParameterDraws, check_calibration, read_calibration
-from twin_master.assets.reduced_model import ReducedModelSource, check_wing_scenario
-from twin_master.errors import MissionInputError
+from twin_master.assets.reduced_model import ReducedModelSource
+from twin_master.errors import MissingObservationModelError, MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, BeliefSection
 from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
-    from fe.runtime.reduced import ReducedModel
-    from fe.wing.design import WingDesign
-    from fmu_asset.door.binding import Binding
     from fmu_asset.packing.patch_file import PatchFile
 
 Float = NDArray[np.float64]
@@ -88,7 +88,7 @@ class DesignBelief(BeliefSection):
 
     def source(self, scenario: Scenario, flown: AssetSource) -> "DesignSource":
         """Return the model of the wing."""
-        return DesignSource(scenario, self)
+        return DesignSource(scenario, section=self)
 
 
 class CalibrationBelief(DesignBelief):
@@ -98,85 +98,63 @@ class CalibrationBelief(DesignBelief):
     design: Literal["calibration"] = "calibration"
 
 
-class _Wing:
-    """A wing that a scenario names: its files where they are given, or their copies once kept.
+class _Wing(AssetSource):
+    """A wing that a scenario names: its files where they are given, or their copies once kept."""
 
-    Parameters
-    ----------
-    source : Source
-        Of whose files it is made.
-    section : DesignSection or DesignBelief
-        What names the wing.
-    """
-
-    def __init__(self, source: Source, section: DesignSection | DesignBelief) -> None:
-        self._source, self._section = source, section
-        self.name = ""
+    section: DesignSection | DesignBelief
+    effects: ClassVar = "effects"
+    """What a patch adds, in words."""
 
     @property
     def words(self) -> str:
-        """The model of the design, which has its name once prepared."""
-        return f"reduced model of the design {self.name}".rstrip()
+        """The model of the design."""
+        with_effects = "" if self.patch_path is None else f", with {self.effects}"
+        return f"{self.label} of the design {self.design.name}{with_effects}"
 
+    @cached_property
     def calibration(self) -> "Calibration | None":
-        """Return the calibration that the wing is tailored to; None for a design of its own.
+        """The calibration that the wing is tailored to; None for a design of its own.
 
         Raises
         ------
         MissionInputError, CalibrationRecordError
             There is no calibration file, or it is damaged.
         """
-        if self._section.design != CALIBRATED_DESIGN_NAME:
+        if self.section.design != CALIBRATED_DESIGN_NAME:
             return None
         from calibration.result.file import load_calibration
 
-        if CALIBRATION_COPY not in self._source.places:
+        if CALIBRATION_COPY not in self.places:
             raise MissionInputError("the design of a calibration is asked for, and there is no such file.")
-        return load_calibration(self._source.path(CALIBRATION_COPY))
+        return load_calibration(self.path(CALIBRATION_COPY))
 
-    def design(self) -> "WingDesign":
-        """Return the design.
+    @cached_property
+    def design(self) -> WingDesign:
+        """The design.
 
         Raises
         ------
         MissionInputError, InvalidDesignError, CalibrationRecordError
             There is none, or it is wrong.
         """
-        from fe.wing.design import load_design
-
-        calibration = self.calibration()
-        if calibration is not None:
-            return calibration.wing_design
-        return load_design(self._source.path(self._section.copies()["design"]))
-
-    def reduced(self, progress: Progress) -> "ReducedModel":
-        """Reduce the design."""
-        from fe.reduction.model_cache import reduced_model
-
-        design = self.design()
-        self.name = design.name
-        return reduced_model(design, progress=progress)
+        if self.calibration is not None:
+            return self.calibration.wing_design
+        return load_design(self.path(self.section.copies()["design"]))
 
     @property
     def patch_path(self) -> Path | None:
         """The patch file, if there is one."""
-        copy = self._section.copies()["patch"]
-        return self._source.path(copy) if copy in self._source.places else None
+        copy = self.section.copies()["patch"]
+        return self.path(copy) if copy in self.places else None
 
+    @property
     def patch(self) -> "PatchFile | None":
-        """Return the patch, if there is one."""
+        """The patch, if there is one."""
         from fmu_asset.packing.patch_file import load_patch
 
         return None if self.patch_path is None else load_patch(self.patch_path)
 
-    def write_field(
-        self,
-        path: Path,
-        scenario: Scenario,
-        mean: float,
-        state: Mapping[str, float],
-        control: Mapping[str, float],
-    ) -> bool:
+    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write displacement and strain under a state and a control as VTU; return whether there is a field.
 
         Young's modulus is that of the true wing where the scenario tells it, else the mean of the
@@ -190,98 +168,66 @@ class _Wing:
         from fe.reduction.fields import write_wing_vtu
         from fe.reduction.model_cache import wing_fields
 
-        design = self.design() if self.name else None
-        if design is None or {*state} != {*design.regions} or {*control} != {"load_factor"}:
+        name, asset = "young_modulus_factor", self._scenario.asset
+        if {*state} != {*self.design.regions} or {*control} != {"load_factor"}:
             return False
-        wing = wing_fields(design)
-        e = scenario.asset.true_parameters.get("young_modulus_factor", mean)
-        force = scenario.asset.constant_load.get("tip_force", 0.0)
-        values = {**control, "young_modulus_factor": e, "tip_force": force}
+        wing = wing_fields(self.design)
+        e = asset.true_parameters.get(name, self._means.get(name, 1.0))
+        values = {**control, name: e, "tip_force": asset.constant_load.get("tip_force", 0.0)}
         write_wing_vtu(path, wing, wing.vector(values, state))
         return True
 
 
-class WingFmuSource(FmuSource):
+class WingFmuSource(_Wing, FmuSource):
     """The FMU that is packed of a wing design."""
 
-    def __init__(self, scenario: Scenario, section: DesignSection) -> None:
-        super().__init__(scenario, section)
-        self._of = _Wing(self, section)
-        self._packed = section.packed
-        self._mean = 1.0
+    label = "FMU of the reduced model"
+    effects = "hidden effects"
+    section: DesignSection
 
-    @property
-    def words(self) -> str:
-        """The FMU; it has the name of its design once prepared."""
-        return f"FMU of the {self._of.words}{'' if self._of.patch_path is None else ', with hidden effects'}"
-
-    def binding(self) -> "Binding":
+    def binding(self) -> Binding:
         """Return the binding with the damage regions of the design."""
-        return super().binding().with_regions(self._of.design().regions)
+        return super().binding().with_regions(self.design.regions)
 
-    def _effects(self) -> tuple[str, ...]:
+    def _check_calibration(self, binding: Binding) -> tuple[str, ...]:
         from fmu_asset.packing.structure_fmu import check_form
-        from twin_master.assets.patches import effect_names
+        from fmu_asset.slaves.effects import effect_rows
 
-        check_form(self._packed, patched=self._of.patch_path is not None)
-        if self._of.patch_path is None:
-            return ()
-        return effect_names(self._of.patch_path, len(self._of.design().gauges.positions))
+        patch, effects = self.patch, tuple[str, ...]()
+        check_form(self.section.packed, patched=patch is not None)
+        if patch is not None:
+            known = patch.for_gauges(len(self.design.gauges.positions), str(self.patch_path))
+            effects = tuple(row.name for row in effect_rows(known.plain, 0, {}))
+        known_names, where = (*binding.parameter, *effects), f"the binding {binding.name}"
+        check_calibration(self._scenario.calibration, known_names, where, advice=OWN_OF_WING)
+        return effects
 
-    def _check_calibration(self, binding: "Binding", effects: tuple[str, ...]) -> None:
-        known, where = (*binding.parameter, *effects), f"the binding {binding.name}"
-        check_calibration(self._scenario.calibration, known, where, advice=OWN_OF_WING)
-
-    def _fitted(self, binding: "Binding", folder: Path) -> "Binding":
+    def _fitted(self, binding: Binding, folder: Path) -> Binding:
         return binding
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the design and pack the FMU."""
+        from fe.reduction.model_cache import reduced_model
         from fmu_asset.packing.wing_packing import pack_wing
 
-        self.model, options = self._of.reduced(progress), {}
-        calibration = self._of.calibration()
-        if calibration is not None:
+        self.model, options = reduced_model(self.design, progress=progress), {}
+        if self.calibration is not None:
             from calibration.result.plain import tailoring  # takes a second to load
 
-            options = tailoring(calibration)
+            options = tailoring(self.calibration)
         with progress.stage("Packing the FMU"):
             pack_wing(
-                self._of.design(), self.fmu_path(), kind=self._packed, patch=self._of.patch(), activate=True,
+                self.design, self.fmu_path(), kind=self.section.packed, patch=self.patch, activate=True,
                 replace=True, progress=progress, **options,
             )  # fmt: skip
         return {FLOWN_DESIGN_HASH: self.model.design_hash, "fmu": hash_file(self.fmu_path())}
 
-    def draws(self, seed: int) -> ParameterDraws:
-        """Return draws of the calibrated parameter."""
-        draws = super().draws(seed)
-        self._mean = draws.mean
-        return draws
 
-    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
-        """Write displacement and strain of the wing as VTU."""
-        return self._of.write_field(path, self._scenario, self._mean, state, control)
+class DesignSource(_Wing, ReducedModelSource):
+    """The reduced model of a design file, or of the design inside a calibration file, as what is believed."""
 
-
-class DesignSource(ReducedModelSource):
-    """The reduced model of a design file, or of the design inside a calibration file, as what is believed.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        What is flown.
-    section : DesignBelief
-        What is believed.
-    """
-
-    def __init__(self, scenario: Scenario, section: DesignBelief) -> None:
-        super().__init__(scenario, section=section)
-        self._of = _Wing(self, section)
-
-    @property
-    def words(self) -> str:
-        """The reduced model; it has the name of its design once prepared."""
-        return f"{self._of.words}{'' if self._of.patch_path is None else ', with effects'}"
+    label = "reduced model"
+    section: DesignBelief
 
     def check(self) -> None:
         """Read the design without building anything.
@@ -295,46 +241,113 @@ class DesignSource(ReducedModelSource):
         MissingObservationModelError
             The scenario's states, controls, parameter or sensors are not those of the design's model.
         """
-        from fe.wing.design import wing_structure
-        from twin_master.assets.patches import check_model_patch
-
-        calibration = self._scenario.calibration
+        scenario = self._scenario
+        calibration = scenario.calibration
         read_calibration(calibration)
         self.files()
-        design = self._of.design()
+        design, patch = self.design, self.patch
+        gauges = len(design.gauges.positions)
         ranges = {part.name: part.range for part in wing_structure(design.regions, 0).parameter}
         check_calibration(
             calibration, ranges, f"the reduced model of the design {design.name}", ranges=ranges,
             design_hash=design.hash, advice=OWN_OF_WING,
         )  # fmt: skip
-        gauges, patch = len(design.gauges.positions), self._of.patch()
-        check_wing_scenario(self._scenario, design.regions, gauges)
+        for what, came, wanted in (
+            ("states", scenario.state_names, design.regions),
+            ("control inputs", scenario.control[0].values, ("load_factor",)),
+            ("calibrated parameter", (calibration.parameter,), ("young_modulus_factor",)),
+            ("sensor count", (str(scenario.observation.count),), (str(gauges),)),
+        ):
+            if {*came} != {*wanted}:
+                raise MissingObservationModelError(
+                    f"the design's model predicts observations for the {what} {', '.join(sorted(wanted))}, "
+                    f"and the scenario has {', '.join(sorted(came))}: set `belief.kind` to `asset` to ask "
+                    "what is flown itself."
+                )
         if patch is not None:
-            check_model_patch(patch, gauges, str(self._of.patch_path))
+            check_model_patch(patch, gauges, str(self.patch_path))
 
     def _make(self, progress: Progress) -> dict[str, str]:
-        self.model = self._of.reduced(progress)
+        from fe.reduction.model_cache import reduced_model
+
+        self.model = reduced_model(self.design, progress=progress)
         return super()._make(progress)
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Return the strains (E, S, U, G)."""
-        return self._strains(draws, model, self._of.patch())
+        return self._strains(draws, model, self.patch)
 
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
         """Return the strains of the structure itself (E, S, U, G); None where no effect is of its gauges."""
-        patch = self._of.patch()
+        patch = self.patch
         kept = None if patch is None else patch.of_structure
         return None if kept == patch else self._strains(draws, model, kept)
 
     def _strains(self, draws: ParameterDraws, model: GraphicalModel, patch: "PatchFile | None") -> Float:
+        """Return the strains (E, S, U, G) that the twin predicts with the effects of a patch.
+
+        Raises
+        ------
+        PatchFileError, MissionInputError
+            The model cannot carry the patch.
+        """
         if patch is None or not patch.effects:
             return super().observation_table(draws, model)
-        from twin_master.assets.patches import patched_observation_table
+        from fmu_asset.packing.wing_packing import arrays_for
+        from fmu_asset.slaves.base import UnacceptableValuesError
+        from fmu_asset.slaves.behaviour import StructureBehaviour
+        from fmu_asset.slaves.effects import Effects, effect_rows, switch_of
+        from fmu_asset.slaves.table import structure_table
 
-        where, design = str(self._of.patch_path), self._of.design()
-        return patched_observation_table(self.wing, self._scenario, draws, model, patch, design, where)
+        wing, scenario, where = self.wing, self._scenario, str(self.patch_path)
+        check_model_patch(patch, wing.gauge_count, where)
+        effects = patch.for_gauges(wing.gauge_count).plain
+        rows, roles = structure_table(wing, {})
+        acting = Effects(effects, wing.gauge_count, arrays_for(self.design, patch))
+        behaviour = StructureBehaviour(wing, rows, roles, acting)
+        on = {switch_of(effect): 1.0 for effect in effects}
+        behaviour.tune({row.name: float(row.start or 0.0) for row in effect_rows(effects, 0, on)}, 0.0)
+        nominal = {row.name: row.start or 0.0 for row in rows}
+        inputs = [row.name for row in rows if row.causality == "input"]
+        force = scenario.asset.constant_load.get("tip_force", 0.0)
 
-    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
-        """Write displacement and strain of the wing as VTU."""
-        mean = self._means.get("young_modulus_factor", 1.0)
-        return self._of.write_field(path, self._scenario, mean, state, control)
+        def ask(e: float, control: Mapping[str, float], health: Mapping[str, float]) -> Float:
+            losses = {f"health.{name}": loss for name, loss in health.items()}
+            given = {**control, **losses, "tip_force": force}
+            start = {**nominal, "young_modulus_factor": e}
+            shown = behaviour.start(start, 0.0, [given[name] for name in inputs])
+            return np.array(shown[: wing.gauge_count])
+
+        states, controls = model.states.coordinates, [control.values for control in scenario.control]
+        try:
+            return np.array(
+                [
+                    asked_table(scenario.state_names, states, controls, partial(ask, e))
+                    for e in draws.values.tolist()
+                ]
+            )
+        except UnacceptableValuesError as error:
+            raise MissionInputError(f"the twin's model cannot carry {where}: {error}") from error
+
+
+def check_model_patch(patch: "PatchFile", gauge_count: int, where: str = "The patch") -> None:
+    """Check that a model without time can carry the effects of a patch.
+
+    Raises
+    ------
+    MissionInputError
+        An effect depends on time or on what happened before.
+    PatchFileError
+        The wing cannot carry an effect.
+    """
+    from fe.runtime.patch import PortForce, SensorDrift
+
+    for effect in patch.for_gauges(gauge_count, where).effects:
+        for item in effect.patch:
+            drifts = isinstance(item, SensorDrift) and item.exponent != 0.0
+            if drifts or (isinstance(item, PortForce) and item.hysteretic):
+                raise MissionInputError(
+                    f"the effect {effect.id!r} depends on {'time' if drifts else 'the loads before'}, and "
+                    "the twin predicts the readings of each state and control once for the whole mission: "
+                    "leave it out of `belief.patch`."
+                )

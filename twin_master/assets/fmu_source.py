@@ -1,9 +1,8 @@
 """An FMU as the asset of a mission: any FMU with a binding, given or packed of a model script."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 import numpy as np
@@ -11,12 +10,23 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from fmu_asset.archive.fmu_file import packed_design_hash
+from fmu_asset.door.binding import Binding, load_binding
+from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError
+from fmu_asset.folders import scratch_folder
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import BINDING_COPY, FLOWN_DESIGN_HASH, AssetBelief, Source, read_files
-from twin_master.assets.flown_fmu import FmuAsset, InnerRoles
-from twin_master.assets.interface import Asset, asked_table
+from twin_master.assets.asset_source import (
+    BINDING_COPY,
+    FLOWN_DESIGN_HASH,
+    Asset,
+    AssetBelief,
+    AssetReading,
+    AssetSource,
+    InnerTruth,
+    asked_table,
+    read_files,
+)
 from twin_master.assets.parameter import (
     ParameterDraws,
     calibrated_means,
@@ -31,9 +41,10 @@ from twin_master.scenario.section import Flag, Name, Number, Positive
 from twin_master.seeds import generator
 
 if TYPE_CHECKING:
-    from fmu_asset.door.binding import Binding
-    from fmu_asset.door.session import FmiAsset
-    from twin_master.assets.flown_fmu import Session
+    from fmu_asset.coupling.asset import CoupledAsset
+
+    Session = FmiAsset | CoupledAsset
+    """One FMU, or several as one, with the same face."""
 
 Float = NDArray[np.float64]
 
@@ -112,7 +123,96 @@ class ScriptSection(FmuSection):
         return ScriptSource(scenario, self)
 
 
-class FmuSource(Source):
+@dataclass(frozen=True)
+class InnerRoles:
+    """Where an asset with damage and sensors of its own tells the truth; see `[truth]` of a scenario.
+
+    Attributes
+    ----------
+    state : dict of str to str
+        Monitor by state factor.
+    observation : slice
+        The noise-free observation among those of the binding.
+    received : slice or None
+        Where the binding observes whether each sensor is received.
+    """
+
+    state: Mapping[str, str]
+    observation: slice
+    received: slice | None
+
+
+_TAKEN = ("state", "sensor_status", "step", "region", "sensor")
+"""What the truth of a run holds already."""
+
+
+class FmuAsset(Asset):
+    """An FMU, or several coupled ones, as the mission flies them.
+
+    Parameters
+    ----------
+    session : FmiAsset or CoupledAsset
+        The door, at its start.
+    observation : slice
+        Where the observed quantity stands among the observations of the binding.
+    load : mapping of str to float
+        Load inputs, the same in every step.
+    inner : InnerRoles, optional
+        Given where damage and sensors are the asset's own.
+    """
+
+    def __init__(
+        self,
+        session: "Session",
+        observation: slice,
+        load: Mapping[str, float],
+        inner: InnerRoles | None = None,
+    ) -> None:
+        self._session, self._observation, self._load, self._inner = session, observation, dict(load), inner
+        binding, self._names = session.binding, dict[str, str]()
+        taken = {*binding.control, *binding.observation, *_TAKEN}
+        for name in session.recorded_units:  # stored under a name without `/` that is not taken
+            plain = "".join("_" if c == "/" or not c.isprintable() else c for c in name).strip()
+            while plain in taken or not plain:
+                plain += "_"
+            taken.add(plain)
+            self._names[name] = plain
+        inputs = (*binding.parameter.items(), *binding.control.items())
+        self._units = {name: scalar.unit for name, scalar in inputs}
+        self._units |= {self._names[name]: unit for name, unit in session.recorded_units.items()}
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units of parameters, control inputs and of what is recorded beside the observations."""
+        return self._units
+
+    def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        """Make one communication step."""
+        observation = self._session.step(control, health, self._load)
+        sensed = observation.values[self._observation]
+        extra = {self._names[name]: value for name, value in observation.extra.items()}
+        if self._inner is None:
+            return AssetReading(sensed, extra)
+        state = {name: observation.extra[monitor] for name, monitor in self._inner.state.items()}
+        if self._inner.received is not None:
+            sensed = np.where(observation.values[self._inner.received] == 0.0, np.nan, sensed)
+        free = observation.values[self._inner.observation]
+        return AssetReading(free, extra, InnerTruth(state, sensed))
+
+    def save_state(self) -> bytes:
+        """Return the state of the FMU."""
+        return self._session.save_state()
+
+    def restore_state(self, state: bytes) -> None:
+        """Bring the FMU to a saved state."""
+        self._session.restore_state(state)
+
+    def close(self) -> None:
+        """End the worker."""
+        self._session.close()
+
+
+class FmuSource(AssetSource):
     """An FMU from a file.
 
     Parameters
@@ -124,21 +224,11 @@ class FmuSource(Source):
     """
 
     label = "FMU"  # it may hold any model, also that of a design: whether they differ is not known
+    section: FmuSection
 
-    def __init__(self, scenario: Scenario, section: FmuSection) -> None:
-        super().__init__(scenario, section)
-        self._section = section
-
-    @property
-    def step_timeout(self) -> float | None:
-        """Wall-clock limit of a step [s], where the scenario sets one."""
-        return self._section.step_timeout
-
-    def binding(self) -> "Binding":
+    def binding(self) -> Binding:
         """Return the binding: where it is given, or its copy once prepared."""
-        from fmu_asset.door.binding import load_binding
-
-        return load_binding(self._section.binding_path if self._folder is None else self.path(BINDING_COPY))
+        return load_binding(self.section.binding_path if self._folder is None else self.path(BINDING_COPY))
 
     def fmu_path(self) -> Path:
         """Return the FMU, once prepared."""
@@ -156,64 +246,44 @@ class FmuSource(Source):
         FmuError, FiniteElementError
             Binding, FMU, script, design or structure is wrong, or the binding does not fit the FMU.
         """
-        read_calibration(self._scenario.calibration)
+        scenario, section = self._scenario, self.section
+        read_calibration(scenario.calibration)
         self.files()
-        binding, effects = self.binding(), self._effects()
-        self._check_calibration(binding, effects)
-        self._check_names(binding, effects)
-        with TemporaryDirectory(prefix="uav_twin_") as folder, self._told_of_means():
-            binding = self._fitted(binding, Path(folder))
-        self._check_sensors(binding)
-        self._inner_roles(binding)
-
-    def _effects(self) -> tuple[str, ...]:
-        """Return what parameters by the FMU's own names there are beside those of the binding."""
-        return ()
-
-    def _check_calibration(self, binding: "Binding", effects: tuple[str, ...]) -> None:
-        believed = isinstance(self._scenario.belief, AssetBelief)
-        design_hash = packed_design_hash(self.path(FMU_COPY)) if believed and FMU_COPY in self.places else ""
-        known = (*binding.parameter, *effects)
-        where = f"the binding {binding.name}"
-        check_calibration(self._scenario.calibration, known, where, design_hash=design_hash)
-
-    def _check_sensors(self, binding: "Binding") -> None:
-        self._observed(binding)
-
-    @contextmanager
-    def _told_of_means(self) -> Iterator[None]:
-        """Tell of a parameter that the FMU refuses that it may be one of the calibration."""
+        binding = self.binding()
+        parameters = [*binding.parameter, *self._check_calibration(binding)]
+        rows = (
+            ("control input", scenario.control[0].values, binding.control),
+            ("state", () if scenario.truth.kind == "asset" else scenario.state_names, binding.health),
+            ("load", section.load, binding.load),
+            ("parameter", (*section.parameters, *section.seeds), parameters),
+        )
+        check_names("the scenario has the", f"the binding {binding.name}", rows)
         try:
-            yield
+            with scratch_folder() as folder:
+                binding = self._fitted(binding, folder)
         except FmuInputError as error:
-            means = calibrated_means(self._scenario.calibration)
-            given = self._section.parameters
-            own = [f"{name} = {value:.6g}" for name, value in means.items() if name not in given]
+            means = calibrated_means(scenario.calibration)
+            own = [f"{name} = {mean:.6g}" for name, mean in means.items() if name not in section.parameters]
             if not own:
                 raise
             raise MissionInputError(
                 f"{error} The calibration has {', '.join(own)}: give one of what is flown, or name the "
                 "parameter in `asset.parameters`."
             ) from error
+        self._observed(binding)
+        self._inner_roles(binding)
 
-    def _fitted(self, binding: "Binding", folder: Path) -> "Binding":
+    def _check_calibration(self, binding: Binding) -> tuple[str, ...]:
+        """Check the calibration; return what parameters there are beside those of the binding."""
+        believed = isinstance(self._scenario.belief, AssetBelief)
+        design_hash = packed_design_hash(self.path(FMU_COPY)) if believed and FMU_COPY in self.places else ""
+        where = f"the binding {binding.name}"
+        check_calibration(self._scenario.calibration, binding.parameter, where, design_hash=design_hash)
+        return ()
+
+    def _fitted(self, binding: Binding, folder: Path) -> Binding:
         """Return the binding as the FMU fits it: only with that it is known how many values an array has."""
-        from fmu_asset.door.session import FmiAsset
-
         return FmiAsset(self.path(FMU_COPY), binding, parameters=self.parameters()).binding
-
-    def _check_names(self, binding: "Binding", effects: tuple[str, ...]) -> None:
-        scenario, section = self._scenario, self._section
-        check_names(
-            "the scenario has the",
-            f"the binding {binding.name}",
-            (
-                ("control input", scenario.control[0].values, binding.control),
-                ("state", () if scenario.truth.kind == "asset" else scenario.state_names, binding.health),
-                ("load", section.load, binding.load),
-                ("parameter", (*section.parameters, *section.seeds), [*binding.parameter, *effects]),
-            ),
-        )
 
     def _make(self, progress: Progress) -> dict[str, str]:
         packed = packed_design_hash(self.fmu_path())
@@ -224,9 +294,9 @@ class FmuSource(Source):
 
         That holds for assets without memory.
         """
-        scenario, load, rows = self._scenario, self._section.load, []
+        scenario, load, rows = self._scenario, self.section.load, []
         controls = [control.values for control in scenario.control]
-        with self._session() as session:
+        with self._session(self.binding(), self.parameters()) as session:
             chosen = self._observed(session.binding)
             for row, value in enumerate(draws.values):
                 others = {name: float(values[row]) for name, values in draws.others.items()}
@@ -241,7 +311,7 @@ class FmuSource(Source):
                 )
         return np.array(rows)
 
-    def _observed(self, binding: "Binding", role: str = "") -> slice:
+    def _observed(self, binding: Binding, role: str = "") -> slice:
         """Return where a role stands among the observations of the binding, in the units of the scenario."""
         role = role or self._scenario.observation.role
         chosen = self._slice(binding, role)
@@ -254,7 +324,7 @@ class FmuSource(Source):
                 )
         return chosen
 
-    def _slice(self, binding: "Binding", role: str) -> slice:
+    def _slice(self, binding: Binding, role: str) -> slice:
         expected = self._scenario.observation.count
         chosen = binding.observation_slice(role)
         if chosen.stop - chosen.start != expected:
@@ -264,7 +334,7 @@ class FmuSource(Source):
             )
         return chosen
 
-    def _inner_roles(self, binding: "Binding") -> InnerRoles | None:
+    def _inner_roles(self, binding: Binding) -> InnerRoles | None:
         """Return where the asset tells of its own damage and sensors; None where the truth is the scenario's.
 
         Raises
@@ -293,18 +363,13 @@ class FmuSource(Source):
 
         What was calibrated from a campaign and the scenario does not name is at its posterior mean.
         """
-        section, seed = self._section, self._scenario.mission.seed
+        section, seed = self.section, self._scenario.mission.seed
         drawn = generator(seed, "asset").integers(LARGEST_SEED, size=len(section.seeds))
         seeds = {name: float(value) for name, value in zip(section.seeds, drawn, strict=True)}
         return calibrated_means(self._scenario.calibration) | section.parameters | seeds
 
-    def _session(self) -> "Session":
-        return self._opened(self.binding(), self.parameters())
-
-    def _opened(self, binding: "Binding", parameters: Mapping[str, float]) -> "FmiAsset":
-        from fmu_asset.door.session import FmiAsset
-
-        section = self._section
+    def _session(self, binding: Binding, parameters: Mapping[str, float]) -> "Session":
+        section = self.section
         return FmiAsset(
             self.fmu_path(), binding, isolated=section.isolated, step_timeout=section.step_timeout,
             parameters=parameters,
@@ -320,14 +385,14 @@ class FmuSource(Source):
         MissionInputError
             The FMU observes another number of values than the scenario.
         """
-        session = self._session()
+        session = self._session(self.binding(), self.parameters())
         chosen, inner = self._observed(session.binding), self._inner_roles(session.binding)
         try:
             session.reset()
         except BaseException:
             session.close()
             raise
-        return FmuAsset(session, chosen, self._section.load, inner)
+        return FmuAsset(session, chosen, self.section.load, inner)
 
 
 class ScriptSource(FmuSource):
@@ -349,9 +414,7 @@ class ScriptSource(FmuSource):
         script = given.pop(FMU_COPY)
         return {**read_files(given), FMU_COPY: script_fmu(script)[0]}
 
-    def _fitted(self, binding: "Binding", folder: Path) -> "Binding":
-        from fmu_asset.door.session import FmiAsset
-
+    def _fitted(self, binding: Binding, folder: Path) -> Binding:
         packed = folder / "asset.fmu"
         packed.write_bytes(self.files()[FMU_COPY])
         return FmiAsset(packed, binding, parameters=self.parameters()).binding

@@ -1,31 +1,259 @@
-"""An observation library, sampled from an FMU beforehand, as what the twin believes."""
+"""Observation libraries: what an FMU showed at every draw of a parameter, state and control, as NetCDF.
 
+`uav-twin library sample` writes them, and a scenario with a `belief` of the kind `library` believes one.
+The published strain library of Kapteyn et al. 2021 has a format of its own, see `strain_library_source`.
+"""
+
+from __future__ import annotations
+
+import json
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fmu_asset.door.binding import load_binding
+from reporting.errors import DamagedFileError
+from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, Source
+from twin_master.assets.asset_source import Asset, AssetSource, FlownAndBelieved
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.errors import InvalidObservationLibraryError, MissionInputError
-from twin_master.network.graphical_model import GraphicalModel
+from twin_master.errors import InvalidModelError, InvalidObservationLibraryError, MissionInputError
+from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
+from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.asset import BeliefSection
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
-    from twin_master.assets.observation_library import ObservationLibrary
+    import xarray as xr
 
 Float = NDArray[np.float64]
 
-
 OBSERVATIONS_COPY = "asset/observation_library.nc"
+KIND = "uav-twin observation library"
+FORMAT = 1
+RESERVED = ("draw", "control", "sensor", "observation", "parameter_value", "sensor_unit")
+"""Names that a state cannot have, because the file has them already."""
+
+_SAME = 1e-12
+
+
+class ObservationLibrary:
+    """Observations over a grid of E draws, S states, U controls and G sensors.
+
+    Parameters
+    ----------
+    dataset : Dataset
+        Of the layout that `sampled_dataset` makes.
+
+    Attributes
+    ----------
+    values : (E, S, U, G)
+        In the units of the sensors.
+    role : str
+        Observation of the binding.
+    sensors, sensor_units : tuple of str
+        FMU variable and unit of each sensor.
+    states : StateSpace
+        Factors with their levels.
+    state_units : tuple of str
+        Unit of each factor.
+    controls : tuple of str
+        Names of the controls, labels only.
+    control_values : dict of str to (U,)
+        Value of each control input under each control.
+    parameter : str
+        The uncertain parameter; empty without one.
+    draws : (E,)
+        Its values; NaN without one.
+    load : dict of str to float
+        What else was set.
+    settling_steps : int
+        Steps from a fresh start at every point; 0: the FMU has no memory, and each point is one step.
+    fmu_hash : str
+        SHA-256 of the FMU.
+
+    Raises
+    ------
+    KeyError, ValueError, TypeError, InvalidModelError
+        It is no such dataset.
+    """
+
+    def __init__(self, dataset: xr.Dataset) -> None:
+        about = dataset.attrs
+        names: list[str] = json.loads(about["states"])
+        self.dataset = dataset
+        self.states = StateSpace(tuple(Factor(name, tuple(dataset[name].values.tolist())) for name in names))
+        self.state_units = tuple(str(dataset[name].attrs["units"]) for name in names)
+        self.role, self.parameter, self.fmu_hash = (
+            str(about[name]) for name in ("role", "parameter", "fmu_sha256")
+        )
+        self.settling_steps = int(about["settling_steps"])
+        self.load: Mapping[str, float] = json.loads(about["load"])
+        self.sensors, self.sensor_units, self.controls = (
+            tuple(str(text) for text in dataset[name].values) for name in ("sensor", "sensor_unit", "control")
+        )
+        inputs = [f"control_{name}" for name in json.loads(about["control_units"])]
+        for name in (*inputs, *["parameter_value"] * bool(self.parameter)):
+            if not np.all(np.isfinite(dataset[name].values)):
+                raise ValueError(f"a value of {name} is not finite")
+        self.control_values: dict[str, Float] = {
+            name.removeprefix("control_"): np.asarray(dataset[name].values, np.float64) for name in inputs
+        }
+        self.draws: Float = np.asarray(dataset["parameter_value"].values, np.float64)
+        table = dataset["observation"].transpose("draw", *names, "control", "sensor").values
+        self.values: Float = np.array(table, np.float64).reshape(
+            len(table), self.states.size, *table.shape[-2:]
+        )
+        if not np.all(np.isfinite(self.values)):
+            raise ValueError("an observation is not finite")
+        self.values.setflags(write=False)
+
+    def rows_of(self, names: tuple[str, ...], coordinates: Float) -> list[int]:
+        """Return the index of each state (N, F), whose factors are named in any order.
+
+        Raises
+        ------
+        InvalidObservationLibraryError
+            The library has other states, or a level is none of its levels.
+        """
+        if set(names) != set(self.states.names):
+            raise InvalidObservationLibraryError(
+                f"the observation library has the states {', '.join(self.states.names)}, and the scenario "
+                f"asks for {', '.join(names)}: sample one for this scenario."
+            )
+        index = np.zeros(len(coordinates), dtype=int)
+        for factor in self.states.factors:
+            levels, wanted = np.asarray(factor.levels), coordinates[:, names.index(factor.name)]
+            distance = np.abs(levels - wanted[:, None])
+            missing = distance.min(axis=1) > _SAME * np.maximum(np.abs(wanted), 1.0)
+            if missing.any():
+                raise InvalidObservationLibraryError(
+                    f"the observation library has the levels {_listed(levels)} of {factor.name}, and the "
+                    f"scenario asks for {wanted[missing][0]:g}: sample one for this scenario."
+                )
+            index = index * len(levels) + distance.argmin(axis=1)
+        return [int(row) for row in index]
+
+    def control_of(self, name: str, values: Mapping[str, float]) -> int:
+        """Return the index of the control whose inputs have the given values; its name does not matter.
+
+        Raises
+        ------
+        InvalidObservationLibraryError
+            There is none, or the library has other control inputs.
+        """
+        if set(values) != set(self.control_values):
+            raise InvalidObservationLibraryError(
+                f"the observation library has the control inputs {', '.join(self.control_values)}, and the "
+                f"scenario sets {', '.join(values)}: sample one for this scenario."
+            )
+        distance = np.max(
+            [
+                np.abs(self.control_values[key] - value) / max(abs(value), 1.0)
+                for key, value in values.items()
+            ],
+            axis=0,
+        )
+        if distance.min() > _SAME:
+            shown = ", ".join(f"{key} = {value:g}" for key, value in values.items())
+            raise InvalidObservationLibraryError(
+                f"the observation library was not sampled at {shown}, the control {name} of the scenario; it "
+                f"has {', '.join(self.controls)}: sample one for this scenario."
+            )
+        return int(distance.argmin())
+
+    def at_draws(self, name: str, draws: Float) -> Float:
+        """Return the observations (N, S, U, G) at N values of the parameter, linear between the sampled ones.
+
+        Raises
+        ------
+        InvalidObservationLibraryError
+            The library has another parameter, or a value lies outside the sampled ones.
+        """
+        if not self.parameter and len(draws) == 1:
+            return self.values
+        if name != self.parameter:
+            raise InvalidObservationLibraryError(
+                f"the observation library was sampled over the parameter {self.parameter or 'none'}, and the "
+                f"scenario calibrates {name}: sample one for this scenario."
+            )
+        order = np.argsort(self.draws, kind="stable")
+        nodes = self.draws[order]
+        slack = _SAME * max(1.0, float(np.abs(nodes).max()))
+        if draws.min() < nodes[0] - slack or draws.max() > nodes[-1] + slack:
+            raise InvalidObservationLibraryError(
+                f"the draws of {name} reach from {draws.min():.6g} to {draws.max():.6g}, and the observation "
+                f"library from {nodes[0]:.6g} to {nodes[-1]:.6g}: sample one for this scenario and seed, or "
+                f"over a wider range with --grid parameter.{name}=..."
+            )
+        upper = np.clip(np.searchsorted(nodes, draws, side="left"), 0, len(nodes) - 1)
+        lower = np.maximum(upper - 1, 0)
+        width = nodes[upper] - nodes[lower]
+        share = np.divide(draws - nodes[lower], width, out=np.ones(len(draws)), where=width > 0.0)
+        share = np.clip(share, 0.0, 1.0)[:, None, None, None]
+        low, high = self.values[order[lower]], self.values[order[upper]]
+        # At a sampled value exactly what was sampled.
+        return np.where(share == 1.0, high, (1.0 - share) * low + share * high)
+
+    def holds_draws(self, draws: Float) -> bool:
+        """Return whether every value of the parameter was sampled, so that nothing is interpolated."""
+        return bool(np.isin(draws, self.draws).all())
+
+
+def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
+    """Write a library in one step; equal libraries give equal bytes.
+
+    Raises
+    ------
+    FileNotWrittenError
+        The disk is full or the folder cannot be written.
+    """
+    return atomic_write_bytes(path, bytes(library.dataset.to_netcdf(engine="h5netcdf")))
+
+
+def load_observation_library(path: Path) -> ObservationLibrary:
+    """Read a library.
+
+    Raises
+    ------
+    InvalidObservationLibraryError
+        There is no whole library; the sentence says what is wrong.
+    """
+    if not path.is_file():
+        raise InvalidObservationLibraryError(
+            f"there is no observation library {path}: make it with `uav-twin library sample`."
+        )
+    from reporting.netcdf import read_groups  # which loads xarray
+
+    try:
+        dataset = read_groups(path).to_dataset()
+    except DamagedFileError as error:
+        raise InvalidObservationLibraryError(
+            f"{path} is not a whole NetCDF file: sample the library again."
+        ) from error
+    if dataset.attrs.get("kind") != KIND or dataset.attrs.get("format") != FORMAT:
+        raise InvalidObservationLibraryError(
+            f"{path} is no observation library of this version (format {FORMAT}): sample it again."
+        )
+    try:
+        return ObservationLibrary(dataset)
+    except (KeyError, ValueError, TypeError, InvalidModelError) as error:
+        reason = error.args[0] if error.args else error
+        raise InvalidObservationLibraryError(
+            f"{path} does not have the layout of an observation library ({reason}): sample it again."
+        ) from error
+
+
+def _listed(values: Float) -> str:
+    return ", ".join(f"{value:g}" for value in values)
 
 
 class LibraryBelief(BeliefSection):
@@ -38,7 +266,7 @@ class LibraryBelief(BeliefSection):
 
     kept: ClassVar[Mapping[str, str]] = {"file": OBSERVATIONS_COPY, "design": DESIGN_COPY}
 
-    def source(self, scenario: Scenario, flown: AssetSource) -> "LibrarySource":
+    def source(self, scenario: Scenario, flown: AssetSource) -> LibrarySource:
         """Return the library.
 
         Raises
@@ -53,11 +281,11 @@ class LibraryBelief(BeliefSection):
             )
         model: AssetSource = flown
         if self.design is not None:
-            model = DesignSource(scenario, DesignBelief(design=self.design))
+            model = DesignSource(scenario, section=DesignBelief(design=self.design))
         return LibrarySource(scenario, self, model, scenario.asset.binding_path)
 
 
-class LibrarySource(Source):
+class LibrarySource(AssetSource):
     """Predicted observations from an observation library.
 
     Parameters
@@ -75,9 +303,7 @@ class LibrarySource(Source):
     def __init__(self, scenario: Scenario, section: LibraryBelief, model: AssetSource, binding: Path) -> None:
         super().__init__(scenario, section)
         self._model, self._binding = model, binding
-        self._library: ObservationLibrary | None = None
         self._other_fmu: bool | None = False
-        self.open = model.open  # a library is flown by nobody
 
     @property
     def words(self) -> str:
@@ -90,15 +316,42 @@ class LibrarySource(Source):
         """The library, twice."""
         return FlownAndBelieved(self.words, self.words, differ=self._other_fmu is True)
 
-    def check(self) -> None:
-        """Check that the library has what the scenario asks for.
+    @cached_property
+    def library(self) -> ObservationLibrary:
+        """The library, which has what the scenario asks for.
 
         Raises
         ------
         InvalidObservationLibraryError
-            The library is missing or damaged, or lacks something.
+            It is missing or damaged, or lacks something.
         """
-        self._read()
+        library = load_observation_library(self.path(OBSERVATIONS_COPY))
+        scenario, section = self._scenario, self._scenario.observation
+        vector = load_binding(self._binding).observation.get(section.role)
+        units = zip(library.states.names, library.state_units, strict=True)
+        of_states = {f"{factor.name}: {factor.unit}" for factor in scenario.state}
+        for what, has, wanted in (
+            ("observes", (library.role,), (section.role,)),
+            ("has the sensors", library.sensors, () if vector is None else vector.variables),
+            ("has them in", library.sensor_units, section.sensor_units),
+            ("has the states in", sorted(f"{name}: {unit}" for name, unit in units), sorted(of_states)),
+            ("was sampled under the load", _shown(library.load), _shown(scenario.asset.constant_load)),
+        ):
+            if has != wanted:
+                raise InvalidObservationLibraryError(
+                    f"the observation library {self.path(OBSERVATIONS_COPY).name} {what} "
+                    f"{', '.join(has) or 'none'}, and the scenario with its binding asks for "
+                    f"{', '.join(wanted) or 'none'}: sample one for this scenario."
+                )
+        if not library.parameter or library.parameter == scenario.calibration.parameter:
+            self._places(library, build_graphical_model(scenario))
+        else:
+            library.at_draws(scenario.calibration.parameter, np.zeros(2))  # says what is wrong
+        return library
+
+    def check(self) -> None:
+        """Check that the library has what the scenario asks for."""
+        _ = self.library
 
     def files(self) -> dict[str, bytes]:
         """Return the library, and the design if one is named.
@@ -116,18 +369,16 @@ class LibrarySource(Source):
     def _make(self, progress: Progress) -> dict[str, str]:
         """Prepare the design if one is named; what is flown is prepared before."""
         assert self._folder is not None
-        own = isinstance(self._model, DesignSource)
+        fmu, own = self._folder / FMU_COPY, isinstance(self._model, DesignSource)
         hashes = self._model.prepare(self._folder, progress) if own else {}
-        fmu = self._folder / FMU_COPY
-        library = self._read()
-        self._other_fmu = library.fmu_hash != hash_file(fmu) if fmu.exists() else None  # several have several
+        # Of several FMUs each has its own hash.
+        self._other_fmu = self.library.fmu_hash != hash_file(fmu) if fmu.exists() else None
         return {**hashes, "observation_library": hash_file(self.path(OBSERVATIONS_COPY))}
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the parameter, from the calibration of the scenario."""
         draws = self._model.draws(seed)
-        library = self._library or self._read()
-        if not library.parameter or library.holds_draws(draws.values):
+        if not self.library.parameter or self.library.holds_draws(draws.values):
             return draws
         return replace(
             draws, source=f"{draws.source}; the observation library is interpolated between its own"
@@ -141,54 +392,23 @@ class LibrarySource(Source):
         InvalidObservationLibraryError
             The library lacks a state, control or range of the parameter.
         """
-        library = self._library or self._read()
-        rows, controls = self._places(library, model)
-        return library.at_draws(draws.name, draws.values)[:, rows][:, :, controls]
+        rows, controls = self._places(self.library, model)
+        return self.library.at_draws(draws.name, draws.values)[:, rows][:, :, controls]
+
+    def open(self) -> Asset:
+        """Return the asset of the model: a library is flown by nobody."""
+        return self._model.open()
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write the field of the model."""
         return self._model.write_field(path, state, control)
 
-    def _places(self, library: "ObservationLibrary", model: GraphicalModel) -> tuple[list[int], list[int]]:
+    def _places(self, library: ObservationLibrary, model: GraphicalModel) -> tuple[list[int], list[int]]:
+        """Return where the states and controls of the scenario stand in the library."""
         rows = library.rows_of(self._scenario.state_names, model.states.coordinates)
         controls = [library.control_of(control.name, control.values) for control in self._scenario.control]
         return rows, controls
 
-    def _read(self) -> "ObservationLibrary":
-        from fmu_asset.door.binding import load_binding
-        from twin_master.assets.observation_library import load_observation_library
-        from twin_master.network.twin import build_graphical_model
 
-        library = load_observation_library(self.path(OBSERVATIONS_COPY))
-        scenario = self._scenario
-        section = scenario.observation
-        vector = load_binding(self._binding).observation.get(section.role)
-        flown = () if vector is None else vector.variables
-        units = zip(library.states.names, library.state_units, strict=True)
-        for what, has, wanted in (
-            ("observes", (library.role,), (section.role,)),
-            ("has the sensors", library.sensors, flown),
-            ("has them in", library.sensor_units, section.sensor_units),
-            (
-                "has the states in",
-                tuple(sorted(f"{name}: {unit}" for name, unit in units)),
-                tuple(sorted(f"{factor.name}: {factor.unit}" for factor in scenario.state)),
-            ),
-            ("was sampled under the load", _shown(library.load), _shown(scenario.asset.constant_load)),
-        ):
-            if has != wanted:
-                raise InvalidObservationLibraryError(
-                    f"the observation library {self.path(OBSERVATIONS_COPY).name} {what} "
-                    f"{', '.join(has) or 'none'}, and the scenario with its binding asks for "
-                    f"{', '.join(wanted) or 'none'}: sample one for this scenario."
-                )
-        if not library.parameter or library.parameter == scenario.calibration.parameter:
-            self._places(library, build_graphical_model(scenario))
-        else:
-            library.at_draws(scenario.calibration.parameter, np.zeros(2))  # says what is wrong
-        self._library = library
-        return library
-
-
-def _shown(values: Mapping[str, float]) -> tuple[str, ...]:
-    return tuple(f"{name} = {value:g}" for name, value in sorted(values.items()))
+def _shown(values: Mapping[str, float]) -> list[str]:
+    return [f"{name} = {value:g}" for name, value in sorted(values.items())]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmu_asset.errors import FmuCallError
-from twin_master.assets.interface import Asset, asked_table
+from twin_master.assets.asset_source import Asset, asked_table
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario

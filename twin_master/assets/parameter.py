@@ -78,7 +78,7 @@ def draw_parameter(
     """
     name, count = calibration.parameter, calibration.draws
     if calibration.source == "file":
-        found = _read(calibration)
+        found = read_calibration(calibration)
         assert found is not None  # the schema asks for it
         values = found.stratified_draws(name, count, seed_sequence(seed, "calibration"))
         from calibration.result.plain import run_record
@@ -154,19 +154,14 @@ def _draws_of_load_test(calibration: Calibration, seed: int, model: "ReducedMode
     )
 
 
-def read_calibration(calibration: Calibration) -> None:
-    """Read the calibration file, if there is one.
+def read_calibration(calibration: Calibration) -> "Calibrated | None":
+    """Return the calibration that a scenario names; None if it names none.
 
     Raises
     ------
     CalibrationRecordError
         It is damaged or of another kind, or has no samples of the parameter.
     """
-    _read(calibration)
-
-
-def _read(calibration: Calibration) -> "Calibrated | None":
-    """Return the calibration that a scenario names; None if it names none."""
     if calibration.file is None:
         return None
     from calibration.result.file import load_calibration
@@ -211,7 +206,7 @@ def check_calibration(
         It has a parameter that is not known, or one whose posterior mean lies outside its range; or it is of
         another design.
     """
-    found = _read(calibration)
+    found = read_calibration(calibration)
     if found is None or found.design is not None:
         return
     names = {prior.name for prior in found.priors}
@@ -244,7 +239,7 @@ def is_of_parameters(file: Path | str) -> bool:
 
 def calibrated_means(calibration: Calibration) -> dict[str, float]:
     """Return the posterior means of the parameters of a model that were calibrated from a campaign, SI."""
-    found = _read(calibration)
+    found = read_calibration(calibration)
     if found is None or found.design is not None:
         return {}
     return {prior.name: found.mean(prior.name) for prior in found.priors}

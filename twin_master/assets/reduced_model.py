@@ -1,28 +1,32 @@
-"""A reduced model, of a wing or a structure, in a scenario: what it predicts, and itself as an asset."""
+"""A reduced model, of a wing or a structure: what it predicts, itself as an asset, and modes of records."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fe.runtime.modal_system import rayleigh_damping_ratio
+from fmu_asset.door.binding import Binding
 from reporting.progress import Progress
-from twin_master.assets.asset_source import Source
-from twin_master.assets.interface import Asset, AssetReading, StatelessAsset
+from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, InnerTruth, StatelessAsset
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.assets.structure_modes import modal_values
-from twin_master.errors import MissingObservationModelError, MissionInputError
+from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.identified import packed_row
 from twin_master.scenario.asset import FileSection
+from twin_master.scenario.observation import ModesSection
 from twin_master.scenario.schema import Scenario
+from twin_master.seeds import seed_sequence
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
+    from twin_master.assets.fmu_source import Session
 
 Float = NDArray[np.float64]
 
 
-class ReducedModelSource(Source):
+class ReducedModelSource(AssetSource):
     """A reduced model, believed or flown without an FMU.
 
     Parameters
@@ -42,7 +46,6 @@ class ReducedModelSource(Source):
     ) -> None:
         super().__init__(scenario, section)
         self.model = model
-        self._means: dict[str, float] = {}
 
     @property
     def wing(self) -> "ReducedModel":
@@ -53,12 +56,6 @@ class ReducedModelSource(Source):
 
     def _make(self, progress: Progress) -> dict[str, str]:
         return {"design": self.wing.design_hash}
-
-    def draws(self, seed: int) -> ParameterDraws:
-        """Return draws of the parameter."""
-        found = super().draws(seed)
-        self._means[found.name] = found.mean
-        return found
 
     @property
     def _true_values(self) -> dict[str, float]:
@@ -124,23 +121,131 @@ class ReducedModelSource(Source):
         return StatelessAsset(observe)
 
 
-def check_wing_scenario(scenario: Scenario, regions: tuple[str, ...], gauge_count: int) -> None:
-    """Check that a scenario speaks of what a wing model has.
+def modal_values(
+    model: "ReducedModel", vector: Float, section: ModesSection, damping: tuple[float, float] | None = None
+) -> Float:
+    """Return frequency [Hz], damping ratio and relative shape (M, 1 + A) of the observed modes of a model.
+
+    Parameters
+    ----------
+    model : ReducedModel
+    vector : (V,)
+        Values of all that can be chosen.
+    section : ModesSection
+        Which modes, at which accelerometers.
+    damping : (float, float), optional
+        Rayleigh's alpha [1/s] and beta [s]; those of the model by default.
 
     Raises
     ------
-    MissingObservationModelError
-        It does not.
+    OutsideModelError
+        A value lies outside the ranges of the model.
     """
-    for what, came, wanted in (
-        ("states", scenario.state_names, regions),
-        ("control inputs", scenario.control[0].values, ("load_factor",)),
-        ("calibrated parameter", (scenario.calibration.parameter,), ("young_modulus_factor",)),
-        ("sensor count", (str(scenario.observation.count),), (str(gauge_count),)),
-    ):
-        if {*came} != {*wanted}:
-            raise MissingObservationModelError(
-                f"the design's model predicts observations for the {what} {', '.join(sorted(wanted))}, and "
-                f"the scenario has {', '.join(sorted(came))}: set `belief.kind` to `asset` to ask what is "
-                "flown itself."
-            )
+    modes = model.modes(vector)
+    alpha, beta = model.damping.tolist() if damping is None else damping
+    frequency = modes.frequency[section.places]
+    rows = [model.static_count + model.accelerations.index(name) for name in section.accelerometers]
+    shape = modes.output[rows][:, section.places]
+    return np.column_stack(
+        [frequency, rayleigh_damping_ratio(alpha, beta, frequency), *(shape[1:] / shape[0])]
+    )
+
+
+class RecordedStructure(Asset):
+    """The FMU of a structure in motion: each step makes a record of accelerations and identifies its modes.
+
+    Each record begins anew at rest; what the sensors say are the features that were identified, with their
+    covariance, and the noise-free observation are those of the model that was packed.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With `observation.modes` and `truth.record`.
+    model : ReducedModel
+        The model that was packed.
+    session : callable
+        Opens the FMU with a binding and parameters.
+    binding : Binding
+        Of the FMU.
+    parameters : mapping of str to float
+        Of the true structure.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        model: "ReducedModel",
+        session: "Callable[[Binding, Mapping[str, float]], Session]",
+        binding: Binding,
+        parameters: Mapping[str, float],
+    ) -> None:
+        assert scenario.observation.modes is not None
+        assert scenario.truth.record is not None
+        self._scenario, self._model = scenario, model
+        self._section, self._record = scenario.observation.modes, scenario.truth.record
+        bound = binding.with_header(step_size=1.0 / self._record.sampling_rate)
+        self._parameters = {**parameters, "response": 2.0}
+        self._session = session(bound, self._parameters)
+        begin, names = bound.observation_slice("acceleration").start, self._section.accelerometers
+        variables = bound.observation["acceleration"].variables
+        self._chosen = [begin + variables.index(f"acceleration.{name}") for name in names]
+        self._units = {name: item.unit for name, item in (*bound.parameter.items(), *bound.control.items())}
+        self._turn = 0
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Units of parameters and control inputs."""
+        return self._units
+
+    def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        """Make and identify the record of a turn.
+
+        Raises
+        ------
+        FmuError
+            The FMU refuses an input, or fails.
+        ExperimentDataError
+            The record is too short for the bands.
+        """
+        from calibration.dynamics.modal_identification import identify_modes
+
+        section, record, model = self._section, self._record, self._model
+        root = seed_sequence(self._scenario.mission.seed, "asset")
+        random = np.random.default_rng([*root.generate_state(4).tolist(), self._turn])
+        count = round(record.duration * record.sampling_rate)
+        held: dict[str, float] = dict(control)
+        course: dict[str, Float | float] = dict(control)
+        if record.kind == "ambient":
+            course[record.input] = held[record.input] + record.amplitude * random.standard_normal(count)
+        else:
+            held[record.input] += record.amplitude
+        self._session.reset(self._parameters, control=held, health=health)
+        history = self._session.simulate(control=course, health=health, steps=count)
+        acceleration = history.values[:, self._chosen]
+        acceleration = acceleration + record.noise * random.standard_normal(acceleration.shape)
+        found = identify_modes(acceleration, record.sampling_rate, section.bands, record.kind)
+        self._turn += 1
+        given = {**self._parameters, **control, **health}
+        vector = model.vector({name: value for name, value in given.items() if name in model.chosen})
+        alpha, beta = model.damping.tolist()
+        damping = given.get("damping_alpha", alpha), given.get("damping_beta", beta)
+        errors = section.observed(found.standard_error).tolist()
+        titles = self._scenario.observation.titles
+        sensed = packed_row(section.observed(found.value), section.covariance(found.covariance))
+        return AssetReading(
+            section.observed(modal_values(model, vector, section, damping)),
+            {f"standard_error_{title}": error for title, error in zip(titles, errors, strict=True)},
+            InnerTruth({}, sensed),
+        )
+
+    def save_state(self) -> bytes:
+        """Return the number of records made: each begins anew."""
+        return str(self._turn).encode()
+
+    def restore_state(self, state: bytes) -> None:
+        """Go on behind as many records."""
+        self._turn = int(state)
+
+    def close(self) -> None:
+        """End the worker."""
+        self._session.close()

@@ -1,29 +1,187 @@
-"""The strain library of the authors of Kapteyn et al. 2021 as what is flown and what the twin believes."""
+"""The strain library of the authors of Kapteyn et al. 2021 as what is flown and what the twin believes.
+
+`UAVconfig.json`, read from their repository as it is, holds the strains of their finite element model for a
+grid of damage states, two controls and thirty draws of Young's modulus. It serves as an observation model,
+and as an asset whose state may lie between the levels of the grid.
+"""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from reporting.json_file import read_json
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import AssetBelief, AssetSource, Source
-from twin_master.assets.interface import Asset, AssetReading, StatelessAsset
+from twin_master.assets.asset_source import Asset, AssetBelief, AssetReading, AssetSource, StatelessAsset
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.assets.strain_library import FILE_NAME, StrainLibrary, load_strain_library
-from twin_master.errors import MissingObservationModelError, MissionInputError, check_names
-from twin_master.network.graphical_model import GraphicalModel
+from twin_master.errors import (
+    InvalidStrainLibraryError,
+    MissingObservationModelError,
+    MissionInputError,
+    check_names,
+)
+from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
 from twin_master.scenario.asset import AssetSection, BeliefSection
 from twin_master.scenario.schema import Scenario
 
 Float = NDArray[np.float64]
 
+FILE_NAME = "UAVconfig.json"
+"""Name of the file in the authors' repository UAV-Digital-Twin."""
 REPOSITORY = "https://github.com/michaelkapteyn/UAV-Digital-Twin"
 """Where the authors of Kapteyn et al. 2021 published their strain library."""
 LIBRARY_COPY = f"asset/{FILE_NAME}"
 _TOLERANCE = 1e-9
+
+REGION_NAMES = ("z1", "z2")
+PERCENT, MICROSTRAIN = 1e-2, 1e-6
+
+
+@dataclass(frozen=True)
+class StrainLibrary:
+    """Strains for every damage state, control and draw of Young's modulus.
+
+    Attributes
+    ----------
+    states : StateSpace
+        Stiffness loss of the regions z1 and z2, fractions.
+    controls : tuple of str
+        For example "2g", "3g".
+    young_modulus_factor : (E,) dimensionless
+        The draws e.
+    strain_per_draw : (E, S, U, G) dimensionless
+        Strain of each draw, joint state, control and gauge.
+    strain : (S, U, G) dimensionless
+        The entry "mean": the solution at e = 1.0073, not the average of the draws.
+    discount : float
+        gamma of the authors' planning problem.
+    worsening_probability : dict of str to float
+        Probability of each control to worsen a region by one level in a step.
+    """
+
+    states: StateSpace
+    controls: tuple[str, ...]
+    young_modulus_factor: Float
+    strain_per_draw: Float
+    strain: Float
+    discount: float
+    worsening_probability: Mapping[str, float]
+
+    @property
+    def gauge_count(self) -> int:
+        """Number G of gauges."""
+        return int(self.strain.shape[-1])
+
+    def strain_at(self, stiffness_loss: ArrayLike, control_index: int) -> Float:
+        """Return the strain of a damage state between the levels, as an asset would have it.
+
+        Multilinear in the stiffness losses, from the entry "mean".
+
+        Parameters
+        ----------
+        stiffness_loss : (regions,)
+            Fractions, inside the range of the levels.
+        control_index : int
+            Of `controls`.
+
+        Returns
+        -------
+        (G,) dimensionless
+
+        Raises
+        ------
+        InvalidStrainLibraryError
+            If the state lies outside the levels, or there is no such control.
+        """
+        loss = np.asarray(stiffness_loss, dtype=np.float64)
+        if loss.shape != (len(self.states.factors),) or not 0 <= control_index < len(self.controls):
+            raise InvalidStrainLibraryError(
+                f"expected one stiffness loss for each of {', '.join(self.states.names)} and a control index "
+                f"below {len(self.controls)}, got shape {loss.shape} and control {control_index}"
+            )
+        values = self.strain.reshape(*self.states.shape, *self.strain.shape[1:])[..., control_index, :]
+        for factor, value in zip(self.states.factors, loss, strict=True):
+            levels = np.asarray(factor.levels)
+            if not levels[0] <= value <= levels[-1]:
+                raise InvalidStrainLibraryError(
+                    f"the strain library covers {factor.name} from {levels[0]:g} to {levels[-1]:g}, "
+                    f"got {value:g}"
+                )
+            upper = min(int(np.searchsorted(levels, value, side="right")), len(levels) - 1)
+            lower = max(upper - 1, 0)
+            width = levels[upper] - levels[lower]
+            share = (value - levels[lower]) / width if width > 0.0 else 0.0
+            values = (1.0 - share) * values[lower] + share * values[upper]
+        result: Float = np.array(values, dtype=np.float64)
+        return result
+
+
+def load_strain_library(path: str | Path) -> StrainLibrary:
+    """Read the authors' library.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file `UAVconfig.json`, or the folder (such as a clone of their repository) that holds it.
+
+    Raises
+    ------
+    InvalidStrainLibraryError
+        If the file cannot be read, is no JSON, lacks an entry (it is named), or has values that are not in
+        the published format.
+    """
+    path = Path(path)
+    file = path / FILE_NAME if path.is_dir() else path
+    content = read_json(file, InvalidStrainLibraryError, what="strain library")
+    try:
+        return _arranged(content)
+    except KeyError as error:
+        raise InvalidStrainLibraryError(
+            f"the strain library {file} lacks the entry {error}; is it the file {FILE_NAME} as published?"
+        ) from error
+    except (TypeError, ValueError, AttributeError, IndexError) as error:
+        raise InvalidStrainLibraryError(
+            f"the strain library {file} is not in the published format: {error}"
+        ) from error
+
+
+def _arranged(content: Mapping[str, Any]) -> StrainLibrary:
+    levels = content["states"]
+    if len(levels) != len(REGION_NAMES):
+        raise ValueError(
+            f"expected the levels of {len(REGION_NAMES)} regions under 'states', got {len(levels)}"
+        )
+    controls = tuple(str(control) for control in content["controls"])
+    observations, probabilities = content["observations"], content["transition_probabilities"]
+    first = observations[str(levels[0][0])][str(levels[1][0])][controls[0]]
+    draws = [key for key in first if key != "mean"]
+    gauges = len(first["mean"])
+    rows = []
+    for draw, z1, z2, control in product(("mean", *draws), *levels, controls):
+        row = observations[str(z1)][str(z2)][control][draw]
+        if np.shape(row) != (gauges,) or not np.all(np.isfinite(np.asarray(row, dtype=np.float64))):
+            raise ValueError(f"observations[{z1}][{z2}][{control}][{draw}] must hold {gauges} finite strains")
+        rows.append(row)
+    table = np.array(rows, dtype=np.float64).reshape(len(draws) + 1, -1, len(controls), gauges) * MICROSTRAIN
+    table.setflags(write=False)
+    factors = (
+        Factor(name, tuple(float(level) * PERCENT for level in given))
+        for name, given in zip(REGION_NAMES, levels, strict=True)
+    )
+    return StrainLibrary(
+        states=StateSpace(tuple(factors)),
+        controls=controls,
+        young_modulus_factor=np.array([float(draw) for draw in draws]),
+        strain_per_draw=table[1:],
+        strain=table[0],
+        discount=float(content["gamma"]),
+        worsening_probability={control: float(probabilities[control]) for control in controls},
+    )
 
 
 class StrainLibrarySection(AssetSection):
@@ -55,9 +213,7 @@ class StrainLibrarySection(AssetSection):
                 f"({REPOSITORY}) and name its file {FILE_NAME} by `--strain-library FILE`, or as "
                 f"`asset.file` in a copy of the scenario."
             )
-        if self.differs_from(scenario.belief):
-            check_load_factors(scenario)
-        return _read(scenario, Path(self.file))
+        return _read(scenario, Path(self.file), compared=self.differs_from(scenario.belief))
 
 
 class StrainLibraryBelief(BeliefSection):
@@ -87,15 +243,10 @@ class StrainLibraryBelief(BeliefSection):
             raise MissionInputError(
                 "a strain library flies, and the twin is to believe one: set `belief.kind` to `asset`."
             )
-        check_load_factors(scenario)
-        return _read(scenario, Path(self.file))
+        return _read(scenario, Path(self.file), compared=True)
 
 
-def _read(scenario: Scenario, path: Path) -> "StrainLibrarySource":
-    return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)
-
-
-class StrainLibrarySource(Source):
+class StrainLibrarySource(AssetSource):
     """A strain library in the format of the authors of Kapteyn et al. 2021, as model and as asset."""
 
     label = "strain library"
@@ -106,18 +257,15 @@ class StrainLibrarySource(Source):
         super().__init__(scenario)
         self.places = {} if path is None else {LIBRARY_COPY: path}
         self._library, self._hash = library, content_hash
-        self._control_index = self._find_controls()
+        rows = [("control", scenario.control_names, library.controls)]
+        check_names("the scenario has the", "the strain library", rows, MissingObservationModelError)
+        self._control_index = [library.controls.index(name) for name in scenario.control_names]
         if scenario.observation.count != library.gauge_count or scenario.state_names != library.states.names:
             raise MissingObservationModelError(
                 f"the strain library has {library.gauge_count} gauges and the states "
                 f"{', '.join(library.states.names)}, and the scenario asks for {scenario.observation.count} "
                 f"and {', '.join(scenario.state_names)}."
             )
-
-    def _find_controls(self) -> list[int]:
-        rows = [("control", self._scenario.control_names, self._library.controls)]
-        check_names("the scenario has the", "the strain library", rows, MissingObservationModelError)
-        return [self._library.controls.index(name) for name in self._scenario.control_names]
 
     def _make(self, progress: Progress) -> dict[str, str]:
         return {"strain_library": self._hash}
@@ -155,15 +303,15 @@ class StrainLibrarySource(Source):
         return StatelessAsset(observe)
 
 
-def check_load_factors(scenario: Scenario) -> None:
-    """Check that a control named as in the library, such as `3g`, is a turn at that load factor.
+def _read(scenario: Scenario, path: Path, *, compared: bool) -> StrainLibrarySource:
+    """Return the library of a file; `compared` with a model, a control such as `3g` must be that load factor.
 
     Raises
     ------
     MissingObservationModelError
         It is another one: asset and model would fly different turns.
     """
-    for control in scenario.control:
+    for control in scenario.control if compared else ():
         named, given = control.name.removesuffix("g"), control.values.get("load_factor")
         try:
             expected = float(named)
@@ -174,3 +322,4 @@ def check_load_factors(scenario: Scenario) -> None:
                 f"the strain library flies the control {control.name} at load factor {expected:g}, and the "
                 f"scenario gives the model of the design {given:g}: set `load_factor` to {expected:g}."
             )
+    return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)

@@ -154,7 +154,7 @@ def _watched_table(watched: "FleetWatch") -> "Table":
     from rich import box
     from rich.table import Table
 
-    from twin_master.report.view import printed_state
+    from twin_master.scenario.section import printed_state
 
     assets = list(watched.assets.values())
     told = [asset for asset in worst_first(assets) if asset.decision is not None][:ROWS]

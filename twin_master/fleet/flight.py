@@ -18,7 +18,7 @@ from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance
 from twin_master.assets.asset_source import AssetSource
-from twin_master.assets.resolution import asset_source, believed_source, located_scenario, portable_scenario
+from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine, Piece, flown
 from twin_master.fleet.plan import Fleet, Group, load_fleet
@@ -27,8 +27,6 @@ from twin_master.fleet.store import FAILED, FleetStore, check_installed, sizes_o
 from twin_master.mission.opening import released
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
-from twin_master.mission.truth import Truth
-from twin_master.network.twin import build_graphical_model
 from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
@@ -280,8 +278,7 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
     e = np.array([member.parameters.get(name, own) for member in group.members])
     states = np.zeros((1, len(scenario.state)))
     if scenario.truth.kind == "scripted":
-        truth = Truth(scenario, build_graphical_model(scenario), group.members[0].seed)
-        states = np.array([truth.state(step, None, None) for step in range(scenario.mission.steps)])
+        states = scenario.scripted_history()
     found = [(name, e, ranges[name], "assets")]
     found += [
         (region, states[:, place], ranges[region], f"{scenario.mission.step_name}s")
@@ -298,7 +295,7 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
 
 def prepared(scenario: Scenario, folder: Path, progress: Progress, *, real: bool = False) -> bytes:
     """Return the packed `Kit` of a scenario, what belongs to it made in a folder."""
-    located = located_scenario(portable_scenario(scenario), folder)
+    located = scenario.portable().moved(folder)
     for name, content in source_of(scenario, real=real).files().items():
         if not (folder / name).exists():
             atomic_write_bytes(folder / name, content)
@@ -312,7 +309,7 @@ def prepared(scenario: Scenario, folder: Path, progress: Progress, *, real: bool
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
-    return Kit(portable_scenario(scenario).to_dict(), files, wing).packed()
+    return Kit(scenario.portable().to_dict(), files, wing).packed()
 
 
 def group_folder(folder: Path, group: Group, place: int) -> Path:

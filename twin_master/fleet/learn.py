@@ -11,7 +11,6 @@ from reporting.arrays import Float, Index
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_record
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.assets.resolution import located_scenario
 from twin_master.errors import FleetError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import GROUPS, fleet_config, source_of
@@ -217,7 +216,7 @@ def _seen(folder: Path, record: dict[str, Any], group: "xr.Dataset") -> Iterator
         if record["files"]:
             own, mine = own / str(place), np.flatnonzero(flown == place)
         if len(mine):
-            scenario = located_scenario(Scenario.model_validate(table), own)
+            scenario = Scenario.model_validate(table).moved(own)
             known = kept_knowledge(own, scenario)
             followed = np.unique(given[mine][:, :-1][given[mine][:, 1:] >= 0])
             controls = frozenset(scenario.control_names[index] for index in followed)

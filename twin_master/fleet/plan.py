@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from reporting.provenance import hash_file
 from reporting.section import checked
 from reporting.toml_file import read_toml
-from twin_master.assets.resolution import Overrides, portable_scenario, resolve_scenario
+from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.opening import file_record
@@ -159,7 +159,7 @@ class Group:
         """Return the group for `config.json`."""
         found = {
             "name": self.name,
-            "scenarios": [portable_scenario(scenario).to_dict() for scenario in self.scenarios],
+            "scenarios": [scenario.portable().to_dict() for scenario in self.scenarios],
             "parameters": {name: spread.model_dump() for name, spread in self.spreads.items()},
             "members": [[member.name, member.seed] for member in self.members],
             "files": list(self.files),

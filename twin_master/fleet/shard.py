@@ -22,10 +22,8 @@ from numpy.typing import NDArray
 from reporting.files import atomic_write_bytes
 from reporting.progress import SilentProgress
 from reporting.provenance import collect_provenance, hash_record
-from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.asset_source import Asset, AssetSource, StatelessAsset
 from twin_master.assets.fmu_source import FmuSource
-from twin_master.assets.interface import Asset, StatelessAsset
-from twin_master.assets.resolution import located_scenario
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import outcomes_of
@@ -169,7 +167,7 @@ class _Unpacked:
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         for name, content in kit.files.items():
             atomic_write_bytes(folder / name, content)
-        self.scenario = located_scenario(Scenario.model_validate(kit.scenario), folder)
+        self.scenario = Scenario.model_validate(kit.scenario).moved(folder)
         self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
         self._wing = kit.wing
         self._model: Asset | None = None

@@ -2,9 +2,9 @@
 
 import json
 import os
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,41 +42,10 @@ def has_flown(status: NDArray[Any]) -> NDArray[np.int64]:
     return np.flatnonzero((status == FLOWN) | (status == ENDED))
 
 
-@dataclass(frozen=True)
-class Variable:
-    """A variable of the store: its dimensions after `twin`, its type, and what it is."""
-
-    dimensions: tuple[str, ...]
-    type: str
-    title: str
-    unit: str = "1"
-
-
-VARIABLES: Mapping[str, Variable] = {
-    "status": Variable(
-        (),
-        "i1",
-        "0: has not flown, 1: has flown to its end, 2: failed in flight, 3: its asset ended early",
-    ),
-    "seed": Variable((), "i8", "seed of the mission"),
-    "observed": Variable(("turn", "sensor"), "f4", "what the sensors said; NaN where lost", "SI"),
-    "control_index": Variable(("turn",), "i1", "control in force; -1 after a failure or an end"),
-    "state": Variable(("turn", "factor"), "f4", "true state", "SI"),
-    "mean": Variable(("turn", "factor"), "f4", "mean of the filtered belief", "SI"),
-    "standard_deviation": Variable(("turn", "factor"), "f4", "standard deviation of the same", "SI"),
-    "log_evidence": Variable(("turn",), "f4", "log p(o_t | o_0..o_t-1)"),
-    "belief": Variable(("level",), "f4", "filtered belief after the last turn, over all joint states"),
-    "delay": Variable(
-        (),
-        "f4",
-        "turns from the damage that calls for a fallback to it; infinite: none came, NaN: not called",
-    ),
-    "early": Variable((), "i1", "whether another control than the first was flown before that damage"),
-    "credible": Variable((), "f4", "share of turns with the true state in the 90 % set of the belief"),
-    "notices": Variable(("notice_kind",), "i4", f"notices of the kinds {', '.join(NOTICE_KINDS)}"),
-    "first_notice": Variable(("notice_kind",), "i4", "turn of the first of each kind; -1: none"),
-}
-"""What is stored of each twin, by its name; true parameters that differ from twin to twin stand beside it."""
+SCHEMA: dict[str, tuple[str, str, str, str]] = tomllib.loads(
+    Path(__file__).with_name("store.toml").read_text(encoding="utf-8")
+)
+"""Axes behind `twin`, type, unit and meaning of every variable."""
 
 
 def sizes_of(scenario: Scenario) -> dict[str, int]:
@@ -127,7 +96,7 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
             failed | unknown, np.nan, inside.reshape(-1, steps).sum(axis=1) / np.maximum(turns, 1)
         ),
     }
-    found = {name: np.ascontiguousarray(values, VARIABLES[name].type) for name, values in found.items()}
+    found = {name: np.ascontiguousarray(values, SCHEMA[name][1]) for name, values in found.items()}
     for name in members[0].parameters:
         found[name] = np.array([member.parameters[name] for member in members])
     return found
@@ -280,19 +249,17 @@ def _create(path: Path, fleet: Fleet) -> None:
 def _create_group(made: "zarr.Group", group: Group, fleet: Fleet) -> None:
     scenario, count = group.scenarios[0], len(group.members)
     sizes = sizes_of(scenario)
-    variables = {**VARIABLES, **{name: Variable((), "f8", "true parameter", "SI") for name in group.spreads}}
-    for name, variable in variables.items():
-        shape = (count, *(sizes[dimension] for dimension in variable.dimensions))
+    variables = SCHEMA | dict.fromkeys(group.spreads, ("", "f8", "SI", "true parameter"))
+    for name, (axes, kind, unit, title) in variables.items():
+        shape = (count, *(sizes[axis] for axis in axes.split()))
         made.create_array(
             name,
             shape=shape,
             chunks=(min(fleet.shard, count), *shape[1:]),
-            dtype=variable.type,
-            fill_value=np.nan
-            if variable.type.startswith("f")
-            else -int(name in ("control_index", "first_notice")),
-            dimension_names=("twin", *variable.dimensions),
-            attributes={"title": variable.title, "units": variable.unit},
+            dtype=kind,
+            fill_value=np.nan if kind[0] == "f" else -int(name in ("control_index", "first_notice")),
+            dimension_names=("twin", *axes.split()),
+            attributes={"title": title, "units": unit},
             overwrite=True,
         )
     made.attrs.update(

@@ -13,7 +13,6 @@ from typing import Any
 from reporting.errors import DiskFullError
 from reporting.files import atomic_write_text
 from reporting.progress import SilentProgress
-from twin_master.assets.resolution import portable_scenario
 from twin_master.errors import FleetError
 from twin_master.fleet.flight import hold_folder, see_folder
 from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
@@ -254,8 +253,7 @@ class FleetWatch:
 def _held(fleet: Fleet, folder: Path) -> int:
     """Make the folder of a fleet, or see that it holds the same; return what holds it for this process."""
     groups = [
-        {"name": group.name, "scenarios": [portable_scenario(group.scenarios[0]).to_dict()]}
-        for group in fleet.groups
+        {"name": group.name, "scenarios": [group.scenarios[0].portable().to_dict()]} for group in fleet.groups
     ]
     heading = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "groups": groups}
     config = {"kind": KIND, "format": 1, "fleet": heading}

@@ -197,7 +197,7 @@ def grid_of_scenario(
         load=dict(scenario.asset.constant_load),
         parameters=fixed,
         settling_steps=settling_steps,
-        step_timeout=flown.step_timeout or binding.limits.step_time or STEP_TIMEOUT,
+        step_timeout=flown.section.step_timeout or binding.limits.step_time or STEP_TIMEOUT,
     )
 
 

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -24,10 +23,11 @@ from fmu_asset.door.placement import say_sandbox
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuError
 from reporting.files import TEMPORARY_SUFFIX, atomic_write_text, remove_leftovers, write_error
+from reporting.folders import lock_folder
 from reporting.json_file import parse_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_file
-from twin_master.assets.observation_library import (
+from twin_master.assets.library_source import (
     FORMAT,
     KIND,
     RESERVED,
@@ -125,7 +125,12 @@ def sample_library(
     _check_grid(grid, binding)
     record = _record(grid)
     folder = _prepare_folder(out, record, resume=resume, replace_existing=replace_existing)
-    with _locked(folder):
+    lock = lock_folder(folder)
+    if lock is None:
+        raise InvalidObservationLibraryError(
+            f"another process is sampling into {folder}: wait for it to end."
+        )
+    try:
         remove_leftovers(folder)
         found = _read_blocks(grid, folder)
         todo = [number for number in range(len(grid.blocks)) if number not in found]
@@ -143,6 +148,8 @@ def sample_library(
         library = ObservationLibrary(sampled_dataset(grid, binding, record, rows))
         write_observation_library(out, library)
         shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        os.close(lock)
     return SamplingOutcome(out, library, len(grid.blocks) - len(todo), len(grid.blocks), count, seconds)
 
 
@@ -293,24 +300,6 @@ def _read_blocks(grid: SamplingGrid, folder: Path) -> dict[int, Float]:
     return found
 
 
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Take the folder for this process."""
-    import fcntl
-
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise InvalidObservationLibraryError(
-                f"another process is sampling into {folder}: wait for it to end."
-            ) from None
-        yield
-    finally:
-        os.close(descriptor)
-
-
 def sampled_dataset(
     grid: SamplingGrid, binding: Binding, record: Mapping[str, Any], rows: Float
 ) -> xr.Dataset:
@@ -338,17 +327,20 @@ def sampled_dataset(
         coordinates[f"control_{name}"] = xr.Variable("control", values, about)
     dimensions = ("draw", *grid.states, "control", "sensor")
     shown = {"long_name": f"{grid.role} without noise", "units": "see sensor_unit"}
-    records = {"load": dict(grid.load), "parameters": dict(grid.parameters), "control_units": units}
     attributes: dict[str, Any] = {
         "kind": KIND,
         "format": FORMAT,
         "role": grid.role,
         "parameter": grid.parameter,
+        "states": json.dumps(list(grid.states)),
+        "settling_steps": grid.settling_steps,
+        "fmu_sha256": record["fmu"],
+        "binding_sha256": record["binding"],
+        "uav_twin_version": record["version"],
+        "load": json.dumps(dict(grid.load), sort_keys=True),
+        "parameters": json.dumps(dict(grid.parameters), sort_keys=True),
+        "control_units": json.dumps(units, sort_keys=True),
     }
-    attributes |= {"states": json.dumps(list(grid.states)), "settling_steps": grid.settling_steps}
-    attributes |= {"fmu_sha256": record["fmu"], "binding_sha256": record["binding"]}
-    attributes |= {"uav_twin_version": record["version"]}
-    attributes |= {name: json.dumps(value, sort_keys=True) for name, value in records.items()}
     return xr.Dataset(
         {"observation": (dimensions, rows.reshape(*grid.shape, -1), shown)}, coordinates, attributes
     )

@@ -10,7 +10,6 @@ from reporting.folders import restore_folder
 from reporting.progress import Progress
 from reporting.provenance import collect_provenance
 from twin_master.assets.asset_source import AssetSource
-from twin_master.assets.resolution import located_scenario, portable_scenario
 from twin_master.errors import NotResumableError
 from twin_master.run_folder import CONFIG_NAME, KIND, create_run_folder, lock_run_folder, read_config
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
@@ -66,13 +65,13 @@ def begin_folder(
         "kind": KIND,
         "format": 1,
         **({"watched": True} if watched else {}),
-        "scenario": portable_scenario(resolved).to_dict(),
+        "scenario": resolved.portable().to_dict(),
         "scenario_file": dict(file),
         "provenance": collect_provenance(resolved.mission.seed).as_dict(),
     }
     lock = create_run_folder(folder, config, {**source.files(), **files}, replace=replace)
     with released(lock):
-        return config, located_scenario(portable_scenario(resolved), folder), lock
+        return config, resolved.portable().moved(folder), lock
 
 
 def resume_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
@@ -102,7 +101,7 @@ def resume_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
         )
     lock = lock_run_folder(folder)
     with released(lock):
-        return config, located_scenario(scenario, folder), lock
+        return config, scenario.moved(folder), lock
 
 
 @contextmanager

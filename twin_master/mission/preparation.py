@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.progress import Progress, SilentProgress
 from reporting.words import brief
-from twin_master.assets.asset_source import AssetSource, structural_table
-from twin_master.assets.interface import Asset
+from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.errors import RunFolderError
@@ -169,7 +168,7 @@ def prepare_knowledge(
     model = build_graphical_model(scenario)
     draws = source.draws(seed)
     predicted, section = source.observation_table(draws, model), scenario.observation
-    true = structural_table(source, draws, model)
+    true = source.structural_table(draws, model)
     for key, deviation in (
         ("observation.standard_deviation", section.standard_deviation),
         ("truth.noise.standard_deviation", scenario.truth.noise.standard_deviation),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibration.errors import CalibrationError
 from fe.runtime.errors import FiniteElementError
 from fmu_asset.errors import FmuError
-from twin_master.assets.interface import Asset, StatelessAsset
+from twin_master.assets.asset_source import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
 from twin_master.mission.loop import ended_sentence, fly
 from twin_master.mission.preparation import Knowledge

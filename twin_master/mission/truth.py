@@ -1,6 +1,6 @@
 """What really happens: damage, noise and faults, and the flown asset that is driven by them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmu_asset.errors import FmuEndedError
-from twin_master.assets.interface import Asset, AssetReading
+from twin_master.assets.asset_source import Asset, AssetReading
 from twin_master.errors import AssetOutputError, MissionError, TwinMasterError
 from twin_master.mission.turns import Happened, Reading
 from twin_master.network.graphical_model import GraphicalModel
@@ -18,9 +18,6 @@ from twin_master.seeds import generator
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-_DECIMALS = 12
-"""Sums of scripted gains are rounded to this many digits, so that ten times 2 % and 40 % are 60 %."""
 
 
 class SensorStatus(IntEnum):
@@ -73,14 +70,10 @@ class Truth:
         drawn = generator(seed, "inspection").standard_normal((steps, len(self._readings)))
         self.reading_noise: Float = drawn * [deviation for *_, deviation in self._readings]
         self.in_asset = scenario.truth.kind == "asset"
-        self.uniform: Float = np.zeros(steps)
-        if self.in_asset:
-            self._state: StateRule = _untold
-        elif scenario.truth.kind == "scripted":
-            self._state = _scripted(scenario, model)
-        else:
-            self.uniform = generator(seed, "damage").random(steps)
-            self._state = _random_growth(model, self.uniform)
+        self._scripted = scenario.scripted_history() if scenario.truth.kind == "scripted" else None
+        grows = scenario.truth.kind == "random_growth"
+        self.uniform: Float = generator(seed, "damage").random(steps) if grows else np.zeros(steps)
+        self._states, self._growth = model.states, DamageGrowth(model)
 
     def _apply_faults(self, scenario: Scenario) -> None:
         steps = np.arange(scenario.mission.steps)
@@ -111,7 +104,16 @@ class Truth:
         previous_state, previous_control
             State and control index of the step before; None at step 0.
         """
-        return self._state(step, previous_state, previous_control)
+        if self.in_asset:
+            raise MissionError(
+                "the damage of this asset is its own: it is read from the asset, not given to it."
+            )
+        if self._scripted is not None:
+            return np.array(self._scripted[step])
+        before = None if previous_state is None else np.array([self._states.index(tuple(previous_state))])
+        control = None if previous_control is None else np.array([previous_control])
+        place = self._growth.following(control, before, self.uniform[[step]])
+        return np.asarray(self._states.coordinates[place][0])
 
     def sense(self, step: int, observation: Float) -> Float:
         """Return what the sensors say about an observation (G,): noise and drift added, lost ones NaN."""
@@ -132,30 +134,6 @@ def inspected(readings: Sequence[Sequence[Any]], state: Float, control: Index) -
     """
     read = [np.where(control == action, state[:, place], np.nan) for action, place, *_ in readings]
     return np.array(read).reshape(-1, len(control)).T
-
-
-StateRule = Callable[[int, "Float | None", "int | None"], Float]
-
-
-def _untold(_step: int, _previous_state: Float | None, _previous_control: int | None) -> Float:
-    raise MissionError("the damage of this asset is its own: it is read from the asset, not given to it.")
-
-
-def _scripted(scenario: Scenario, model: GraphicalModel) -> StateRule:
-    """Return the rule of a scripted history: the gain of a step is in the state of that step."""
-    names = list(scenario.state_names)
-    gain = np.zeros((scenario.mission.steps, len(names)))
-    gain[0] = model.states.coordinates[int(np.argmax(model.prior))]
-    for entry in scenario.truth.gains:
-        last = entry.last_step if entry.last_step is not None else entry.first_step
-        gain[entry.first_step : last + 1, names.index(entry.state)] += entry.gain
-    history = np.round(np.cumsum(gain, axis=0), _DECIMALS)
-
-    def rule(step: int, _previous_state: Float | None, _previous_control: int | None) -> Float:
-        state: Float = history[step].copy()
-        return state
-
-    return rule
 
 
 class DamageGrowth:
@@ -186,18 +164,6 @@ class DamageGrowth:
         reached, possible = self._rows[key]
         place = np.searchsorted(reached, uniform, side="right").clip(max=len(possible) - 1)
         return np.asarray(possible[place])
-
-
-def _random_growth(model: GraphicalModel, uniform: Float) -> StateRule:
-    """Return the rule of damage that follows the prior and transitions of the model; `uniform` is (T,)."""
-    states, growth = model.states, DamageGrowth(model)
-
-    def rule(step: int, previous_state: Float | None, previous_control: int | None) -> Float:
-        before = None if previous_state is None else np.array([states.index(tuple(previous_state))])
-        control = None if previous_control is None else np.array([previous_control])
-        return np.asarray(states.coordinates[growth.following(control, before, uniform[[step]])][0])
-
-    return rule
 
 
 def checked_values(scenario: Scenario, reading: AssetReading, step: int, control: str) -> Float:

@@ -13,6 +13,7 @@ import numpy as np
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
 from twin_master.errors import PlanningError
+from twin_master.network.distributions import expect_shape
 from twin_master.network.planner import BeliefPolicy, evaluate_policy, value_iteration
 from twin_master.network.transition import TransitionModel
 
@@ -71,12 +72,10 @@ class DecisionProblem:
 
     def __post_init__(self) -> None:
         controls, states, _ = self.transition.shape
-        wrong = [table.shape for table in self.likelihood if table.shape[1:] != (states,)]
-        if self.reward.shape != (states, controls) or len(self.likelihood) != controls or wrong:
-            raise PlanningError(
-                f"expected rewards of shape {(states, controls)} and for each control observations of "
-                f"{states} columns, got {self.reward.shape} and {[t.shape for t in self.likelihood]}"
-            )
+        expect_shape("rewards", self.reward.shape, states, controls, error=PlanningError)
+        expect_shape("likelihoods of controls", (len(self.likelihood),), controls, error=PlanningError)
+        for table in self.likelihood:
+            expect_shape("a likelihood", table.shape, "classes", states, error=PlanningError)
         if any(np.any(np.abs(table.sum(axis=0) - 1.0) > 1e-9) for table in self.likelihood):
             raise PlanningError("the observations of each state must have probabilities that sum to one")
 

@@ -1,10 +1,12 @@
-"""Probability distributions and stochastic matrices, checked once where they come in."""
+"""Probability distributions, stochastic matrices and the shapes of arrays, checked where they come in."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float
-from twin_master.errors import InvalidDistributionError
+from twin_master.errors import InvalidDistributionError, InvalidModelError, TwinMasterError
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of a probability distribution from one."""
@@ -56,6 +58,42 @@ def distribution(probabilities: ArrayLike, *, size: int, name: str) -> Float:
         If it has another shape, or does not pass `stochastic_matrix`.
     """
     vector = stochastic_matrix(probabilities, name=name)
-    if vector.shape != (size,):
-        raise InvalidDistributionError(f"{name}: expected shape ({size},), got {vector.shape}")
+    expect_shape(name, vector.shape, size, error=InvalidDistributionError)
     return vector
+
+
+def expect_shape(
+    what: str, shape: Sequence[int], *wanted: int | str, error: type[TwinMasterError] = InvalidModelError
+) -> None:
+    """Refuse an array of another shape.
+
+    Parameters
+    ----------
+    what : str
+        What it is, for the sentence.
+    shape : tuple of int
+        That it has.
+    *wanted : int or str
+        Lengths of its axes; a word stands for any length, and ``...`` as the first for any axes before.
+    error : type
+        What is raised.
+    """
+    if shape == wanted:
+        return
+    before = wanted[0] == "..."
+    ends = wanted[1:] if before else wanted
+    own = shape[max(len(shape) - len(ends), 0) :] if before else shape
+    pairs = zip(ends, own, strict=False)
+    if len(own) != len(ends) or any(isinstance(length, int) and length != has for length, has in pairs):
+        told = ", ".join(map(str, wanted)) + "," * (len(wanted) == 1)
+        raise error(f"expected {what} of shape ({told}), got {tuple(shape)}")
+
+
+def expect_controls(index: ArrayLike, count: int) -> None:
+    """Refuse indices of controls, an array of any shape, that are none of `count`."""
+    if isinstance(index, int):
+        low = high = index
+    else:
+        low, high = np.min(index, initial=0), np.max(index, initial=0)
+    if low < 0 or high >= count:
+        raise InvalidModelError(f"expected control indices between 0 and {count - 1}, got {low} to {high}")

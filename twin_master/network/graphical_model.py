@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from reporting.arrays import Float
 from reporting.words import brief
 from twin_master.errors import InvalidModelError
-from twin_master.network.distributions import distribution, stochastic_matrix
+from twin_master.network.distributions import distribution, expect_shape, stochastic_matrix
 from twin_master.network.transition import TransitionModel
 
 
@@ -193,12 +193,7 @@ class GraphicalModel:
             )
         size = self.states.size
         object.__setattr__(self, "prior", distribution(self.prior, size=size, name="prior"))
-        expected = (len(self.controls), size, size)
-        if self.transition.shape != expected:
-            raise InvalidModelError(
-                f"transition: expected shape {expected} for {len(self.controls)} controls and {size} states, "
-                f"got {self.transition.shape}"
-            )
+        expect_shape("a transition", self.transition.shape, len(self.controls), size, size)
 
     @classmethod
     def from_tables(
@@ -258,11 +253,7 @@ class GraphicalModel:
             If a row is no distribution, or the shape is another one.
         """
         policy = stochastic_matrix(rows, name="policy[state]")
-        expected = (self.states.size, len(self.controls))
-        if policy.shape != expected:
-            raise InvalidModelError(
-                f"policy: expected shape {expected} (states, controls), got {policy.shape}"
-            )
+        expect_shape("a policy", policy.shape, self.states.size, len(self.controls))
         return policy
 
 

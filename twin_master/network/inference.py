@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
+from twin_master.network.distributions import expect_controls, expect_shape
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.kernels import backward_pass, forward_pass, move
 from twin_master.network.transition import TransitionModel
@@ -74,18 +75,14 @@ class Predicted:
 def _checked_controls(model: GraphicalModel, control_index: ArrayLike) -> Index:
     """Return the controls as the compiled loops expect them."""
     control = np.array(control_index, dtype=np.int64, order="C")
-    if control.size and (control.min() < 0 or control.max() >= len(model.controls)):
-        found = f"{control.min()} to {control.max()}"
-        raise InvalidModelError(f"expected indices between 0 and {len(model.controls) - 1}, got {found}")
+    expect_controls(control, len(model.controls))
     return control
 
 
 def _checked_rows(model: GraphicalModel, control: Index, rows: ArrayLike, *, what: str) -> Float:
     """Return rows of logarithms, one for each control, as the compiled loops expect them."""
     rows = np.require(rows, np.float64, ["C", "W"])
-    expected = (*control.shape, model.states.size)
-    if rows.shape != expected:
-        raise InvalidModelError(f"{what}: expected shape {expected} (turns, states), got {rows.shape}")
+    expect_shape(what, rows.shape, *control.shape, model.states.size)
     if not np.all(rows < np.inf):  # NaN fails this as well
         where = tuple(np.argwhere(~(rows < np.inf))[0].tolist())
         raise InvalidObservationError(f"{what} at {where} is {rows[where]}; expected a number or -inf")
@@ -198,8 +195,7 @@ def filter_sequence(
         As `filter_step`.
     """
     control = _checked_controls(model, control_index)
-    if control.ndim != 1:
-        raise InvalidModelError(f"expected one control for each step, got an array of shape {control.shape}")
+    expect_shape("controls", control.shape, "steps")
     rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
     found, failed = filter_many(model, control[None], rows[None], model.log_prior)
     if failed[0] >= 0:
@@ -224,8 +220,7 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
         If shapes do not fit, or a log belief is NaN or plus infinity.
     """
     control = _checked_controls(model, control_index)
-    if control.ndim != 1:
-        raise InvalidModelError(f"expected one control for each step, got an array of shape {control.shape}")
+    expect_shape("controls", control.shape, "steps")
     rows = _checked_rows(model, control, log_filtered, what="log belief")
     found = smooth_many(model.transition, control[None], np.exp(rows)[None], rows[None])
     return np.asarray(found[0])
@@ -260,16 +255,11 @@ def predict(
     size, controls = model.states.size, len(model.controls)
     belief = np.asarray(belief, dtype=np.float64)
     policy = np.asarray(policy, dtype=np.float64)
-    if belief.shape != (size,) or policy.shape != (size, controls):
-        raise InvalidModelError(
-            f"expected a belief of shape ({size},) and a policy of shape ({size}, {controls}), "
-            f"got {belief.shape} and {policy.shape}"
-        )
-    if not 0 <= control_index < controls or horizon < 0:
-        raise InvalidModelError(
-            f"expected a control index between 0 and {controls - 1} and a horizon of 0 or more steps, "
-            f"got {control_index} and {horizon}"
-        )
+    expect_shape("a belief", belief.shape, size)
+    expect_shape("a policy", policy.shape, size, controls)
+    expect_controls(control_index, controls)
+    if horizon < 0:
+        raise InvalidModelError(f"expected a horizon of 0 or more steps, got {horizon}")
     predicted, transition = np.empty((horizon, size)), model.transition
     now: Float = belief
     closed_loop = None if transition.is_product else np.einsum("su,usn->sn", policy, transition.matrix)

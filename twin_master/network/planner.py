@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from reporting.arrays import Float, Index
 from twin_master.errors import PlanningError
-from twin_master.network.distributions import stochastic_matrix
+from twin_master.network.distributions import expect_shape, stochastic_matrix
 from twin_master.network.graphical_model import deterministic_policy
 from twin_master.network.kernels import sweep
 from twin_master.network.transition import TransitionModel
@@ -168,11 +168,7 @@ def _checked(
     if not isinstance(transition, TransitionModel):
         transition = TransitionModel((np.asarray(transition, dtype=np.float64),))
     rewards = np.array(reward, dtype=np.float64, order="C")
-    if rewards.shape != transition.shape[1::-1]:
-        raise PlanningError(
-            f"expected rewards of shape {transition.shape[1::-1]} (states, controls), as the transitions "
-            f"have, got {rewards.shape}"
-        )
+    expect_shape("rewards", rewards.shape, *transition.shape[1::-1], error=PlanningError)
     if not np.all(np.isfinite(rewards)):
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(rewards))[0])
         raise PlanningError(
@@ -269,8 +265,7 @@ def evaluate_policy(
     """
     model, rewards, factors = _checked(transition, reward, discount)
     rows = stochastic_matrix(policy, name="policy[state]")
-    if rows.shape != rewards.shape:
-        raise PlanningError(f"expected a policy of shape {rewards.shape}, got {rows.shape}")
+    expect_shape("a policy", rows.shape, *rewards.shape, error=PlanningError)
     expected = np.einsum("su,su->s", rows, rewards)
     if not model.is_product:
         closed_loop = np.einsum("su,ust->st", rows * factors, model.matrix)

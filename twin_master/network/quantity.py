@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
 from twin_master.errors import InvalidModelError
-from twin_master.network.distributions import distribution
+from twin_master.network.distributions import distribution, expect_shape
 
 TIE = 1e-12
 """A cumulative probability reaches a level when it misses it by no more than this (rounding of the sum)."""
@@ -70,10 +70,9 @@ class QuantityModel:
 
     def __init__(self, value_per_draw: ArrayLike, draw_weight: ArrayLike | None = None) -> None:
         values = np.array(value_per_draw, dtype=np.float64, order="C")
-        if values.ndim != 4 or values.size == 0:
-            raise InvalidModelError(
-                f"expected values of shape (draws, states, controls, sensors), got {values.shape}"
-            )
+        expect_shape("values", values.shape, "draws", "states", "controls", "sensors")
+        if values.size == 0:
+            raise InvalidModelError(f"expected one value or more, got the shape {values.shape}")
         if not np.all(np.isfinite(values)):
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
             raise InvalidModelError(
@@ -103,14 +102,11 @@ class QuantityModel:
         owner, draw = np.divmod(order, self.draw_count)
         return order, owner, self.draw_weight[draw], np.take_along_axis(points, order, axis=1)
 
-    def _weights(self, joint: ArrayLike) -> Float:
+    def weights(self, joint: ArrayLike) -> Float:
         """Return the checked joint (..., S, U)."""
         joint = np.asarray(joint, dtype=np.float64)
-        if joint.shape[-2:] != (self.state_count, self.control_count):
-            raise InvalidModelError(
-                f"expected a joint belief of shape (..., {self.state_count}, {self.control_count}) over "
-                f"states and controls, got {joint.shape}; use `known_control` where the control is known"
-            )
+        what = "a joint belief, see `known_control`,"
+        expect_shape(what, joint.shape, "...", self.state_count, self.control_count)
         return joint
 
     def moments(self, joint: ArrayLike) -> tuple[Float, Float]:
@@ -126,7 +122,7 @@ class QuantityModel:
         tuple of two (..., G)
             In the unit of the values.
         """
-        weights = self._weights(joint)
+        weights = self.weights(joint)
         flat = weights.reshape(-1, self.state_count * self.control_count)
         mean_table = self.mean.reshape(-1, self.sensor_count)
         mean = flat @ mean_table
@@ -154,7 +150,7 @@ class QuantityModel:
         (..., P, G)
             In the unit of the values.
         """
-        weights = self._weights(joint)
+        weights = self.weights(joint)
         chosen = np.array(levels, dtype=np.float64)
         if chosen.ndim != 1 or np.any(np.diff(chosen) < 0) or not np.all((chosen > 0.0) & (chosen <= 1.0)):
             raise InvalidModelError(f"expected increasing quantile levels in (0, 1], got {chosen}")

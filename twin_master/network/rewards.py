@@ -12,6 +12,7 @@ from scipy.special import ndtr
 
 from reporting.arrays import Float, Index
 from twin_master.errors import InvalidModelError
+from twin_master.network.distributions import expect_shape
 from twin_master.network.quantity import QuantityModel
 
 
@@ -119,12 +120,9 @@ class RewardModel:
                 f"expected a control reward and a normaliser for each of {quantity.control_count} controls, "
                 f"got {len(settings.control_reward)} and {len(normaliser)}"
             )
-        shape = quantity.value_per_draw.shape
-        if true_per_draw is not None and true_per_draw.shape != shape:
-            raise InvalidModelError(
-                f"expected what is there at the sensors in the shape of what they show, {shape}, got "
-                f"{true_per_draw.shape}"
-            )
+        if true_per_draw is not None:
+            shape = quantity.value_per_draw.shape
+            expect_shape("what is there at the sensors", true_per_draw.shape, *shape)
         self.quantity = quantity
         self.settings = settings
         self.true_per_draw = true_per_draw
@@ -165,12 +163,7 @@ class RewardModel:
             If shapes do not fit.
         """
         quantity = self.quantity
-        joint = np.asarray(joint, dtype=np.float64)
-        if joint.shape[-2:] != (quantity.state_count, quantity.control_count):
-            raise InvalidModelError(
-                f"expected a joint belief of shape (..., {quantity.state_count}, {quantity.control_count}), "
-                f"got {joint.shape}"
-            )
+        joint = quantity.weights(joint)
         lead = joint.shape[:-2]
         flat = joint.reshape(-1, quantity.state_count, quantity.control_count)
         mean = np.full((len(flat), 3), np.nan)
@@ -186,11 +179,7 @@ class RewardModel:
         variance[:, 1] = np.einsum("bu,bu->b", control, (self._control_reward - mean[:, 1, None]) ** 2)
         if observation is not None:
             observation = np.asarray(observation, dtype=np.float64)
-            if observation.shape != (*lead, quantity.sensor_count):
-                raise InvalidModelError(
-                    f"expected observations of shape {(*lead, quantity.sensor_count)}, "
-                    f"got {observation.shape}"
-                )
+            expect_shape("observations", observation.shape, *lead, quantity.sensor_count)
             for row, seen in enumerate(observation.reshape(-1, quantity.sensor_count)):
                 if not np.isnan(seen).all():
                     state, chosen = np.nonzero(flat[row])

@@ -14,6 +14,7 @@ from scipy.special import ndtr
 from reporting.arrays import Float, Index
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
+from twin_master.network.distributions import expect_controls, expect_shape
 from twin_master.network.quantity import QuantityModel
 from twin_master.network.sensor_kernels import log_densities, separated
 
@@ -151,11 +152,9 @@ class GaussianSensorModel(QuantityModel):
         )  # a root of a square rounds
         shape = independent.shape
         self.interval = np.zeros((*shape, 0)) if interval is None else np.array(interval, dtype=np.float64)
-        if self.interval.shape[:-1] != shape or not np.all(np.isfinite(self.interval)):
-            raise InvalidModelError(
-                f"expected finite changes within intervals of shape {(*shape, 'factors')}, "
-                f"got {self.interval.shape}"
-            )
+        expect_shape("changes within intervals", self.interval.shape, *shape, "factors")
+        if not np.all(np.isfinite(self.interval)):
+            raise InvalidModelError("expected finite changes within intervals")
         self.independent_standard_deviation = independent
         self.total_standard_deviation = np.hypot(independent, np.linalg.norm(self.interval, axis=-1))
         for array in (independent, self.total_standard_deviation, self.interval):
@@ -184,10 +183,9 @@ class GaussianSensorModel(QuantityModel):
             The shape is another one, or a value is infinite.
         """
         observation = np.array(observation, dtype=np.float64, order="C")
-        if observation.ndim == 0 or observation.shape[-1] != self.sensor_count:
-            raise InvalidObservationError(
-                f"expected {self.sensor_count} sensor values, got an array of shape {observation.shape}"
-            )
+        expect_shape(
+            "sensor values", observation.shape, "...", self.sensor_count, error=InvalidObservationError
+        )
         if np.any(np.isinf(observation)):
             where = tuple(int(i) for i in np.argwhere(np.isinf(observation))[0])
             raise InvalidObservationError(
@@ -260,13 +258,9 @@ class GaussianSensorModel(QuantityModel):
         """Return log densities (T, S, E) of each draw, or of their average where `draws` is one."""
         observations = self.checked(observations)
         control = np.array(control_index, dtype=np.int64)
-        if observations.ndim != 2 or control.shape != observations.shape[:1]:
-            raise InvalidModelError(
-                "expected observations of shape (steps, sensors) and controls of shape (steps,), "
-                f"got {observations.shape} and {control.shape}"
-            )
-        if control.size and (control.min() < 0 or control.max() >= self.control_count):
-            raise InvalidModelError(f"expected control indices between 0 and {self.control_count - 1}")
+        expect_shape("observations", observations.shape, "steps", self.sensor_count)
+        expect_shape("controls", control.shape, len(observations))
+        expect_controls(control, self.control_count)
         inside = self.averages_inside and draws == 1
         result = np.zeros((len(observations), self.state_count, draws))
         for sensors in np.eye(self.sensor_count, dtype=bool) if inside else [np.array([True])]:
@@ -327,7 +321,7 @@ class GaussianSensorModel(QuantityModel):
         It is noise, model error, and what a sensor changes by within the interval of a state.
         """
         return np.asarray(
-            np.sqrt(np.tensordot(self._weights(joint), self.total_standard_deviation**2, axes=2))
+            np.sqrt(np.tensordot(self.weights(joint), self.total_standard_deviation**2, axes=2))
         )
 
     def observed_count(self, observations: ArrayLike) -> Index:
@@ -346,12 +340,8 @@ class GaussianSensorModel(QuantityModel):
         """
         observation = self.checked(observation)
         mean, spread = self.moments(joint)
-        if mean.shape != observation.shape:
-            raise InvalidModelError(
-                f"expected one belief for each observation, "
-                f"got {mean.shape[:-1]} and {observation.shape[:-1]}"
-            )
-        weights = self._weights(joint).reshape(-1, self.state_count, self.control_count)
+        expect_shape("observations", observation.shape, *mean.shape)
+        weights = self.weights(joint).reshape(-1, self.state_count, self.control_count)
         deviation = np.sqrt(spread**2 + self.noise(joint) ** 2)
         rows = observation.reshape(-1, self.sensor_count)
         transform = np.empty_like(rows)

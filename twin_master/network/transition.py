@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from reporting.arrays import Float
 from twin_master.errors import InvalidModelError
-from twin_master.network.distributions import stochastic_matrix
+from twin_master.network.distributions import expect_shape, stochastic_matrix
 from twin_master.network.kernels import Lists
 from twin_master.network.memory import TRANSITION_COPIES, check_fits, transition_bytes
 
@@ -61,10 +61,7 @@ class TransitionModel:
     def __post_init__(self) -> None:
         checked = tuple(stochastic_matrix(block, name="transition[control, state]") for block in self.blocks)
         for block in checked:
-            if block.ndim != 3 or block.shape[1] != block.shape[2]:
-                raise InvalidModelError(
-                    f"transition: expected shape (controls, states, states), got {block.shape}"
-                )
+            expect_shape("a transition", block.shape, "controls", block.shape[-1], block.shape[-1])
         if len({len(block) for block in checked}) != 1:
             raise InvalidModelError(
                 f"transition: every block needs the same controls, got {[len(block) for block in checked]}"

@@ -14,6 +14,7 @@ from reporting.arrays import Float
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network import graphical_model
+from twin_master.network.distributions import expect_controls
 from twin_master.network.estimator import (
     Carried,
     Estimate,
@@ -381,10 +382,7 @@ class Twin:
             if control not in controls:
                 raise InvalidModelError(f"no control is named {control!r}; there are {', '.join(controls)}")
             return controls.index(control)
-        if not 0 <= control < len(controls):
-            raise InvalidModelError(
-                f"expected a control index between 0 and {len(controls) - 1}, got {control}"
-            )
+        expect_controls(control, len(controls))
         return int(control)
 
     def _decided(self, estimate: Estimate) -> TwinTurn:

@@ -13,7 +13,6 @@ from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.folders import restore_folder
 from reporting.json_file import read_json
-from reporting.words import capital, parameter_title
 from twin_master.errors import RunFolderError, TwinMasterError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import smooth
@@ -22,7 +21,7 @@ from twin_master.report.view import PrintedFactor, PrintedSensors, printed_facto
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.store.mission_result import MOMENTS, LearntQuantity, printed_learnt
+from twin_master.store.mission_result import MOMENTS, SCHEMA, LearntQuantity, printed_learnt, titles_of
 from twin_master.store.writing import RUN_NAME, SUMMARY_NAME
 from twin_master.store.writing import read_run as read_tree
 
@@ -30,19 +29,9 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-_OF_A_BELIEF = {
-    "probability": "state", "mean": "region", "standard_deviation": "region", "quantity_mean": "sensor",
-    "quantity_standard_deviation": "sensor", "quantity_lower": "sensor", "quantity_upper": "sensor",
-    "reward_mean": "reward", "reward_standard_deviation": "reward",
-}  # fmt: skip
-_OPTIONAL = ("truth", "learnt", "notice")
-"""Groups that not every run has."""
-_TITLES = {
-    "noise_scale": "Noise, as a factor on the assumed one",
-    "gauge_gain": "Gain error",
-    "gauge_offset": "Offset",
-    "transition_factor": "Factor on the transitions",
-}
+_GROUPS = ("observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth")
+"""Groups that are read; the last one not every run has."""
+_UNREAD = ("noise_standard_deviation", "residual", "sensors_received", "sensor_status")
 _ROUNDING = 1e-6
 
 
@@ -158,11 +147,9 @@ class Run:
                 for part in ("", "_prior")
             )
             truth = self.get(f"truth/{name}")
-            title = _TITLES.get(name, capital(parameter_title(name)))
             unit = "µε" if unit == "microstrain" else unit
-            found.append(
-                LearntQuantity(name, title, unit, course, prior, None if truth is None else scale * truth)
-            )
+            truth = None if truth is None else scale * truth
+            found.append(LearntQuantity(name, titles_of(name)[1], unit, course, prior, truth))
         return tuple(found)
 
     def smoothed_until(self, now: int) -> Float:
@@ -221,25 +208,17 @@ def open_run(folder: Path | str) -> "xr.DataTree":
 
 def _check(run: Run) -> None:
     """Refuse what no twin has ever stored; the figures rely on it."""
-    role = run.sensors.quantity
-    layout: dict[str, tuple[str, ...]] = {
-        "observed/control_index": ("step",), f"observed/{role}": ("step", "sensor"),
-        "filtered/log_evidence": ("step",), "filtered/decision_probability": ("step", "control"),
-        "predicted/control_probability": ("step", "horizon", "control"),
-        "policy/control_index": ("state",), "policy/action_value": ("state", "control"),
-        "calibration/draw_value": ("draw",), "truth/state": ("step", "region"),
-        f"truth/{role}": ("step", "sensor"),
-    }  # fmt: skip
-    for group, lead in (("filtered", ()), ("smoothed", ()), ("predicted", ("horizon",))):
-        layout |= {f"{group}/{name}": ("step", *lead, axis) for name, axis in _OF_A_BELIEF.items()}
-    for path, axes in layout.items():
-        group, _, name = path.partition("/")
-        if group in _OPTIONAL and group not in run.tree.children:
-            continue
-        if group not in run.tree.children or name not in run.tree[group]:
-            raise ValueError(f"the variable {path} is missing")
-        if run.tree[path].dims != axes:
-            raise ValueError(f"{name} has the axes {run.tree[path].dims} and not {axes}")
+    for group in _GROUPS if "truth" in run.tree.children else _GROUPS[:-1]:
+        lead = "step horizon" if group == "predicted" else "step"
+        own = SCHEMA["belief"] if group in ("filtered", "smoothed", "predicted") else {}
+        for key, (axes, *_) in (own | SCHEMA[group]).items():
+            if key in _UNREAD or ("{" in key and key != "{role}"):
+                continue
+            name, wanted = key.format(role=run.sensors.quantity), tuple(axes.format(lead=lead).split())
+            if group not in run.tree.children or name not in run.tree[group]:
+                raise ValueError(f"the variable {group}/{name} is missing")
+            if run.tree[group][name].dims != wanted:
+                raise ValueError(f"{name} has the axes {run.tree[group][name].dims} and not {wanted}")
     for path in ("observed/control_index", "policy/control_index"):
         if not (run[path].min() >= 0 and run[path].max() < len(run.controls)):
             raise ValueError(f"{path} goes beyond its {len(run.controls)} controls")

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import printed_state
 
 NORMAL_95 = 1.959963984540054
 """Half-width of a 95 % interval of the normal distribution, in standard deviations."""
@@ -84,11 +85,6 @@ def printed_sensors(scenario: Scenario) -> PrintedSensors:
         units, scale = ("µε",) * section.count, 1.0e6
     titles = section.titles or tuple(f"{word} {number}" for number in range(1, section.count + 1))
     return PrintedSensors(word, titles, section.role, units, scale, bool(section.titles))
-
-
-def printed_state(unit: str) -> tuple[float, str]:
-    """Return the factor from the stored unit of a state factor to the printed one, and its name."""
-    return (100.0, "%") if unit == "1" else (1.0, unit)
 
 
 def short_number(value: float) -> str:

@@ -1,7 +1,7 @@
 """Reading scenario files: TOML in, a checked `Scenario` out, and one clear sentence for whatever is wrong."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -165,32 +165,19 @@ def _sentence(error: Mapping[str, Any], table: Mapping[str, Any]) -> str:
     return f"`{where}` {expected}, and {shown(error['input'] if value is table else value)} came."
 
 
-def _step(node: Any, part: int | str) -> tuple[bool, Any, str]:
-    """Follow one part of a location; return whether it led anywhere, the node and the key as written."""
-    if isinstance(node, Mapping):
-        for key in node:
-            if key == part or str(key).startswith(f"{part}_"):
-                if key != part and part in node:
-                    continue
-                return True, node[key], str(key)
-    elif (
-        isinstance(node, Sequence)
-        and not isinstance(node, str)
-        and isinstance(part, int)
-        and part < len(node)
-    ):
-        return True, node[part], f"[{part + 1}]"
-    return False, None, str(part)
-
-
 def _written(location: tuple[int | str, ...], table: Mapping[str, Any]) -> tuple[str, Any]:
     """Return a location as the file has it, and what stands there: keys with units, entries from 1."""
     node: Any = table
     text = ""
     for index, part in enumerate(location):
-        found, next_node, key = _step(node, part)
+        key, keyed = part, isinstance(node, Mapping)
+        listed = isinstance(part, int) and isinstance(node, list | tuple) and part < len(node)
+        if keyed and part not in node:  # but perhaps with its unit
+            key = next((own for own in node if str(own).startswith(f"{part}_")), part)
+        found = listed or (keyed and key in node)
         # Else the name of a branch of a union, which the file does not have.
-        if found or (index == len(location) - 1 and isinstance(node, Mapping) and isinstance(part, str)):
-            text += key if key.startswith("[") or not text else f".{key}"
-        node = next_node if found else node
+        if found or (keyed and isinstance(part, str) and index == len(location) - 1):
+            step = f"[{int(part) + 1}]" if listed else str(key)
+            text += step if listed or not text else f".{step}"
+        node = node[key] if found else node
     return text, node

@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, SerializeAsAny, model_validator
 
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
@@ -18,7 +20,6 @@ from twin_master.scenario.section import (
     Name,
     NotNegative,
     Number,
-    PerSensor,
     Probability,
     Section,
     Seed,
@@ -33,6 +34,7 @@ from twin_master.scenario.tables import (
     Learning,
     NoticingOrNot,
     Planner,
+    Rewards,
     Transition,
     TruthSection,
     WatchSection,
@@ -41,6 +43,8 @@ from twin_master.scenario.tables import (
 
 LARGEST_STRAIN_NOISE = 0.1
 """Standard deviation of a strain gauge beyond which a unit was forgotten [1]."""
+_DECIMALS = 12
+"""Sums of scripted gains are rounded to this many digits, so that ten times 2 % and 40 % are 60 %."""
 REWARD_NAMES = ("health", "control", "error")
 """The rewards (9)-(11)."""
 FALLBACK_FIGURES = (
@@ -99,6 +103,11 @@ class StateFactor(Section):
             )
         return self
 
+    @property
+    def start(self) -> float:
+        """The most probable level before the first observation."""
+        return self.levels[self.prior.index(max(self.prior))]
+
 
 class Control(Section):
     """One choice that the twin has, and the value of each control input of the asset under it (SI)."""
@@ -106,22 +115,6 @@ class Control(Section):
     name: Name
     title: str = ""
     values: Annotated[dict[str, Number], Field(min_length=1)]
-
-
-class Rewards(Section):
-    """Figures of the rewards, eqs. (9)-(11), and their weights in planning."""
-
-    units: ClassVar[Mapping[str, str]] = {"health_limit": "microstrain", "error_scale": "microstrain"}
-    health_limit: PerSensor
-    """Value at which the health reward is zero, one for all sensors that count for it or one for each."""
-    health_sensors: Literal["all"] | Annotated[tuple[Count, ...], Field(min_length=1)] = "all"
-    """Sensors, numbered from 1, that have a limit and so count for the health reward."""
-    health_weight: Number = 1.0
-    control_weight: Number = 1.0
-    error_scale: PerSensor
-    """Distance of observation and model that costs one, one for all sensors or one for each."""
-    normalise_error_by: Name | None = None
-    control: dict[str, Number]
 
 
 class Reference(Section):
@@ -268,6 +261,15 @@ class Scenario(Section):
         if self.notice is not None:
             names += [*NOTICE_FIGURES]
         return tuple(names)
+
+    def scripted_history(self) -> NDArray[np.float64]:
+        """Return the scripted true state (T, F), SI: the gain of a step is in the state of that step."""
+        gain = np.zeros((self.mission.steps, len(self.state)))
+        gain[0] = [factor.start for factor in self.state]
+        for entry in self.truth.gains:
+            last = entry.first_step if entry.last_step is None else entry.last_step
+            gain[entry.first_step : last + 1, self.state_names.index(entry.state)] += entry.gain
+        return np.asarray(np.round(np.cumsum(gain, axis=0), _DECIMALS))
 
     @property
     def another_model(self) -> bool:

@@ -128,6 +128,11 @@ def short(values: object) -> str:
     return str(values)
 
 
+def printed_state(unit: str, percent: str = "%") -> tuple[float, str]:
+    """Return the factor from the stored unit of a state factor to the printed one, and its name."""
+    return (100.0, percent) if unit == "1" else (1.0, unit)
+
+
 def check_known(name: str, names: tuple[str, ...], where: str, what: str) -> None:
     """Check that a name is one of those there are."""
     if name not in names:

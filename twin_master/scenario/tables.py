@@ -29,6 +29,22 @@ ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of probabilities from one, as the graphical model has it."""
 
 
+class Rewards(Section):
+    """Figures of the rewards, eqs. (9)-(11), and their weights in planning."""
+
+    units: ClassVar[Mapping[str, str]] = {"health_limit": "microstrain", "error_scale": "microstrain"}
+    health_limit: PerSensor
+    """Value at which the health reward is zero, one for all sensors that count for it or one for each."""
+    health_sensors: Literal["all"] | Annotated[tuple[Count, ...], Field(min_length=1)] = "all"
+    """Sensors, numbered from 1, that have a limit and so count for the health reward."""
+    health_weight: Number = 1.0
+    control_weight: Number = 1.0
+    error_scale: PerSensor
+    """Distance of observation and model that costs one, one for all sensors or one for each."""
+    normalise_error_by: Name | None = None
+    control: dict[str, Number]
+
+
 class Transition(Section):
     """How the state moves in one step under each control; factors move independently given the control."""
 

@@ -1,15 +1,17 @@
 """Everything that a mission made, before it is stored, and what its twin has learnt."""
 
 import re
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reporting.words import parameter_title
+from reporting.words import capital, parameter_title
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.setup import learning_filter
@@ -26,12 +28,16 @@ MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 """What is kept of each posterior; the last two bound the central 90 % interval."""
 
 _OF_A_SENSOR = re.compile(r"(\w+)\[(\d+)\]")
-_TITLES = {
-    "noise_scale": "factor on the assumed noise of each sensor",
-    "gauge_gain": "relative gain error of each sensor",
-    "gauge_offset": "offset of each sensor",
-    "transition_factor": "factor on the probabilities to leave a state",
-}
+SCHEMA: dict[str, dict[str, list[str]]] = tomllib.loads(
+    Path(__file__).with_name("run.toml").read_text(encoding="utf-8")
+)
+"""Axes, unit and meaning of every variable of `run.nc`, by its group; and what is learnt, see `titles_of`."""
+
+
+def titles_of(name: str) -> list[str]:
+    """Return what a learnt quantity is called: in `run.nc`, as a heading, and in short."""
+    title = parameter_title(name)
+    return SCHEMA["quantities"].get(name, [title, capital(title), title])
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,7 @@ def _learnt(result: "MissionResult", prior: Mapping[str, Learnt]) -> tuple[Learn
             whole[:, sensors], first[sensors] = course, before
             course, before = whole, first
         truth = None if result.truth is None else _truth(scenario, name)
-        title = _TITLES.get(name, parameter_title(name))
+        title = titles_of(name)[0]
         found.append(LearntQuantity(name, title, units.get(name, "1"), course, before, truth))
     return tuple(found)
 

@@ -2,9 +2,7 @@
 
 import csv
 import io
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,15 +13,11 @@ from twin_master.learning.expectation import Expected
 from twin_master.mission.truth import SensorStatus, Truth
 from twin_master.network.inference import known_control
 from twin_master.scenario.schema import REWARD_NAMES
-from twin_master.store.mission_result import MOMENTS, SEVERAL_UNITS, MissionResult
+from twin_master.scenario.section import printed_state
+from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, MissionResult
 
 Float = NDArray[np.float64]
 
-
-SCHEMA: dict[str, dict[str, list[str]]] = tomllib.loads(
-    Path(__file__).with_name("run.toml").read_text(encoding="utf-8")
-)
-"""Axes, unit and meaning of every variable, by its group."""
 
 Entry = tuple[str, NDArray[Any], Mapping[str, str]]
 """A name in the schema, the values, and the words that stand in its braces."""
@@ -239,7 +233,6 @@ def _truth(result: MissionResult, truth: Truth) -> Iterator[Entry]:
 
 
 MICROSTRAIN = 1.0e6
-PERCENT = 100.0
 
 Columns = dict[str, Any]
 """Numbers or texts of each column, by its heading."""
@@ -274,7 +267,8 @@ def _observations(group: Group, variable: str, role: str) -> Columns:
         units = [str(unit) for unit in group["sensor_unit"].values]
     columns = {}
     for place, (sensor, unit) in enumerate(zip(sensors, units, strict=True)):
-        factor, name = _edge(unit, MICROSTRAIN, "microstrain") if role == "strain" else (1.0, unit)
+        strain = role == "strain" and unit == "1"
+        factor, name = (MICROSTRAIN, "microstrain") if strain else (1.0, unit)
         columns[f"{role}_{sensor}_{name}"] = factor * values[:, place]
     return columns
 
@@ -282,7 +276,7 @@ def _observations(group: Group, variable: str, role: str) -> Columns:
 def _health(groups: Mapping[str, Group]) -> Columns:
     columns = {}
     for place, region in enumerate(groups["filtered"]["region"].values):
-        factor, unit = _edge(groups["policy"][region].attrs["units"], PERCENT, "percent")
+        factor, unit = printed_state(groups["policy"][region].attrs["units"], "percent")
         if "truth" in groups:
             columns[f"{region}_true_{unit}"] = factor * groups["truth"]["state"].values[:, place]
         for kind in ("filtered", "smoothed"):
@@ -306,17 +300,12 @@ def _decisions(groups: Mapping[str, Group]) -> Columns:
 def _policy(groups: Mapping[str, Group]) -> Columns:
     policy, columns = groups["policy"], {}
     for region in groups["filtered"]["region"].values:
-        factor, unit = _edge(policy[region].attrs["units"], PERCENT, "percent")
+        factor, unit = printed_state(policy[region].attrs["units"], "percent")
         columns[f"{region}_{unit}"] = factor * policy[region].values
     controls = policy["control"].values
     columns["control"] = controls[policy["control_index"].values]
     values = zip(controls, policy["action_value"].values.T, strict=True)
     return columns | {f"action_value_{name}": action for name, action in values}
-
-
-def _edge(unit: str, factor: float, name: str) -> tuple[float, str]:
-    """Return factor and name of the printed unit of a stored one."""
-    return (factor, name) if unit == "1" else (1.0, unit)
 
 
 def _csv(columns: Columns) -> str:

@@ -17,7 +17,8 @@ from twin_master.scenario.schema import (
     REWARD_NAMES,
     Scenario,
 )
-from twin_master.store.mission_result import MissionResult, printed_learnt
+from twin_master.scenario.section import printed_state
+from twin_master.store.mission_result import MissionResult, printed_learnt, titles_of
 
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -219,14 +220,6 @@ def _parameter_figures(result: MissionResult) -> list[Figure]:
     return figures
 
 
-_LEARNT_WORDS = {
-    "noise_scale": "noise factor",
-    "gauge_offset": "offset",
-    "gauge_gain": "gain error",
-    "transition_factor": "transition factor",
-}
-
-
 def _learnt_figures(result: MissionResult) -> list[Figure]:
     """Return what was learnt beside the parameter; the sensor that departs most stands for all of them."""
     figures = []
@@ -235,7 +228,7 @@ def _learnt_figures(result: MissionResult) -> list[Figure]:
         if quantity.name == result.scenario.calibration.parameter:
             continue
         factor, unit = printed_learnt(quantity.name, quantity.unit)
-        word, last = f"{_LEARNT_WORDS[quantity.name]} learnt", factor * quantity.course[-1]
+        word, last = f"{titles_of(quantity.name)[2]} learnt", factor * quantity.course[-1]
         if quantity.of_sensors:
             departure = np.abs(last[:, 0] - factor * quantity.prior[:, 0]) / last[:, 1]
             most = int(np.nanargmax(departure))
@@ -258,11 +251,6 @@ def noticed(result: MissionResult) -> dict[str, Any]:
     return {"notices": [{"turn": turn} | vars(notice) for turn, notice in result.flight.notices]}
 
 
-def _printed(unit: str, percent: str = "%") -> tuple[float, str]:
-    """Return the factor from a stored unit of a state to the printed one, and its name."""
-    return (100.0, percent) if unit == "1" else (1.0, unit)
-
-
 def _scored(result: MissionResult) -> list[Figure]:
     """Return the figures that need the truth: how the control fell back, and errors of the estimate."""
     scenario, flight, known = result.scenario, result.flight, result.knowledge
@@ -273,7 +261,7 @@ def _scored(result: MissionResult) -> list[Figure]:
     )
     errors = filtered_rms_error(known.model, flight.filtered, flight.state)
     for factor, error in zip(scenario.state, errors.tolist(), strict=True):
-        scale, unit = _printed(factor.unit, "points")
+        scale, unit = printed_state(factor.unit, "points")
         key, title = f"filtered_rms_error_{factor.name}", f"filtered rms error of {factor.name}"
         figures.append(Figure(key, title, scale * error, unit))
     return figures
@@ -285,7 +273,7 @@ def _watched(result: MissionResult) -> list[Figure]:
     moments = {"mean": states.mean(belief), "standard_deviation": states.standard_deviation(belief)}
     figures = []
     for index, factor in enumerate(result.scenario.state):
-        scale, unit = _printed(factor.unit)
+        scale, unit = printed_state(factor.unit)
         for moment, values in moments.items():
             title = f"last {moment.replace('_', ' ')} of {factor.name}"
             key = f"last_{moment}_{factor.name}"
@@ -326,7 +314,7 @@ def _fallback_figures(fallback: Fallback, scenario: Scenario, step: str) -> list
     if name is None or level is None:
         title = "policy leaves the first control"
         return [Figure(FALLBACK_FIGURES[0], title, "nowhere, or by several states")]
-    scale, unit = _printed(scenario.state[scenario.state_names.index(name)].unit)
+    scale, unit = printed_state(scenario.state[scenario.state_names.index(name)].unit)
     if fallback.early_step is not None and fallback.delay == 0:  # in force since before the damage
         fallback = replace(fallback, fallback_step=None)
     delay = fallback.delay

@@ -16,7 +16,6 @@ from twin_master.assets.resolution import (
     Overrides,
     believed_source,
     given_overrides,
-    located_scenario,
     resolve_scenario,
 )
 from twin_master.errors import MissionInputError, NotResumableError
@@ -137,7 +136,7 @@ def flown(folder: Path, first: int | None, last: int | None, progress: Progress)
         with (folder / JOURNAL_NAME).open("rb") as journal:
             (copy / JOURNAL_NAME).write_bytes(journal.read(end))
         scenario = parse_scenario(config["scenario"], str(folder / CONFIG_NAME))
-        Watch(copy, config, located_scenario(scenario, copy), progress).store(Counts(), report=False)
+        Watch(copy, config, scenario.moved(copy), progress).store(Counts(), report=False)
         yield copy
 
 

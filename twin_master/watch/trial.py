@@ -29,8 +29,8 @@ from twin_master.mission.journal import array_of, records
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
-from twin_master.report.view import printed_state
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import printed_state
 from twin_master.store.summary import policy_switch
 from twin_master.watch.replay import BelievedModel, gap_of, replay
 

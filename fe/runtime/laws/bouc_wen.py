@@ -24,7 +24,7 @@ class BoucWen(PortForce):
     order: Annotated[float, "1"]
 
 
-def advance(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, least: int) -> None:
+def advance(law: FloatArray, memory: FloatArray, x: float, least: int) -> None:
     """Follow z to `x`."""
     change = x - memory[1]
     memory[1] = x
@@ -36,9 +36,7 @@ def parts(law: FloatArray, way: float) -> int:
     return int(min(way / law[1] * law[2] * 20.0, 2000.0)) + 4
 
 
-def pull(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, h: float, least: int
-) -> tuple[float, float]:
+def pull(law: FloatArray, memory: FloatArray, x: float, h: float, least: int) -> tuple[float, float]:
     """Return force and slope at `x`."""
     z = _path(law, memory[HEAD], x - memory[1], least)
     loading = z * (x - memory[1]) > 0.0

@@ -25,8 +25,6 @@ class FreePlay(PortForce):
         return self.stiffness * self.half_width
 
 
-def pull(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, h: float, least: int
-) -> tuple[float, float]:
+def pull(law: FloatArray, memory: FloatArray, x: float, h: float, least: int) -> tuple[float, float]:
     """Return force and slope at `x`."""
     return -law[0] * min(max(x, -law[1]), law[1]), (-law[0] if abs(x) < law[1] else 0.0)

@@ -6,10 +6,8 @@ part; a law of speed sets `PortForce.of_speed` and has `pull` and the second par
 
 They are called at every step, in the subset of Python that numba compiles too. What they are given:
 
-law : (`PARAMETERS`,) ndarray
-    The law's parameters, `PortForce.row`.
-elements : (E,) ndarray
-    Parameters of its hysteretic elements, `PortForce.elements`.
+law : (`PARAMETERS` + E,) ndarray
+    The law's parameters, then those of its hysteretic elements, `PortForce.row`.
 memory : (`HEAD` + E,) ndarray
     1 if friction holds the port; its last position; the law's force after the lag of omitted modes; what
     loads that are gone still add to the position; the last force of damping on a flexible port; then the
@@ -56,18 +54,15 @@ class PortForce(Primitive):
     port: str
 
     @property
-    def row(self) -> tuple[float, ...]:
-        """Parameters for the functions of the law, `PARAMETERS` at most: its numbers, in their order."""
-        return tuple(float(getattr(self, name)) for name, kind in self.values().items() if kind is not str)
+    def row(self) -> FloatArray:
+        """Parameters for the functions of the law: its numbers, in their order, and zeros after fewer."""
+        numbers = [float(getattr(self, name)) for name, kind in self.values().items() if kind is not str]
+        return np.pad(numbers, (0, PARAMETERS - len(numbers)))
 
     @property
     def magnitude(self) -> float:
         """Zero where the law gives no force at all."""
         return float(getattr(self, self.proportional[0]))
-
-    def elements(self) -> FloatArray:
-        """Return a parameter (E,) of each hysteretic element."""
-        return np.zeros(0)
 
     def check(self) -> None:
         """Raise `InvalidPatchError` where a number cannot be."""
@@ -111,7 +106,7 @@ def decayed(size: float, exponent: float, strength: float, duration: float) -> f
 # ---------------------------------------------------------------- a law of position
 
 
-def advance(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, least: int) -> None:
+def advance(law: FloatArray, memory: FloatArray, x: float, least: int) -> None:
     """Carry the memory from its last position to `x`."""
 
 
@@ -120,9 +115,7 @@ def parts(law: FloatArray, way: float) -> int:
     return 1
 
 
-def pull(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, h: float, least: int
-) -> tuple[float, float]:
+def pull(law: FloatArray, memory: FloatArray, x: float, h: float, least: int) -> tuple[float, float]:
     """Return force and slope at `x`; the memory, of where the way begins, is left as it is.
 
     Of dry friction the largest force, as if it moved forwards.

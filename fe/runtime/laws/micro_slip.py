@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 
 from ..errors import InvalidPatchError
-from .interface import HEAD, FloatArray, PortForce
+from .interface import HEAD, PARAMETERS, FloatArray, PortForce
 
 MOST_ELEMENTS = 10_000
 """Far more than the curve of a joint can show."""
@@ -35,9 +35,9 @@ class MicroSlip(PortForce):
     element_count: int = 12
 
     @property
-    def row(self) -> tuple[float, ...]:
-        """k, n."""
-        return self.stiffness, float(self.element_count)
+    def row(self) -> FloatArray:
+        """k, n, and the slip displacements of the elements."""
+        return np.array((self.stiffness, self.element_count, *[0.0] * (PARAMETERS - 2), *self.elements()))
 
     def elements(self) -> FloatArray:
         """Return the slip displacements (n,) of the elements.
@@ -60,25 +60,24 @@ class MicroSlip(PortForce):
             )
 
 
-def advance(law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, least: int) -> None:
+def advance(law: FloatArray, memory: FloatArray, x: float, least: int) -> None:
     """Stretch the elements to `x`, each up to its slip."""
     change = x - memory[1]
     memory[1] = x
     for i in range(int(law[1])):
         stretch = memory[HEAD + i] + change
-        memory[HEAD + i] = min(max(stretch, -elements[i]), elements[i])
+        memory[HEAD + i] = min(max(stretch, -law[PARAMETERS + i]), law[PARAMETERS + i])
 
 
-def pull(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, h: float, least: int
-) -> tuple[float, float]:
+def pull(law: FloatArray, memory: FloatArray, x: float, h: float, least: int) -> tuple[float, float]:
     """Return force and slope at `x`."""
     count = int(law[1])
     total = 0.0
     moving = 0
     for i in range(count):
         stretch = memory[HEAD + i] + x - memory[1]
-        total += min(max(stretch, -elements[i]), elements[i])
-        if abs(stretch) >= elements[i]:
+        slip = law[PARAMETERS + i]
+        total += min(max(stretch, -slip), slip)
+        if abs(stretch) >= slip:
             moving += 1
     return law[0] * (total / count - x), -law[0] * moving / count

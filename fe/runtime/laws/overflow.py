@@ -23,9 +23,7 @@ class Overflow(PortForce):
     reference_velocity: Annotated[float, "m/s or rad/s"]
 
 
-def pull(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, h: float, least: int
-) -> tuple[float, float]:
+def pull(law: FloatArray, memory: FloatArray, x: float, h: float, least: int) -> tuple[float, float]:
     """Return force and slope at `x`, the speed being that of the way."""
     above = (x - memory[1]) / h - law[2]
     if above <= 0.0:

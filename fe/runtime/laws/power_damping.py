@@ -33,9 +33,7 @@ class PowerDamping(PortForce):
     reference_displacement: Annotated[float, "m or rad"]
 
 
-def pull(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, h: float, least: int
-) -> tuple[float, float]:
+def pull(law: FloatArray, memory: FloatArray, x: float, h: float, least: int) -> tuple[float, float]:
     """Return force and slope at `x`, the speed being that of the way; of dry friction the largest force."""
     way = abs(x - memory[1])
     size = law[0] * power(abs(x / law[4]), law[2])

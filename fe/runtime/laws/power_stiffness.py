@@ -31,9 +31,7 @@ class PowerStiffness(PortForce):
             raise InvalidPatchError(f"side of {self.kind!r} must lie from -1 to 1, but is {self.side:g}.")
 
 
-def pull(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, h: float, least: int
-) -> tuple[float, float]:
+def pull(law: FloatArray, memory: FloatArray, x: float, h: float, least: int) -> tuple[float, float]:
     """Return force and slope at `x`."""
     if law[2] * x < 0.0 or x == 0.0:
         return 0.0, (law[0] / law[3] if law[1] == 1.0 and law[2] == 0.0 else 0.0)

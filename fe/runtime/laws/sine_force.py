@@ -19,9 +19,7 @@ class SineForce(PortForce):
     phase: Annotated[float, "rad"]
 
 
-def pull(
-    law: FloatArray, elements: FloatArray, memory: FloatArray, x: float, h: float, least: int
-) -> tuple[float, float]:
+def pull(law: FloatArray, memory: FloatArray, x: float, h: float, least: int) -> tuple[float, float]:
     """Return force and slope at `x`."""
     angle = law[1] * x + law[2]
     return law[0] * np.sin(angle), law[0] * law[1] * np.cos(angle)

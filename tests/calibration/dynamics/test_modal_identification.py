@@ -1,16 +1,12 @@
 """Modes of records against closed forms, their covariance against many records."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
-from calibration.dynamics.modal_identification import IdentifiedModes, identify_modes
+from calibration.dynamics.modal_identification import identify_modes
 from calibration.errors import ExperimentDataError
 
 Float = NDArray[np.float64]
@@ -29,7 +25,7 @@ LONG = lfilter([1.0], [1.0, -2.0 * POLE.real, abs(POLE) ** 2], np.random.default
 """A mode that remembers a minute, in 80 s."""
 
 
-def record(kind: str, seed: int) -> Float:
+def record(kind, seed):
     """Accelerations of a chain of three masses, shaken by white noise or let go, with noise."""
     random = np.random.default_rng(seed)
     damping = SHAPES @ np.diag(2.0 * RATIO * OMEGA) @ SHAPES.T
@@ -52,9 +48,9 @@ def record(kind: str, seed: int) -> Float:
 
 
 @pytest.mark.parametrize(("kind", "count"), [("ambient", 14), ("decay", 14)])
-def test_errors_are_those_of_the_records(kind: str, count: int) -> None:
+def test_errors_are_those_of_the_records(kind, count):
     """Squared errors over their variances have a mean of one; 500 records of each kind gave 0.8 to 1.2."""
-    found = [identify_modes(record(kind, seed), RATE, BANDS, kind) for seed in range(count)]  # type: ignore[arg-type]
+    found = [identify_modes(record(kind, seed), RATE, BANDS, kind) for seed in range(count)]
     errors = np.array([(one.value - TRUE) / one.standard_error for one in found])
     assert 0.6 < np.mean(errors**2) < 1.6
     assert np.mean(np.abs(errors) < 1.96) > 0.88
@@ -69,16 +65,16 @@ def test_errors_are_those_of_the_records(kind: str, count: int) -> None:
 
 @pytest.mark.parametrize(("kind", "samples"), [("ambient", 8000), ("decay", 1500)])
 @pytest.mark.parametrize("channels", [1, 3])
-def test_noise_alone_has_no_mode(kind: str, samples: int, channels: int) -> None:
+def test_noise_alone_has_no_mode(kind, samples, channels):
     """At 1e-3 over all frequencies: 200 records of each gave none."""
     for seed in range(8):
         noise = np.random.default_rng([seed, channels]).standard_normal((samples, channels))
-        found = identify_modes(noise, RATE, BANDS, kind)  # type: ignore[arg-type]
+        found = identify_modes(noise, RATE, BANDS, kind)
         assert np.isnan(found.value).all(), seed
 
 
 @pytest.mark.parametrize("kind", ["ambient", "decay"])
-def test_a_band_without_a_mode_stays_empty_beside_one_with(kind: str) -> None:
+def test_a_band_without_a_mode_stays_empty_beside_one_with(kind):
     pole = np.exp((-0.01 + 1j) * OMEGA[0] / RATE)
     for seed in range(4):
         random = np.random.default_rng(seed)
@@ -88,18 +84,18 @@ def test_a_band_without_a_mode_stays_empty_beside_one_with(kind: str) -> None:
             moved = (pole ** np.arange(1500)).real
         seen = moved[:, None] * [1.0, 0.8, 0.5]
         seen += 0.2 * seen.std() * random.standard_normal(seen.shape)
-        found = identify_modes(seen, RATE, BANDS, kind)  # type: ignore[arg-type]
+        found = identify_modes(seen, RATE, BANDS, kind)
         assert np.isfinite(found.value[0]).all()
         assert np.isnan(found.value[1:]).all()
 
 
-def test_a_record_without_noise_is_told_to_all_digits() -> None:
+def test_a_record_without_noise_is_told_to_all_digits():
     """A free decay of one channel, sampled from its closed form."""
     time = np.arange(400) / RATE
     decay = np.exp(-0.02 * 2.0 * np.pi * 5.0 * time) * np.cos(
         2.0 * np.pi * 5.0 * np.sqrt(1.0 - 0.02**2) * time
     )
-    found: IdentifiedModes = identify_modes(decay, RATE, [[4.0, 6.0], [20.0, 30.0]], "decay")
+    found = identify_modes(decay, RATE, [[4.0, 6.0], [20.0, 30.0]], "decay")
     np.testing.assert_allclose(found.value[0], [5.0, 0.02], rtol=1e-9)
     assert found.standard_error[0, 0] < 1e-6
     assert np.isnan(found.value[1]).all()
@@ -119,6 +115,6 @@ def test_a_record_without_noise_is_told_to_all_digits() -> None:
         (np.ones((5000, 1)), [[1.0, 2.0], [1.9, 3.0]], "bands overlap"),
     ],
 )
-def test_what_cannot_be_told_is_refused(record_of: Float, bands: Any, sentence: str) -> None:
+def test_what_cannot_be_told_is_refused(record_of, bands, sentence):
     with pytest.raises(ExperimentDataError, match=sentence):
         identify_modes(record_of, RATE, bands)

@@ -4,13 +4,20 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.stats import chi2, norm
 
 from calibration.errors import PosteriorError
-from calibration.paper.load_test import kernel_density, normal_reference_bandwidth, particle_filter
-from calibration.static.errors_in_variables import exact_posterior, pair_log_likelihoods
+from calibration.paper.figures import calibration_figure
+from calibration.paper.load_test import (
+    calibrate_static,
+    kernel_density,
+    normal_reference_bandwidth,
+    particle_filter,
+)
+from calibration.static.errors_in_variables import assess_fit, exact_posterior, pair_log_likelihoods
 from calibration.static.experiments import published_measurements
 from calibration.static.posterior import GaussianPrior
-from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of
+from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of, stiffness_line
 
 DATA = published_measurements()
 
@@ -28,6 +35,27 @@ def test_table_1_of_the_paper(seed):
     assert 3e5 < posterior.effective_sample_size[-1] < 8e5
     assert posterior.stiffness.mean == pytest.approx(575.2 * posterior.mean + 101.8)
     assert posterior.stiffness.standard_deviation == pytest.approx(575.2 * posterior.standard_deviation)
+    # readings whose ratio has heavy tails
+    vague = dataclasses.replace(DATA, displacement_standard_deviation=2e-3)
+    posterior = particle_filter(vague, seed=seed, particle_count=200_000)
+    limit = exact_posterior(vague, measure="ratio")
+    assert posterior.mean == pytest.approx(limit.mean, abs=1e-3)
+    assert posterior.standard_deviation == pytest.approx(limit.standard_deviation, rel=0.02)
+
+
+def test_filters_repeat_bit_for_bit_and_with_a_tabulated_curve():
+    curve = stiffness_curve_of(lambda factor: float(PUBLISHED_LINE.stiffness(factor)), (0.85, 1.15))
+    first, again, other = (particle_filter(DATA, seed=seed, particle_count=20_000) for seed in (7, 7, 8))
+    assert first.mean == again.mean != other.mean
+    assert np.array_equal(first.density, again.density)
+    assert np.array_equal(first.likelihood, again.likelihood)
+    table = particle_filter(DATA, seed=7, curve=curve, particle_count=20_000)
+    assert table.mean == pytest.approx(first.mean, abs=1e-9)
+    assert table.standard_deviation == pytest.approx(first.standard_deviation, abs=1e-9)
+    # effective particles fall with the pairs on the whole
+    effective = first.effective_sample_size
+    assert effective.shape == (8,)
+    assert effective[-1] < effective[0] < 20_000
 
 
 def test_kernel_likelihoods_tend_to_the_density_of_the_ratio():
@@ -40,22 +68,6 @@ def test_kernel_likelihoods_tend_to_the_density_of_the_ratio():
         )
 
 
-def test_repeats_bit_for_bit_and_differs_between_seeds():
-    first, again, other = (particle_filter(DATA, seed=seed, particle_count=20_000) for seed in (7, 7, 8))
-    assert first.mean == again.mean
-    assert np.array_equal(first.density, again.density)
-    assert np.array_equal(first.likelihood, again.likelihood)
-    assert first.mean != other.mean
-
-
-def test_a_tabulated_curve_gives_what_its_line_gives():
-    curve = stiffness_curve_of(lambda factor: float(PUBLISHED_LINE.stiffness(factor)), (0.85, 1.15))
-    table = particle_filter(DATA, seed=1, curve=curve, particle_count=100_000)
-    line = particle_filter(DATA, seed=1, particle_count=100_000)
-    assert table.mean == pytest.approx(line.mean, abs=1e-9)
-    assert table.standard_deviation == pytest.approx(line.standard_deviation, abs=1e-9)
-
-
 def test_the_density_agrees_with_the_particles():
     filtered = particle_filter(DATA, seed=2, particle_count=200_000)
     density = filtered.density
@@ -66,36 +78,17 @@ def test_the_density_agrees_with_the_particles():
     assert deviation == pytest.approx(filtered.standard_deviation, rel=0.01)
 
 
-def test_effective_particles_fall_with_the_pairs_on_the_whole():
-    effective = particle_filter(DATA, seed=0, particle_count=50_000).effective_sample_size
-    assert effective.shape == (8,)
-    assert effective[-1] < effective[0] < 50_000
-
-
-def test_measurements_that_no_particle_explains_are_refused():
-    far = dataclasses.replace(DATA, displacement=DATA.displacement * 0.5)
-    with pytest.raises(PosteriorError, match="no particle explains pair"):
-        particle_filter(far, seed=0, particle_count=2000)
-
-
-def test_too_few_effective_particles_are_refused():
-    with pytest.raises(PosteriorError, match="effectively remain"):
-        particle_filter(DATA, seed=0, prior=GaussianPrior(0.93, 0.015), particle_count=100)
-    with pytest.raises(PosteriorError, match="at least 100"):
-        particle_filter(DATA, seed=0, particle_count=0)
-
-
-def test_uncertain_readings_whose_ratio_has_heavy_tails():
-    vague = dataclasses.replace(DATA, displacement_standard_deviation=2e-3)
-    posterior = particle_filter(vague, seed=0, particle_count=200_000)
-    limit = exact_posterior(vague, measure="ratio")
-    assert posterior.mean == pytest.approx(limit.mean, abs=1e-3)
-    assert posterior.standard_deviation == pytest.approx(limit.standard_deviation, rel=0.02)
-
-
-def direct(samples, weights, bandwidth, value):
-    kernel = np.exp(-0.5 * ((value[:, None] - samples) / bandwidth) ** 2) / (bandwidth * np.sqrt(2.0 * np.pi))
-    return kernel @ weights
+@pytest.mark.parametrize(
+    ("change", "count", "prior", "words"),
+    [
+        ({"displacement": DATA.displacement * 0.5}, 2000, GaussianPrior(), "no particle explains pair"),
+        ({}, 100, GaussianPrior(0.93, 0.015), "effectively remain"),
+        ({}, 0, GaussianPrior(), "at least 100"),
+    ],
+)
+def test_refusals(change, count, prior, words):
+    with pytest.raises(PosteriorError, match=words):
+        particle_filter(dataclasses.replace(DATA, **change), seed=0, prior=prior, particle_count=count)
 
 
 @pytest.mark.parametrize("count", [50, 3000])
@@ -109,7 +102,7 @@ def test_a_kernel_density_of_counts_is_that_of_samples(count, kind):
     bandwidth = normal_reference_bandwidth(samples)
     grid, density = kernel_density(samples, bandwidth, (0.0, 1.2), weights if kind == "weighted" else None)
     value = np.linspace(0.0, 1.2, 1500)
-    exact = direct(samples, weights, bandwidth, value)
+    exact = norm.pdf(value[:, None], samples, bandwidth) @ weights
     assert np.abs(np.interp(value, grid, density) - exact).max() < 1e-3 * exact.max()
     assert density.min() >= 0.0
 
@@ -122,11 +115,60 @@ def test_a_kernel_density_integrates_to_one_and_vanishes_at_the_ends_of_its_grid
     # what lies beyond the window has its share of the whole, and no density within
     _, far = kernel_density(samples, 0.5, (1e6, 1e6 + 1.0))
     assert not far.any()
-
-
-def test_bandwidth_is_the_robust_normal_reference_rule():
-    samples = np.array([1.0, 2.0, 3.0, 4.0, 100.0])  # median 3, median deviation 1
+    # the bandwidth is the robust normal reference rule: median 3, median deviation 1
+    samples = np.array([1.0, 2.0, 3.0, 4.0, 100.0])
     assert normal_reference_bandwidth(samples) == pytest.approx(1.0 / 0.6745 * (4.0 / 15.0) ** 0.2)
     for without_spread in (np.ones(5), np.array([1.0, np.nan, 2.0])):
         with pytest.raises(PosteriorError, match="spread"):
             normal_reference_bandwidth(without_spread)
+
+
+# -------------------------------- calibration step 2 as a whole: record, quality of fit, report, files
+
+
+COUNT = 40_000
+
+
+@pytest.fixture(scope="module")
+def result():
+    return calibrate_static(seed=3, particle_count=COUNT)
+
+
+def test_tip_stiffness_of_figure_5(result):
+    exact, prior = result.tip_stiffness_exact, result.tip_stiffness_prior
+    assert prior.mean == pytest.approx(677.0, abs=0.01)
+    assert prior.standard_deviation == pytest.approx(575.2 * 0.05 / 1.96, rel=1e-4)
+    assert exact.mean == pytest.approx(575.2 * result.exact.mean + 101.8, abs=1e-6)
+    assert exact.standard_deviation == pytest.approx(575.2 * result.exact.standard_deviation, rel=1e-6)
+    assert exact.interval() == pytest.approx(PUBLISHED_LINE.stiffness(result.exact.interval()), abs=1e-3)
+    assert result.particle.stiffness.mean == pytest.approx(681.2, abs=0.6)
+
+
+def test_the_offset_between_the_runs_is_noticed(result):
+    assert "differ by 0.47 mm" in result.quality.remarks[0]
+    chi_square = float(np.sum(result.quality.standardised_residual**2))
+    assert chi_square == pytest.approx(11.76, abs=0.05)
+    assert chi2.sf(chi_square, 7) == pytest.approx(0.109, abs=0.002)
+    perfect = assess_fit(dataclasses.replace(DATA, displacement=DATA.load / 680.0), 680.0)
+    assert perfect.remarks == ()
+    assert perfect.standardised_residual == pytest.approx(np.zeros(8), abs=1e-10)
+
+
+def test_alternatives_stay_near_and_within_the_model(result):
+    """Only the assumption of a shared offset is wide enough to reach the end of a short curve."""
+    assert len(result.alternatives) == 3
+    means = [posterior.mean for posterior in result.alternatives.values()]
+    assert means == pytest.approx([1.00868, 1.00730, 1.01337], abs=1e-4)
+    line = stiffness_line(575.2, 101.8, "short", 0.9, 1.06)
+    assert [*calibrate_static(line, particle_count=20_000).alternatives] == ["flat in load", "ratio"]
+
+
+def test_other_curves_and_a_single_pair_will_do():
+    """The same stiffness from another curve: e differs, what was measured does not."""
+    curve = stiffness_curve_of(lambda e: 1.0 / (1.0 / (640.0 * e + 100.0) + 1.0 / 8500.0), (0.9, 1.1))
+    calibrated = calibrate_static(curve, seed=1, particle_count=COUNT)
+    assert calibrated.tip_stiffness_exact.mean == pytest.approx(681.6, abs=2.0)
+    one = dataclasses.replace(DATA, load=DATA.load[:1], displacement=DATA.displacement[:1], run=DATA.run[:1])
+    calibrated = calibrate_static(data=one, particle_count=COUNT)
+    assert 0.02 < calibrated.exact.standard_deviation < 0.0256
+    assert len(calibration_figure(calibrated).axes) == 3

@@ -1,38 +1,29 @@
 """Calibration step 3: masses with a closed solution, the authors' table, our model beside it, bad input."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from calibration.errors import (
-    ExperimentDataError,
-    ExperimentFileError,
-    OutsideValidityError,
-)
+from calibration.errors import ExperimentDataError, ExperimentFileError, OutsideValidityError
 from calibration.joint.measurement import PUBLISHED_MODES
 from calibration.joint.wing_table import TOTAL_MASS, tabulate_wing, weighed
 from calibration.paper.procedure import damping_coefficients, fit_masses, read_published_results
-from calibration.result.record import Reading
 from fe.runtime.modal_system import rayleigh_damping_ratio
 
 MASSES = {"servo_mass": (0.05, 0.3), "pitot_mass": (0.0, 0.3)}
 READ = (weighed(), *PUBLISHED_MODES)
 
 
-def read(**changed: float) -> tuple[Reading, ...]:
+def read(**changed):
     """What is published, some of it changed."""
     return tuple(replace(item, value=changed.get(item.name, item.value)) for item in READ)
 
 
-def line_model(states: NDArray[np.float64]) -> NDArray[np.float64]:
+def line_model(states):
     """Frequencies of a wing whose logarithms are linear, with the reference model's slopes [Hz]."""
     factor, servo, pitot = states.T
     assert pitot == pytest.approx(TOTAL_MASS - 2.0 * servo)
@@ -42,7 +33,7 @@ def line_model(states: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @given(factor=st.floats(0.97, 1.05))
-def test_masses_of_a_closed_solution(factor: float) -> None:
+def test_masses_of_a_closed_solution(factor):
     result = fit_masses(line_model, np.array([factor]), MASSES, READ)
     # The first frequency answers more strongly, so the error of (19), (20) is least where it is met exactly.
     pitot = 0.1345 + math.log(5.632 * factor**0.4114 / 5.6492) / 0.5075
@@ -57,16 +48,14 @@ def test_masses_of_a_closed_solution(factor: float) -> None:
     alpha=st.floats(0.01, 10.0),
     beta=st.floats(1e-5, 1e-2),
 )
-def test_damping_coefficients_undo_the_damping_ratios(
-    first: float, factor: float, alpha: float, beta: float
-) -> None:
+def test_damping_coefficients_undo_the_damping_ratios(first, factor, alpha, beta):
     frequency = first, first * factor
     ratio = rayleigh_damping_ratio(alpha, beta, frequency)
     found = damping_coefficients(frequency, (float(ratio[0]), float(ratio[1])))
     assert found == pytest.approx((alpha, beta), rel=1e-6, abs=1e-9)
 
 
-def test_the_authors_table_gives_their_figures(reference: Path) -> None:
+def test_the_authors_table_gives_their_figures(reference):
     result = read_published_results(reference)
     assert result.samples.shape == (100, 5)
     mean, deviation = result.samples.mean(axis=0), result.samples.std(axis=0, ddof=1)
@@ -78,7 +67,7 @@ def test_the_authors_table_gives_their_figures(reference: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-def test_our_wing_on_the_published_targets(reference: Path) -> None:
+def test_our_wing_on_the_published_targets(reference):
     from fe.reduction.model_cache import reduced_model
 
     authors = read_published_results(reference)
@@ -94,31 +83,36 @@ def test_our_wing_on_the_published_targets(reference: Path) -> None:
         fit_masses(wing.frequency, np.array([1.0, 1.5]), wing.validity, READ)
 
 
-def test_refusals() -> None:
-    one = np.ones(1)
-    with pytest.raises(ExperimentDataError, match="cannot weigh 2 kg"):
-        fit_masses(line_model, one, MASSES, read(weighed_mass=2.0))
-    with pytest.raises(ExperimentDataError, match="cannot weigh nan"):
-        fit_masses(line_model, one, MASSES, read(weighed_mass=math.nan))
-    with pytest.raises(ExperimentDataError, match="at the limit of the model"):
-        fit_masses(line_model, one, MASSES, read(frequency_1=7.0))
-    with pytest.raises(ExperimentDataError, match="neither may be negative"):
-        fit_masses(line_model, one, MASSES, read(damping_ratio_1=0.02, damping_ratio_2=0.5))
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"weighed_mass": 2.0}, "cannot weigh 2 kg"),
+        ({"weighed_mass": math.nan}, "cannot weigh nan"),
+        ({"frequency_1": 7.0}, "at the limit of the model"),
+        ({"damping_ratio_1": 0.02, "damping_ratio_2": 0.5}, "neither may be negative"),
+    ],
+)
+def test_refusals(changed, words):
+    with pytest.raises(ExperimentDataError, match=words):
+        fit_masses(line_model, np.ones(1), MASSES, read(**changed))
 
 
-def test_bad_files(tmp_path: Path) -> None:
-    file = tmp_path / "e.csv"
-    header = "e_sample,target_freq_1,target_freq_2,zeta_1,zeta_2,mass_servo_1,mass_pitot,freq_1,freq_2\n"
-    row = "1,5.6,29.9,.03,.07,.17,.1,5.6,28.6\n"
-    for text, words in (
-        (header, "no rows"),
-        (header.replace("freq_2\n", "f\n") + row, "no column 'freq_2'"),
-        (header + row.replace(".17,.1,", ".17,,"), "'mass_pitot' must hold a number, and nothing"),
-    ):
-        file.write_text(text, encoding="utf-8")
-        with pytest.raises(ExperimentFileError, match=words):
-            read_published_results(file)
-    with pytest.raises(ExperimentFileError, match="does not hold"):
-        read_published_results(tmp_path)
-    with pytest.raises(ExperimentFileError, match="does not exist"):
-        read_published_results(tmp_path / "nothing")
+HEADER = "e_sample,target_freq_1,target_freq_2,zeta_1,zeta_2,mass_servo_1,mass_pitot,freq_1,freq_2\n"
+
+ROW = "1,5.6,29.9,.03,.07,.17,.1,5.6,28.6\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("e.csv", HEADER.replace("freq_2\n", "f\n") + ROW, "no column 'freq_2'"),
+        ("e.csv", HEADER + ROW.replace(".17,.1,", ".17,,"), "'mass_pitot' must hold a number, and nothing"),
+        ("", "", "does not hold"),
+        ("nothing", "", "does not exist"),
+    ],
+)
+def test_bad_files(tmp_path, name, text, words):
+    if text:
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(ExperimentFileError, match=words):
+        read_published_results(tmp_path / name)

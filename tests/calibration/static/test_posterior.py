@@ -1,13 +1,23 @@
 """Densities on a grid: moments, quantiles, samples."""
 
+import dataclasses
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import norm
+from scipy.stats import multivariate_normal, norm
 
-from calibration.errors import PosteriorError
+from calibration.errors import OutsideValidityError, PosteriorError
+from calibration.static.errors_in_variables import exact_posterior, log_likelihood, pair_log_likelihoods
+from calibration.static.experiments import LoadDisplacementData, published_measurements
 from calibration.static.posterior import GaussianPrior, ScalarPosterior, child_seed
+from calibration.static.stiffness_curve import (
+    PUBLISHED_LINE,
+    TABLE_TOLERANCE,
+    stiffness_curve_of,
+    stiffness_line,
+)
 
 
 def gaussian(mean=1.0, deviation=0.02, size=2001):
@@ -48,21 +58,16 @@ def test_the_scale_of_the_density_does_not_matter(scale):
 
 
 def test_samples_repeat_bit_for_bit_and_follow_the_density():
+    """One in each stratum, in random order."""
     _, posterior = gaussian()
     samples = posterior.samples(5, 20_000)
-    assert np.array_equal(samples, posterior.samples(5, 20_000))
     assert np.array_equal(samples, posterior.samples(np.random.SeedSequence(5), 20_000))
     assert not np.array_equal(samples, posterior.samples(6, 20_000))
     assert samples.mean() == pytest.approx(1.0, abs=6e-4)
     assert samples.std() == pytest.approx(0.02, rel=0.03)
-
-
-def test_stratified_samples_have_one_in_each_stratum_in_random_order():
-    _, posterior = gaussian()
     samples = posterior.samples(5, 100)
-    strata = np.floor(posterior.cumulative(samples) * 100.0 + 1e-9).astype(int)
-    assert sorted(strata) == list(range(100))
-    assert list(strata) != list(range(100))
+    strata = np.floor(posterior.cumulative(samples) * 100.0 + 1e-9).astype(int).tolist()
+    assert sorted(strata) == list(range(100)) != strata
     assert abs(samples.mean() - 1.0) < 2e-4
 
 
@@ -88,14 +93,214 @@ def test_what_is_no_density_is_refused(grid, density):
         ScalarPosterior(np.array(grid), np.array(density))
 
 
-def test_senseless_requests_are_refused():
-    _, posterior = gaussian()
-    with pytest.raises(PosteriorError, match="from 0 to 1"):
-        posterior.quantile(1.1)
-    with pytest.raises(PosteriorError, match="number of samples"):
-        posterior.samples(0, 0)
-    with pytest.raises(PosteriorError, match="at most 10,000,000 samples"):
-        posterior.samples(0, 10**40)
-    for mean, deviation in ((np.nan, 1.0), (1.0, 0.0), (1.0, np.inf)):
-        with pytest.raises(PosteriorError, match="prior"):
-            GaussianPrior(mean, deviation)
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda: gaussian()[1].quantile(1.1), "from 0 to 1"),
+        (lambda: gaussian()[1].samples(0, 0), "number of samples"),
+        (lambda: gaussian()[1].samples(0, 10**40), "at most 10,000,000 samples"),
+        (lambda: GaussianPrior(np.nan, 1.0), "prior"),
+        (lambda: GaussianPrior(1.0, 0.0), "prior"),
+        (lambda: GaussianPrior(1.0, np.inf), "prior"),
+    ],
+)
+def test_senseless_requests_are_refused(ask, words):
+    with pytest.raises(PosteriorError, match=words):
+        ask()
+
+
+# ---------------------------------------------------------------- stiffness curves
+
+
+RANGE = (0.9, 1.1)
+
+
+class Springs:
+    """A skin spring in parallel with another, both on a root spring: a smooth curve that is no line."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def tip_stiffness(self, young_modulus_factor):
+        self.calls += 1
+        return 1.0 / (1.0 / (640.0 * young_modulus_factor + 100.0) + 1.0 / 8000.0)
+
+
+def test_published_line():
+    assert PUBLISHED_LINE.stiffness(1.0) == pytest.approx(677.0)
+    assert PUBLISHED_LINE.stiffness([0.9, 1.1]) == pytest.approx([619.48, 734.52])
+    assert PUBLISHED_LINE.young_modulus_factor(677.0) == pytest.approx(1.0)
+    assert PUBLISHED_LINE.slope([0.9, 1.1]) == pytest.approx(575.2)
+
+
+def test_a_table_meets_its_model_within_the_stated_error():
+    """And continues smoothly beyond its ends."""
+    model = Springs()
+    curve = stiffness_curve_of(model.tip_stiffness, RANGE)
+    assert (curve.lower, curve.upper) == (0.9, 1.1)
+    assert model.calls < 600
+    factor = np.linspace(0.9, 1.1, 997)
+    exact = np.array([model.tip_stiffness(value) for value in factor])
+    assert np.abs(curve.stiffness(factor) / exact - 1.0).max() < 3.0 * TABLE_TOLERANCE
+    slope = (curve.stiffness(factor + 1e-6) - curve.stiffness(factor - 1e-6)) / 2e-6
+    assert curve.slope(factor[1:-1]) == pytest.approx(slope[1:-1], rel=1e-4)
+    for end in RANGE:
+        below, at, above = curve.stiffness([end - 1e-6, end, end + 1e-6])
+        assert at - below == pytest.approx(above - at, rel=1e-3)
+
+
+@given(factor=st.floats(0.3, 1.9))
+def test_the_inverse_inverts_also_beyond_the_table(factor):
+    curve = stiffness_curve_of(Springs().tip_stiffness, RANGE)
+    assert float(curve.young_modulus_factor(curve.stiffness(factor))) == pytest.approx(factor, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: stiffness_line(-1.0, 700.0), "rise with e"),
+        (lambda: stiffness_line(1.0, -5.0), "positive"),
+        (lambda: stiffness_curve_of(lambda e: 700.0 - e, RANGE), "rise with e"),
+        (
+            lambda: stiffness_curve_of(lambda e: 600.0 + 100.0 * e + 5.0 * (70.0 * e // 1.0), RANGE),
+            "too rough",
+        ),
+    ],
+)
+def test_bad_curves_are_refused(make, words):
+    with pytest.raises(PosteriorError, match=words):
+        make()
+
+
+# ---------------------------------------------------------------- the exact posterior
+
+
+DATA = published_measurements()
+FACTORS = np.linspace(0.85, 1.2, 36)
+
+
+@pytest.mark.parametrize("measure", ["displacement", "load", "ratio"])
+def test_pair_likelihoods_equal_quadrature_over_the_true_displacement(measure):
+    true = np.linspace(1e-5, 25e-3, 40_001)  # m
+    k = PUBLISHED_LINE.stiffness(FACTORS)
+    weight = true if measure == "ratio" else 1.0
+    brute = np.empty((DATA.count, FACTORS.size))
+    for pair, (load, displacement) in enumerate(zip(DATA.load, DATA.displacement, strict=True)):
+        of_displacement = norm.pdf(displacement, true, DATA.displacement_standard_deviation) * weight
+        for index, stiffness in enumerate(k):
+            of_load = norm.pdf(load, stiffness * true, DATA.load_standard_deviation)
+            brute[pair, index] = np.trapezoid(of_load * of_displacement, true)
+    brute = brute * {"load": k, "ratio": 575.2}.get(measure, 1.0)
+    if measure == "ratio":
+        ours = pair_log_likelihoods(PUBLISHED_LINE, DATA, FACTORS, "ratio")
+        assert ours == pytest.approx(np.log(brute), abs=1e-8)
+    total = log_likelihood(PUBLISHED_LINE, DATA, FACTORS, measure=measure)
+    assert total == pytest.approx(np.log(brute).sum(axis=0), abs=1e-7)
+
+
+@pytest.mark.parametrize("zero_offset", [0.0, 1e-4, 5e-3])
+def test_a_shared_zero_offset_equals_the_full_covariance(zero_offset):
+    expected = np.zeros(FACTORS.size)
+    for index, k in enumerate(PUBLISHED_LINE.stiffness(FACTORS)):
+        for run in DATA.run_indices:
+            of_run = DATA.run == run
+            count = int(of_run.sum())
+            variance = DATA.load_standard_deviation**2 + (k * DATA.displacement_standard_deviation) ** 2
+            covariance = variance * np.eye(count) + (k * zero_offset) ** 2
+            residual = DATA.load[of_run] - k * DATA.displacement[of_run]
+            expected[index] += multivariate_normal.logpdf(residual, np.zeros(count), covariance)
+    ours = log_likelihood(PUBLISHED_LINE, DATA, FACTORS, zero_offset_standard_deviation=zero_offset)
+    assert ours == pytest.approx(expected, abs=1e-8)
+
+
+def test_exact_displacements_on_a_line_give_the_conjugate_gaussian():
+    data = dataclasses.replace(DATA, displacement_standard_deviation=0.0)
+    prior = GaussianPrior()
+    gradient, intercept = 575.2, 101.8
+    information = 1.0 / prior.standard_deviation**2
+    information += np.sum((gradient * data.displacement / data.load_standard_deviation) ** 2)
+    pull = prior.mean / prior.standard_deviation**2
+    pull += np.sum(gradient * data.displacement * (data.load - intercept * data.displacement)) / (
+        data.load_standard_deviation**2
+    )
+    posterior = exact_posterior(data)
+    assert posterior.mean == pytest.approx(pull / information, abs=1e-10)
+    assert posterior.standard_deviation == pytest.approx(information**-0.5, rel=1e-8)
+
+
+def test_published_pairs():
+    posterior = exact_posterior(DATA)
+    assert posterior.mean == pytest.approx(1.00797, abs=1e-5)
+    assert posterior.standard_deviation == pytest.approx(0.01031, abs=1e-5)
+    # The closed form of the paper's filter meets the paper's Table 1 to its last digit.
+    ratio = exact_posterior(DATA, measure="ratio")
+    assert f"{ratio.mean:.4f} {ratio.standard_deviation:.4f}" == "1.0073 0.0103"
+    # the grid does not matter
+    coarse, fine = exact_posterior(DATA, grid_size=301), exact_posterior(DATA, grid_size=8001)
+    assert coarse.mean == pytest.approx(fine.mean, abs=1e-9)
+    assert coarse.standard_deviation == pytest.approx(fine.standard_deviation, rel=1e-7)
+    # measurements far from the prior are followed
+    stiff = dataclasses.replace(
+        DATA, displacement=DATA.load / PUBLISHED_LINE.stiffness(1.6), displacement_standard_deviation=1e-6,
+        load_standard_deviation=1e-4,
+    )  # fmt: skip
+    posterior = exact_posterior(stiff)
+    assert posterior.mean == pytest.approx(1.6, abs=1e-3)
+    assert 0.0 < posterior.standard_deviation < 1e-3
+    curve = stiffness_line(575.2, 101.8, "narrow model", 0.9, 0.99)
+    with pytest.raises(OutsideValidityError, match=r"outside \[0.9, 0.99\], where narrow model"):
+        exact_posterior(DATA, curve=curve)
+    with pytest.raises(PosteriorError, match="zero offset"):
+        log_likelihood(PUBLISHED_LINE, DATA, FACTORS, measure="ratio", zero_offset_standard_deviation=1e-4)
+
+
+@given(load_scale=st.floats(1e-4, 1e4), displacement_scale=st.floats(1e-4, 1e4))
+@settings(max_examples=30, deadline=None)
+def test_units_do_not_matter(load_scale, displacement_scale):
+    data = LoadDisplacementData(
+        load=DATA.load * load_scale,
+        displacement=DATA.displacement * displacement_scale,
+        run=DATA.run,
+        load_standard_deviation=DATA.load_standard_deviation * load_scale,
+        displacement_standard_deviation=DATA.displacement_standard_deviation * displacement_scale,
+    )
+    scale = load_scale / displacement_scale
+    curve = stiffness_line(575.2 * scale, 101.8 * scale)
+    posterior, reference = exact_posterior(data, curve=curve), exact_posterior(DATA)
+    assert posterior.mean == pytest.approx(reference.mean, abs=1e-9)
+    assert posterior.standard_deviation == pytest.approx(reference.standard_deviation, rel=1e-6)
+
+
+@given(repeats=st.integers(1, 40), noise=st.floats(0.01, 10.0), factor=st.floats(0.7, 1.3))
+@settings(max_examples=40, deadline=None)
+def test_more_measurements_shrink_the_variance_and_never_beyond_the_prior(repeats, noise, factor):
+    load = np.tile(DATA.load[:4], repeats)
+    data = LoadDisplacementData(
+        load=load,
+        displacement=load / PUBLISHED_LINE.stiffness(factor),
+        run=np.arange(load.size),
+        load_standard_deviation=DATA.load_standard_deviation * noise,
+        displacement_standard_deviation=DATA.displacement_standard_deviation * noise,
+    )
+    doubled = dataclasses.replace(
+        data, load=np.tile(load, 2), displacement=np.tile(data.displacement, 2), run=np.arange(2 * load.size)
+    )
+    posterior, narrower = exact_posterior(data), exact_posterior(doubled)
+    assert narrower.standard_deviation < posterior.standard_deviation
+    assert posterior.standard_deviation < 1.02 * GaussianPrior().standard_deviation
+    assert np.all(np.isfinite(posterior.density))
+
+
+def test_intervals_cover_the_truth_on_virtual_wings():
+    generator = np.random.default_rng(2021)
+    prior = GaussianPrior()
+    repetitions, covered = 200, 0
+    for _ in range(repetitions):
+        truth = generator.normal(prior.mean, prior.standard_deviation)
+        load = DATA.load + DATA.load_standard_deviation * generator.standard_normal(DATA.count)
+        displacement = DATA.load / PUBLISHED_LINE.stiffness(truth)
+        displacement += DATA.displacement_standard_deviation * generator.standard_normal(DATA.count)
+        data = dataclasses.replace(DATA, load=load, displacement=displacement)
+        lower, upper = exact_posterior(data, grid_size=401).interval(0.90)
+        covered += lower <= truth <= upper
+    assert 0.85 <= covered / repetitions <= 0.95

@@ -1,29 +1,23 @@
 """What is read of a lab folder, and what is published instead."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from calibration.errors import ExperimentFileError
 from calibration.wing.lab_data import published_data, read_lab_folder
 
 
-def test_the_published_figures_are_those_of_the_authors_folder(reference: Path) -> None:
+def test_the_published_figures_are_those_of_the_authors_folder(reference):
     read, published = read_lab_folder(reference, "published"), published_data()
     assert read.pairs.sha256 == published.pairs.sha256
     assert read.input_hashes == published.input_hashes
     assert [origin.read for origin in read.origins] == [True, True, False]
     assert "left aside" in read.origins[2].text
-    assert read.authors is not None
     assert read.authors.samples.shape == (100, 5)
     assert read.trials is None
 
 
-def test_digitised_records_are_fitted_by_their_extremes(reference: Path) -> None:
+def test_digitised_records_are_fitted_by_their_extremes(reference):
     read = read_lab_folder(reference)
-    assert read.trials is not None
     assert len(read.trials.fits) == 5
     assert [read.trials.average("frequency", mode).mean for mode in (0, 1)] == pytest.approx(
         (5.6547, 29.94), rel=1e-3
@@ -34,7 +28,7 @@ def test_digitised_records_are_fitted_by_their_extremes(reference: Path) -> None
     assert sum(name.startswith("ring_down_") for name in read.input_hashes) == 5
 
 
-def folder_with(root: Path, above: str, *steps: int) -> Path:
+def folder_with(root, above, *steps):
     for step in steps:
         place = root / above / f"step{step}"
         place.mkdir(parents=True)
@@ -49,7 +43,7 @@ def folder_with(root: Path, above: str, *steps: int) -> Path:
 
 
 @pytest.mark.parametrize("above", ["", "datafiles", "src/datafiles"])
-def test_parts_of_a_folder(tmp_path: Path, above: str) -> None:
+def test_parts_of_a_folder(tmp_path, above):
     lab = read_lab_folder(folder_with(tmp_path, above, 1, 3))
     assert [origin.read for origin in lab.origins] == [True, False, False]
     assert lab.lengths.semi_span.measured == pytest.approx(1.829)
@@ -58,7 +52,7 @@ def test_parts_of_a_folder(tmp_path: Path, above: str) -> None:
     assert lab.readings[0].value == 0.472
 
 
-def test_a_weighed_mass(tmp_path: Path) -> None:
+def test_a_weighed_mass(tmp_path):
     folder = folder_with(tmp_path, "datafiles", 2, 3)
     file = folder / "datafiles" / "step3" / "weighed_mass.csv"
     file.write_text("mass,standard_deviation\n455,2\n", encoding="utf-8")
@@ -68,6 +62,6 @@ def test_a_weighed_mass(tmp_path: Path) -> None:
     assert "weighed_mass.csv read" in lab.origins[2].text
 
 
-def test_records_that_are_asked_for_must_be_there(tmp_path: Path) -> None:
+def test_records_that_are_asked_for_must_be_there(tmp_path):
     with pytest.raises(ExperimentFileError, match="no ring-down record, and --measured asks for them"):
         read_lab_folder(folder_with(tmp_path, "", 1, 2), "measured")

@@ -1,7 +1,5 @@
 """A user's effects with `time` and the events of a campaign, from the files to the motion."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -9,10 +7,10 @@ import numpy as np
 import pytest
 
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, Event
+from discrepancy.campaign.records import Event
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.catalogue.effect_file import effects_of_file
-from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, CampaignFileError, CatalogueError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe
@@ -27,7 +25,7 @@ MODEL = one_mass(free=True)
 TIME = np.linspace(0.0, 10.0, 101)
 
 
-def folder_of(path: Path, toml: str = TOML) -> Path:
+def folder_of(path, toml=TOML):
     (path / "campaign.toml").write_text(toml, encoding="utf-8")
     for name in ("a.csv", "b.csv"):
         rows = "\n".join(f"{time:.1f},0.0" for time in TIME)
@@ -36,23 +34,23 @@ def folder_of(path: Path, toml: str = TOML) -> Path:
 
 
 @pytest.fixture(scope="module")
-def campaign(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
+def campaign(tmp_path_factory):
     return read_campaign(folder_of(tmp_path_factory.mktemp("pump")))
 
 
-def example() -> str:
+def example():
     page = PAGE.read_text(encoding="utf-8")
     (text,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     return str(text)
 
 
-def effect_of(path: Path, text: str) -> Effect:
+def effect_of(path, text):
     (path / "effect.toml").write_text(text, encoding="utf-8")
     (found,) = effects_of_file(path / "effect.toml")
     return found
 
 
-def test_the_example_of_the_page_pulls_as_it_says(campaign: Campaign, tmp_path: Path) -> None:
+def test_the_example_of_the_page_pulls_as_it_says(campaign, tmp_path):
     effect = effect_of(tmp_path, example())
     setting = Setting(campaign, MODEL, MODEL.scales(campaign))
     assert effect.unavailable(setting) is None
@@ -68,7 +66,7 @@ def test_the_example_of_the_page_pulls_as_it_says(campaign: Campaign, tmp_path: 
     np.testing.assert_allclose(pumping, expected, atol=1e-6 * expected.max())
 
 
-def test_an_effect_acts_from_a_parameter_after_an_event_on(campaign: Campaign, tmp_path: Path) -> None:
+def test_an_effect_acts_from_a_parameter_after_an_event_on(campaign, tmp_path):
     text = example().replace('kind = "port_load"', 'kind = "channel_offset"').replace("port = ", "channel = ")
     text = text.replace(
         'force = "slope * max(0, time - pump_on)"', 'offset = "slope"\nbegin = "pump_on + slope"'
@@ -81,7 +79,7 @@ def test_an_effect_acts_from_a_parameter_after_an_event_on(campaign: Campaign, t
     np.testing.assert_array_equal(shown, np.where((TIME >= 3.25) & (TIME < 8.0), 0.75, 0.0))
 
 
-def test_events_survive_the_files(campaign: Campaign, tmp_path: Path) -> None:
+def test_events_survive_the_files(campaign, tmp_path):
     assert campaign.events == (Event("pump_on", ("pumping",), 2.5, 8.0),)
     assert campaign.event_times("pumping") == {"pump_on": 2.5, "pump_on_until": 8.0}
     assert campaign.event_times("quiet") == {}
@@ -106,7 +104,7 @@ def test_events_survive_the_files(campaign: Campaign, tmp_path: Path) -> None:
         ('trial = "pumping", time', "trials = [], time", "at least 1 entry is expected, but () came"),
     ],
 )  # fmt: skip
-def test_wrong_events_are_refused_in_one_sentence(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_wrong_events_are_refused_in_one_sentence(tmp_path, old, new, words):
     assert old in TOML
     with pytest.raises((CampaignFileError, CampaignDataError), match=re.escape(words)) as caught:
         read_campaign(folder_of(tmp_path, TOML.replace(old, new)))
@@ -123,12 +121,12 @@ def test_wrong_events_are_refused_in_one_sentence(tmp_path: Path, old: str, new:
         ('kind = "port_load"', 'kind = "point_mass"', "unknown key"),
     ],
 )  # fmt: skip
-def test_wrong_effects_in_time_are_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_wrong_effects_in_time_are_refused(tmp_path, old, new, words):
     with pytest.raises(CatalogueError, match=re.escape(words)):
         effect_of(tmp_path, example().replace(old, new))
 
 
-def test_an_effect_without_its_event_says_why(tmp_path: Path) -> None:
+def test_an_effect_without_its_event_says_why(tmp_path):
     without = read_campaign(folder_of(tmp_path, TRIALS))
     effect = effect_of(tmp_path, example())
     reason = effect.unavailable(Setting(without, MODEL, MODEL.scales(without)))

@@ -1,7 +1,5 @@
 """The catalogue on the lumped models that come with the package."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from importlib.resources import files
 
@@ -23,7 +21,7 @@ OUTPUTS = {"tip": ("x3", Quantity.DISPLACEMENT), "g0": ("base_strain", Quantity.
 
 
 @pytest.fixture(scope="module")
-def setting() -> Setting:
+def setting():
     model = LumpedModel.load(str(files("discrepancy.lumped_models") / "three_mass_chain.toml"))
     given = campaign()
     noise = NoiseRecord(1e-6, 200.0)
@@ -54,7 +52,7 @@ ABSENT = ("local_stiffness_loss", "gauge_misalignment", "washout", "inertia_reli
 
 
 @pytest.mark.parametrize("effect", library(), ids=lambda effect: effect.identifier)
-def test_an_effect_that_is_available_shows_and_another_says_why(effect, setting: Setting) -> None:  # type: ignore[no-untyped-def]
+def test_an_effect_that_is_available_shows_and_another_says_why(effect, setting):
     reason = effect.unavailable(setting)
     model = setting.model
     if effect.identifier in ABSENT:

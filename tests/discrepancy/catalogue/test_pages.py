@@ -1,7 +1,5 @@
 """Pages and catalogue agree; every effect has its picture."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest
@@ -13,7 +11,7 @@ from discrepancy.catalogue.library import library
 IDENTIFIERS = {effect.identifier for effect in library()}
 
 
-def test_the_pages_are_those_of_the_catalogue() -> None:
+def test_the_pages_are_those_of_the_catalogue():
     """If this fails: python -m benchmarks.effect_pages."""
     made = pages()
     assert {path.name for path in FOLDER.glob("*.md")} == set(made)
@@ -21,7 +19,7 @@ def test_the_pages_are_those_of_the_catalogue() -> None:
         assert (FOLDER / name).read_text(encoding="utf-8") == text, name
 
 
-def test_every_effect_has_paragraphs() -> None:
+def test_every_effect_has_paragraphs():
     texts = paragraphs()
     assert set(texts) == IDENTIFIERS | {"overview"}
     assert set(PICTURES) <= IDENTIFIERS
@@ -37,7 +35,7 @@ def test_every_effect_has_paragraphs() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(IDENTIFIERS))
-def test_a_picture_is_small(name: str) -> None:
+def test_a_picture_is_small(name):
     data = (FOLDER / "images" / f"{name}.png").read_bytes()
     assert len(data) <= 40 * 1024
     width, height = struct.unpack(">II", data[16:24])
@@ -45,11 +43,11 @@ def test_a_picture_is_small(name: str) -> None:
     assert 150 <= height <= 300
 
 
-def test_no_picture_is_left_over() -> None:
+def test_no_picture_is_left_over():
     assert {path.stem for path in (FOLDER / "images").iterdir()} == IDENTIFIERS
 
 
-def test_a_picture_can_be_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_picture_can_be_drawn_again(monkeypatch):
     setting = picture_setting()
     effects = {effect.identifier: effect for effect in library()}
     picture = draw(effects["cubic_stiffness"], setting)

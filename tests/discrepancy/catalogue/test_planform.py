@@ -1,7 +1,5 @@
 """Effects that act over the wing's planform: their sizes mean what they say of the first mode."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import pi
 
@@ -10,33 +8,32 @@ import pytest
 from scipy.linalg import eigh
 
 from discrepancy.campaign.records import Campaign, Release, TrialKind
-from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
 from discrepancy.catalogue.scales import loss_integral
-from discrepancy.models.wing import WingModel
-from fe.runtime.patch_arrays import PatchArrays
+from discrepancy.models.structures import WingModel
 from tests.discrepancy.models.test_wing import RING
 
 RELEASE = 0.03
 
 
 @pytest.fixture(scope="module")
-def setting(coarse_patch_arrays: PatchArrays) -> Setting:
+def setting(coarse_patch_arrays):
     model = WingModel(coarse_patch_arrays)
     ring = replace(RING, kind=TrialKind.RINGDOWN, release=Release(displacement=RELEASE))
     campaign = Campaign("lab", {}, (ring,), None, {}, "")
     return Setting(campaign, model, model.scales(campaign))
 
 
-def effect(identifier: str) -> Effect:
+def effect(identifier):
     return next(item for item in library() if item.identifier == identifier)
 
 
-def first_mode(setting: Setting) -> tuple[np.ndarray, np.ndarray, float, float]:
+def first_mode(setting):
     """Shares of stations, their motion when the mean moves by one, stiffness at the mean, frequency."""
     model = setting.model
     e, servo, pitot, *_ = (item.mean for item in model.parameters)
-    structure = model.wing.structure(e, (0.0, 0.0), servo, pitot)
+    structure = model.wing.at(np.array((e, 0.0, 0.0, servo, pitot, 0.0, 0.0)))
     square, shapes = eigh(structure.stiffness, structure.mass, subset_by_index=[0, 0])
     arrays = model.wing.arrays
     motion = arrays.line_rows[2] @ shapes[:, 0]
@@ -44,15 +41,13 @@ def first_mode(setting: Setting) -> tuple[np.ndarray, np.ndarray, float, float]:
     return arrays.station_weights, motion / mean, float(square[0]) / mean**2, float(np.sqrt(square[0]))
 
 
-def test_they_act_there(setting: Setting) -> None:
+def test_they_act_there(setting):
     assert effect("quadratic_damping").places(setting) == ("planform",)
     assert effect("cubic_stiffness").places(setting) == ("tip", "planform")
 
 
 @pytest.mark.parametrize(("velocity", "displacement"), [(2.0, 0.0), (1.4, 0.0), (2.0, 0.6)])
-def test_damping_takes_the_stated_share_of_the_first_mode(
-    setting: Setting, velocity: float, displacement: float
-) -> None:
+def test_damping_takes_the_stated_share_of_the_first_mode(setting, velocity, displacement):
     """2 pi zeta k A^2 in a cycle, with every station of the mesh instead of six."""
     share, motion, stiffness, frequency = first_mode(setting)
     values = {
@@ -73,7 +68,7 @@ def test_damping_takes_the_stated_share_of_the_first_mode(
     assert loss == pytest.approx(2.0 * pi * 0.01 * stiffness * size**2, rel=1e-2)
 
 
-def test_a_cubic_spring_has_the_stated_share_of_the_first_modes_force(setting: Setting) -> None:
+def test_a_cubic_spring_has_the_stated_share_of_the_first_modes_force(setting):
     share, motion, stiffness, _ = first_mode(setting)
     (force,) = effect("cubic_stiffness").patch(setting, {"stiffening": 0.2}, "planform")
     size = setting.scales.ports["planform"].largest_displacement

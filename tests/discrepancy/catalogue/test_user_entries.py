@@ -1,14 +1,10 @@
 """Effects of a user: TOML files and entry points."""
 
-from __future__ import annotations
-
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library, load_catalogue
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import Conditions
@@ -23,8 +19,8 @@ BUFFER = INPUTS.text("buffer.toml")
 
 
 @pytest.fixture
-def write(tmp_path: Path):
-    def file(text: str) -> Path:
+def write(tmp_path):
+    def file(text):
         path = tmp_path / "mine.toml"
         path.write_text(text, encoding="utf-8")
         return path
@@ -32,7 +28,7 @@ def write(tmp_path: Path):
     return file
 
 
-def test_a_file_with_one_effect(write, setting: Setting) -> None:
+def test_a_file_with_one_effect(write, setting):
     catalogue = load_catalogue([write(PYLON)], installed=False)
     assert len(catalogue) == len(library()) + 1
     pylon = effect_by_identifier("store_pylon", catalogue)
@@ -46,7 +42,7 @@ def test_a_file_with_one_effect(write, setting: Setting) -> None:
     assert np.max(np.abs(seen.values - trial.values)) > 1e-4
 
 
-def test_a_file_with_several_effects_places_and_a_family(write, setting: Setting) -> None:
+def test_a_file_with_several_effects_places_and_a_family(write, setting):
     buffer, gauge = load_catalogue([write(BUFFER)], installed=False)[-2:]
     assert buffer.places(setting) == ("root", "tip", "span")
     spring, damper = buffer.patch(setting, {"share": 0.05}, "tip")
@@ -61,7 +57,7 @@ def test_a_file_with_several_effects_places_and_a_family(write, setting: Setting
     ]
 
 
-def test_an_effect_whose_place_is_no_port(write, setting: Setting) -> None:
+def test_an_effect_whose_place_is_no_port(write, setting):
     text = BUFFER.replace('places = "ports"', 'places = ["flap"]')
     buffer = load_catalogue([write(text)], installed=False)[-2]
     with pytest.raises(CatalogueError, match="has no port 'flap'; it has root, tip, span"):
@@ -69,7 +65,7 @@ def test_an_effect_whose_place_is_no_port(write, setting: Setting) -> None:
 
 
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("effect"))
-def test_a_bad_entry_is_refused_with_one_sentence(write, old: str, new: str, sentence: str) -> None:
+def test_a_bad_entry_is_refused_with_one_sentence(write, old, new, sentence):
     assert old in PYLON
     with pytest.raises(CatalogueError) as caught:
         load_catalogue([write(PYLON.replace(old, new, 1))], installed=False)
@@ -77,7 +73,7 @@ def test_a_bad_entry_is_refused_with_one_sentence(write, old: str, new: str, sen
     assert "\n" not in str(caught.value)
 
 
-def test_effects_as_objects(tmp_path: Path) -> None:
+def test_effects_as_objects(tmp_path):
     with pytest.raises(CatalogueError, match="cannot be read"):
         load_catalogue([tmp_path / "none.toml"], installed=False)
     assert load_catalogue(library()[:0], installed=False) == library()
@@ -85,7 +81,7 @@ def test_effects_as_objects(tmp_path: Path) -> None:
         load_catalogue(library()[:1], installed=False)
 
 
-def test_an_installed_package_adds_effects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_installed_package_adds_effects(tmp_path, monkeypatch):
     """A package on the path with metadata of its own, as pip would leave it."""
     (tmp_path / "pylons.py").write_text(
         "from dataclasses import replace\n"
@@ -116,9 +112,9 @@ def test_an_installed_package_adds_effects(tmp_path: Path, monkeypatch: pytest.M
     sys.modules.pop("pylons", None)
 
 
-def test_values_that_no_primitive_can_have(write, setting: Setting) -> None:
+def test_values_that_no_primitive_can_have(write, setting):
     text = BUFFER.replace('side = "2 - 1"', 'side = "0.5 * power"')
     buffer = load_catalogue([write(text)], installed=False)[-2]
-    assert next(iter(buffer.patch(setting, {"share": 0.05}, "tip"))).side == 1  # type: ignore[attr-defined]
+    assert next(iter(buffer.patch(setting, {"share": 0.05}, "tip"))).side == 1
     with pytest.raises(CatalogueError, match="side must be a number"):
         buffer.patch(setting, {"share": 0.05, "power": 2.5}, "tip")

@@ -1,13 +1,12 @@
 """What is read from noise records, against processes with known parameters."""
 
-from __future__ import annotations
-
 from math import inf
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 from scipy.stats import binom
@@ -20,24 +19,45 @@ from discrepancy.campaign.noise import (
     noise_model,
     without_lines,
 )
-from discrepancy.campaign.noise_tests import ljung_box
+from discrepancy.campaign.noise_tests import (
+    benjamini_yekutieli,
+    combine,
+    cumulative_periodogram,
+    fisher_g,
+    holm,
+    ljung_box,
+    periodogram,
+    pooled_variance_p_value,
+    variance_p_value,
+)
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
+
+
+def test_records_that_say_little():
+    """No record, a stated deviation, and a record too short for a spectrum."""
+    for record, freedom, deviation in ((None, 0.0, 0.7), (NoiseRecord(2.0, inf), inf, 2.0)):
+        found = noise_model(Channel("g", Quantity.STRAIN, "g", record), 0.7)
+        assert found.degrees_of_freedom == freedom
+        assert found.standard_deviation == found.static_deviation == deviation
+    short = noise_model(channel(np.random.default_rng(0).standard_normal(30)), 0.7)
+    assert not short.autoregression.size
+
 
 INTERVAL = 0.002
 
 
-def coloured(generator, coefficients, count, burn=2000):  # type: ignore[no-untyped-def]
+def coloured(generator, coefficients, count, burn=2000):
     white = generator.standard_normal(count + burn)
     return lfilter([1.0], np.r_[1.0, -np.asarray(coefficients)], white)[burn:]
 
 
-def channel(samples, interval=INTERVAL):  # type: ignore[no-untyped-def]
+def channel(samples, interval=INTERVAL):
     record = NoiseRecord(float(samples.std()), len(samples) - 1.0, samples, interval, "pre-trigger")
     return Channel("g", Quantity.STRAIN, "g", record)
 
 
 @pytest.mark.parametrize("coefficients", [(0.8,), (1.2, -0.6), (0.5, 0.0, 0.3)])
-def test_autoregression_is_recovered(coefficients: tuple[float, ...]) -> None:
+def test_autoregression_is_recovered(coefficients):
     """Yule-Walker estimates have standard errors of about 1/sqrt(N)."""
     found, innovation = autoregression(coloured(np.random.default_rng(1), coefficients, 8000))
     padded = np.zeros(max(len(found), len(coefficients)))
@@ -47,7 +67,7 @@ def test_autoregression_is_recovered(coefficients: tuple[float, ...]) -> None:
     assert innovation == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / 8000))
 
 
-def test_model_of_a_coloured_record() -> None:
+def test_model_of_a_coloured_record():
     samples = 3.0 * coloured(np.random.default_rng(2), (0.8,), 4000)
     noise = noise_model(channel(samples), 1.0)
     assert noise.standard_deviation == pytest.approx(3.0, rel=0.05)  # of the innovation
@@ -58,7 +78,7 @@ def test_model_of_a_coloured_record() -> None:
     np.testing.assert_array_equal(noise.whiten(samples, 2.0 * INTERVAL), samples)
 
 
-def test_white_records_stay_white() -> None:
+def test_white_records_stay_white():
     generator = np.random.default_rng(3)
     orders = [
         len(noise_model(channel(generator.standard_normal(400)), 1.0).autoregression) for _ in range(300)
@@ -67,21 +87,8 @@ def test_white_records_stay_white() -> None:
     assert np.count_nonzero(orders) <= binom.isf(1e-4, 300, 1e-3)
 
 
-def test_lines_are_found_where_they_are_and_taken_out() -> None:
-    generator = np.random.default_rng(6)
-    time = INTERVAL * np.arange(1000)
-    for frequency in (50.0, 60.0):
-        samples = generator.standard_normal(1000) + 0.5 * np.cos(2.0 * np.pi * frequency * time + 0.3)
-        rest, lines = without_lines(samples, INTERVAL)
-        assert lines == (frequency,)
-        assert rest.std() == pytest.approx(1.0, rel=0.1)
-    # 400 Hz is not below half the rate of 500 Hz: it shows at 100 Hz
-    samples = generator.standard_normal(1000) + np.cos(2.0 * np.pi * 100.0 * time)
-    assert without_lines(samples, INTERVAL)[1] == (400.0,)
-
-
 @pytest.mark.parametrize("coefficients", [pytest.param((), marks=pytest.mark.long), (0.9,)])
-def test_lines_are_not_found_in_noise(coefficients: tuple[float, ...]) -> None:
+def test_lines_are_not_found_in_noise(coefficients):
     """Level 1e-4 a line against a level known from 20 neighbours: (1 + 9.2 / 20)^-20 = 5e-4, three lines."""
     generator = np.random.default_rng(7)
     found = sum(
@@ -90,8 +97,30 @@ def test_lines_are_not_found_in_noise(coefficients: tuple[float, ...]) -> None:
     assert found <= binom.isf(1e-3, 2100, 6e-4)
 
 
+@pytest.mark.parametrize(
+    ("interval", "count", "shown", "size", "line"),
+    [
+        (INTERVAL, 1000, 50.0, 0.5, 50.0),
+        (INTERVAL, 1000, 60.0, 0.5, 60.0),
+        (INTERVAL, 1000, 100.0, 1.0, 400.0),  # above half the rate: it shows at 100 Hz
+        # a record of 8 s resolves 0.125 Hz, and 400 Hz may be off by 0.4 Hz
+        *(
+            (1e-3, 8000, 400.0 * (1.0 + share * MAINS_DEVIATION), 2.0, 400.0)
+            for share in (-0.8, -0.2, 0.5, 1.0)
+        ),
+    ],
+)
+def test_lines_are_found_where_they_are_and_taken_out(interval, count, shown, size, line):
+    time = interval * np.arange(count)
+    noise = np.random.default_rng(9).standard_normal(count)
+    rest, lines = without_lines(noise + size * np.cos(2.0 * np.pi * shown * time + 0.3), interval)
+    assert lines == (line,)
+    assert rest.std() == pytest.approx(1.0, rel=0.1 if count == 1000 else 0.03)
+    assert ljung_box(rest)[1] > 1e-3
+
+
 @given(st.floats(0.0, 1e3), st.floats(1e-4, 1e-1))
-def test_aliases_agree_at_the_samples(frequency: float, interval: float) -> None:
+def test_aliases_agree_at_the_samples(frequency, interval):
     shown = aliased(frequency, interval)
     assert 0.0 <= shown <= 0.5 / interval * (1.0 + 1e-9)
     time = interval * np.arange(6)
@@ -100,19 +129,8 @@ def test_aliases_agree_at_the_samples(frequency: float, interval: float) -> None
     )
 
 
-def test_records_that_say_little() -> None:
-    """No record, a stated deviation, and a record too short for a spectrum."""
-    none = noise_model(Channel("g", Quantity.STRAIN, "g", None), 0.7)
-    assert none.degrees_of_freedom == 0.0
-    assert none.standard_deviation == none.static_deviation == 0.7
-    stated = noise_model(Channel("g", Quantity.STRAIN, "g", NoiseRecord(2.0, inf)), 0.7)
-    assert (stated.standard_deviation, stated.degrees_of_freedom) == (2.0, inf)
-    short = noise_model(channel(np.random.default_rng(0).standard_normal(30)), 0.7)
-    assert not short.autoregression.size
-
-
 @pytest.mark.parametrize("coefficients", [(0.9,), (1.2, -0.6), (0.5, 0.0, 0.3)])
-def test_whitening_is_that_of_the_whole_covariance(coefficients: tuple[float, ...]) -> None:
+def test_whitening_is_that_of_the_whole_covariance(coefficients):
     """Sum of squares of whitened samples = x' C^-1 x with the Toeplitz covariance of the process."""
     pulse = np.r_[1.0, np.zeros(3000)]
     impulse = lfilter([1.0], np.r_[1.0, -np.asarray(coefficients)], pulse)
@@ -124,14 +142,126 @@ def test_whitening_is_that_of_the_whole_covariance(coefficients: tuple[float, ..
     np.testing.assert_allclose(noise.whiten(x[:, :2], INTERVAL), white[:, :2], rtol=1e-12)
 
 
-@pytest.mark.parametrize("share", [-0.8, -0.2, 0.5, 1.0])
-def test_lines_are_found_where_the_mains_are_off(share: float) -> None:
-    """A record of 8 s resolves 0.125 Hz, and 400 Hz may be off by 0.4 Hz."""
-    generator = np.random.default_rng(9)
-    time = 1e-3 * np.arange(8000)
-    frequency = 400.0 * (1.0 + share * MAINS_DEVIATION)
-    samples = generator.standard_normal(8000) + 2.0 * np.cos(2.0 * np.pi * frequency * time + 0.3)
-    rest, lines = without_lines(samples, 1e-3)
-    assert lines == (400.0,)
-    assert rest.std() == pytest.approx(1.0, rel=0.03)
-    assert ljung_box(rest)[1] > 1e-3
+# ---------------------------------------------------------------- statistics of residuals
+
+
+def test_periodogram_of_a_cosine_and_of_white_noise():
+    count = 101
+    series = np.cos(2.0 * np.pi * 7 * np.arange(count) / count)
+    ordinates = periodogram(series)
+    assert ordinates.size == 50
+    assert ordinates[6] == pytest.approx(count / 4)
+    assert np.delete(ordinates, 6).max() < 1e-20
+    noise = np.random.default_rng(0).standard_normal((4000, 64))
+    assert np.mean([periodogram(row) for row in noise]) == pytest.approx(1.0, abs=0.01)
+    assert periodogram(np.ones(64)).size == 31
+
+
+@pytest.mark.parametrize("count", [64, 301])
+def test_p_values_of_serial_tests_are_uniform_under_white_noise(count):
+    noise = np.random.default_rng(count).standard_normal((1500, count))
+    for test in (ljung_box, cumulative_periodogram, fisher_g):
+        p = np.array([test(row)[1] for row in noise])
+        for level in (0.2, 0.05, 0.01, 0.0025):
+            error = np.sqrt(level / len(noise))
+            assert np.mean(p <= level) == pytest.approx(level, abs=4.0 * error), (test.__name__, level)
+
+
+def test_fisher_g_against_his_exact_sum():
+    from math import comb
+
+    series = np.random.default_rng(2).standard_normal(41) + 1.1 * np.cos(0.9 * np.arange(41))
+    g, p, _ = fisher_g(series)
+    count = periodogram(series).size
+    exact = sum(
+        (-1) ** (j - 1) * comb(count, j) * (1.0 - j * g) ** (count - 1) for j in range(1, int(1.0 / g) + 1)
+    )
+    assert p == pytest.approx(exact, rel=0.02)
+
+
+def test_serial_tests_see_what_they_are_for():
+    generator = np.random.default_rng(4)
+    noise = generator.standard_normal(400)
+    correlated = np.empty(400)
+    correlated[0] = noise[0]
+    for n in range(1, 400):
+        correlated[n] = 0.4 * correlated[n - 1] + noise[n]
+    assert ljung_box(correlated)[1] < 1e-6
+    assert cumulative_periodogram(correlated)[1] < 1e-4
+    share, p, place = fisher_g(noise + 0.6 * np.cos(2.0 * np.pi * 50 / 400 * np.arange(400)))
+    assert p < 1e-6
+    assert place == 50
+    assert share == pytest.approx(0.18 / 1.18, rel=0.5)
+
+
+def test_holm_and_benjamini_yekutieli_by_hand():
+    assert holm([0.004, 0.011, 0.03, np.nan], 0.03) == (True, True, True, False)
+    assert holm([0.011, 0.02, 0.03], 0.03) == (False, False, False)
+    assert holm([], 0.01) == ()
+    # c(4) = 25/12: limits are 0.006, 0.012, 0.018, 0.024 for a rate of 0.05.
+    assert benjamini_yekutieli(np.array([0.5, 0.007, 0.0115, 0.0179]), 0.05).tolist() == [
+        False, True, True, True,
+    ]  # fmt: skip
+    assert not benjamini_yekutieli(np.array([0.0061, 0.5, 0.5, 0.5]), 0.05).any()
+    assert benjamini_yekutieli(np.zeros(0), 0.05).size == 0
+
+
+def test_combined_p_values_are_valid():
+    p = np.random.default_rng(8).uniform(size=(4000, 7))
+    combined = np.array([combine(row) for row in p])
+    for level in (0.1, 0.01):
+        assert np.mean(combined <= level) <= level + 3.0 * np.sqrt(level / 4000)
+    assert combine([0.3]) == 0.3
+
+
+def test_ljung_box_allows_for_samples_that_do_not_count():
+    """A third is left out, in blocks and singly: levels hold, and its value there does not matter."""
+    generator = np.random.default_rng(12)
+    used = np.ones(150, dtype=bool)
+    used[40:70] = False
+    used[generator.choice(150, 20, replace=False)] = False
+    rows = generator.standard_normal((4000, 150))
+    p = np.array([ljung_box(row, used=used)[1] for row in rows])
+    for level in (0.2, 0.05, 0.01, 0.0025):
+        assert np.mean(p <= level) == pytest.approx(level, abs=4.0 * np.sqrt(level / 4000) + 0.2 * level)
+    rows[:, ~used] = 100.0
+    assert ljung_box(rows[0], used=used)[1] == p[0]
+    assert ljung_box(rows[0], used=np.zeros(150, dtype=bool)) == (0.0, 1.0)
+    every = np.ones(150, dtype=bool)
+    again = generator.standard_normal(150)
+    assert ljung_box(again, used=every)[0] == pytest.approx(ljung_box(again)[0], rel=1e-12)
+
+
+def test_weights_of_the_pooled_variance_have_the_most_power():
+    """A gap that raises all channels alike is found more often than with any simpler weights.
+
+    Channels of a short record, of few readings and of many: what tells most is neither the most readings
+    (their record is short) nor every channel alike.
+    """
+    freedom = np.array([4000.0, 4000.0, 300.0, 6.0, 6.0, 6.0, 6.0])
+    record = np.array([12.0, 12.0, np.inf, np.inf, 50.0, np.inf, 50.0])
+    generator = np.random.default_rng(5)
+    draws, gap, level = 2000, 0.35, 1e-3
+    noise = np.where(np.isinf(record), 1.0, generator.chisquare(np.minimum(record, 1e6), (draws, 7)) / record)
+
+    def p_values(size):
+        squares = size * generator.chisquare(freedom, (draws, 7)) / freedom / noise
+        return np.array(
+            [
+                [variance_p_value(*row) for row in zip(square, freedom, record, strict=True)]
+                for square in squares
+            ]
+        )
+
+    def share(p, weights):
+        scores = stats.norm.isf(np.clip(p, 1e-300, 1.0 - 1e-16)) @ weights / np.sqrt(weights @ weights)
+        return float(np.mean(stats.norm.sf(scores) < level))
+
+    gapped = p_values(1.0 + gap)
+    found = np.mean([pooled_variance_p_value(row, freedom, record) < level for row in gapped])
+    known = np.where(np.isinf(record), 1e9, record)
+    simpler = (np.ones(7), np.sqrt(freedom), freedom, known, freedom / (1.0 + freedom / record))
+    for weights in simpler:
+        assert found > share(gapped, weights) + 0.02
+    silent = [pooled_variance_p_value(row, freedom, record) for row in p_values(1.0)]
+    assert stats.kstest(silent, "uniform").pvalue > 1e-3

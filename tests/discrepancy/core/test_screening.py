@@ -1,111 +1,132 @@
 """Screening and gates: dense projections, fits, level and power."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from math import inf
+from math import inf, sin
 
 import numpy as np
 import pytest
 from scipy.stats import binom
 
 from discrepancy.campaign.records import NoiseRecord
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate, absolute_tests, shape_gate
+from discrepancy.fits.predictive import ensemble, residual_set, with_draws
 from discrepancy.fits.screening import Screen, grid, rescaled
+from discrepancy.judgement.conclusion import named_effects
 from discrepancy.search.hypotheses import pairs
 from discrepancy.search_settings import SEARCH
+from discrepancy.workflow import patch_draws
+from fe.runtime.patch import ModelPatch, RunOffset
+
+from . import kit
 
 
 @pytest.fixture(scope="module")
-def screened(kit):  # type: ignore[no-untyped-def]
+def screened():
     """Problem, fit without effect, screen, two linear effects (wide priors) with their changes."""
     problem = kit.closed_problem(seed=12, effect=0.12)
     none = kit.fitted(problem, iterations=40)
     screen = Screen(problem, none)
-    terms = (Term(kit.offset_effect(deviation=10.0), "y1"), Term(kit.drift_effect(deviation=10.0), "y1"))
-    changes = [next(iter(screen.changes(term))) for term in terms]
-    return problem, none, screen, terms, changes
+    terms = (
+        Term(kit.offset_effect(deviation=10.0), "y1"),
+        Term(kit.drift_effect(deviation=10.0), "y1"),
+    )
+    return problem, none, screen, terms, [next(iter(screen.changes(term))) for term in terms]
 
 
-def dense_projection(kit, problem, none, term, start):  # type: ignore[no-untyped-def]
-    """Return, densely, change d, nuisances' derivatives A, Hessian, residual and gradient at the fit."""
-    linear = kit.Linear(problem, Candidate((term,)))
-    q = problem.shared.size
-    zero = np.concatenate((none.point.shared, np.zeros(1), *none.point.local))
-    moved = zero.copy()
-    moved[q] = start[0]
-    d = linear.residual(zero) - linear.residual(moved)
-    bare = kit.Linear(problem, Candidate())
-    _, a = bare.dense()
-    residual = linear.residual(zero)
-    gradient = a.T @ residual - bare.precision * np.delete(zero, q)
-    return d, a, a.T @ a + np.diag(bare.precision), residual, gradient
-
-
-def test_change_is_the_projected_one(kit, screened) -> None:  # type: ignore[no-untyped-def]
+def test_change_is_the_projected_one(screened):
+    """Beside change d, derivatives A by nuisances, Hessian, residual and gradient as dense matrices."""
     problem, none, screen, terms, changes = screened
+    q = problem.shared.size
+    bare = kit.Linear(problem)
+    _, a, hessian = bare.dense()
+    zero = np.concatenate((none.point.shared, np.zeros(1), *none.point.local))
+    kernel = np.eye(len(a)) - a @ np.linalg.solve(hessian, a.T)
     vectors = []
     for term, change in zip(terms, changes, strict=True):
-        d, a, hessian, residual, gradient = dense_projection(kit, problem, none, term, change.start)
-        kernel = np.eye(len(d)) - a @ np.linalg.solve(hessian, a.T)
+        linear, moved = kit.Linear(problem, Candidate((term,))), zero.copy()
+        moved[q] = change.start[0]
+        residual = linear.residual(zero)
+        d = residual - linear.residual(moved)
+        gradient = a.T @ residual - bare.precision * np.delete(zero, q)
         assert change.size == pytest.approx(d @ kernel @ d, rel=1e-6)
         # b(d) = r.d - g' H^-1 J' d; the gradient g is small at the fit, and would be zero at its very end
         expected = residual @ d - gradient @ np.linalg.solve(hessian, a.T @ d)
         assert change.fits == pytest.approx(expected, rel=1e-6)
-        assert float(change.vector * screen.sign @ change.vector) == pytest.approx(change.size, rel=1e-9)
-        vectors.append((d, kernel))
-    (one, kernel), (other, _) = vectors
-    product = one @ kernel @ other
-    assert float(changes[0].vector * screen.sign @ changes[1].vector) == pytest.approx(product, rel=1e-6)
+        vectors.append(d)
+    vector = [change.vector for change in changes]
+    for one, other in ((0, 0), (0, 1), (1, 1)):
+        product = vectors[one] @ kernel @ vectors[other]
+        assert float(vector[one] * screen.sign @ vector[other]) == pytest.approx(product, rel=1e-6)
 
 
-def test_gain_is_what_a_fit_achieves(screened) -> None:  # type: ignore[no-untyped-def]
+def test_pairs_are_fitted_together_and_one_change_is_no_pair(screened):
+    problem, none, screen, terms, changes = screened
+    options = {change.term.effect.identifier: [change] for change in changes}
+    ((misfit, first, second),) = list(pairs(options, screen.sign))
+    found = kit.fitted(problem, *terms, iterations=40)
+    assert none.objective - found.objective == pytest.approx(-misfit, rel=0.02, abs=0.05)
+    start = np.concatenate((rescaled(first), rescaled(second)))
+    np.testing.assert_allclose(start, found.point.effect, rtol=0.03, atol=1e-3)
+    assert not list(pairs({"one": [changes[0]], "other": [changes[0]]}, screen.sign))
+
+
+def test_gain_is_what_a_fit_achieves(screened):
     """For a linear effect with a wide prior the screen is the fit."""
     problem, none, _, terms, changes = screened
     for term, change in zip(terms, changes, strict=True):
-        candidate = Candidate((term,))
-        found = fit(problem, candidate, problem.start(candidate), iterations=40)
+        found = kit.fitted(problem, term, iterations=40)
         prior = 0.5 * float(found.point.effect @ found.point.effect)
         assert none.objective - found.objective + prior == pytest.approx(change.gain, rel=0.02, abs=0.03)
         assert rescaled(change)[0] == pytest.approx(found.point.effect[0], rel=0.02, abs=1e-4)
 
 
-def test_pairs_are_fitted_together(kit, screened) -> None:  # type: ignore[no-untyped-def]
-    problem, none, screen, terms, changes = screened
-    options = {change.term.effect.identifier: [change] for change in changes}
-    ((misfit, first, second),) = list(pairs(options, screen.sign))
-    candidate = Candidate(terms)
-    found = fit(problem, candidate, problem.start(candidate), iterations=40)
-    assert none.objective - found.objective == pytest.approx(-misfit, rel=0.02, abs=0.05)
-    np.testing.assert_allclose(
-        np.concatenate((rescaled(first), rescaled(second))), found.point.effect, rtol=0.03, atol=1e-3
-    )
-
-
-def test_two_changes_that_are_one_are_no_pair(kit, screened) -> None:  # type: ignore[no-untyped-def]
-    _, _, screen, _, changes = screened
-    twin = {"one": [changes[0]], "other": [changes[0]]}
-    assert not list(pairs(twin, screen.sign))
-
-
-def test_noise_unknown_to_the_record_counts_by_what_is_left(kit) -> None:  # type: ignore[no-untyped-def]
+def test_noise_unknown_to_the_record_counts_by_what_is_left():
     """With n0 = 0 the residual's own size stands for the noise: gains do not depend on the stand-in scale."""
-    problem = kit.closed_problem(seed=13, effect=0.12, known_noise=False)
-    none = kit.fitted(problem, iterations=40)
-    term = Term(kit.offset_effect(), "y1")
-    change = next(iter(Screen(problem, none).changes(term)))
-    known = kit.closed_problem(seed=13, effect=0.12)
-    at_known = kit.fitted(known, iterations=40)
-    other = next(iter(Screen(known, at_known).changes(term)))
-    # the stand-in is a thousandth of the range, the noise is not; sizes agree in units of what is left
-    left = at_known.sums[0] / (known.counts[0] - at_known.spent[0])
-    assert change.size == pytest.approx(other.size / left, rel=0.25)
+    sizes = []
+    for noise in (kit.NOISE, None):
+        problem = kit.closed_problem(seed=13, effect=0.12, noise=noise)
+        none = kit.fitted(problem, iterations=40)
+        sizes.append(next(iter(Screen(problem, none).changes(kit.OFFSET))).size)
+        if noise:  # sizes agree in units of what is left
+            left = none.sums[0] / (problem.counts[0] - none.spent[0])
+    assert sizes[1] == pytest.approx(sizes[0] / left, rel=0.25)
 
 
-def test_grids_hold_one_scale_and_every_level(catalogue) -> None:  # type: ignore[no-untyped-def]
-    for effect in catalogue:
+@pytest.mark.parametrize(
+    ("freedom", "kinds", "samples", "gap"),
+    [
+        (inf, ("static",), 0, 0.0),
+        (30.0, ("static",), 0, 0.0),
+        *(
+            pytest.param(*row, 60, 0.0, marks=pytest.mark.long)  # between the two above and the one below
+            for row in ((inf, ("ringdown",)), (30.0, ("ringdown",)), (200.0, ("static", "ringdown")))
+        ),
+        (20.0, ("static", "ringdown"), 60, 0.0),
+        (200.0, ("ringdown",), 120, 0.0),  # long enough for whiteness
+        (inf, ("ringdown",), 80, 0.5),  # a third more variance, spread evenly
+    ],
+)
+def test_absolute_gate_has_its_level_and_its_power(freedom, kinds, samples, gap):
+    """Rejected at most 1e-3 of the time where nothing is missing, and nearly always beside a gap."""
+    problem = kit.closed_problem(seed=1, noise=NoiseRecord(0.02, freedom), kinds=kinds, samples=samples)
+    found = kit.fitted(problem)
+    generator = np.random.default_rng(17)
+    draws, rejected = 300 if gap else 1500, 0
+    for _ in range(draws):
+        scale = 1.0 if freedom == inf else generator.chisquare(freedom, 3) / freedom
+        sums = (1.0 + gap) * generator.chisquare(problem.counts - found.spent) / scale
+        residuals = tuple(generator.standard_normal(r.shape) for r in found.residuals)
+        drawn = replace(found, sums=sums, residuals=residuals)
+        rejected += absolute_gate(problem, drawn).passed is False
+    whiteness = any(name.startswith("whiteness") for name, _ in absolute_tests(problem, found))
+    assert whiteness or samples < 120
+    assert rejected > 280 if gap else rejected <= binom.isf(1e-3, draws, ABSOLUTE_LEVEL)
+
+
+def test_grids_hold_one_scale_and_every_level():
+    for effect in kit.CATALOGUE:
         term = Term(effect)
         points = list(grid(term))
         assert points
@@ -126,76 +147,42 @@ def test_grids_hold_one_scale_and_every_level(catalogue) -> None:  # type: ignor
             assert any(values[effect.parameters[n].name] != 0.0 for n in magnitudes) or not magnitudes
 
 
-# ---------------------------------------------------------------- level and power of the gates
-
-
-DRAWS = 1500
-
-
-def null_gates(kit, freedom, kinds, samples, draws=DRAWS, gap=0.0):  # type: ignore[no-untyped-def]
-    """Return a fit and, at sums drawn under the null (or with a gap), whether the gate passed."""
-    noise = NoiseRecord(0.02, freedom)
-    problem = kit.closed_problem(seed=1, noise=noise, kinds=kinds, samples=samples)
-    found = kit.fitted(problem)
-    generator = np.random.default_rng(17)
-    left = problem.counts - found.spent
-    passed = []
-    for _ in range(draws):
-        scale = 1.0 if freedom == inf else generator.chisquare(freedom, 3) / freedom
-        sums = (1.0 + gap) * generator.chisquare(left) / scale
-        residuals = tuple(generator.standard_normal(r.shape) for r in found.residuals)
-        passed.append(absolute_gate(problem, replace(found, sums=sums, residuals=residuals)).passed)
-    return problem, found, passed
-
-
-@pytest.mark.parametrize(
-    ("freedom", "kinds", "samples"),
-    [
-        (inf, ("static",), 0),
-        (30.0, ("static",), 0),
-        *(
-            pytest.param(*row, 60, marks=pytest.mark.long)  # between the two above and the one below
-            for row in ((inf, ("ringdown",)), (30.0, ("ringdown",)), (200.0, ("static", "ringdown")))
-        ),
-        (20.0, ("static", "ringdown"), 60),
-    ],
-)
-def test_absolute_gate_has_its_level(kit, freedom: float, kinds: tuple[str, ...], samples: int) -> None:  # type: ignore[no-untyped-def]
-    """Rejected at most 1e-3 of the time where nothing is missing; of 1500 draws more than 7 are too many."""
-    _, _, passed = null_gates(kit, freedom, kinds, samples)
-    assert passed.count(False) <= binom.isf(1e-3, DRAWS, ABSOLUTE_LEVEL)
-
-
-def test_absolute_gate_has_its_level_with_whiteness(kit) -> None:  # type: ignore[no-untyped-def]
-    problem, found, passed = null_gates(kit, 200.0, ("ringdown",), 120, draws=1500)
-    assert any(name.startswith("whiteness") for name, _ in absolute_tests(problem, found))
-    assert passed.count(False) <= binom.isf(1e-3, 1500, ABSOLUTE_LEVEL)
-
-
-def test_absolute_gate_rejects_a_gap_in_all_channels(kit) -> None:  # type: ignore[no-untyped-def]
-    """A third more variance, spread evenly: 60 samples, 5 channels of record."""
-    _, _, passed = null_gates(kit, inf, ("ringdown",), 80, draws=300, gap=0.5)
-    assert passed.count(False) > 280
-
-
-def test_residuals_of_the_truth_pass_and_of_a_gap_fail(kit) -> None:  # type: ignore[no-untyped-def]
+def test_residuals_of_the_truth_pass_and_of_a_gap_fail():
     """Fits, not drawn sums: the degrees of freedom that nuisances take are counted right."""
     shares = []
     for seed in range(40):
-        problem = kit.closed_problem(seed=100 + seed, noise=NoiseRecord(0.02, inf), samples=40)
+        problem = kit.closed_problem(seed=100 + seed, samples=40)
         found = kit.fitted(problem)
         assert absolute_gate(problem, found).passed
         shares.append(found.sums.sum() / (problem.counts.sum() - found.spent.sum()))
     assert np.mean(shares) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (40 * 200)))
     problem = kit.closed_problem(seed=1, extra=lambda rows: 0.1 * np.sin(2.0 * rows))
-    found = kit.fitted(problem)
-    gate = absolute_gate(problem, found)
+    gate = absolute_gate(problem, kit.fitted(problem))
     assert gate.passed is False
     assert gate.statistic < ABSOLUTE_LEVEL
 
 
-def test_without_a_record_nothing_absolute_is_said_but_of_colour(kit) -> None:  # type: ignore[no-untyped-def]
-    problem = kit.closed_problem(seed=1, known_noise=False, samples=150)
+def test_ensembles_have_the_moments_of_a_gaussian_and_follow_a_bent_ridge():
+    """Spread a hundredth of what it should be at first."""
+    root = np.array([[1.0, 0.0], [0.9, 0.2]])
+    covariance = root @ root.T
+
+    def gaussian(x):
+        return 0.5 * float((x - 1.0) @ np.linalg.solve(covariance, x - 1.0))
+
+    draws, again = (ensemble(gaussian, np.ones(2), 0.01 * np.eye(2)) for _ in range(2))
+    np.testing.assert_allclose(draws.mean(axis=0), 1.0, atol=0.35)
+    np.testing.assert_allclose(draws.std(axis=0), np.sqrt(np.diag(covariance)), rtol=0.35)
+    assert draws.tobytes() == again.tobytes()
+    bent = ensemble(
+        lambda x: 0.5 * x[0] ** 2 + 0.5 * ((x[1] - x[0] ** 2) / 0.2) ** 2, np.zeros(2), 0.1 * np.eye(2)
+    )
+    assert bent[:, 0].std() == pytest.approx(1.0, rel=0.4)
+    assert np.abs(bent[:, 1] - bent[:, 0] ** 2).mean() < 0.2
+
+
+def test_without_a_record_nothing_absolute_is_said_but_of_colour():
+    problem = kit.closed_problem(seed=1, noise=None, samples=150)
     found = kit.fitted(problem)
     gate = absolute_gate(problem, found)
     assert gate.passed is None
@@ -205,7 +192,7 @@ def test_without_a_record_nothing_absolute_is_said_but_of_colour(kit) -> None:  
     assert absolute_gate(problem, swung).passed is False
 
 
-def test_shape_gate_compares_evidence(kit) -> None:  # type: ignore[no-untyped-def]
+def test_shape_gate_compares_evidence():
     problem = kit.closed_problem(seed=1)
     found = kit.fitted(problem, Term(kit.offset_effect(), "y1"))
     for gain, passes in ((-3.0, True), (SHAPE_GAIN - 0.01, True), (SHAPE_GAIN + 0.01, False)):
@@ -213,3 +200,104 @@ def test_shape_gate_compares_evidence(kit) -> None:  # type: ignore[no-untyped-d
         assert gate.passed is passes
         assert gate.statistic == pytest.approx(gain)
     assert shape_gate(found, None).passed is True
+
+
+# ---------------------------------------------------------------- draws, and predictions of held-out trials
+
+
+RIPPLES = 200.0
+"""Waves of the ripple in a metre, over 2 pi."""
+
+
+def test_the_misfit_rises_by_the_covariance_where_all_is_linear():
+    problem = kit.closed_problem(seed=3, effect=0.2)
+    found = kit.fitted(problem, kit.OFFSET, iterations=40)
+    screen = Screen(problem, found, record_noise=False)
+    (centre,), deviation = found.point.effect, float(np.sqrt(found.effect_covariance[0, 0]))
+    for steps in (-2.0, 0.5, 1.0):
+        moved = centre + steps * deviation
+        rise = screen.rise(np.array([moved])) + 0.5 * (moved**2 - centre**2)
+        # a fit ends a little beside its optimum
+        assert rise == pytest.approx(0.5 * steps**2, rel=0.01)
+    assert with_draws(problem, found) is found
+
+
+def rippled(steepest):
+    """Return an offset with a ripple on it, whose slope is nearly twice that of its course at one value."""
+
+    def build(setting, values, place):
+        size = values["size"]
+        offset = size + 0.9 / RIPPLES * sin(RIPPLES * (size - steepest))
+        return ModelPatch((RunOffset("A", offset, channel=place, quantity=""),))
+
+    return replace(kit.offset_effect(), identifier="rippled", build=build)
+
+
+def test_intervals_are_as_wide_as_the_posterior_behind_ripples():
+    problem = kit.closed_problem(seed=3, effect=0.2)
+    smooth = kit.fitted(problem, kit.OFFSET, iterations=40)
+    (course,) = named_effects(problem, smooth)[0].parameters
+    candidate = Candidate((Term(rippled(course.value), "y1"),))
+    found = fit(problem, candidate, smooth.point, iterations=40)
+    drawn = with_draws(problem, found)
+    (narrow,) = named_effects(problem, found)[0].parameters
+    (wide,) = named_effects(problem, drawn)[0].parameters
+    assert narrow.high - narrow.low < 0.65 * (course.high - course.low)
+    assert wide.high - wide.low == pytest.approx(course.high - course.low, rel=0.3)
+    assert with_draws(problem, found).draws.tobytes() == drawn.draws.tobytes()
+    (patches,) = patch_draws(problem, drawn, seed=1, count=300)
+    offsets = np.array([item.offset for patch in patches for item in patch])
+    assert np.ptp(np.quantile(offsets, (0.05, 0.95))) == pytest.approx(course.high - course.low, rel=0.3)
+
+
+# ---------------------------------------------------------------- predictions of held-out trials
+
+
+def held_out_problem(seed, shift=0.0, **more):
+    """Return a problem two trials of which are held out, their readings shifted."""
+    problem = kit.closed_problem(seed=seed, samples=25, **more)
+    trials = tuple(
+        replace(trial, held_out=True, values=trial.values + shift) if trial.name in ("down", "two") else trial
+        for trial in problem.campaign.trials
+    )
+    return kit.problem_of(replace(problem.campaign, trials=trials), problem.model)
+
+
+def test_intervals_cover_under_the_right_model():
+    """90 % intervals of held-out readings hold 90 % of them; of fitted ones leverage is the dense one."""
+    scores = []
+    for seed in range(60):
+        problem = held_out_problem(seed, gain_deviation=0.02)
+        items = residual_set(problem, kit.fitted(problem), sensitivities=False).trials
+        scores += [item.residual / item.predictive_deviation for item in items if item.trial.held_out]
+    z = np.concatenate([score.ravel() for score in scores])
+    # readings of a campaign are not independent: six times the binomial error
+    assert abs(np.mean(np.abs(z) < 1.6448536) - 0.9) < 6.0 * np.sqrt(0.09 / z.size)
+    assert abs(np.mean(z**2) - 1.0) < 0.08
+    problem = held_out_problem(3)
+    _, a, hessian = kit.Linear(problem).dense()
+    covariance = a @ np.linalg.solve(hessian, a.T)
+    items = [item for item in residual_set(problem, kit.fitted(problem)).trials if not item.trial.held_out]
+    leverage = np.concatenate([item.leverage.ravel() for item in items])
+    np.testing.assert_allclose(leverage, np.diag(covariance), rtol=1e-6, atol=1e-9)
+    rows = np.concatenate([item.sensitivity.reshape(-1, item.sensitivity.shape[2]) for item in items])
+    np.testing.assert_allclose(rows @ rows.T, covariance, rtol=1e-5, atol=1e-8)
+
+
+def test_held_out_trials_move_nothing_that_is_shared():
+    problem, wild = held_out_problem(5), held_out_problem(5, shift=7.0)
+    found, other = kit.fitted(problem), kit.fitted(wild)
+    np.testing.assert_array_equal(found.point.shared, other.point.shared)
+    assert found.log_evidence == other.log_evidence
+    there = problem.with_trials(problem.campaign.held_out)
+    start = Point(found.point.shared, tuple(np.zeros(d.unknowns.size) for d in there.trials), np.empty(0))
+    adapted = fit(there, Candidate(), start, local_only=True)
+    np.testing.assert_array_equal(adapted.point.shared, found.point.shared)
+    assert any(np.any(u != 0.0) for u in adapted.point.local)
+    # its own nuisances are at their optimum given the rest: the dense solution of one trial
+    for number, data in enumerate(there.trials):
+        parts = there.linearise(number, start, Candidate())
+        local, _ = there.derivatives(number, start, parts, Candidate()).dense()
+        residual = there.residual(number, start, parts.response).ravel()
+        exact = np.linalg.solve(local @ local.T + np.diag(data.unknowns.precision), local @ residual)
+        np.testing.assert_allclose(adapted.point.local[number], exact, atol=0.02)

@@ -1,10 +1,7 @@
 """Campaign folders: round trip to the last bit, units, noise records, and one sentence for what is wrong."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,6 +28,46 @@ from discrepancy.campaign.writing import write_campaign
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
 from tests.refusals import Inputs
 
+
+def test_missing_folders_and_bytes(tmp_path):
+    for place, words in (
+        (tmp_path / "nowhere", "There is no folder"),
+        (tmp_path, "There is no campaign.toml in"),
+    ):
+        with pytest.raises(CampaignFileError, match=words):
+            read_campaign(place)
+    folder = folder_of(tmp_path)
+    for content, words in ((b"\xff", "is not text in UTF-8"), (b"\x00", "zero byte")):
+        (folder / "turn.csv").write_bytes(b"load_factor,g17\n1," + content + b"\n")
+        with pytest.raises(CampaignFileError, match=words):
+            read_campaign(folder)
+    (folder / "turn.csv").write_bytes("\ufeffload_factor,g17\r\n1,900\r\n".encode())  # as Excel writes it
+    assert read_campaign(folder).trials[2].values.tolist() == [[9e-4]]
+
+
+@pytest.mark.parametrize(
+    ("stamps", "said"),
+    [
+        ([f"{k / 1613.0:.4f}" for k in range(300)], ""),  # printed with few decimals
+        (["0.0195" if k == 10 else f"{k * 0.002:.3f}" for k in range(60)],
+         "steps of 0.0015 to 0.0025 s, usually 0.002 s"),
+        ([f"{k * 0.002:.3f}" for k in range(60) if k not in (19, 20)],
+         "widest gap, 0.006 s, begins at 0.036 s"),
+    ],
+)  # fmt: skip
+def test_uneven_stamps_are_taken_as_they_come(tmp_path, stamps, said):
+    rows = "".join(f"{stamp},{k % 7}\n" for k, stamp in enumerate(stamps))
+    campaign = read_campaign(folder_of(tmp_path, release=f"time,w [mm]\n{rows}"))
+    time = campaign.trials[1].time
+    if not said:
+        assert campaign.trials[1].interval == pytest.approx(1.0 / 1613.0, rel=1e-3)
+        assert np.ptp(np.diff(time)) < 1e-12
+        return
+    np.testing.assert_array_equal(time, [float(stamp) for stamp in stamps])
+    assert not is_even(time)
+    assert any(said in remark for remark in campaign.remarks)
+
+
 INPUTS = Inputs(__file__)
 TOML = INPUTS.text("campaign.toml")
 TABLES = {
@@ -42,7 +79,7 @@ TABLES = {
 }
 
 
-def folder_of(path: Path, toml: str = TOML, **tables: str) -> Path:
+def folder_of(path, toml=TOML, **tables):
     path.mkdir(exist_ok=True)
     (path / "campaign.toml").write_text(toml, encoding="utf-8")
     for name, text in (TABLES | {f"{key}.csv": text for key, text in tables.items()}).items():
@@ -50,7 +87,7 @@ def folder_of(path: Path, toml: str = TOML, **tables: str) -> Path:
     return path
 
 
-def test_everything_comes_out_in_si(tmp_path: Path) -> None:
+def test_everything_comes_out_in_si(tmp_path):
     campaign = read_campaign(folder_of(tmp_path))
     gauge, tip = campaign.channels["g17"], campaign.channels["tip"]
     assert (gauge.quantity, gauge.output, gauge.station, gauge.chord, gauge.gain_deviation) == (
@@ -86,17 +123,16 @@ def test_everything_comes_out_in_si(tmp_path: Path) -> None:
     assert [trial.name for trial in campaign.fitted] == ["tip load up", "release"]
 
 
-def test_a_column_of_no_channel_is_one_remark(tmp_path: Path) -> None:
-    release = TABLES["release.csv"].replace("time,w [mm]\n", "time,w [mm],g71\n")
-    release = "\n".join([line if "g71" in line else f"{line},1" for line in release.splitlines()])
+def test_a_column_of_no_channel_is_one_remark(tmp_path):
+    release = "time,w [mm],g71\n" + "".join(f"{line},1\n" for line in RELEASE.splitlines()[1:])
     tip_up = "force,g71,w [mm]\n0,0.5,0.1\n5,120.25,7.3\n"
-    campaign = read_campaign(folder_of(tmp_path, tip_up=tip_up, release=f"{release}\n"))
+    campaign = read_campaign(folder_of(tmp_path, tip_up=tip_up, release=release))
     assert campaign.trials[0].channels == ("tip",)
     (said,) = (remark for remark in campaign.remarks if "'g71'" in remark)
     assert said.startswith("tip_up.csv and 1 more: no channel has the column 'g71'")
 
 
-def test_hash_follows_every_file(tmp_path: Path) -> None:
+def test_hash_follows_every_file(tmp_path):
     folder = folder_of(tmp_path)
     before = read_campaign(folder).data_hash
     assert read_campaign(folder / "campaign.toml").data_hash == before
@@ -116,7 +152,7 @@ names = st.text(
 
 
 @st.composite
-def campaigns(draw: st.DrawFn) -> Campaign:
+def campaigns(draw):
     channel_names = draw(st.lists(names, min_size=1, max_size=3, unique=True))
     interval = draw(st.floats(1e-5, 1.0))
     channels = {}
@@ -181,7 +217,7 @@ def campaigns(draw: st.DrawFn) -> Campaign:
     )  # fmt: skip
 
 
-def same(one: object, other: object) -> bool:
+def same(one, other):
     if isinstance(one, np.ndarray):
         if not isinstance(other, np.ndarray) or (one.dtype, one.shape) != (other.dtype, other.shape):
             return False
@@ -204,7 +240,7 @@ def same(one: object, other: object) -> bool:
 
 @given(campaigns())
 @settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
-def test_round_trip_keeps_everything(tmp_path_factory: pytest.TempPathFactory, campaign: Campaign) -> None:
+def test_round_trip_keeps_everything(tmp_path_factory, campaign):
     folder = tmp_path_factory.mktemp("campaign")
     again = read_campaign(write_campaign(campaign, folder))
     # Only remarks of the reader itself may be new.
@@ -212,14 +248,14 @@ def test_round_trip_keeps_everything(tmp_path_factory: pytest.TempPathFactory, c
     assert same(replace(again, remarks=campaign.remarks), campaign)
 
 
-def test_what_the_reader_remarked_is_not_said_twice(tmp_path: Path) -> None:
+def test_what_the_reader_remarked_is_not_said_twice(tmp_path):
     once = read_campaign(folder_of(tmp_path / "a"))
     twice = read_campaign(write_campaign(once, tmp_path / "b"))
     assert same(once, twice)
     assert len(once.remarks) == 1
 
 
-def test_what_cannot_be_written_says_so(tmp_path: Path) -> None:
+def test_what_cannot_be_written_says_so(tmp_path):
     campaign = read_campaign(folder_of(tmp_path / "a"))
     with pytest.raises(CampaignFileError, match="no reference temperature"):
         write_campaign(replace(campaign, reference_temperature=None), tmp_path / "b")
@@ -234,7 +270,7 @@ def test_what_cannot_be_written_says_so(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- noise from repeats
 
 
-def test_noise_from_repeats_is_the_pooled_deviation(tmp_path: Path) -> None:
+def test_noise_from_repeats_is_the_pooled_deviation(tmp_path):
     rng = np.random.default_rng(4)
     readings = rng.normal(size=(3, 4)) + np.array([0.0, 10.0, 20.0, 30.0])
     trials = "".join(
@@ -274,14 +310,8 @@ RELEASE = TABLES["release.csv"]
 WRONG_TABLES = [
     ("tip_up", "load,g17\n1,2\n", CampaignFileError, "tip_up.csv has no column 'force', .*are load, g17"),
     ("tip_up", "force,strain\n1,2\n", CampaignFileError, "holds no channel: its columns are force, strain"),
-    ("tip_up", "", CampaignFileError, "is empty"),
-    ("tip_up", "force,g17\n", CampaignFileError, "no rows"),
-    ("tip_up", "force;g17\n1;2\n", CampaignFileError, "not separated by commas"),
-    ("tip_up", "force,g17,g17\n1,2,3\n", CampaignFileError, "more than one column 'g17'"),
-    ("tip_up", "force,g17\n1,2,3\n", CampaignFileError, "line 2: 3 cells came, and the header has 2"),
     ("tip_up", "force,g17\n# x\n1,two\n", CampaignFileError,
      "line 3: column 'g17' must hold a number, and 'two'"),
-    ("tip_up", "force,g17\n,2\n", CampaignFileError, "column 'force' must hold a number, and nothing came"),
     ("tip_up", "force,g17\n1,nan\n", CampaignDataError, "line 2: column 'g17' holds nan; leave the cell"),
     ("tip_up", "force,g17\n1,-inf\n", CampaignDataError, "holds -inf"),
     ("tip_up", "force,g17\n1,\n", CampaignDataError, "no reading in the column 'g17'"),
@@ -299,13 +329,13 @@ WRONG_TABLES = [
 ]  # fmt: skip
 
 
-def check_sentence(text: str) -> None:
+def check_sentence(text):
     assert text.endswith(".")
     assert "\n" not in text
 
 
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("campaign"))
-def test_a_wrong_key_is_named_in_one_sentence(tmp_path: Path, old: str, new: str, sentence: str) -> None:
+def test_a_wrong_key_is_named_in_one_sentence(tmp_path, old, new, sentence):
     assert old in TOML
     with pytest.raises(CampaignFileError, match=sentence) as caught:
         read_campaign(folder_of(tmp_path, TOML.replace(old, new, 1)))
@@ -314,42 +344,16 @@ def test_a_wrong_key_is_named_in_one_sentence(tmp_path: Path, old: str, new: str
 
 
 @pytest.mark.parametrize(("table", "text", "error", "sentence"), WRONG_TABLES)
-def test_a_wrong_table_is_named_in_one_sentence(
-    tmp_path: Path, table: str, text: str, error: type[DiscrepancyError], sentence: str
-) -> None:
+def test_a_wrong_table_is_named_in_one_sentence(tmp_path, table, text, error, sentence):
     folder = folder_of(tmp_path, **{table: text})
     with pytest.raises(error, match=sentence) as caught:
         read_campaign(folder)
     check_sentence(str(caught.value))
 
 
-def test_missing_folders_and_bytes(tmp_path: Path) -> None:
-    with pytest.raises(CampaignFileError, match="There is no folder"):
-        read_campaign(tmp_path / "nowhere")
-    with pytest.raises(CampaignFileError, match=r"There is no campaign.toml in"):
-        read_campaign(tmp_path)
-    folder = folder_of(tmp_path)
-    for content, words in ((b"\xff", "is not text in UTF-8"), (b"\x00", "zero byte")):
-        (folder / "turn.csv").write_bytes(b"load_factor,g17\n1," + content + b"\n")
-        with pytest.raises(CampaignFileError, match=words):
-            read_campaign(folder)
-    (folder / "turn.csv").write_bytes("\ufeffload_factor,g17\r\n1,900\r\n".encode())  # as Excel writes it
-    assert read_campaign(folder).trials[2].values.tolist() == [[9e-4]]
-
-
-def test_times_may_be_printed_with_few_decimals(tmp_path: Path) -> None:
-    interval = 1.0 / 1613.0
-    rows = "".join(f"{k * interval:.4f},{k % 7}\n" for k in range(300))
-    trial = read_campaign(folder_of(tmp_path, release="time,w [mm]\n" + rows)).trials[1]
-    assert trial.interval == pytest.approx(interval, rel=1e-3)
-    assert np.ptp(np.diff(trial.time)) < 1e-12
-
-
 @given(st.sampled_from([*TABLES, "campaign.toml"]), st.data())
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
-def test_damaged_files_are_refused_or_read_but_never_crash(
-    tmp_path_factory: pytest.TempPathFactory, file: str, data: st.DataObject
-) -> None:
+def test_damaged_files_are_refused_or_read_but_never_crash(tmp_path_factory, file, data):
     folder = folder_of(tmp_path_factory.mktemp("hostile"))
     content = bytearray((folder / file).read_bytes())
     for _ in range(data.draw(st.integers(1, 3))):
@@ -373,24 +377,7 @@ def test_damaged_files_are_refused_or_read_but_never_crash(
         assert np.isfinite(trial.force).all()
 
 
-@pytest.mark.parametrize(
-    ("table", "said"),
-    [
-        (RELEASE.replace("0.020,", "0.0195,"), "steps of 0.0015 to 0.0025 s, usually 0.002 s"),
-        ("\n".join(RELEASE.splitlines()[:20] + RELEASE.splitlines()[22:]),
-         "widest gap, 0.006 s, begins at 0.036 s"),
-    ],
-)  # fmt: skip
-def test_uneven_stamps_are_taken_as_they_come(tmp_path: Path, table: str, said: str) -> None:
-    campaign = read_campaign(folder_of(tmp_path, release=table))
-    trial = next(trial for trial in campaign.trials if trial.name == "release")
-    stamps = [float(line.split(",")[0]) for line in table.splitlines()[1:] if line[:1].isdigit()]
-    np.testing.assert_array_equal(trial.time, stamps)
-    assert not is_even(trial.time)
-    assert any(said in remark for remark in campaign.remarks)
-
-
-def test_all_missing_and_all_unknown_keys_are_named_at_once(tmp_path: Path) -> None:
+def test_all_missing_and_all_unknown_keys_are_named_at_once(tmp_path):
     toml = (
         '[[channel]]\nname = "tip"\n[[channel]]\nunit = "mm"\noutput = "x"\nquantity = "displacement"\n'
         '[[trial]]\nkind = "ringdown"\n'

@@ -1,7 +1,6 @@
 """What a campaign can tell: trials that are held out, and what records say of parameters."""
 
-from __future__ import annotations
-
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,12 +14,17 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
 from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model, prior_left, unobservable
+from discrepancy.checks.outliers import mark_outliers
+from discrepancy.checks.quality import check_data
+from discrepancy.errors import CampaignFileError, ModelError
 from discrepancy.models.lumped import LumpedModel
+from discrepancy.sources.examples import example_campaign, plan_for, wing_plan, write_example
+from fe.runtime.patch import HighPass, ModelPatch, PointMass, PowerDamping, RootCompliance, SensorGain
 from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
 
 
-def trial(name: str, kind: TrialKind, top: float, count: int = 4, run: str = "A", channels=("x",)) -> Trial:
+def trial(name, kind, top, count=4, run="A", channels=("x",)):
     rows = np.linspace(0.0, top, count)
     drive = {
         TrialKind.RINGDOWN: {"release": Release(top)},
@@ -31,20 +35,33 @@ def trial(name: str, kind: TrialKind, top: float, count: int = 4, run: str = "A"
     return Trial.plain(name, kind, tuple(channels), rows, values=values, load_place="x", run=run, **drive)
 
 
-def campaign(*trials: Trial) -> Campaign:
+def chosen_of(*trials):
     channels = {name: Channel(name, Quantity.DISPLACEMENT, "x", None) for name in ("x", "y")}
-    return Campaign("", channels, trials, None, {}, "")
+    return choose_held_out(Campaign("", channels, trials, None, {}, ""))
 
 
-def held(*trials: Trial) -> list[str]:
-    return [item.name for item in choose_held_out(campaign(*trials)).held_out]
+def held(*trials):
+    return [item.name for item in chosen_of(*trials).held_out]
 
 
-def releases(*levels: float) -> list[Trial]:
+def releases(*levels):
     return [trial(f"r{n}", TrialKind.RINGDOWN, value) for n, value in enumerate(levels)]
 
 
-def test_amplitudes_inside_come_first() -> None:
+def test_what_only_one_trial_has_stays_and_what_is_marked_is_respected():
+    first, second, third = releases(1.0, 0.5, 0.2)
+    assert held(first, replace(second, run="B"), third) == []
+    assert held(first, trial("r1", TrialKind.RINGDOWN, 0.5, channels=("x", "y")), third) == []
+    marked = chosen_of(first, second, replace(third, held_out=True))
+    assert [item.name for item in marked.held_out] == ["r2"]
+    assert choose_held_out(marked) is marked
+    few = chosen_of(first, second)
+    assert not few.held_out
+    assert "Nothing is held out" in few.remarks[-1]
+    assert [item.name for item in few.trials] == ["r0", "r1"]
+
+
+def test_amplitudes_inside_come_first():
     assert held(*releases(1.0, 0.5, 0.2)) == ["r1"]
     assert held(*releases(0.2, 1.0, 0.3, 0.6)) == ["r3"]
     assert held(*releases(1.0, 0.9, 0.6, 0.5, 0.3, 0.2)) == ["r2", "r3"]
@@ -53,33 +70,11 @@ def test_amplitudes_inside_come_first() -> None:
     assert held(*releases(1.0, 1.0, 1.0, 1.0, 1.0)) == ["r4"]
 
 
-def test_marked_trials_are_respected() -> None:
-    trials = releases(1.0, 0.5, 0.2)
-    given_campaign = campaign(
-        trials[0], replace(trials[1], held_out=False), replace(trials[2], held_out=True)
-    )
-    assert choose_held_out(given_campaign) is given_campaign
-
-
-def test_what_only_one_trial_has_stays() -> None:
-    trials = releases(1.0, 0.5, 0.2)
-    assert held(trials[0], replace(trials[1], run="B"), trials[2]) == []
-    two = trial("r1", TrialKind.RINGDOWN, 0.5, channels=("x", "y"))
-    assert held(trials[0], two, trials[2]) == []
-
-
-def test_too_few_trials_are_said() -> None:
-    chosen = choose_held_out(campaign(*releases(1.0, 0.5)))
-    assert not chosen.held_out
-    assert "Nothing is held out" in chosen.remarks[-1]
-    assert [item.name for item in chosen.trials] == ["r0", "r1"]
-
-
 @pytest.mark.parametrize("kind", [TrialKind.STATIC, TrialKind.FLIGHT])
-def test_load_levels_of_a_single_trial(kind: TrialKind) -> None:
+def test_load_levels_of_a_single_trial(kind):
     single = trial("s", kind, 8.0, count=9)
-    chosen = choose_held_out(campaign(single))
-    fitted, proof = chosen.fitted[0], chosen.held_out[0]
+    chosen = chosen_of(single)
+    (fitted,), (proof,) = chosen.fitted, chosen.held_out
     load = "force" if kind is TrialKind.STATIC else "load_factor"
     assert getattr(proof, load).tolist() == [2.0, 5.0]
     assert getattr(fitted, load).tolist() == [0.0, 1.0, 3.0, 4.0, 6.0, 7.0, 8.0]
@@ -90,19 +85,15 @@ def test_load_levels_of_a_single_trial(kind: TrialKind) -> None:
     assert held(replace(single, force=path, load_factor=0 * path)) == []  # a path that turns stays whole
 
 
-@given(
-    st.lists(
-        st.tuples(st.sampled_from(TrialKind), st.sampled_from([0.1, 0.2, 0.5, 1.0]), st.sampled_from("AB")),
-        min_size=1,
-        max_size=9,
-    )
-)
+TRIALS = st.tuples(st.sampled_from(TrialKind), st.sampled_from([0.1, 0.2, 0.5, 1.0]), st.sampled_from("AB"))
+
+
+@given(st.lists(TRIALS, min_size=1, max_size=9))
 @settings(max_examples=100, deadline=None)
-def test_what_is_left_covers_what_is_held_out(rows: list[tuple[TrialKind, float, str]]) -> None:
+def test_what_is_left_covers_what_is_held_out(rows):
     trials = [trial(str(n), kind, top, 8, run) for n, (kind, top, run) in enumerate(rows)]
-    before = campaign(*trials)
-    chosen = choose_held_out(before)
-    assert [item.name for item in choose_held_out(before).held_out] == [item.name for item in chosen.held_out]
+    chosen = chosen_of(*trials)
+    assert held(*trials) == [item.name for item in chosen.held_out]
     assert sum(len(item.time) for item in chosen.trials) == sum(len(item.time) for item in trials)
     for item in chosen.held_out:
         left = [other for other in chosen.fitted if other.kind is item.kind]
@@ -112,34 +103,35 @@ def test_what_is_left_covers_what_is_held_out(rows: list[tuple[TrialKind, float,
         assert any(other.run == item.run for other in chosen.fitted)
 
 
-# ---------------------------------------------------------------- what records tell of parameters
+MODEL = Inputs(__file__).text("cart.toml")
+TOML = Inputs(__file__).text("cart_campaign.toml")
+
+CART = model_of(MODEL)
 
 
-INPUTS = Inputs(__file__)
-MODEL = INPUTS.text("cart.toml")
-TOML = INPUTS.text("cart_campaign.toml")
-
-
-@pytest.fixture
-def model() -> LumpedModel:
-    return model_of(MODEL)
-
-
-def campaign_of(folder: Path, scale: float = 1.0) -> Campaign:
-    time = np.linspace(0.0, 2.0, 81)
-    rows = [f"{t!r},1.0,{scale * 250.0 * t * t!r}" for t in time.tolist()]
-    (folder / "push.csv").write_text("\n".join(["time,motor,x", *rows]))
-    (folder / "campaign.toml").write_text(TOML)
+def written(folder, toml, table):
+    (folder / "push.csv").write_text(table)
+    (folder / "campaign.toml").write_text(toml)
     return read_campaign(folder)
 
 
-def test_what_is_left_of_each_prior(tmp_path: Path, model: LumpedModel) -> None:
-    campaign = campaign_of(tmp_path)
-    left = prior_left(campaign, model)
-    # by hand: least squares of x by the two parameters, beside their priors
+def pushed(folder, scale=1.0):
+    time = np.linspace(0.0, 2.0, 81)
+    rows = [f"{t!r},1.0,{scale * 250.0 * t * t!r}" for t in time.tolist()]
+    return written(folder, TOML, "\n".join(["time,motor,x", *rows]))
+
+
+def fatal(campaign):
+    return [fault.kind for fault in check_against_model(campaign, CART) if fault.fatal]
+
+
+def test_what_is_left_of_each_prior(tmp_path):
+    """Beside least squares of x by the two parameters, by hand; a short push of a cart is no short record."""
+    campaign = pushed(tmp_path)
+    left = prior_left(campaign, CART)
     time = campaign.trials[0].time
 
-    def x(mass: float, damping: float) -> np.ndarray:
+    def x(mass, damping):
         tau = mass / damping
         return (time - tau * (1.0 - np.exp(-time / tau))) / damping
 
@@ -149,56 +141,114 @@ def test_what_is_left_of_each_prior(tmp_path: Path, model: LumpedModel) -> None:
         (x(2.0, 0.5 * (1 + step)) - x(2.0, 0.5 * (1 - step))) / (2 * step) * 0.01,
     ), axis=1) / 5e-4  # fmt: skip
     expected = np.sqrt(np.diag(np.linalg.inv(np.eye(2) + columns.T @ columns)))
-    assert left["mass_factor"] == pytest.approx(expected[0], rel=2e-3)
-    assert left["damping_factor"] == pytest.approx(expected[1], rel=2e-3)
+    assert [left["mass_factor"], left["damping_factor"]] == pytest.approx(expected, rel=2e-3)
     assert left["mass_factor"] < 0.1
-
-
-def test_a_short_push_of_a_cart_is_no_short_record(tmp_path: Path, model: LumpedModel) -> None:
-    assert not [fault for fault in check_against_model(campaign_of(tmp_path), model) if fault.fatal]
-
-
-def test_what_cannot_be_observed_is_said(tmp_path: Path) -> None:
-    text = MODEL.replace("damping = { matrix = 0.5 }", "damping = { matrix = 1e-5 }")
-    model = model_of(text)
-    campaign = campaign_of(tmp_path)
-    (found,) = unobservable(campaign, model)
+    assert not fatal(campaign)
+    assert fatal(pushed(tmp_path, 1000.0))  # mm for m, or kN for N
+    for scale in (100.0, 9.81):  # no plausible slip
+        assert not fatal(pushed(tmp_path, scale))
+    slippery = model_of(MODEL.replace("damping = { matrix = 0.5 }", "damping = { matrix = 1e-5 }"))
+    (found,) = unobservable(campaign, slippery)
     assert "do not tell the calibrated parameter 'damping_factor' (100%)" in found.sentence
-    faults = check_against_model(campaign, model)
-    assert [fault.kind for fault in faults] == [FaultKind.UNOBSERVABLE]
-    assert not faults[0].fatal
-
-
-def test_only_plausible_unit_slips_are_looked_for(tmp_path: Path, model: LumpedModel) -> None:
-    def slips(scale: float) -> list[FaultKind]:
-        folder = tmp_path / f"{scale:g}"
-        folder.mkdir()
-        return [fault.kind for fault in check_against_model(campaign_of(folder, scale), model) if fault.fatal]
-
-    assert slips(1000.0)  # mm for m, or kN for N
-    assert not slips(100.0)
-    assert not slips(9.81)
+    (fault,) = check_against_model(campaign, slippery)
+    assert (fault.kind, fault.fatal) == (FaultKind.UNOBSERVABLE, False)
 
 
 @pytest.mark.parametrize("hold", ["", 'hold = "linear"', 'hold = "smooth"'])
 @pytest.mark.parametrize("forced", [False, True])
 @pytest.mark.parametrize("samples", [9, 200])
-def test_it_is_asked_what_a_coarse_input_did_between_its_samples(
-    tmp_path: Path, model: LumpedModel, samples: int, forced: bool, hold: str
-) -> None:
+def test_it_is_asked_what_a_coarse_input_did_between_its_samples(tmp_path, samples, forced, hold):
     time = np.arange(12 * samples) / samples
-    rows = [f"{t!r},{float(1.0 * np.sin(2.0 * np.pi * t))!r},{10.0 * t!r}" for t in time.tolist()]
-    (tmp_path / "push.csv").write_text("\n".join([f"time,{'force' if forced else 'motor'},x", *rows]))
+    rows = [f"{t!r},{float(np.sin(2.0 * np.pi * t))!r},{10.0 * t!r}" for t in time.tolist()]
     before, _, after = TOML.partition("[[input]]")
     section, _, last = after.partition("[[trial]]")
     toml = f"{before}[[input]]{section}{hold}\n[[trial]]{last}"
     if forced:
         toml = f"{before}[[trial]]{last.replace('driven', 'forced')}{hold}\n"
-    (tmp_path / "campaign.toml").write_text(toml)
-    faults = check_against_model(read_campaign(tmp_path), model)
+    table = "\n".join([f"time,{'force' if forced else 'motor'},x", *rows])
+    faults = check_against_model(written(tmp_path, toml, table), CART)
     found = [fault for fault in faults if fault.kind is FaultKind.BETWEEN_SAMPLES]
     assert bool(found) is (samples == 9 and not hold)
     name, where = ("force", "[[trial]]") if forced else ("motor", "[[input]]")
     for fault in found:
         assert f"straight lines and curves between the samples of {name!r}" in fault.sentence
         assert f'hold = "smooth", "zero_order" or "linear" in its {where}' in fault.sentence
+
+
+# ---------------------------------------------------------------- examples as a user makes them
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_hidden_effects_are_no_faults_of_the_data(chain, seed):
+    plan = plan_for(chain, OUTPUTS, "end")
+    scales = chain.scales(example_campaign(chain, "laboratory", seed, plan))
+    force = 0.05 * scales.ports["joint"].stiffness * scales.ports["joint"].displacement
+    for items in (
+        (PointMass(0.3 * scales.modal_mass, 0.6),),
+        (RootCompliance(0.3 / scales.tip_stiffness / 0.36),),
+        (PowerDamping("joint", force, 0.0, 0.0, 1.0, 1.0),),
+        (SensorGain("base_strain", -0.15), HighPass("x3", 0.5)),
+    ):
+        campaign = example_campaign(chain, "laboratory", seed, plan, ModelPatch(items))
+        assert [fault for fault in check_data(campaign) if fault.fatal] == []
+        assert check_against_model(campaign, chain) == ()
+        assert sum(int((~trial.used).sum()) for trial in mark_outliers(campaign).trials) <= 2
+
+
+def test_what_cannot_be_an_example(chain):
+    with pytest.raises(CampaignFileError, match="no example 'mission': the kinds are static, ringdown"):
+        example_campaign(chain, "mission", 1)
+    with pytest.raises(ModelError, match="has no output 'x9'"):
+        plan_for(chain, ("x9",), "end")
+
+
+OUTPUTS = ("x3", "x1", "base_strain", "joint_strain")
+
+
+@pytest.fixture(scope="module")
+def chain():
+    return LumpedModel.load("three_mass_chain")
+
+
+def test_written_example_is_sound_and_repeats(chain, tmp_path):
+    plan = plan_for(chain, OUTPUTS, "end")
+    one = write_example(chain, tmp_path / "a", "laboratory", 3, plan)
+    two = write_example(chain, tmp_path / "b", "laboratory", 3, plan)
+    assert one.data_hash == two.data_hash
+    assert one.data_hash != write_example(chain, tmp_path / "c", "laboratory", 4, plan).data_hash
+    assert check_data(one) == ()
+    assert check_against_model(one, chain) == ()
+    assert [trial.name for trial in one.held_out] == ["loading again", "release 3"]
+    assert choose_held_out(one) is one
+    unmarked = replace(one, trials=tuple(replace(trial, held_out=False) for trial in one.trials))
+    assert {trial.kind for trial in choose_held_out(unmarked).held_out} >= {TrialKind.RINGDOWN}
+
+
+def test_plan_of_the_wing_names_its_outputs():
+    plan = wing_plan()
+    assert [channel.output for channel in plan.channels][-1] == "tip_displacement"
+    assert plan.names(TrialKind.FLIGHT) == plan.names(TrialKind.STATIC)[:-1]
+    assert np.isfinite([channel.noise.standard_deviation for channel in plan.channels if channel.noise]).all()
+
+
+def test_the_documented_campaign_is_read(tmp_path):
+    """That of docs/campaign.md, which shows how its tables begin; a record is longer."""
+    text = (Path(__file__).parents[3] / "docs" / "campaign.md").read_text(encoding="utf-8")
+    toml = re.search(r"```toml\n(.*?)```", text, re.DOTALL)
+    tables = re.search(r"begin with\n\n```\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "campaign.toml").write_text(toml.group(1), encoding="utf-8")
+    columns = zip(*(re.split(r"\s{3,}", line) for line in tables.group(1).splitlines()), strict=True)
+    for name, rows in zip(("noise", "tip_up", "release_1", "turns"), columns, strict=True):
+        more = (
+            [f"{0.002 * k:.3f},{(-1) ** k}" for k in range(3, 50)] if name in ("noise", "release_1") else []
+        )
+        (tmp_path / f"{name}.csv").write_text("\n".join([*rows, *more]) + "\n", encoding="utf-8")
+    campaign = read_campaign(tmp_path)
+    up, release, turns = campaign.trials
+    assert [trial.kind.value for trial in campaign.trials] == ["static", "ringdown", "flight"]
+    assert up.values[1].tolist() == [54.1e-6, 2.98e-3]
+    assert up.temperature.tolist() == [1.5] * 3
+    assert release.release.displacement == 0.015
+    assert turns.health[2].tolist() == [0.2, 0.0]
+    assert campaign.channels["g17"].noise.source == "pre-trigger"
+    assert campaign.remarks == ()

@@ -1,10 +1,7 @@
 """Records that no sensor made, in the files of a campaign: held, copied, in another unit, not at rest."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, NoiseRecord, Quantity
-from discrepancy.checks.fault import DataFault, FaultKind
+from discrepancy.campaign.records import NoiseRecord, Quantity
+from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.quality import check_data, held_spans, moves
 from discrepancy.checks.unit_slips import slip_between
@@ -23,7 +20,6 @@ from tests.discrepancy.rigs import model_of
 from tests.refusals import Inputs
 
 FloatArray = NDArray[np.float64]
-
 MODEL = Inputs(__file__).text("mass_on_a_spring.toml")
 CHANNEL = """
 [[channel]]
@@ -45,24 +41,20 @@ TIME = 0.005 * np.arange(1600)
 Change = Callable[[FloatArray], None]
 
 
-def nothing(_: FloatArray) -> None:
-    """Leave a record as it is."""
-
-
-def campaign_of(
-    folder: Path, ring: Change = nothing, rest: Change = nothing, digit: float = 1e-6, trials: int = 2
-) -> Campaign:
+def campaign_of(folder, ring=None, rest=None, digit=1e-6, trials=2):
     """Write rings of x and y [mm] and a rest, changed in place, and return them as read."""
     generator = np.random.default_rng(5)
     folder.mkdir(exist_ok=True)
     text = 'format = 1\nname = "rings"\n' + NOISE + CHANNEL.format("x") + CHANNEL.format("y")
     tables = {"rest": 0.02 * generator.standard_normal((800, 2))}
-    rest(tables["rest"])
+    if rest:
+        rest(tables["rest"])
     for number in range(trials):
         # a tenth stiffer than the model has it: records in phase with it would say less
         motion = (20.0 + number) * np.exp(-0.2 * TIME) * np.cos(np.sqrt(440.0) * TIME + number)
         values = np.column_stack((motion, -0.5 * motion)) + 0.02 * generator.standard_normal((1600, 2))
-        ring(values)
+        if ring:
+            ring(values)
         tables[str(number)] = np.round(values / digit) * digit
         text += TRIAL.format(number)
     for name, values in tables.items():
@@ -73,11 +65,11 @@ def campaign_of(
 
 
 @pytest.fixture(scope="module")
-def model() -> LumpedModel:
+def model():
     return model_of(MODEL)
 
 
-def only(faults: tuple[DataFault, ...], kind: FaultKind) -> DataFault:
+def only(faults, kind):
     """Return the one fault of a campaign, which is of a kind; what is held or scaled belies its noise too."""
     (fault,) = (item for item in faults if item.kind is not FaultKind.NOISE_LABEL)
     assert fault.kind is kind, fault.sentence
@@ -85,11 +77,18 @@ def only(faults: tuple[DataFault, ...], kind: FaultKind) -> DataFault:
     return fault
 
 
-def test_sound_rings_have_no_fault(tmp_path: Path, model: LumpedModel) -> None:
+def test_sound_rings_have_no_fault(tmp_path, model):
+    """A motion that begins somehow tells its parameters, and none does not."""
     for digit in (1e-6, 0.5):
         campaign = campaign_of(tmp_path, digit=digit)
         assert [item for item in check_data(campaign) if item.kind is not FaultKind.NOISE_LABEL] == []
         assert check_against_model(campaign, model) == ()
+
+    def still(values):
+        values[:] = 0.02 * np.random.default_rng(1).standard_normal(values.shape)
+
+    fault = only(check_against_model(campaign_of(tmp_path, still), model), FaultKind.UNOBSERVABLE)
+    assert "'oil'" in fault.sentence
 
 
 # ---------------------------------------------------------------- held
@@ -99,10 +98,8 @@ def test_sound_rings_have_no_fault(tmp_path: Path, model: LumpedModel) -> None:
     ("digit", "start", "stop"),
     [(1e-6, 310, 410), (0.1, 310, 410), (1e-6, 777, 877), (0.1, 777, 877), (1e-6, 1000, 1600)],
 )
-def test_a_sensor_that_freezes_while_another_goes_on(
-    tmp_path: Path, digit: float, start: int, stop: int
-) -> None:
-    def freeze(values: FloatArray) -> None:
+def test_a_sensor_that_freezes_while_another_goes_on(tmp_path, digit, start, stop):
+    def freeze(values):
         values[start:stop, 0] = values[start, 0]
 
     fault = only(check_data(campaign_of(tmp_path, freeze, digit=digit, trials=1)), FaultKind.FROZEN)
@@ -111,14 +108,14 @@ def test_a_sensor_that_freezes_while_another_goes_on(
     assert f"{TIME[start]:.6g} to {TIME[stop - 1]:.6g} s" in fault.sentence
 
 
-def _backlash(motion: FloatArray, gap: float) -> FloatArray:
+def _backlash(motion, gap):
     seen = motion.copy()
     for k in range(1, len(seen)):
         seen[k] = min(max(seen[k - 1], motion[k] - gap), motion[k] + gap)
     return seen
 
 
-def _sound(digit: float, pace: float, generator: np.random.Generator) -> dict[str, FloatArray]:
+def _sound(digit, pace, generator):
     """Return records that stand still at times, each for a reason of its own."""
     wave = np.sin(2.0 * np.pi * pace * TIME + 0.7)
     ring = np.exp(-0.5 * pace * TIME) * wave
@@ -145,24 +142,50 @@ def _sound(digit: float, pace: float, generator: np.random.Generator) -> dict[st
 
 @pytest.mark.parametrize("digit", [1e-3, 0.02, 0.2])
 @pytest.mark.parametrize("pace", [0.4, 1.3, 6.0])
-def test_what_rests_is_not_frozen(digit: float, pace: float) -> None:
+def test_what_rests_is_not_frozen(digit, pace):
+    """Where encoders show no noise, what the others do meanwhile tells a pause from a fault."""
     used = np.ones(len(TIME), dtype=bool)
     other = np.cos(5.0 * TIME)[:, np.newaxis]
     for name, values in _sound(digit, pace, np.random.default_rng(2)).items():
         assert held_spans(values, used, np.zeros((len(TIME), 0))) == [], name
         if name in ("ring", "warming", "day", "backlash", "dead zone"):
             assert held_spans(values, used, other) == [], name
-
-
-def test_a_pause_of_all_is_no_fault_and_a_held_value_is(tmp_path: Path) -> None:
-    """Where encoders show no noise, what the others do meanwhile tells a pause from a fault."""
     clock = np.interp(TIME, [0.0, 3.0, 4.0, 8.0], [0.0, 3.0, 3.0, 7.0])
     motion = clock + 0.1 * clock**2
-    used = np.ones(len(TIME), dtype=bool)
-    fine, coarse = np.round(motion, 3), np.round(motion, 2)
-    assert held_spans(fine, used, coarse[:, np.newaxis]) == []
-    going_on = np.round(np.sin(3.0 * TIME), 3)[:, np.newaxis]
-    assert held_spans(fine, used, going_on) == [(600, 801)]
+    for beside, spans in ((np.round(motion, 2), []), (np.round(np.sin(3.0 * TIME), 3), [(600, 801)])):
+        assert held_spans(np.round(motion, 3), used, beside[:, np.newaxis]) == spans
+
+
+def test_loads_and_readings_in_another_unit():
+    """What four and a half times the load would do, a structure may do as well: no fault, but a limit."""
+    model = LumpedModel.load("three_mass_chain")
+    campaign = example_campaign(model, "laboratory", 3, plan_for(model, ("x3", "x1", "base_strain"), "end"))
+    channels = {
+        name: replace(item, unit="mm" if item.quantity is Quantity.DISPLACEMENT else "microstrain")
+        for name, item in campaign.channels.items()
+    }
+    campaign = replace(campaign, channels=channels)
+    assert check_against_model(campaign, model) == ()
+
+    def judged(change):
+        return check_against_model(
+            replace(campaign, trials=tuple(replace(t, **change(t)) for t in campaign.trials)), model
+        )
+
+    fault = only(
+        judged(lambda t: {"values": t.values * np.where(np.array(t.channels) == "x3", 1.0 / 25.4, 1.0)}),
+        FaultKind.UNIT_SLIP,
+    )
+    assert "'x3' shows about 0.0393701 times what the model says (inch given as mm?)" in fault.sentence
+    assert fault.fatal
+    static = [trial.name for trial in campaign.trials if not trial.is_dynamic]
+    for size, kind, unit in (
+        (9.80665, FaultKind.INPUT_SLIP, "kgf"), (4.448, FaultKind.UNIT_DOUBT, "lbf"),
+    ):  # fmt: skip
+        faults = judged(lambda t, size=size: {"force": t.force / size})
+        assert [(fault.kind, fault.trial) for fault in faults] == [(kind, name) for name in static]
+        assert f"({unit} given as N?)" in faults[0].sentence
+        assert faults[0].fatal is (unit == "kgf")
 
 
 # ---------------------------------------------------------------- copied
@@ -179,10 +202,8 @@ def test_a_pause_of_all_is_no_fault_and_a_held_value_is(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("digit", [1e-6, 0.05])
-def test_a_channel_that_is_another_one(
-    tmp_path: Path, copy: Callable[[FloatArray], FloatArray], how: str, digit: float
-) -> None:
-    def spoil(values: FloatArray) -> None:
+def test_a_channel_that_is_another_one(tmp_path, copy, how, digit):
+    def spoil(values):
         values[:, 0] = np.round(values[:, 0] / digit) * digit
         values[:, 1] = copy(values[:, 0])
 
@@ -192,16 +213,16 @@ def test_a_channel_that_is_another_one(
     assert "(the trial 'ring 0', 0 to 7.995 s), and so in 1 more of its trials" in fault.sentence
 
 
-def test_what_moves_alike_is_no_copy(tmp_path: Path) -> None:
-    def without_noise(values: FloatArray) -> None:
+def test_what_moves_alike_is_no_copy(tmp_path):
+    def without_noise(values):
         values[:, 0] = 20.0 * np.exp(-0.2 * TIME) * np.cos(21.0 * TIME)
         values[:, 1] = -0.5 * values[:, 0]
 
-    def switched(values: FloatArray) -> None:
+    def switched(values):
         values[:, 0] = np.sign(np.cos(21.0 * TIME))
         values[:, 1] = -0.5 * values[:, 0]
 
-    def warmed(values: FloatArray) -> None:
+    def warmed(values):
         values[:, 0] = np.round(20.0 + TIME, 1)
         values[:, 1] = np.round(18.0 + 1.1 * TIME, 1)
 
@@ -232,62 +253,19 @@ def test_what_moves_alike_is_no_copy(tmp_path: Path) -> None:
         (30.0, Quantity.STRAIN, "microstrain", False, ""),
     ],
 )
-def test_a_factor_names_its_pair_of_units(
-    scale: float, quantity: Quantity, stated: str, drive: bool, pair: str
-) -> None:
+def test_a_factor_names_its_pair_of_units(scale, quantity, stated, drive, pair):
     assert str(slip_between(scale, quantity, stated, drive=drive) or "").strip("(?)") == pair
-
-
-@pytest.fixture(scope="module")
-def chain() -> tuple[Campaign, LumpedModel]:
-    model = LumpedModel.load("three_mass_chain")
-    plan = plan_for(model, ("x3", "x1", "base_strain"), "end")
-    campaign = example_campaign(model, "laboratory", 3, plan)
-    channels = {
-        name: replace(item, unit="mm" if item.quantity is Quantity.DISPLACEMENT else "microstrain")
-        for name, item in campaign.channels.items()
-    }
-    return replace(campaign, channels=channels), model
-
-
-def test_inches_stated_as_millimetres(chain: tuple[Campaign, LumpedModel]) -> None:
-    campaign, model = chain
-
-    def inches(campaign: Campaign) -> Campaign:
-        trials = []
-        for trial in campaign.trials:
-            scale = np.where(np.array(trial.channels) == "x3", 1.0 / 25.4, 1.0)
-            trials.append(replace(trial, values=trial.values * scale))
-        return replace(campaign, trials=tuple(trials))
-
-    assert check_against_model(campaign, model) == ()
-    faults = check_against_model(inches(campaign), model)
-    fault = only(faults, FaultKind.UNIT_SLIP)
-    assert "'x3' shows about 0.0393701 times what the model says (inch given as mm?)" in fault.sentence
-    assert fault.fatal
-
-
-@pytest.mark.parametrize(("unit", "kind"), [(9.80665, FaultKind.INPUT_SLIP), (4.448, FaultKind.UNIT_DOUBT)])
-def test_loads_in_another_unit(chain: tuple[Campaign, LumpedModel], unit: float, kind: FaultKind) -> None:
-    """What four and a half times the load would do, a structure may do as well: no fault, but a limit."""
-    campaign, model = chain
-    trials = tuple(replace(trial, force=trial.force / unit) for trial in campaign.trials)
-    faults = check_against_model(replace(campaign, trials=trials), model)
-    static = [trial.name for trial in campaign.trials if not trial.is_dynamic]
-    assert [(fault.kind, fault.trial) for fault in faults] == [(kind, name) for name in static]
-    assert f"({'kgf' if unit > 9.0 else 'lbf'} given as N?)" in faults[0].sentence
-    assert faults[0].fatal is (kind is FaultKind.INPUT_SLIP)
 
 
 # ---------------------------------------------------------------- at rest
 
 
-def _record(samples: FloatArray) -> NoiseRecord:
+def _record(samples):
     return NoiseRecord(float(np.std(samples)), len(samples) - 1.0, samples - samples.mean(), 0.005)
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_noise_of_any_colour_is_at_rest(seed: int) -> None:
+def test_noise_of_any_colour_is_at_rest(seed):
     white = np.random.default_rng(seed).standard_normal(1300)
     mains = np.sin(2.0 * np.pi * 50.0 * 0.005 * np.arange(800) + 0.3)
     for samples in (
@@ -310,10 +288,8 @@ def test_noise_of_any_colour_is_at_rest(seed: int) -> None:
         (lambda t: 0.03 * t, "drifts by 0.000121 (SI) over its length, "),
     ],
 )
-def test_a_noise_record_that_moves_is_a_limit(
-    tmp_path: Path, model: LumpedModel, motion: Callable[[FloatArray], FloatArray], what: str
-) -> None:
-    def move(values: FloatArray) -> None:
+def test_a_noise_record_that_moves_is_a_limit(tmp_path, model, motion, what):
+    def move(values):
         values[:, 1] += motion(TIME[: len(values)])
 
     campaign = campaign_of(tmp_path, rest=move)
@@ -325,16 +301,3 @@ def test_a_noise_record_that_moves_is_a_limit(
     assert {(item.channel, item.fatal) for item in faults} == {("y", False)}
     assert any("the column 'y [mm]' of rest.csv, " in item.sentence for item in faults)
     assert any(what in item.sentence for item in faults), [item.sentence for item in faults]
-
-
-# ---------------------------------------------------------------- what a motion of unknown begin tells
-
-
-def test_a_motion_that_begins_somehow_tells_its_parameters(tmp_path: Path, model: LumpedModel) -> None:
-    assert check_against_model(campaign_of(tmp_path), model) == ()
-
-    def still(values: FloatArray) -> None:
-        values[:] = 0.02 * np.random.default_rng(1).standard_normal(values.shape)
-
-    fault = only(check_against_model(campaign_of(tmp_path, still), model), FaultKind.UNOBSERVABLE)
-    assert "'oil'" in fault.sentence

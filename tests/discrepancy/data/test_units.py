@@ -1,7 +1,5 @@
 """Units of campaigns: those of old have kept their meaning, and pint knows the others."""
 
-from __future__ import annotations
-
 from math import pi
 
 import pytest
@@ -45,7 +43,7 @@ FACTORS = {
 """What the units of campaigns were before pint: written down, for their meaning must not change."""
 
 
-def test_the_units_of_old_mean_the_same() -> None:
+def test_the_units_of_old_mean_the_same():
     known = {(quantity, unit): power for quantity, row in POWERS.items() for unit, power in row.items()}
     for (quantity, unit), power in known.items():
         assert conversion_of(quantity, unit).factor == float(f"1e{power}"), unit
@@ -56,7 +54,7 @@ def test_the_units_of_old_mean_the_same() -> None:
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False, min_value=-1e150, max_value=1e150))
-def test_a_unit_and_back_is_the_same_to_rounding(value: float) -> None:
+def test_a_unit_and_back_is_the_same_to_rounding(value):
     for quantity, row in POWERS.items():
         for unit, power in row.items():
             known = conversion_of(quantity, unit)
@@ -87,7 +85,7 @@ def test_a_unit_and_back_is_the_same_to_rounding(value: float) -> None:
         ("mAh", Quantity.CHARGE, 3.6),
     ],
 )
-def test_units_as_laboratories_write_them(unit: str, quantity: Quantity, factor: float) -> None:
+def test_units_as_laboratories_write_them(unit, quantity, factor):
     assert quantity in quantities_of(unit)
     assert conversion_of(quantity, unit).factor == pytest.approx(factor, rel=1e-15)
 
@@ -96,18 +94,18 @@ def test_units_as_laboratories_write_them(unit: str, quantity: Quantity, factor:
     "unit",
     ["", "kg", "t", "1/min", "Hz", "links", "dB", "2 mm", "9**9**9", "kN/m", "i.O.", "degF", "x", "m" * 9999],
 )
-def test_what_is_no_unit_of_ours_is_of_no_quantity(unit: str) -> None:
+def test_what_is_no_unit_of_ours_is_of_no_quantity(unit):
     assert quantities_of(unit) == ()
 
 
 @pytest.mark.parametrize("unit", ["mV/V", "V/V", "µV/V", "mV/volt"])
-def test_a_ratio_of_volts_is_a_signal_and_no_strain(unit: str) -> None:
+def test_a_ratio_of_volts_is_a_signal_and_no_strain(unit):
     assert quantities_of(unit) == (Quantity.SIGNAL,)
     with pytest.raises(ValueError, match=f"strain must have a unit such as .*, and '{unit}' came"):
         conversion_of(Quantity.STRAIN, unit)
 
 
-def test_a_time_is_converted_and_a_length_is_no_time() -> None:
+def test_a_time_is_converted_and_a_length_is_no_time():
     assert conversion("ms", "s").factor == 1e-3
     with pytest.raises(ValueError, match="cannot become s"):
         conversion("mm", "s")

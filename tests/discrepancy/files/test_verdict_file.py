@@ -1,16 +1,13 @@
 """Files of a verdict: round trips to the last bit, the shipped schemas, damaged files."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Sequence
 from dataclasses import fields, replace
 from math import inf, nan
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
@@ -51,6 +48,15 @@ from discrepancy.verdict import (
 from fe.runtime.patch import PRIMITIVES, Line, ModelPatch, PointMass, PowerDamping, PowerStiffness, Window
 from reporting.errors import FileNotWrittenError
 from reporting.provenance import collect_provenance
+from tests.discrepancy.bench import Bench
+from tests.refusals import refused
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    bench = Bench(amplitudes=(200.0, 150.0), held_out=(False, True))
+    return bench.fit(np.random.default_rng(7))
+
 
 ORIGIN = Origin(
     "Wing in the laboratory", "wing", "ab" * 32, "cd" * 32, "uav-twin discrepancy campaign --out verdict",
@@ -96,14 +102,12 @@ VERDICT = Verdict(
 )  # fmt: skip
 
 
-def same(first: object, second: object) -> bool:
+def same(first, second):
     """Compare records with nan equal to nan."""
     return repr(first) == repr(second)
 
 
-def test_a_verdict_comes_back_equal(tmp_path: Path, make_bench) -> None:
-    bench = make_bench(amplitudes=(200.0, 150.0), held_out=(False, True))
-    fitted = bench.fit(np.random.default_rng(7))
+def test_a_verdict_comes_back_equal(tmp_path, fitted):
     proof = prove(fitted, fitted)
     for number, content in enumerate((proof, None, replace(proof, held_out_before=None))):
         path = write_verdict(tmp_path / str(number) / "verdict.json", VERDICT, content, ORIGIN)
@@ -118,55 +122,50 @@ def test_a_verdict_comes_back_equal(tmp_path: Path, make_bench) -> None:
     assert again.read_bytes() == path.read_bytes()
 
 
-def stored_patch(*effects: NamedEffect, draws: Sequence[Sequence[ModelPatch]] = ()) -> StoredPatch:
+def stored_patch(*effects, draws=()):
     found = patch_effects(effects, draws)
     return StoredPatch(VerdictKind.NAMED, "Two.", found, {}, (STIFFNESS,), ORIGIN)
 
 
-def test_a_patch_comes_back_identical_with_its_intervals(tmp_path: Path) -> None:
-    generator = np.random.default_rng(1)
-    draws = [
-        ModelPatch((PowerDamping("root", float(c), 0.0, 0.0, 0.1, 5e-324),))
-        for c in generator.normal(1.0 / 3.0, 0.02, 4000)
-    ]
+def test_a_patch_comes_back_identical_with_its_intervals(tmp_path):
+    (law,) = FRICTION.patch
+    drawn = np.random.default_rng(1).normal(1.0 / 3.0, 0.02, 4000)
+    draws = [ModelPatch((replace(law, coefficient=float(c)),)) for c in drawn]
     stored = stored_patch(FRICTION, MASS, draws=(draws, ()))
     back = read_patch(write_patch(tmp_path / "patch.json", stored))
     assert same(back, stored)
     assert back.patch == FRICTION.patch + MASS.patch
     friction, mass = (effect.intervals for effect in back.effects)
-    first = friction[0]
-    assert (first.primitive, first.parameter, first.unit) == (0, "coefficient", "N or N m")
-    assert first.low == pytest.approx(1.0 / 3.0 - 1.645 * 0.02, abs=2e-3)
-    assert first.high == pytest.approx(1.0 / 3.0 + 1.645 * 0.02, abs=2e-3)
-    assert [(i.primitive, i.parameter, i.unit) for i in mass[:3]] == [
-        (0, "mass", "kg"), (0, "station", "m"), (1, "coefficient", "N or N m"),
-    ]  # fmt: skip
+    told = [(i.primitive, i.parameter, i.unit) for i in (friction[0], *mass[:3])]
+    force = "coefficient", "N or N m"
+    assert told == [(0, *force), (0, "mass", "kg"), (0, "station", "m"), (1, *force)]
+    ends = 1.0 / 3.0 + 1.645 * 0.02 * np.array([-1.0, 1.0])
+    assert [friction[0].low, friction[0].high] == pytest.approx(ends, abs=2e-3)
     assert np.isnan(mass[0].low)
+
+
+NUMBER = st.floats(allow_nan=False, allow_infinity=False)
+VALUES = {float: NUMBER, int: st.integers(-5, 50), str: st.text(max_size=5)}
+
+COURSE = st.sampled_from(["3 * time", "step(time - 1.5)"])
+
+WINDOW = st.builds(
+    Window, st.text(max_size=3), st.none() | st.floats(0.0, 1.0), st.none() | st.floats(2.0, 3.0)
+)
 
 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
-def test_every_primitive_with_any_numbers_survives_the_file(
-    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    number = st.floats(allow_nan=False, allow_infinity=False)
+def test_every_primitive_with_any_numbers_survives_the_file(data, tmp_path_factory):
     primitives = []
     for kind in data.draw(st.lists(st.sampled_from(sorted(PRIMITIVES)), min_size=1, max_size=4)):
-        values = {}
-        for name, wanted in PRIMITIVES[kind].values().items():
-            values[name] = data.draw(
-                number
-                if wanted is float
-                else st.integers(-5, 50)
-                if wanted is int
-                else st.sampled_from(["3 * time", "step(time - 1.5)"])
-                if name in PRIMITIVES[kind].courses
-                else st.text(max_size=5)
-            )
-        moments = st.none() | st.floats(0.0, 1.0)
-        window = st.builds(Window, st.text(max_size=3), moments, st.none() | st.floats(2.0, 3.0))
-        windows = data.draw(st.lists(window, max_size=2)) if PRIMITIVES[kind].in_windows else []
-        primitives.append(PRIMITIVES[kind](**values, windows=tuple(windows)))
+        primitive = PRIMITIVES[kind]
+        values = {
+            name: data.draw(COURSE if name in primitive.courses else VALUES[wanted])
+            for name, wanted in primitive.values().items()
+        }
+        windows = data.draw(st.lists(WINDOW, max_size=2)) if primitive.in_windows else []
+        primitives.append(primitive(**values, windows=tuple(windows)))
     effect = replace(MASS, patch=ModelPatch(tuple(primitives)))
     path = tmp_path_factory.mktemp("patch") / "patch.json"
     back = read_patch(write_patch(path, stored_patch(effect))).patch
@@ -174,18 +173,10 @@ def test_every_primitive_with_any_numbers_survives_the_file(
     assert same(back, effect.patch)  # tells 0.0 from -0.0
 
 
-def test_every_real_parameter_of_every_primitive_has_a_unit() -> None:
-    for kind, primitive in PRIMITIVES.items():
-        assert set(PRIMITIVE_UNITS[kind]) == {
-            name for name, own in primitive.values().items() if own is float
-        }
-    assert set(PRIMITIVE_UNITS) == set(PRIMITIVES)
-
-
-def json_schema(record: type, schema: str) -> str:
+def json_schema(record, schema):
     """Return the JSON Schema (draft 2020-12) of a document as it is shipped: every key is always there."""
     found = TypeAdapter(record).json_schema()
-    definitions: dict[str, Any] = found["$defs"]
+    definitions = found["$defs"]
     own = {name: table for name, table in found["properties"].items() if name != "origin"}
     of_origin = definitions.pop("Origin")["properties"]
     properties = {"schema": {"const": schema, "type": "string"}, **of_origin, **own}
@@ -209,31 +200,25 @@ def json_schema(record: type, schema: str) -> str:
     ("name", "document", "schema"),
     [("verdict", StoredVerdict, VERDICT_SCHEMA), ("patch", StoredPatch, PATCH_SCHEMA)],
 )
-def test_the_shipped_schema_is_that_of_the_records(name: str, document: type, schema: str) -> None:
-    assert shipped_schema(name) == json.loads(json_schema(document, schema))
+def test_the_shipped_schema_is_that_of_the_records_and_every_key_in_the_page(name, document, schema):
+    shipped = shipped_schema(name)
+    assert shipped == json.loads(json_schema(document, schema))
+    page = (Path(__file__).parents[3] / "docs" / "verdict.md").read_text(encoding="utf-8")
+    for table in (shipped, *shipped["$defs"].values()):
+        if table.get("properties", {}).get("kind", {}).get("const") in PRIMITIVES:
+            continue  # parameters of primitives are those of fe.runtime.patch
+        for key in table.get("properties", {}):
+            assert f"`{key}`" in page, key
+    assert {kind for kind in PRIMITIVES if f"`{kind}`" in page} == set(PRIMITIVES) == set(PRIMITIVE_UNITS)
+    for kind, primitive in PRIMITIVES.items():  # every real parameter has a unit
+        assert set(PRIMITIVE_UNITS[kind]) == {key for key, own in primitive.values().items() if own is float}
     with pytest.raises(VerdictFileError, match="but not for 'report'"):
         shipped_schema("report")
 
 
-def test_every_key_is_in_the_page() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "verdict.md").read_text(encoding="utf-8")
-    for name in ("verdict", "patch"):
-        schema = shipped_schema(name)
-        tables = [schema, *schema["$defs"].values()]
-        kinds = set(PRIMITIVES)
-        for table in tables:
-            if table.get("properties", {}).get("kind", {}).get("const") in kinds:
-                continue  # parameters of primitives are those of fe.runtime.patch
-            for key in table.get("properties", {}):
-                assert f"`{key}`" in page, key
-    for kind in PRIMITIVES:
-        assert f"`{kind}`" in page, kind
-
-
-def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
+def test_damaged_files_are_refused_in_one_sentence_and_nothing_is_written_where_it_cannot_be(tmp_path):
     path = write_verdict(tmp_path / "verdict.json", VERDICT, None, ORIGIN)
     whole = path.read_text(encoding="utf-8")
-
     mass = '"family": "mass",'
     nested = f'"remarks": [{"[" * 3000}{"]" * 3000}, '
     for old, new, words in (
@@ -252,51 +237,43 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path: Path) -> None:
         ('"mass": 0.30000000000000004', '"mass": null', "mass"),
     ):
         path.write_text(whole.replace(old, new, 1), encoding="utf-8")
-        with pytest.raises(VerdictFileError, match=words) as caught:
+        with refused(VerdictFileError, words):
             read_verdict(path)
-        assert "\n" not in str(caught.value)
-    with pytest.raises(VerdictFileError, match="There is no file"):
+    with refused(VerdictFileError, "There is no file"):
         read_verdict(tmp_path / "nothing.json")
     path.write_text(whole, encoding="utf-8")
-    with pytest.raises(VerdictFileError, match="'uav-twin verdict 4', but 'uav-twin patch 2' is needed"):
+    with refused(VerdictFileError, "'uav-twin verdict 4', but 'uav-twin patch 2' is needed"):
         read_patch(path)
-
-
-def test_nothing_is_written_where_it_cannot_be(tmp_path: Path) -> None:
-    wrong = replace(VERDICT, probability="sure")  # type: ignore[arg-type]
-    with pytest.raises(VerdictFileError, match=r"verdict.json cannot be written: verdict.probability"):
-        write_verdict(tmp_path / "verdict.json", wrong, None, ORIGIN)
+    path.unlink()
+    wrong = replace(VERDICT, probability="sure")
+    with refused(VerdictFileError, r"verdict.json cannot be written: verdict.probability"):
+        write_verdict(path, wrong, None, ORIGIN)
     assert not list(tmp_path.iterdir())
-    with pytest.raises(FileNotWrittenError, match="is a folder"):
+    with refused(FileNotWrittenError, "is a folder"):
         write_verdict(tmp_path, VERDICT, None, ORIGIN)
-    with pytest.raises(ValueError, match="shorter"):
+    with refused(ValueError, "shorter"):
         patch_effects((FRICTION, MASS), ((),))
     other = ModelPatch((Line("g1", 50.0, 1.0, 0.0),))
-    with pytest.raises(VerdictFileError, match="Draw 1 of the posterior has the primitives line"):
+    with refused(VerdictFileError, "Draw 1 of the posterior has the primitives line"):
         primitive_intervals(MASS.patch, (other,))
 
 
 # ---------------------------------------------------------------- residuals
 
 
-def test_residuals_come_back_to_the_last_bit(tmp_path: Path, make_bench) -> None:
-    bench = make_bench(amplitudes=(200.0, 150.0), held_out=(False, True))
-    fitted = bench.fit(np.random.default_rng(7))
+def test_residuals_come_back_to_the_last_bit(tmp_path, fitted):
     samples = np.random.default_rng(0).standard_normal(50)
     noise = NoiseRecord(2.0, inf, samples, 0.01, "pre-trigger")
     channels = dict(fitted.channels)
     channels["g2"] = replace(channels["g2"], noise=noise, station=0.4, offset_deviation=inf)
     channels["g3"] = replace(channels["g3"], noise=None)
     item = fitted.trials[0]
-    used = item.used.copy()
-    used[3, 1] = False
-    residual = item.residual.copy()
-    residual[3, 1] = nan
+    used, residual = item.used.copy(), item.residual.copy()
+    used[3, 1], residual[3, 1] = False, nan
     place = replace(item.trial, used=used, load_place=(1.0, 0.35))
     trials = (replace(item, trial=place, residual=residual), *fitted.trials[1:])
     fitted = replace(fitted, channels=channels, trials=trials)
-    path = write_residuals(tmp_path / "residuals.nc", fitted, {"hypothesis": "none"})
-    back = read_residuals(path)
+    back = read_residuals(write_residuals(tmp_path / "residuals.nc", fitted, {"hypothesis": "none"}))
     assert same(back.channels["g1"], fitted.channels["g1"])
     assert back.channels["g3"].noise is None
     np.testing.assert_array_equal(back.channels["g2"].noise.samples, samples)
@@ -308,48 +285,39 @@ def test_residuals_come_back_to_the_last_bit(tmp_path: Path, make_bench) -> None
         assert (first.rates is None) == (second.rates is None)
         for slot in fields(first.trial):
             one, two = getattr(first.trial, slot.name), getattr(second.trial, slot.name)
-            if isinstance(one, np.ndarray):
-                np.testing.assert_array_equal(one, two)
-                assert one.dtype == two.dtype
-            else:
-                assert one == two
+            np.testing.assert_array_equal(one, two)
+            assert getattr(one, "dtype", None) == getattr(two, "dtype", None)
 
 
-def test_residual_file_carries_units_and_refuses_damage(tmp_path: Path, make_bench) -> None:
-    import xarray as xr
-
-    path = write_residuals(tmp_path / "residuals.nc", make_bench().fit(np.random.default_rng(1)))
-    with xr.open_datatree(path, engine="h5netcdf") as tree:
-        group = tree["trial_001"].to_dataset()
-        assert group["time"].attrs["units"] == "s"
-        assert set(group["unit"].values) == {"1"}
-        assert group["residual"].dims == ("row", "channel")
-        assert group.attrs["name"] == "release 1"
+def test_residual_file_carries_units_and_refuses_damage(tmp_path, fitted):
+    path = write_residuals(tmp_path / "residuals.nc", fitted)
     with xr.open_datatree(path, engine="h5netcdf") as opened:
         tree = opened.load()
+    group = tree["trial_001"].to_dataset()
+    assert group["time"].attrs["units"] == "s"
+    assert set(group["unit"].values) == {"1"}
+    assert group["residual"].dims == ("row", "channel")
+    assert group.attrs["name"] == "release 1"
     tree["trial_001/time"].values[1] = nan
-    lost = tmp_path / "lost.nc"
-    tree.to_netcdf(lost, engine="h5netcdf")
-    with pytest.raises(VerdictFileError, match="time is not finite"):
-        read_residuals(lost)
     whole = path.read_bytes()
-    for damaged in (whole[: len(whole) // 2], b""):
-        path.write_bytes(damaged)
-        with pytest.raises(VerdictFileError, match="damaged"):
+    for write, words in (
+        (lambda: tree.to_netcdf(path, engine="h5netcdf"), "time is not finite"),
+        (lambda: path.write_bytes(whole[: len(whole) // 2]), "damaged"),
+        (lambda: path.write_bytes(b""), "damaged"),
+        (lambda: xr.Dataset(attrs={"schema": "other"}).to_netcdf(path, engine="h5netcdf"), "'other'"),
+        (path.unlink, "There is no file"),
+    ):
+        write()
+        with refused(VerdictFileError, words):
             read_residuals(path)
-    with pytest.raises(VerdictFileError, match="There is no file"):
-        read_residuals(tmp_path / "nothing.nc")
-    xr.Dataset(attrs={"schema": "other"}).to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(VerdictFileError, match="'other'"):
-        read_residuals(path)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_files_of_earlier_numbers_are_read(number: int, tmp_path: Path) -> None:
+def test_files_of_earlier_numbers_are_read(number, tmp_path):
     path = write_verdict(tmp_path / "verdict.json", VERDICT, None, ORIGIN)
     content = json.loads(path.read_text(encoding="utf-8"))
     content["schema"] = f"uav-twin verdict {number}"
-    later: dict[str, object] = {"force": None}
+    later = {"force": None}
     if number < 3:
         del content["model_file"]
         for row in content["verdict"]["hypotheses"]:

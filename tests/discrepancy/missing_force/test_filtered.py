@@ -1,24 +1,39 @@
 """The filter with a missing force against Gaussian conditioning on dense matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
-from scipy.signal import lfilter
 
+from benchmarks.event_moments import found_in as found_in_series
+from benchmarks.event_moments import noise, record
+from benchmarks.force_events import counted, drawn, found_in, problem_of
+from discrepancy.campaign.noise import NoiseModel
+from discrepancy.judgement.when import begins_inside, when_sentence
+from discrepancy.missing_force.events import Acting, EventSearch
 from discrepancy.missing_force.filtered import Filtered, Process, regression
-from discrepancy.missing_force.trial import SeenTrial
+from discrepancy.missing_force.trial import SeenTrial, decaying_part
+from discrepancy.missing_force.view import View
+from discrepancy.missing_force.windows import residual_windows
 from discrepancy.models.interface import PortedSystem
+from discrepancy.report.residual_figures import time_line_figure
+from discrepancy.verdict import GapWindow, Moment
+from discrepancy.workflow import investigate
+from tests.discrepancy.bench import Bench
+
+
+def gaussian(covariance, readings):
+    """Return the log evidence of readings but for a constant."""
+    quadratic = readings @ np.linalg.solve(covariance, readings)
+    return -0.5 * (quadratic + np.linalg.slogdet(covariance)[1])
+
 
 FloatArray = NDArray[np.float64]
-
 FREQUENCY, RATIO, PARTS = 9.0, 0.05, 8
 PROCESS = Process(2.0, 0.15)
 
 
-def oscillator() -> PortedSystem:
+def oscillator():
     """One mass of 1 kg on a spring: its displacement and its accelerometer, a force at the mass."""
     generator = np.array([[0.0, 1.0], [-(FREQUENCY**2), -2.0 * RATIO * FREQUENCY]])
     return PortedSystem(
@@ -27,15 +42,7 @@ def oscillator() -> PortedSystem:
     )  # fmt: skip
 
 
-def trial_of(
-    time: FloatArray,
-    residual: FloatArray,
-    *,
-    used: NDArray[np.bool_] | None = None,
-    deviation: FloatArray | None = None,
-    local: FloatArray | None = None,
-    coloured: tuple[tuple[int, float, float], ...] = (),
-) -> SeenTrial:
+def trial_of(time, residual, *, used=None, deviation=None, local=None, coloured=()):
     """Return a trial without shared unknowns; the residual is over the noise's deviation."""
     count = len(time)
     used = np.ones(residual.shape, dtype=bool) if used is None else used
@@ -48,12 +55,7 @@ def trial_of(
     )  # fmt: skip
 
 
-def dense(
-    trial: SeenTrial,
-    process: Process,
-    per_second: int = 4000,
-    window: tuple[float, float] = (-np.inf, np.inf),
-) -> tuple[FloatArray, FloatArray]:
+def dense(trial, process, per_second=4000, window=(-np.inf, np.inf)):
     """Return the covariance (N C, N C) of the readings by the force, and of force and readings (N, N C).
 
     By quadrature of what a kernel over all pairs of moments, those of a window, does to an impulse response;
@@ -92,7 +94,7 @@ def dense(
 
 @pytest.mark.parametrize("rough", [False, True], ids=["bends", "jumps"])
 @pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
-def test_evidence_and_force_are_those_of_dense_conditioning(rough: bool, uneven: bool) -> None:
+def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven):
     random = np.random.default_rng(3)
     time = 0.02 * np.arange(40)
     if uneven:
@@ -106,7 +108,7 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough: bool, uneven:
     at = np.flatnonzero(used.ravel())
     covariance = covariance[np.ix_(at, at)] + np.eye(len(at))
     readings = residual.ravel()[at]
-    wanted = -0.5 * readings @ np.linalg.solve(covariance, readings) - 0.5 * np.linalg.slogdet(covariance)[1]
+    wanted = gaussian(covariance, readings)
     found = filtered.whitened(trial.residual[None])
     value = -0.5 * float(np.sum(found**2)) - filtered.log_determinant
     assert value == pytest.approx(wanted, abs=0.05 if rough else 0.02)
@@ -119,7 +121,7 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough: bool, uneven:
     np.testing.assert_allclose(filtered.deviation(0), np.sqrt(variance), atol=0.02 * process.size)
 
 
-def test_steady_gains_are_those_of_every_step() -> None:
+def test_steady_gains_are_those_of_every_step():
     random = np.random.default_rng(4)
     time = 0.02 * np.arange(900)
     trial = trial_of(time, random.standard_normal((900, 2)))
@@ -139,7 +141,7 @@ def test_steady_gains_are_those_of_every_step() -> None:
     np.testing.assert_allclose(filtered.deviation(0), every.deviation(0), atol=1e-8)
 
 
-def test_the_state_between_samples_is_that_of_samples_in_between() -> None:
+def test_the_state_between_samples_is_that_of_samples_in_between():
     random = np.random.default_rng(5)
     count = 30
     residual = random.standard_normal((count, 2))
@@ -154,7 +156,26 @@ def test_the_state_between_samples_is_that_of_samples_in_between() -> None:
     np.testing.assert_allclose(added, other[::PARTS], atol=1e-9)
 
 
-def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning() -> None:
+def test_states_and_noise_by_closed_forms():
+    """Backwards a force of a long correlation would grow by e^1000 within a step, and stays finite."""
+    trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
+    filtered = Filtered(trial, {0: Process(1.0, 1e-3)})
+    assert np.isfinite(filtered.log_determinant)
+    assert np.all(np.isfinite(filtered.smoothed(trial.residual)[1]))
+    # a pushed state
+    trial = trial_of(0.02 * np.arange(50), np.zeros((50, 2)))
+    generator, push = trial.system.generator, -trial.system.actions[0]
+    wanted = [np.linalg.solve(generator, (expm(generator * t) - np.eye(2)) @ push) for t in trial.fine_time]
+    np.testing.assert_allclose(trial.pushed(0, np.ones(len(wanted))), wanted, atol=1e-12)
+    # noise of first order is taken apart
+    noise = NoiseModel(1.0, 1.0 / np.sqrt(1.0 - 0.81), np.inf, np.array([0.9]), 0.01, ())
+    assert decaying_part(noise, 0.01) == (
+        pytest.approx(1.0 - 1e-3, abs=2e-3), pytest.approx(-np.log(0.9) / 0.01, rel=1e-6),
+    )  # fmt: skip
+    assert decaying_part(noise, 0.02) is None
+
+
+def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning():
     random = np.random.default_rng(6)
     time = 0.02 * np.arange(60)
     residual = random.standard_normal((60, 2))
@@ -171,38 +192,125 @@ def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning(
     flat = local.reshape(2, -1)
     covariance = covariance + noise + flat.T @ flat
     readings = residual.ravel()
-    wanted = -0.5 * readings @ np.linalg.solve(covariance, readings) - 0.5 * np.linalg.slogdet(covariance)[1]
+    wanted = gaussian(covariance, readings)
     assert value == pytest.approx(wanted, abs=0.02)
 
 
-def test_a_long_correlation_within_a_short_step_stays_finite() -> None:
-    """Backwards the force would grow by e^1000 within a step."""
-    trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
-    filtered = Filtered(trial, {0: Process(1.0, 1e-3)})
-    assert np.isfinite(filtered.log_determinant)
-    assert np.all(np.isfinite(filtered.smoothed(trial.residual)[1]))
+# ---------------------------------------------------------------- forces that act at times
 
 
-def test_a_pushed_state_follows_the_closed_form() -> None:
-    trial = trial_of(0.02 * np.arange(50), np.zeros((50, 2)))
-    state = trial.pushed(0, np.ones(len(trial.fine_time)))
-    generator = trial.system.generator
-    push = -trial.system.actions[0]
-    wanted = np.array(
-        [np.linalg.solve(generator, (expm(generator * t) - np.eye(2)) @ push) for t in trial.fine_time]
-    )
-    np.testing.assert_allclose(state, wanted, atol=1e-12)
+KINDS = ("power", "leak", "tank", "push", "friction", "always", "nothing")
+EVENT, REST = Process(2.0, 0.15, rough=True), Process(0.5, 0.4, rough=True)
 
 
-def test_noise_of_first_order_is_taken_apart_exactly() -> None:
-    from discrepancy.campaign.noise import NoiseModel
-    from discrepancy.missing_force.trial import decaying_part
+@pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
+def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
+    random = np.random.default_rng(3)
+    time = 0.02 * np.arange(40)
+    if uneven:
+        time = np.round(time + np.r_[0.0, random.uniform(-0.006, 0.006, 39)], 3)
+    residual = random.standard_normal((40, 2)) * [3.0, 1.0]
+    local = random.standard_normal((1, 40, 2))
+    trial = trial_of(time, residual, local=local)
+    search = EventSearch(View([trial], np.zeros(0)), 0, EVENT, [np.zeros(40, dtype=bool)])
+    steps = search.steps(0, Acting(EVENT, REST))
+    starts, ends = np.array([0, 7, 20]), np.array([9, 26, 40])
+    values = search.evidence(*search.ways(0, steps, np.zeros(40, dtype=bool), starts, ends))
+    always = dense(trial, REST)[0] + np.eye(80) + np.outer(local.ravel(), local.ravel())
+    for a, start in enumerate(starts):
+        for b, end in enumerate(ends):
+            if end <= start:
+                assert values[a, b] == -np.inf
+                continue
+            edge = (-np.inf if start == 0 else time[start], np.inf if end == 40 else time[end])
+            covariance = always + dense(trial, EVENT, window=edge)[0]
+            assert values[a, b] == pytest.approx(gaussian(covariance, residual.ravel()), abs=0.05)
+            on = np.zeros(40, dtype=bool)
+            on[start:end] = True
+            assert search.evidence(*search.whole(0, steps, on)) == pytest.approx(values[a, b], abs=1e-7)
 
-    noise = NoiseModel(1.0, 1.0 / np.sqrt(1.0 - 0.81), np.inf, np.array([0.9]), 0.01, ())
-    found = decaying_part(noise, 0.01)
-    assert found is not None
-    assert found[0] == pytest.approx(1.0 - 1e-3, abs=2e-3)
-    assert found[1] == pytest.approx(-np.log(0.9) / 0.01, rel=1e-6)
-    answer = lfilter([1.0], [1.0, -0.9], np.r_[1.0, np.zeros(3)])
-    assert np.exp(-found[1] * 0.01) == pytest.approx(answer[1], rel=1e-6)
-    assert decaying_part(noise, 0.02) is None
+
+def test_a_force_that_turns_is_one_that_does_not_turned():
+    """Its readings before and after a turn have the opposite correlation; what they are alone is the same."""
+    trial = trial_of(0.02 * np.arange(40), np.random.default_rng(5).standard_normal((40, 2)))
+    never, turns = np.zeros(40, dtype=bool), np.arange(40) == 20
+    both = [EventSearch(View([trial], np.zeros(0)), 0, EVENT, [flips]) for flips in (never, turns)]
+    acting = Acting(EVENT, Process(1e-6, 1.0, rough=True))
+    for on, same in ((np.arange(40) < 20, True), (~never, False)):
+        one, other = (search.total(acting, [on]) for search in both)
+        assert (abs(one - other) < 1e-9) is same
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        ("power", 9), ("leak", 5), ("tank", 3), ("push", 9), ("push", 8), ("friction", 2), ("always", 0),
+        ("nothing", 2),
+    ],
+)  # fmt: skip
+def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path, kind, seed):
+    case = drawn(tmp_path / kind, kind, (1, seed, KINDS.index(kind)))
+    found = found_in(case)
+    counts = counted(case, found)
+    assert counts["close"] == counts["moments"] == 2 * len(case.windows) == len(found)
+    for true, (_, low, high) in zip(np.ravel(case.windows), found, strict=True):
+        wide = high - low  # an interval of 90 % three times as wide fails in one of a million cases
+        assert low - wide < true < high + wide
+    if (kind, seed) != ("leak", 5):
+        return
+    problem = problem_of(case)
+    verdict = investigate(problem.campaign, problem.model).verdict
+    told = [window for window in verdict.windows if not window.with_effect]
+    for window, moments in zip(told, case.windows, strict=True):
+        assert (window.begin.value, window.end.value) == pytest.approx(moments, abs=0.01 * case.length)
+        assert window.channels == ("block",)
+        assert window.size > 3.0
+    assert when_sentence(told) in verdict.sentence
+
+
+@pytest.mark.parametrize("kind", ["offset", "random motion", "line", "scatter", "quiet"])
+def test_moments_of_residuals_are_where_they_were_made(kind):
+    """And quiet records of coloured noise have none."""
+    generator = np.random.default_rng(7 if kind == "quiet" else 5)
+    for _ in range(5 if kind == "quiet" else 2):
+        if kind == "quiet":
+            assert not found_in_series(np.arange(400.0), noise(generator, 400, 0.5)).moments(0).size
+            continue
+        time, values, truth = record(generator, kind)
+        found = found_in_series(time, values).moments(0)
+        assert len(found) == len(truth)
+        np.testing.assert_allclose(found[:, 0], truth, atol=0.01 * time[-1])
+
+
+def test_a_window_of_a_campaign_is_told_and_drawn():
+    event = np.zeros((300, 4))
+    event[120:200, 1] = 16.0  # eight noises, from 1.2 s to 2 s
+    fitted = Bench(count=300).fit(np.random.default_rng(4), extra={1: event})
+    (window,) = residual_windows(fitted)
+    assert (window.trial, window.channels) == ("release 2", ("g2",))
+    assert window.begin.low - 0.01 <= 1.2 <= window.begin.high + 0.01
+    assert window.end.low - 0.01 <= 2.0 <= window.end.high + 0.01
+    assert window.size == pytest.approx(8.0, rel=0.1)
+    assert residual_windows(fitted) == (window,)
+    assert begins_inside((window,))
+    assert when_sentence((window,)).startswith("The gap is there in 'release 2' since 1.")
+    (axis, *_) = time_line_figure((window,)).axes
+    assert [text.get_text() for text in axis.get_yticklabels()] == ["release 2"]
+    assert residual_windows(Bench(count=300).fit(np.random.default_rng(4))) == ()
+    assert time_line_figure(()) is None
+
+
+def test_words_of_windows():
+    whole = GapWindow("a", ("x",), None, None, 0.0, 9.0, 4.0)
+    part = GapWindow("b", ("x",), Moment(1.0, 0.98, 1.04), None, 0.0, 9.0, 3.0)
+    left = GapWindow("b", ("x",), None, Moment(2.0, 1.5, 2.5), 0.0, 9.0, 2.0, with_effect=True)
+    throughout = "in 'a' throughout the record, 4 times the noise."
+    assert not begins_inside((whole,))
+    for windows, sentence in (
+        ((whole,), "The gap is there throughout the records."),
+        ((whole, part), "The gap is there in 'b' since 1.000 s (0.980 to 1.040), to the end of the record, "
+         f"3 times the noise; {throughout}"),
+        ((whole, part, part, part), f"The gap comes and goes, 4 times; the largest is {throughout}"),
+        ((left,), ""),
+    ):  # fmt: skip
+        assert when_sentence(windows) == sentence

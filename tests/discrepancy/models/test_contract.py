@@ -15,8 +15,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.reduced_structure import StructureModel
-from discrepancy.models.wing import SHIPPED_PRIOR, WingModel
+from discrepancy.models.structures import SHIPPED_PRIOR, StructureModel, WingModel
 from fe.runtime import patch
 from fe.runtime.laws import LAWS
 from fe.runtime.patch import (

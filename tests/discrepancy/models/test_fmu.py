@@ -26,7 +26,7 @@ from tests.discrepancy.asking import FloatArray, campaign, integrated
 from tests.discrepancy.asking import seen as shown
 from tests.discrepancy.asking import trial as asked
 from tests.discrepancy.rigs import fmu_rig
-from tests.refusals import Inputs
+from tests.refusals import Inputs, refused
 
 INPUTS = Inputs(__file__)
 STIFFNESS, AMPLITUDE, FREQUENCY = 1974.0, 0.02, np.sqrt(987.0)
@@ -167,9 +167,7 @@ def test_rates_are_the_derivatives(rig: FmuModel, lumped: LumpedModel) -> None:
           ((), (LAWS["coulomb"],), (LAWS["bouc-wen"],), (LoadGain(0.1, 0.0),))),
     ],
 )  # fmt: skip
-def test_motion_converges_to_the_lumped_model(
-    error, what: Trial, items, largest: float, least: float
-) -> None:
+def test_motion_converges_to_the_lumped_model(error, what, items, largest: float, least: float) -> None:
     coarse, fine = (error(what, *items, refinement=n) for n in (1, 4))
     assert coarse < largest
     assert np.log(coarse / fine) / np.log(4.0) > least
@@ -236,9 +234,8 @@ def test_what_is_hidden_is_named_and_nothing_where_nothing_is(rig, lumped, hidde
 
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("rig"))
 def test_a_wrong_file_is_refused_in_one_sentence(write, old: str, new: str, sentence: str) -> None:
-    with pytest.raises(ModelError, match=sentence) as refusal:
+    with refused(ModelError, sentence):
         FmuModel.load(write((old, new)))
-    assert "\n" not in str(refusal.value)
 
 
 def test_the_documented_file_is_one() -> None:

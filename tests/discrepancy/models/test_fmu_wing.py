@@ -13,7 +13,7 @@ import pytest
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, RootCompliance
 from fmu_asset.packing.patch_file import parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
@@ -83,6 +83,12 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
 @pytest.mark.parametrize("state", [{}, {"health": np.array([[0.2, 0.3]])}])
 def test_it_is_the_wing(pair: Pair, case: Trial, tolerance: float, state: dict[str, Any]) -> None:
     assert pair.share(case, **state) < tolerance
+
+
+def test_another_use_of_the_instance_at_rest_leaves_no_trace(pair: Pair) -> None:
+    for health in (0.1, 0.4):  # inputs of one step after another; parameters would ask for a reset
+        assert pair.share(LOADS, health=np.full((1, 2), health)) < 1e-9
+        pair.fmu.fmu.started(1.0, {}, {}, settle=False)
 
 
 @pytest.mark.parametrize("item", [PointMass(0.3, 0.9), RootCompliance(3e-4)])

@@ -15,7 +15,7 @@ from discrepancy.campaign.records import Quantity, Release, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
-from discrepancy.models.reduced_structure import StructureModel
+from discrepancy.models.structures import StructureModel
 from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.patch import PowerStiffness
 from fe.runtime.reduced import ReducedModel
@@ -122,8 +122,8 @@ def test_any_region_is_known_by_its_name(model: Model, kinds: Kinds) -> None:
 def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(kinds: Kinds, monkeypatch) -> None:
     """Nor are springs of next to no stiffness, which change nothing, whatever steps they take."""
     model, asked = kinds.fmu, []
-    advanced = model.runs.advanced
-    monkeypatch.setattr(model.runs, "advanced", lambda *given: (asked.append(given[-1]), advanced(*given))[1])
+    advanced = model.fmu.advanced
+    monkeypatch.setattr(model.fmu, "advanced", lambda *given: (asked.append(given[-1]), advanced(*given))[1])
     for e in (1.0, 1.03):
         wanted = seen(model, RELEASED, OUTPUTS, **at(e, 0.05))
         for force in (1e-9, 1e-6, 100.0):
@@ -132,15 +132,15 @@ def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(kinds: Kinds, monkeyp
             if force < 1.0:
                 alike(values, wanted, 1e-6)
         assert 0 < len(asked) == before
-    assert max(parts for parts, _ in model._laws._refinements.values()) > 1
+    assert max(parts for parts, _ in model.fmu._refinements.values()) > 1
 
 
 def test_an_accelerometer_that_nobody_reads_does_not_shorten_the_steps(kinds: Kinds) -> None:
     model, found, refinements = kinds.fmu, [], []
     for outputs in (OUTPUTS, OUTPUTS[:2]):
-        model._laws._refinements.clear()
+        model.fmu._refinements.clear()
         found.append(seen(model, RELEASED, outputs, SPRING, **at(1.0, 0.05))[:, :2])
-        refinements += [parts for parts, _ in model._laws._refinements.values()]
+        refinements += [parts for parts, _ in model.fmu._refinements.values()]
     alike(found[1], found[0], 5e-4)
     assert refinements[1] < refinements[0]
 

@@ -14,7 +14,7 @@ from calibration.result.file import save_calibration
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import entry
 from fe.runtime import patch
@@ -64,7 +64,7 @@ class Wing:
     def matrices(self, *items: Any, loss: Any = (0.0, 0.0), warm: float = 1.0) -> tuple[Any, Any, Any]:
         """Stiffness, mass and damping."""
         e, servo, pitot, alpha, beta = self.means
-        structure = self.wing.structure(warm * e, tuple(loss), servo, pitot, ModelPatch(items))
+        structure = self.wing.at(np.array((warm * e, *loss, servo, pitot, 0.0, 0.0)), ModelPatch(items))
         return structure.stiffness, structure.mass, alpha * structure.mass + beta * structure.stiffness
 
     def static(self, loads: Any, *items: Any, **state: Any) -> FloatArray:
@@ -237,7 +237,7 @@ def test_the_posterior_of_a_calibration_is_the_prior(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     design = load_design().changed(mesh={"refinement": 0.25})
     cache_folder().mkdir()
-    coarse_patch_arrays.save(entry("patches", design.hash, None))
+    entry("patches", design.hash, None).write_bytes(coarse_patch_arrays.to_bytes())
     result = replace(make_calibration(), design=design, design_hash=design.hash)
     save_calibration(result, tmp_path / "wing.nc")
     model = WingModel.of_calibration(tmp_path / "wing.nc")

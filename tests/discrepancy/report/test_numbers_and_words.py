@@ -1,10 +1,6 @@
 """Numbers, formulas and sentences of a report."""
 
-from __future__ import annotations
-
 import re
-import tomllib
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,9 +11,7 @@ from hypothesis import strategies as st
 from discrepancy.files.verdict import primitive_intervals
 from discrepancy.judgement.conclusion import named_effects, probability_text
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.lumped_file import parse_lumped
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from discrepancy.report.residual_figures import (
     gauge_places,
     planform_figure,
@@ -25,61 +19,58 @@ from discrepancy.report.residual_figures import (
     size_by_channel,
     size_table,
 )
-from discrepancy.report.text import (
-    formula,
-    headline,
-    number,
-    rounded,
-    si_sizes,
-    size_sentence,
-)
+from discrepancy.report.text import formula, headline, number, rounded, si_sizes, size_sentence
 from discrepancy.verdict import Verdict, VerdictKind
-from discrepancy.workflow import Investigation, patch_draws
+from discrepancy.workflow import patch_draws
 from fe.runtime.patch import (
     ModelPatch,
     Overflow,
     PointMass,
     PowerDamping,
     PowerStiffness,
-    Primitive,
     SensorDrift,
     SensorGain,
 )
 from fe.wing.design import load_design
 from reporting.words import listing
-
-pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
-
-
-@given(st.floats(-1e6, 1e6), st.floats(1e-9, 1e3))
-def test_rounding_keeps_values_within_a_twentieth_of_their_spread(value: float, spread: float) -> None:
-    text = rounded(value, spread)(value).replace("\N{MINUS SIGN}", "-")
-    assert abs(float(text) - value) <= 0.051 * spread + 1e-9 * abs(value)
+from tests.discrepancy.bench import Bench
+from tests.discrepancy.rigs import model_of
 
 
-def test_numbers_that_nobody_should_read_as_certain() -> None:
-    assert probability_text(1.0 - 1e-6) == "> 0.999"
-    assert probability_text(1e-200) == "< 1e-99"
-    assert probability_text(float("nan")) == "not known"
+def test_numbers_formulas_and_lists_as_they_are_written():
+    minus = "\N{MINUS SIGN}"
+    for value, text in (
+        (1582.6, "1,580"), (-11424.0, f"{minus}11,400"), (0.98, "0.98"), (2e6, "2e+06"), (999.6, "1,000"),
+    ):  # fmt: skip
+        assert number(value) == text
+    # numbers that nobody should read as certain
+    for value, text in ((1.0 - 1e-6, "> 0.999"), (1e-200, "< 1e-99"), (float("nan"), "not known")):
+        assert probability_text(value) == text
     assert rounded(float("nan"), 1.0)(float("nan")) == "not known"
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(1582.6, "1,580"), (-11424.0, "\N{MINUS SIGN}11,400"), (0.98, "0.98"), (2e6, "2e+06"), (999.6, "1,000")],
-)
-def test_large_numbers_are_written_out(value: float, text: str) -> None:
-    assert number(value) == text
-
-
-def test_formulas_and_lists() -> None:
     assert formula("zeta_eq = 4 c A w^2 / (3 pi k) -> zeta") == "ζ_eq = 4 c A w² / (3 π k) → ζ"
     assert formula("x^n, beta2, multiplier mu") == "x^n, beta2, multiplier μ"
     assert listing(["a"]) == "a"
     assert listing(["a", "b", "c"]) == "a, b and c"
 
 
-def test_a_headline_has_one_probability() -> None:
+TANK = """
+format = 1
+name = "Tank"
+capacity = 2.0
+conductance_part = [{ name = "outlet", matrix = 0.1 }]
+output = [{ name = "level", vector = 1.0, quantity = "level" }]
+port = [{ name = "outlet", vector = 1.0 }]
+"""
+pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
+
+
+@given(st.floats(-1e6, 1e6), st.floats(1e-9, 1e3))
+def test_rounding_keeps_values_within_a_twentieth_of_their_spread(value, spread):
+    text = rounded(value, spread)(value).replace("\N{MINUS SIGN}", "-")
+    assert abs(float(text) - value) <= 0.051 * spread + 1e-9 * abs(value)
+
+
+def test_a_headline_has_one_probability():
     named = Verdict(VerdictKind.NAMED, "The model lacks drag (probability 0.998).", 0.998, 12.0)
     assert headline(named).count("probability") == 1
     group = Verdict(VerdictKind.GROUP, "One of a, b is missing.", 0.97, 12.0)
@@ -88,9 +79,9 @@ def test_a_headline_has_one_probability() -> None:
     assert headline(broken) == "Channel x is clipped."
 
 
-def test_sizes_are_one_for_noise_and_follow_what_is_added(make_bench: Callable[..., object]) -> None:
-    bench = make_bench(amplitudes=(200.0, 150.0))  # type: ignore[call-arg]
-    residuals: ResidualSet = bench.fit(np.random.default_rng(3))  # type: ignore[attr-defined]
+def test_sizes_are_one_for_noise_and_follow_what_is_added():
+    bench = Bench(amplitudes=(200.0, 150.0))
+    residuals = bench.fit(np.random.default_rng(3))
     channels, _, table = size_table(residuals)
     assert table.shape == (4, 3)
     assert channels == ["g1", "g2", "g3", "g4"]
@@ -102,9 +93,9 @@ def test_sizes_are_one_for_noise_and_follow_what_is_added(make_bench: Callable[.
     assert size_by_channel(alone)["g3"] == pytest.approx(size(item, 2), rel=1e-12)
 
 
-def test_gauges_lie_where_the_design_has_them(make_bench: Callable[..., object]) -> None:
-    bench = make_bench()  # type: ignore[call-arg]
-    residuals: ResidualSet = bench.fit(np.random.default_rng(3))  # type: ignore[attr-defined]
+def test_gauges_lie_where_the_design_has_them():
+    bench = Bench()
+    residuals = bench.fit(np.random.default_rng(3))
     design = load_design()
     channels = {
         name: replace(channel, output=f"strain[{number}]")
@@ -115,7 +106,6 @@ def test_gauges_lie_where_the_design_has_them(make_bench: Callable[..., object])
     own = {"g1": replace(channels["g1"], station=0.5, chord=0.2)}
     assert gauge_places(list(own.values()), design) == {"g1": (0.5, 0.2)}
     figure = planform_figure(replace(residuals, channels=channels), None, design)
-    assert figure is not None
     labels = [text.get_text() for text in figure.axes[0].texts]
     assert labels == ["g1", "g2", "g3", "g4"]
     nowhere = {name: replace(channel, output="x") for name, channel in channels.items()}
@@ -123,79 +113,66 @@ def test_gauges_lie_where_the_design_has_them(make_bench: Callable[..., object])
 
 
 @pytest.mark.parametrize(
-    ("primitive", "text"),
+    ("make", "primitive", "text"),
     [
-        (PowerDamping("slide", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.5000 N"),
-        (PowerDamping("slide", 0.5, 2.0, 0.0, 0.25, 1.0), "force 0.5000 N at 0.25 m/s"),
-        (PowerStiffness("slide", 3.0, 3.0, 0, 0.01), "force 3.000 N at 0.01 m"),
-        (PointMass(0.2, 0.4), "mass 0.200 kg at 0.4 m"),
-        (SensorGain("displacement", 0.02), ""),
-        (SensorDrift("displacement", 0.002, 10.0), "amplitude 0.002 m"),
-        (SensorDrift("leaf_strain", 0.002, 10.0), ""),
-        (PowerDamping("elsewhere", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N or N m"),
+        *(
+            (None, *row)
+            for row in (
+                (PowerDamping("slide", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.5000 N"),
+                (PowerDamping("slide", 0.5, 2.0, 0.0, 0.25, 1.0), "force 0.5000 N at 0.25 m/s"),
+                (PowerStiffness("slide", 3.0, 3.0, 0, 0.01), "force 3.000 N at 0.01 m"),
+                (PointMass(0.2, 0.4), "mass 0.200 kg at 0.4 m"),
+                (SensorGain("displacement", 0.02), ""),
+                (SensorDrift("displacement", 0.002, 10.0), "amplitude 0.002 m"),
+                (SensorDrift("leaf_strain", 0.002, 10.0), ""),
+                (PowerDamping("elsewhere", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N or N m"),
+            )
+        ),
+        (lambda: model_of(TANK), PowerDamping("outlet", 0.5, 0.5, 0.0, 2.0, 1.0),
+         "flow 0.500 m/s times capacity at 2 m"),
+        (lambda: model_of(TANK), Overflow("outlet", 0.5, 1.5, 3.0, 2.0),
+         "flow 0.500 m/s times capacity, level 3.000 m"),
+        (WingModel.shipped, PowerDamping("root", 0.5, 0.0, 0.0, 1.0, 1.0), "moment 0.500 N m"),
+        (WingModel.shipped, PowerDamping("tip", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N"),
     ],
-)
-def test_sizes_have_the_unit_of_their_port_or_channel(
-    drag: Investigation, primitive: Primitive, text: str
-) -> None:
+)  # fmt: skip
+def test_sizes_have_the_unit_of_their_port_state_or_channel(drag, make, primitive, text):
     patch = ModelPatch((primitive,))
-    found = si_sizes(patch, primitive_intervals(patch), drag.model, drag.campaign)
+    model = make() if make else drag.model
+    found = si_sizes(patch, primitive_intervals(patch), model, drag.campaign)
     assert re.sub(r"(\d\.\d*?)0+(?= )", r"\1", found) == re.sub(r"(\d\.\d*?)0+(?= )", r"\1", text)
 
 
-def test_a_flow_has_the_unit_of_its_state(drag: Investigation) -> None:
-    tank = """
-format = 1
-name = "Tank"
-capacity = 2.0
-conductance_part = [{ name = "outlet", matrix = 0.1 }]
-output = [{ name = "level", vector = 1.0, quantity = "level" }]
-port = [{ name = "outlet", vector = 1.0 }]
-"""
-    model = LumpedModel(parse_lumped(tomllib.loads(tank)))
-    for law, text in (
-        (PowerDamping("outlet", 0.5, 0.5, 0.0, 2.0, 1.0), "flow 0.500 m/s times capacity at 2 m"),
-        (Overflow("outlet", 0.5, 1.5, 3.0, 2.0), "flow 0.500 m/s times capacity, level 3.000 m"),
-    ):
-        patch = ModelPatch((law,))
-        assert si_sizes(patch, primitive_intervals(patch), model, drag.campaign) == text
-
-
 @pytest.mark.parametrize(
-    ("first", "second", "units"),
+    ("known", "units"),
     [
         (
             'output = [{ name = "a", vector = [1.0, 0.0], quantity = "angle" }]',
-            "",
             ["N m", "N or N m", "N or N m"],
         ),
         (
-            'output = [{ name = "a", vector = [1.0, 0.0] }]',
+            'output = [{ name = "a", vector = [1.0, 0.0] }]\n'
             'input = [{ name = "b", vector = [0.0, 1.0], quantity = "angular_velocity" }]',
             ["N", "N m", "N or N m"],
         ),
     ],
 )
-def test_a_port_turns_as_what_is_measured_or_prescribed_of_it(
-    first: str, second: str, units: list[str]
-) -> None:
-    text = f"""
+def test_a_port_turns_as_what_is_measured_or_prescribed_of_it(known, units):
+    model = model_of(f"""
 format = 1
 name = "Two"
 mass = [[1.0, 0.0], [0.0, 1.0]]
 free = true
-{first}
-{second}
+{known}
 port = [
   {{ name = "one", vector = [1.0, 0.0] }}, {{ name = "other", vector = [0.0, 1.0] }},
   {{ name = "between", vector = [1.0, -1.0] }},
 ]
-"""
-    model = LumpedModel(parse_lumped(tomllib.loads(text)))
+""")
     assert [model.port_unit(name) for name in ("one", "other", "between")] == units
 
 
-def test_a_name_that_holds_its_identifier_is_said_once(drag: Investigation) -> None:
+def test_a_name_that_holds_its_identifier_is_said_once(drag):
     (effect,) = drag.verdict.effects
     named = replace(effect, identifier="outflow", name="outflow by a power of the level")
     sentence = f"The nearest is outflow; {named.name} closes 74 %."
@@ -203,23 +180,13 @@ def test_a_name_that_holds_its_identifier_is_said_once(drag: Investigation) -> N
     assert said.startswith(f"The nearest is {named.name}; {named.name} closes 74 %")
 
 
-def test_a_port_that_turns_has_a_moment(drag: Investigation) -> None:
-    wing = WingModel.shipped()
-    for port, text in (("root", "moment 0.500 N m"), ("tip", "force 0.500 N")):
-        patch = ModelPatch((PowerDamping(port, 0.5, 0.0, 0.0, 1.0, 1.0),))
-        assert si_sizes(patch, primitive_intervals(patch), wing, drag.campaign) == text
-
-
-def test_the_headline_size_is_that_of_the_patch(drag: Investigation) -> None:
-    assert drag.problem is not None
-    assert drag.fit is not None
+def test_the_headline_size_is_that_of_the_patch(drag):
     effects = named_effects(drag.problem, drag.fit)
     draws = patch_draws(drag.problem, drag.fit, 0)
     intervals = [primitive_intervals(e.patch, d) for e, d in zip(effects, draws, strict=True)]
     sentence = size_sentence(drag, effects, intervals)
     force, low, high = (float(text) for text in re.findall(r"\d+\.\d+", sentence)[:3])
     (law,) = effects[0].patch
-    assert isinstance(law, PowerDamping)
     assert force == pytest.approx(law.coefficient, rel=1e-2)
     assert low < force < high
     assert "m/s; 90 % intervals" in sentence

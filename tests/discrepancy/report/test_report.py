@@ -1,10 +1,7 @@
 """What a page says of a verdict: the finding first, then its grounds."""
 
-from __future__ import annotations
-
 import html
 import re
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -36,25 +33,26 @@ from discrepancy.report.text import (
     shares_sentence,
 )
 from discrepancy.verdict import ExplainedShare, NotFitted, RemainderEstimate, VerdictKind
-from discrepancy.workflow import Investigation
 from reporting.page import Page
 from reporting.words import listing
 from tests.discrepancy.rigs import FEW, ORIGIN
 
+
+def page_of(investigation, **verdict):
+    """Return the whole page of an investigation without its figures, its verdict changed."""
+    changed = replace(investigation, verdict=replace(investigation.verdict, **verdict))
+    return read(render_report(ReportInput(changed, ORIGIN), {}, {}))
+
+
 pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
 
 
-def read(page: str) -> str:
+def read(page):
     """Return a page as a browser shows it."""
     return html.unescape(page).replace("\N{NO-BREAK SPACE}", " ")
 
 
-def text_of(investigation: Investigation) -> str:
-    """Return the whole page of an investigation without its figures."""
-    return read(render_report(ReportInput(investigation, ORIGIN), {}, {}))
-
-
-def section_of(add: Callable[..., None], content: object) -> str:
+def section_of(add, content):
     """Return what is added to a page."""
     page = Page("a", "b")
     page.add_section("c")
@@ -62,10 +60,8 @@ def section_of(add: Callable[..., None], content: object) -> str:
     return read(page.render())
 
 
-def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag: Investigation) -> None:
-    assert drag.proof is not None
+def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
     closed, held = drag.proof.gap_closed, drag.proof.held_out_after
-    assert held is not None
     said = closing_sentence(drag)
     assert said.startswith(f"It closes {percent(closed)} % of the gap on held-out trials: χ²/dof is ")
     assert f"and {number(held.chi_square_per_dof)} after it" in said
@@ -82,11 +78,8 @@ def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag: 
     assert closing_sentence(replace(drag, proof=None)) == ""
 
 
-def test_a_report_opens_with_effect_size_share_and_probability(drag: Investigation) -> None:
-    force = drag.verdict.force
-    assert force is not None
-    assert force.held_out is not None
-    text = text_of(drag)
+def test_a_report_opens_with_effect_size_share_and_probability(drag):
+    force, text = drag.verdict.force, page_of(drag)
     opening = (
         f"Quadratic aerodynamic damping at {force.port}", f"{number(force.rms)} N",
         share_text(force.held_out), probability_text(drag.verdict.probability), headline(drag.verdict),
@@ -95,18 +88,17 @@ def test_a_report_opens_with_effect_size_share_and_probability(drag: Investigati
     assert places == sorted(places)
 
 
-def test_members_of_a_group_stand_apart_and_first(drag: Investigation) -> None:
+def test_members_of_a_group_stand_apart_and_first(drag):
     (effect,) = drag.verdict.effects
     rival = replace(effect, identifier="rival", name="a rival")
     hypotheses = tuple(
         replace(drag.verdict.hypotheses[0], effects=effects, log_evidence=0.0, probability=0.3)
         for effects in ((), (effect,), (effect, replace(rival, identifier="other", name="other")), (rival,))
     )
-    verdict = replace(
-        drag.verdict, kind=VerdictKind.GROUP, effects=(effect, rival), hypotheses=hypotheses,
+    text = page_of(
+        drag, kind=VerdictKind.GROUP, effects=(effect, rival), hypotheses=hypotheses,
         group=(effect.identifier, rival.identifier),
     )  # fmt: skip
-    text = text_of(replace(drag, verdict=verdict))
     assert f"Quadratic aerodynamic damping at {effect.place} or a rival at {effect.place}" in text
     members = re.findall(r"<td>(\d?)</td><td>(.*?)</td>", text[text.index("The members of the group") :])
     assert [row for row in members if row[0]] == [("1", effect.name), ("2", "a rival")]
@@ -114,52 +106,36 @@ def test_members_of_a_group_stand_apart_and_first(drag: Investigation) -> None:
     assert [role for _, role in roles[:4]] == ["member of the group"] * 2 + [""] * 2
 
 
-def test_what_was_not_compared_is_told_by_reason(drag: Investigation) -> None:
-    left = tuple(NotFitted(name, "No flight trial.") for name in ("washout", "inertia_relief"))
-    left += (NotFitted("free_play", "screened out: 0.3 nat at most", 0.3),)
-    text = section_of(add_not_compared, replace(drag.verdict, not_fitted=left))
-    assert "<td>No flight trial.</td><td>washout and inertia relief</td>" in text
-    assert "<td>Screened out</td><td>free play (0.3 nat)</td>" in text
-
-
-def test_parameters_are_shown_before_and_after(drag: Investigation) -> None:
+def test_parameters_are_shown_before_and_after(drag):
     rows = parameter_rows(drag)
     assert [row[0] for row in rows] == ["stiffness factor", "damping factor"]
-    assert drag.fit is not None
-    fitted = drag.problem.shared.parameters(drag.fit.point.shared)  # type: ignore[union-attr]
+    fitted = drag.problem.shared.parameters(drag.fit.point.shared)
     for row, item, value in zip(rows, drag.model.parameters, fitted, strict=True):
         moments = [[float(part) for part in cell.split(" ± ")] for cell in row[2:]]
         assert moments[0] == pytest.approx([item.mean, norm.ppf(0.95) * item.deviation], rel=0.03)
         assert moments[2][0] == pytest.approx(value, abs=0.06 * moments[2][1])
         assert moments[2][1] < moments[0][1]
-    nothing = replace(drag, fit=drag.search.none)  # type: ignore[union-attr]
+    nothing = replace(drag, fit=drag.search.none)
     assert [row[:4] for row in parameter_rows(nothing)] == [row[:4] for row in rows]
     assert {len(row) for row in parameter_rows(nothing)} == {4}
 
 
-def test_gates_say_what_they_compare(drag: Investigation) -> None:
+def test_gates_say_what_they_compare(drag):
+    """The one that decided stands out where the absolute fit could not be judged."""
     text = section_of(add_gates, drag)
     absolute, shape, consistency, _ = drag.verdict.gates
     for gate in (absolute, consistency):
         assert f"p = {gate.statistic:.2g}</td>" in text
         assert f"p at least {gate.limit:g}</td>" in text
     assert f"at most {shape.limit:g} nat</td>" in text
-
-
-def test_the_gate_that_decided_stands_out_where_the_absolute_fit_could_not_be_judged(
-    drag: Investigation,
-) -> None:
-    absolute, shape, consistency, _ = drag.verdict.gates
-    gates = (
-        replace(absolute, passed=None, statistic=float("nan")), shape,
-        replace(consistency, passed=False, statistic=2e-5),
-    )  # fmt: skip
+    unknown = replace(absolute, passed=None, statistic=float("nan"))
+    gates = (unknown, shape, replace(consistency, passed=False, statistic=2e-5))
     verdict = replace(drag.verdict, kind=VerdictKind.UNEXPLAINED, effects=(), gates=gates, force=None)
     text = section_of(add_verdict, ReportInput(replace(drag, verdict=verdict, proof=None), ORIGIN))
     assert "p of the consistency; a fit has at least 0.001" in text
 
 
-def test_a_reader_sees_which_trial_is_held_out(drag: Investigation) -> None:
+def test_a_reader_sees_which_trial_is_held_out(drag):
     assert drag.before is not None
     _, names, _ = size_table(drag.before)
     trials = drag.campaign.trials
@@ -169,9 +145,7 @@ def test_a_reader_sees_which_trial_is_held_out(drag: Investigation) -> None:
     assert f"Held out: {listing(trial.name for trial in trials if trial.held_out)};" in caption
 
 
-def test_what_explains_most_of_the_gap_is_told_first(drag: Investigation) -> None:
-    assert drag.location is not None
-    assert drag.before is not None
+def test_what_explains_most_of_the_gap_is_told_first(drag):
     gap = {"static": 0.0, "ring-down": 0.0}
     for item in drag.before.trials:
         if not item.trial.held_out:
@@ -182,17 +156,21 @@ def test_what_explains_most_of_the_gap_is_told_first(drag: Investigation) -> Non
     assert told == sorted(told, reverse=True)
 
 
-def test_each_reason_is_given_once_and_each_confusion_by_name(able: Separability) -> None:
+def test_what_was_not_compared_is_told_by_reason_and_each_confusion_by_name(drag, able):
+    left = tuple(NotFitted(name, "No flight trial.") for name in ("washout", "inertia_relief"))
+    left += (NotFitted("free_play", "screened out: 0.3 nat at most", 0.3),)
+    text = section_of(add_not_compared, replace(drag.verdict, not_fitted=left))
+    assert "<td>No flight trial.</td><td>washout and inertia relief</td>" in text
+    assert "<td>Screened out</td><td>free play (0.3 nat)</td>" in text
     assert untested_lines(able) == ["Not testable: washout. The campaign has no flight trial to fit."]
     lines = confused_lines(able)
     assert len(lines) == sum(bool(neighbours(able, name)) for name in able.identifiers)
     for line in lines:
-        name = line.split()[1]
-        assert all(other in line for other in neighbours(able, name))
+        assert all(other in line for other in neighbours(able, line.split()[1]))
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_an_effect_is_not_the_nearest_to_itself(drag: Investigation, count: int) -> None:
+def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     hidden = tuple(
         Detectability(effect, "", "", DETECTED / (n + 2) ** 2, "size", 1.0, "1", 0.5)
         for n, effect in enumerate(FEW[:count])
@@ -207,7 +185,7 @@ def test_an_effect_is_not_the_nearest_to_itself(drag: Investigation, count: int)
     assert told.endswith("with noise 2 times smaller or 4 times as many trials.")
 
 
-def test_rows_of_what_can_be_decided(drag: Investigation, able: Separability) -> None:
+def test_rows_of_what_can_be_decided(drag, able):
     rows = {row[0]: row for row in rows_of(able)}
     assert set(rows) == {effect.identifier for effect in FEW}
     assert rows["washout"][1] == "no"
@@ -222,15 +200,13 @@ def test_rows_of_what_can_be_decided(drag: Investigation, able: Separability) ->
         assert group[0].replace("_", " ") in text
 
 
-def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(drag: Investigation) -> None:
-    verdict = replace(
-        drag.verdict,
-        kind=VerdictKind.NAMED_IN_PART,
-        explained=ExplainedShare(0.94, 0.92, 0.953, 3.1, 0.9, 0.06, 0.04, "held-out"),
+def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(drag):
+    explained = ExplainedShare(0.94, 0.92, 0.953, 3.1, 0.9, 0.06, 0.04, "held-out")
+    text = page_of(
+        drag, kind=VerdictKind.NAMED_IN_PART, explained=explained,
         remainders=(RemainderEstimate("displacement", 3.1, 0.25, 2.0),),
         not_fitted=(NotFitted("washout", "No flight trial."), NotFitted("free_play", "screened out", 0.3)),
-    )
-    text = text_of(replace(drag, verdict=verdict))
+    )  # fmt: skip
     for words in (
         "90.0 % of the mean square on held-out trials",
         "displacement 3.1 noises over 0.25 s, swinging at 2 Hz",
@@ -239,8 +215,7 @@ def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(dr
         "closes most of the gap on trials that it did not see",
     ):
         assert words in text
-    assert shares_sentence(replace(verdict, explained=None)) == ""
-    assert verdict.explained is not None
+    assert shares_sentence(replace(drag.verdict, explained=None)) == ""
     # a mean square of 25 in units of the noise, of which 2.5 are left
-    assert residual_sizes(verdict.explained) == ("5", "1.6")
-    assert remainders_sentence(replace(verdict, remainders=())) == ""
+    assert residual_sizes(explained) == ("5", "1.6")
+    assert remainders_sentence(replace(drag.verdict, remainders=())) == ""

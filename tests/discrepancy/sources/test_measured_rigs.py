@@ -2,23 +2,33 @@
 
 import os
 import re
-from collections.abc import Callable
+from functools import cache
+from math import pi
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from benchmarks.public_rigs.__main__ import BLOWN, RIGS, write
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign
+from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.checks.model_check import check_against_model
-from discrepancy.errors import CampaignFileError
+from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.model_choice import load_model
 from discrepancy.models.interface import Model
-from discrepancy.sources.measured_rigs import write_rig_campaign
-from discrepancy.verdict import Verdict, VerdictKind
+from discrepancy.sources.measured_rigs import (
+    READING_ERROR,
+    SIGNAL,
+    TIP,
+    trial_scatter,
+    wing_campaign,
+    write_rig_campaign,
+    write_wing_campaign,
+)
+from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from uav_twin.cli import app
 
@@ -29,8 +39,11 @@ Rig = tuple[Campaign, Model]
 
 
 @pytest.fixture(scope="module")
-def rig(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Rig]:
-    def made(name: str) -> Rig:
+def rig(tmp_path_factory):
+    """What makes campaign and model of a published rig, once."""
+
+    @cache
+    def made(name):
         if not (PUBLISHED / name).is_dir():
             pytest.skip(f"the published records of {name} are not beside the project")
         folder = write_rig_campaign(name, PUBLISHED / name, tmp_path_factory.mktemp(name) / "campaign")
@@ -39,27 +52,16 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Rig]:
     return made
 
 
-@pytest.fixture(scope="module")
-def phone(rig: Callable[[str], Rig]) -> Rig:
-    return rig("falling_phone")
-
-
-@pytest.fixture(scope="module")
-def tanks(rig: Callable[[str], Rig]) -> Rig:
-    return rig("two_tanks")
-
-
-@pytest.fixture(scope="module")
-def pendulum(rig: Callable[[str], Rig]) -> Rig:
-    return rig("pendulum")
-
-
-def judged(rig: Rig, *effects: str) -> Verdict:
+def judged(rig, *effects):
     chosen = [effect_by_identifier(name, library()) for name in effects]
     return investigate(*rig, chosen, thorough=False).verdict
 
 
-def write_falls(folder: Path, size: int = 400) -> Path:
+def is_sound(campaign, model):
+    return not any(fault.fatal for fault in check_against_model(campaign, model))
+
+
+def write_falls(folder, size=400):
     """Write a rest of a second and a half, a fall of 0.4 s in the middle of a record, and a second record."""
     folder.mkdir()
     time = 0.005 * np.arange(size)
@@ -71,111 +73,88 @@ def write_falls(folder: Path, size: int = 400) -> Path:
     return folder
 
 
-def test_only_the_fall_is_taken_without_its_ends(tmp_path: Path) -> None:
-    read = read_campaign(
-        write_rig_campaign("falling_phone", write_falls(tmp_path / "data"), tmp_path / "out")
-    )
-    assert [trial.name for trial in read.trials] == ["fall_2", "fall_10"]
-    for trial in read.trials:
-        np.testing.assert_allclose(trial.values, 0.2)
-        assert trial.time[0] == pytest.approx(0.04)
-        assert trial.time[-1] == pytest.approx(0.345)
-
-
-def test_the_command_writes_what_run_reads(tmp_path: Path) -> None:
+def test_only_the_fall_is_taken_without_its_ends_and_run_reads_it(tmp_path):
     out, data = tmp_path / "out", write_falls(tmp_path / "data")
     words = ["discrepancy", "convert", str(out), "--rig", "falling_phone", "--data", str(data)]
     said = CliRunner().invoke(app, words)
     assert said.exit_code == 0, said.output
     assert "2 trials" in said.output
-    assert not [
-        fault
-        for fault in check_against_model(read_campaign(out), load_model(out / "model.toml"))
-        if fault.fatal
-    ]
+    read = read_campaign(out)
+    assert is_sound(read, load_model(out / "model.toml"))
+    assert [trial.name for trial in read.trials] == ["fall_2", "fall_10"]
+    for trial in read.trials:
+        np.testing.assert_allclose(trial.values, 0.2)
+        assert (trial.time[0], trial.time[-1]) == pytest.approx((0.04, 0.345))
 
 
-def test_what_is_not_as_published_is_refused_in_a_sentence_and_nothing_is_written(tmp_path: Path) -> None:
+def test_what_is_not_as_published_is_refused_in_a_sentence_and_nothing_is_written(tmp_path):
     out, data = tmp_path / "out", write_falls(tmp_path / "data")
-    with pytest.raises(
-        CampaignFileError, match="There is no rig 'wing': give one of real_wing, falling_phone, two_tanks"
+    flat = "".join(f"{0.01 * k},0,0,9.7\n" for k in range(20))
+    for name, rows, words in (
+        ("wing", None, "There is no rig 'wing': give one of real_wing, falling_phone, two_tanks"),
+        ("two_tanks", None, r"There is no .*dataBenchmark\.csv: give the folder"),
+        ("pendulum", None, r"There is no .*pd_trajectory\.csv: give the folder"),
+        ("falling_phone", "0,0,0\n" * 20, r"fall_2\.csv is not as it was published: it needs the column"),
+        ("falling_phone", flat, "holds no fall"),
+        ("falling_phone", "0.1,0,0,0.1\n" * 20, "its times must increase"),
     ):
-        write_rig_campaign("wing", data, out)
-    for name, missing in (("two_tanks", r"dataBenchmark\.csv"), ("pendulum", r"pd_trajectory\.csv")):
-        with pytest.raises(CampaignFileError, match=rf"There is no .*{missing}: give the folder"):
+        if rows:
+            (data / "fall_2.csv").write_text("t,x,y,z\n" + rows)
+        with pytest.raises(CampaignFileError, match=words):
             write_rig_campaign(name, data, out)
-    (data / "fall_2.csv").write_text("t,x,y,z\n" + "0,0,0\n" * 20)
-    with pytest.raises(
-        CampaignFileError, match=r"fall_2\.csv is not as it was published: it needs the column"
-    ):
-        write_rig_campaign("falling_phone", data, out)
-    (data / "fall_2.csv").write_text("t,x,y,z\n" + "".join(f"{0.01 * k},0,0,9.7\n" for k in range(20)))
-    with pytest.raises(CampaignFileError, match="holds no fall"):
-        write_rig_campaign("falling_phone", data, out)
-    (data / "fall_2.csv").write_text("t,x,y,z\n" + "0.1,0,0,0.1\n" * 20)
-    with pytest.raises(CampaignFileError, match="its times must increase"):
-        write_rig_campaign("falling_phone", data, out)
     assert not out.exists()
 
 
-def test_a_fall_is_no_short_record(phone: Rig) -> None:
-    assert not [fault for fault in check_against_model(*phone) if fault.fatal]
+def test_published_records_are_read_as_they_were_measured(rig):
+    """A fall is no short record; readings at the end of the level sensor go; the pendulum has 50 Hz."""
+    assert is_sound(*rig("falling_phone"))
+    tanks, _ = rig("two_tanks")
+    assert [trial.name for trial in tanks.held_out] == ["validation"]
+    for trial, left_out in zip(tanks.trials, (47, 37), strict=True):
+        assert trial.values.shape == (1024, 1)
+        assert int((~trial.used).sum()) == left_out
+        assert float(trial.values[trial.used].max()) < 10.0
+    pendulum, _ = rig("pendulum")
+    assert [trial.name for trial in pendulum.held_out] == ["ilqr"]
+    assert [len(trial.time) for trial in pendulum.trials] == [195, 1000]
+    for trial in pendulum.trials:
+        assert float(np.median(np.diff(trial.time))) == pytest.approx(0.02, rel=0.01)
 
 
 @pytest.mark.long  # what reads the rig is tested above, and how drag is named in test_naming.py
-def test_drag_is_named_with_its_exponent_and_nothing_that_only_describes(phone: Rig) -> None:
+def test_drag_is_named_with_its_exponent_and_nothing_that_only_describes(rig):
     verdict = judged(
-        phone, "quadratic_damping", "coulomb_friction", "cubic_stiffness", "joint_micro_slip",
+        rig("falling_phone"), "quadratic_damping", "coulomb_friction", "cubic_stiffness", "joint_micro_slip",
         "gauge_zero_drift", "clock_error",
     )  # fmt: skip
     assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
     assert [effect.identifier for effect in verdict.effects] == ["quadratic_damping"]
-    assert verdict.explained is not None
     assert verdict.explained.trials == "held-out"
     assert verdict.explained.low > 0.9
     told = re.search(r"exponent of the speed \S+ \((\S+) to (\S+)\)", verdict.sentence)
-    assert told is not None, verdict.sentence
     low, high = map(float, told.groups())
     assert 1.0 < low < 2.0 < high
     assert {"joint_micro_slip", "cubic_stiffness"} <= {item.identifier for item in verdict.not_fitted}
 
 
-def test_readings_at_the_end_of_the_level_sensor_are_left_out(tanks: Rig) -> None:
-    campaign, _ = tanks
-    assert [trial.name for trial in campaign.held_out] == ["validation"]
-    for trial, left_out in zip(campaign.trials, (47, 37), strict=True):
-        assert trial.values.shape == (1024, 1)
-        assert int((~trial.used).sum()) == left_out
-        assert float(trial.values[trial.used].max()) < 10.0
-
-
 @pytest.mark.long
-def test_the_tanks_have_a_root_of_the_level_and_an_overflow_in_part(tanks: Rig) -> None:
-    verdict = judged(tanks, "outflow", "overflow", "logger_clock")
+def test_the_tanks_have_a_root_of_the_level_and_an_overflow_in_part(rig):
+    verdict = judged(rig("two_tanks"), "outflow", "overflow", "logger_clock")
     assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
     found = {(effect.identifier, effect.place) for effect in verdict.effects}
     assert found == {("outflow", "lower outlet"), ("overflow", "upper outlet")}
-    assert verdict.explained is not None
     assert verdict.explained.trials == "held-out"
     assert verdict.explained.low > 0.5
 
 
-def test_a_sample_of_the_pendulum_is_a_fiftieth_of_a_second(pendulum: Rig) -> None:
-    campaign, _ = pendulum
-    assert [trial.name for trial in campaign.held_out] == ["ilqr"]
-    for trial, count in zip(campaign.trials, (195, 1000), strict=True):
-        assert len(trial.time) == count
-        assert float(np.median(np.diff(trial.time))) == pytest.approx(0.02, rel=0.01)
-
-
-def test_the_pendulum_has_no_name_and_its_share_is_said(pendulum: Rig) -> None:
-    verdict = judged(pendulum, "coulomb_friction", "quadratic_damping", "clock_error")
+def test_the_pendulum_has_no_name_and_its_share_is_said(rig):
+    verdict = judged(rig("pendulum"), "coulomb_friction", "quadratic_damping", "clock_error")
     assert verdict.kind is VerdictKind.UNEXPLAINED
     assert "is missing at 'pivot', ordered by" in verdict.sentence
     assert verdict.explained is None or verdict.explained.value < 0.5
 
 
-def write_public(folder: Path) -> None:
+def write_public(folder):
     """Write records in the form in which they were published: a fall, a cooling and a swing."""
     time = 0.1 * np.arange(500)
     tables = {
@@ -188,11 +167,11 @@ def write_public(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_a_public_record_becomes_a_campaign_that_its_model_can_follow(name: str, tmp_path: Path) -> None:
+def test_a_public_record_becomes_a_campaign_that_its_model_can_follow(name, tmp_path):
     write_public(tmp_path)
     folder = write(name, tmp_path, tmp_path / name)
-    campaign, model = read_campaign(folder), load_model(folder / "model.toml")
-    assert not [fault for fault in check_against_model(campaign, model) if fault.fatal]
+    campaign = read_campaign(folder)
+    assert is_sound(campaign, load_model(folder / "model.toml"))
     (trial,) = campaign.trials
     swing = [0.1 * np.exp(-0.03 * t) * np.cos(0.7 * t) for t in BLOWN + 0.1 * np.arange(4)]
     last, value = {  # of the swing means of four, from the moment on at which nobody blows any more
@@ -213,7 +192,7 @@ def test_a_public_record_becomes_a_campaign_that_its_model_can_follow(name: str,
         ("swinging_gate", VerdictKind.UNEXPLAINED),
     ],
 )
-def test_public_records_have_the_verdict_of_the_page(name: str, kind: VerdictKind, tmp_path: Path) -> None:
+def test_public_records_have_the_verdict_of_the_page(name, kind, tmp_path):
     folder = write(name, Path(str(PUBLIC)), tmp_path / name)
     verdict = investigate(folder, folder / "model.toml", thorough=False).verdict
     assert verdict.kind is kind, verdict.sentence
@@ -221,3 +200,94 @@ def test_public_records_have_the_verdict_of_the_page(name: str, kind: VerdictKin
         assert verdict.family == "outflow |x|^n"
         low, high = map(float, re.search(r"of the level \S+ \((\S+) to (\S+)\)", verdict.sentence).groups())
         assert 2.0 < low < high < 3.5
+
+
+# ---------------------------------------------------------------- the real wing's measurements
+
+
+FloatArray = NDArray[np.float64]
+
+WING = Path(__file__).parents[3].parent / "shared" / "reference" / "uav_experimental_calibration"
+STEP = 8.1112e-3
+NOISE = 5e-5
+
+
+def write_records(folder, count=4, size=795, seed=3):
+    """Write ring-downs (count, size) of one motion, a zero that they share, and noise; return the zero."""
+    generator = np.random.default_rng(seed)
+    place = folder / "step3"
+    place.mkdir(parents=True)
+    time = 0.016 + STEP * np.arange(size)
+    zero = 3e-4 * np.exp(-time / 2.0)
+    for number in range(1, count + 1):
+        wave = 8e-3 * np.exp(-0.9 * time) * np.cos(2.0 * pi * 5.6 * (time - 1e-3 * generator.normal()))
+        signal = (1.0 + 0.02 * generator.normal()) * wave + zero + NOISE * generator.normal(size=size)
+        table = np.column_stack((time, signal - 2e-4, signal, signal + 2e-4))
+        np.savetxt(
+            place / f"ringdown_trial{number}_digitised.csv",
+            table,
+            delimiter=",",
+            header="t_s,V_low,V_mid,V_high",
+        )
+    return np.asarray(zero)
+
+
+def test_a_sample_is_the_mean_of_four_columns_without_the_shared_zero(tmp_path):
+    write_records(tmp_path)
+    plain = wing_campaign(tmp_path, detrended=False, columns=1)
+    averaged = wing_campaign(tmp_path, detrended=False)
+    first = plain.trials[0].values[:, 0]
+    size = len(averaged.trials[0].values)
+    np.testing.assert_allclose(
+        averaged.trials[0].values[:, 0], first[: 4 * size].reshape(size, 4).mean(axis=1)
+    )
+    assert averaged.trials[0].interval == pytest.approx(4.0 * STEP, rel=1e-4)
+    slow = [np.mean(wing_campaign(tmp_path, detrended=on).trials[0].values) for on in (False, True)]
+    assert abs(slow[1]) < 0.1 * abs(slow[0])
+
+
+def test_the_scatter_between_trials_is_the_noise(tmp_path):
+    generator = np.random.default_rng(5)
+    time = 0.03 * np.arange(400, dtype=np.float64)
+    # a motion of no law that a model could have, the same in all trials but for size, delay and zero
+    motion = np.sin(30.0 * np.sqrt(1.0 + time)) / (1.0 + time)
+    windows = []
+    for k in range(5):
+        shown = (1.0 + 0.02 * k) * motion + 1e-3 * k * np.gradient(motion) + 0.1 * k
+        windows.append((time, np.asarray(shown + 1e-2 * generator.normal(size=400))))
+    noise = trial_scatter(windows)
+    assert noise.shape == (1600,)
+    assert np.std(noise) == pytest.approx(1e-2, rel=0.06)
+
+
+def test_the_noise_record_holds_scatter_and_reading_error(tmp_path):
+    write_records(tmp_path)
+    record = wing_campaign(tmp_path).channels[SIGNAL].noise
+    # the average of four columns has half the noise; the shared zero takes little of it
+    assert record.standard_deviation == pytest.approx(np.hypot(NOISE / 2.0, READING_ERROR), rel=0.08)
+
+
+def test_a_folder_without_records_or_with_too_short_ones_is_refused(tmp_path):
+    with pytest.raises(CampaignFileError, match="cannot be read"):
+        wing_campaign(tmp_path / "nowhere")
+    write_records(tmp_path / "short", size=200)
+    with pytest.raises(CampaignDataError, match="60 are needed"):
+        wing_campaign(tmp_path / "short")
+    write_records(tmp_path / "one", count=1)
+    with pytest.raises(CampaignDataError, match="two or more"):
+        wing_campaign(tmp_path / "one")
+
+
+@pytest.mark.skipif(not WING.is_dir(), reason="the published measurements are not beside the project")
+def test_the_published_measurements_make_a_campaign_that_reads_back(tmp_path):
+    made = wing_campaign(WING)
+    assert [trial.kind for trial in made.trials] == [TrialKind.STATIC] * 2 + [TrialKind.RINGDOWN] * 5
+    assert [trial.name for trial in made.held_out] == ["release 3", "release 5"]
+    np.testing.assert_allclose(made.trials[0].force, [2.4525, 4.905, 7.3575, 9.81])
+    np.testing.assert_allclose(made.trials[1].values[:, 0], [3.3528e-3, 7.2898e-3, 10.7442e-3, 13.7922e-3])
+    assert made.channels[TIP].noise is not None
+    read = write_wing_campaign(WING, tmp_path / "campaign")
+    for one, other in zip(made.trials, read.trials, strict=True):
+        np.testing.assert_array_equal(one.values, other.values)
+        assert one.release == other.release
+    assert read.parameters == made.parameters

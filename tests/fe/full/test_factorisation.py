@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 from scipy.sparse.linalg import spsolve
 from threadpoolctl import threadpool_limits
 
-from fe.full import factorisation
+from fe.full import factorisation, subspace
 from fe.full.dissection import best_cut, elimination_blocks
 from fe.full.factorisation import Factorisation, analyse, lowest_eigenpairs
 from fe.full.subspace import FunctionalBasis, Norm, ProjectedBasis, conjugate_gradients
@@ -211,14 +211,15 @@ def test_a_sum_is_the_sum(coefficients) -> None:
         np.testing.assert_allclose(found.toarray(), wanted, rtol=0.0, atol=1e-13)
 
 
-def test_conjugate_gradients_solve_with_several_matrices_at_once_and_give_up() -> None:
+def test_conjugate_gradients_solve_with_several_matrices_at_once_and_give_up(monkeypatch) -> None:
     matrices, norm = [WHOLE, affine_sum((0.3, 2.0, 1.0), TERMS)], Norm(WHOLE)
     right = np.random.default_rng(4).normal(size=(SIZE, 4)) * [1.0, 1.0, 1.0, 0.0]
     found = conjugate_gradients(matrices, norm, right, np.zeros_like(right), tolerance=1e-12)
     wanted = [np.linalg.solve(m.toarray(), right[:, 2 * k : 2 * k + 2]) for k, m in enumerate(matrices)]
     np.testing.assert_allclose(found, np.concatenate(wanted, axis=1), rtol=1e-9, atol=1e-15)
+    monkeypatch.setattr(subspace, "MOST_ITERATIONS", 2)
     with pytest.raises(SolutionError, match="Conjugate gradients reached"):
-        conjugate_gradients(matrices, norm, right, np.zeros_like(right), tolerance=1e-12, most_iterations=2)
+        conjugate_gradients(matrices, norm, right, np.zeros_like(right), tolerance=1e-12)
 
 
 def test_eigenpairs_equal_the_dense_ones_and_a_structure_that_is_not_held_has_none() -> None:

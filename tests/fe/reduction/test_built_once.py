@@ -1,7 +1,5 @@
 """What is built once: a wait for another process says so, and ends when that one does, or takes too long."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess

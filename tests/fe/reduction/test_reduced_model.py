@@ -1,7 +1,5 @@
 """The contract of reduced models of a wing, a structure, springs: the full model within certified bounds."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fe.reduction.certified_basis import compressed
-from fe.reduction.reduced_basis import reduce_structure
-from fe.reduction.structure_errors import measured_errors
+from fe.reduction.reduced_basis import measured_errors, reduce_structure
 from fe.runtime.errors import OutsideModelError
 from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure, natural_frequencies, static_response

@@ -1,7 +1,5 @@
 """The offline reduction, against pyMOR's own reductor and direct solutions; what cannot be reduced."""
 
-from __future__ import annotations
-
 import tomllib
 from contextlib import contextmanager
 from dataclasses import replace
@@ -19,9 +17,8 @@ from pymor.reductors.coercive import CoerciveRBReductor
 from benchmarks.study_regions import bracket, plate, tube
 from fe.reduction.certified_basis import compressed
 from fe.reduction.model_cache import reduced_structure
-from fe.reduction.reduced_basis import Reduction, reduce_model, reduce_structure
+from fe.reduction.reduced_basis import Reduction, measured_errors, reduce_model, reduce_structure
 from fe.reduction.settings import ModalSettings, StructureSettings, loss_splits, remaining_levels
-from fe.reduction.structure_errors import measured_errors
 from fe.reduction.terms import ReductionTerms
 from fe.runtime.errors import FiniteElementError, ReductionError, SolutionError
 from fe.structure.affine import affine_sum, static_response

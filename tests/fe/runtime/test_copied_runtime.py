@@ -32,7 +32,7 @@ def test_runtime_files_import_only_numpy_the_standard_library_and_each_other() -
 def test_copied_runtime_evaluates_the_same_without_this_package(model: ReducedModel, tmp_path: Path) -> None:
     folder = tmp_path / "copy_of_the_runtime"
     shutil.copytree(PACKAGE, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    model.save(tmp_path / "wing.npz")
+    (tmp_path / "wing.npz").write_bytes(model.to_bytes())
     code = (
         "import sys; sys.path.insert(0, '.')\n"
         "from copy_of_the_runtime import transient, reduced\n"

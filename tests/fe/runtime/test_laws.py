@@ -14,8 +14,7 @@ from discrepancy.models.compiled_motion import compiled_kernel
 from fe.runtime import laws as functions
 from fe.runtime import patch
 from fe.runtime.errors import InvalidPatchError, SolutionError
-from fe.runtime.flexible_ports import settle_port
-from fe.runtime.laws.interface import PortForce
+from fe.runtime.laws.interface import PARAMETERS, PortForce
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import (
     NO_LAWS,
@@ -30,6 +29,7 @@ from fe.runtime.motion import (
 from fe.runtime.motion_arrays import State
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.runtime.patched_wing import PatchedWing
+from fe.runtime.static_path import settle_port
 from fe.runtime.stepwise import substeps
 from fe.runtime.wing_rows import planform_stations
 from tests.fe.runtime.stepping import simulate
@@ -72,7 +72,7 @@ def test_the_slope_is_that_of_the_force(kind: str) -> None:
     memory = law.memory()
     for x in (-0.03, 0.0013, 0.021):
         force = [
-            functions.pull(law.numbers[0], law.values[0], law.elements[0], memory[0], x + way, 0.02, 400)
+            functions.pull(law.numbers[0], law.values[0], memory[0], x + way, 0.02, 400)
             for way in (-1e-7, 0.0, 1e-7)
         ]
         assert force[1][1] == pytest.approx((force[2][0] - force[0][0]) / 2e-7, rel=2e-3, abs=1e-6)
@@ -170,7 +170,7 @@ def test_a_structure_that_softens_away_is_refused() -> None:
 @pytest.mark.parametrize("flexibility", [0.1, 0.16])  # from 1/6 m/N on there is more than one root
 def test_a_sine_on_flexibility_is_settled(flexibility: float) -> None:
     sine = laws(patch.SineForce("tip", 2.0, 3.0, 0.4))
-    ports = sine.at(np.zeros((1, 0)), np.array([flexibility]), 0.0, np.zeros((2, 1)))
+    ports = sine.at(np.zeros((1, 0)))._replace(flexibility=np.array([flexibility]))
     for y in np.linspace(-9.0, 9.0, 91):
         state = State(np.zeros(0), np.zeros(0), sine.memory(), np.zeros(1))
         x = settle_port(0, np.zeros(1, dtype=np.int64), ports, state, y, flexibility, 1.0, 1)
@@ -288,8 +288,10 @@ def test_where_all_places_move_alike_the_forces_add_up_to_the_law(kind: str) -> 
     assert [force.port for force in spread if isinstance(force, PortForce)] == list(STATION_PORTS)
     one, parts = laws(item), laws_of(ModelPatch(tuple(spread)), STATION_PORTS)
     np.testing.assert_allclose(parts.values[:, 0], share * one.values[0, 0], rtol=1e-12)
-    assert np.all(parts.values[:, 1:] == one.values[0, 1:])
-    assert np.allclose(parts.elements, one.elements)  # each slips where the whole does
+    assert np.all(parts.values[:, 1:PARAMETERS] == one.values[0, 1:PARAMETERS])
+    assert np.allclose(
+        parts.values[:, PARAMETERS:], one.values[:, PARAMETERS:]
+    )  # each slips where the whole does
 
 
 def test_rows_of_the_stations_are_displacements_of_the_elastic_line(coarse_patched_wing: PatchedWing) -> None:

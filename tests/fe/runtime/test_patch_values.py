@@ -1,7 +1,5 @@
 """What patches and states are made of: expressions, kinds of primitives, the digital state."""
 
-from __future__ import annotations
-
 import math
 from typing import ClassVar
 

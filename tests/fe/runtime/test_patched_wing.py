@@ -1,7 +1,5 @@
 """The patched wing against the full model with the same change, each change made in its own way there."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -47,7 +45,8 @@ class Compared:
     def structure(
         self, *items: Any, state: Any = STATE, masses: Any = MASSES, temperature: float = 0.0
     ) -> Any:
-        return self.wing.structure(*state, *masses, ModelPatch(items), temperature)
+        vector = np.array((state[0], *state[1], *masses, 0.0, 0.0))
+        return self.wing.at(vector, ModelPatch(items), temperature)
 
     def load(self, load_factor: float, *items: Any) -> FloatArray:
         return np.array((load_factor, load_factor**2)) @ self.wing.load_parts(ModelPatch(items))

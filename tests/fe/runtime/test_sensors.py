@@ -1,7 +1,5 @@
 """Sensor primitives on arrays, against closed forms and independent integration, as a whole or by samples."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Small meshes made by hand, in the node order of mesh files, and structures on them."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from pathlib import Path

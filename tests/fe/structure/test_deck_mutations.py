@@ -1,7 +1,5 @@
 """Decks, meshes, TOML, JSON and tables with faults, or of one long word: read or refused, never for long."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Iterator
 from functools import partial

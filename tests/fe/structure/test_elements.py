@@ -1,7 +1,5 @@
 """Shape functions, faces and element arrays against scikit-fem, closed forms and the patch test."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Structures from matrices: shells and beams against CalculiX, formats, closed forms, and what is refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Mesh files of all programs: the same cells and sets, coordinates of any kind, faults in a sentence."""
 
-from __future__ import annotations
-
 import gzip
 from pathlib import Path
 from typing import Any

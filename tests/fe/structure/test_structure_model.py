@@ -1,7 +1,5 @@
 """Structures against closed forms, CalculiX and each other; every fault of their files is one sentence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

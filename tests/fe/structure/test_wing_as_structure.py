@@ -1,7 +1,5 @@
 """The wing's own mesh, written as a deck of CalculiX and read as a structure, is the wing."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import replace

@@ -8,9 +8,14 @@ import pytest
 
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
-from fe.verification.calculix_comparison import agreement, ring_down_agreement
+from fe.verification.calculix_comparison import (
+    agreement,
+    read_frequencies,
+    read_tables,
+    ring_down_agreement,
+    run_calculix,
+)
 from fe.verification.calculix_deck import wing_deck
-from fe.verification.calculix_job import read_frequencies, read_tables, run_calculix
 from fe.verification.known_answers import (
     cantilever_check,
     macneal_harder_beam,

@@ -9,8 +9,7 @@ from scipy.sparse.linalg import norm
 from fe.elements.cells import jacobians
 from fe.elements.kinds import gauss_points
 from fe.runtime.errors import InvalidDesignError, MeshError
-from fe.wing.grid import chord_lines
-from fe.wing.mesh import SKIN, build_mesh, straight_edged
+from fe.wing.mesh import SKIN, build_mesh, chord_lines, straight_edged
 from fe.wing.operators import (
     ROOT_UNKNOWNS,
     assemble,

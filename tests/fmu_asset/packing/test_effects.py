@@ -23,7 +23,7 @@ from discrepancy.document import Origin
 from discrepancy.files.verdict import StoredPatch, fmu_outputs, patch_effects, read_patch, write_patch
 from discrepancy.models.high_pass import filtered_record
 from discrepancy.models.interface import Conditions
-from discrepancy.models.wing import WingModel
+from discrepancy.models.structures import WingModel
 from discrepancy.verdict import NamedEffect, VerdictKind
 from fe.runtime.patch import STRUCTURE, ModelPatch, SensorGain, SensorRotation
 from fe.runtime.patch_arrays import PatchArrays

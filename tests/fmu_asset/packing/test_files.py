@@ -115,7 +115,7 @@ def test_equal_input_gives_equal_bytes(ours, name, tmp_path, monkeypatch) -> Non
 
 def test_the_environment_does_not_show_and_other_content_does(ours, model, tmp_path) -> None:
     fmu = ours("python")
-    model.save(tmp_path / "model.npz")
+    (tmp_path / "model.npz").write_bytes(model.to_bytes())
     program = (
         "import sys; from fe.runtime.reduced import ReducedModel; "
         "from fmu_asset.packing.structure_fmu import build_fmu; "

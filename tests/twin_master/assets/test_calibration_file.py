@@ -1,9 +1,6 @@
 """A calibration file in a scenario: what the twin draws from it, what the run keeps, what is refused."""
 
-from __future__ import annotations
-
 import json
-import tomllib
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -18,13 +15,12 @@ from calibration.result.record import Calibration as Calibrated
 from calibration.result.record import ParameterPrior
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
+from tests.twin_master.runs import edited, table_of, text_of, written
 from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.parameter import draw_parameter
 from twin_master.assets.resolution import (
     Overrides,
     asset_source,
-    located_scenario,
-    portable_scenario,
     resolve_scenario,
 )
 from twin_master.errors import MissionInputError, ScenarioError
@@ -34,7 +30,7 @@ from twin_master.scenario.schema import Calibration
 from twin_master.workflow import fly as new_run
 
 MakeCalibration = Callable[..., Calibrated]
-TEXT = scenario_files()["level_turns"].read_text(encoding="utf-8")
+TEXT = text_of("level_turns")
 
 
 @pytest.fixture
@@ -50,49 +46,43 @@ def of_campaign(file: Path, **means: float) -> Path:
         ParameterPrior(name, "1", mean, 0.1 * mean, 0.5 * mean, 2.0 * mean, "model.toml")
         for name, mean in means.items()
     )
-    found = Calibrated(
-        "spring 7", "spring", "0" * 64, "Gaussian", priors, samples, samples, None, (), (), "test", 1, {}
-    )
+    heading = ("spring 7", "spring", "0" * 64, "Gaussian")
+    found = Calibrated(*heading, priors, samples, samples, None, (), (), "test", 1, {})
     file.write_bytes(result_bytes(found))
     return file
 
 
-def section(file: Path | str | None, **others: object) -> Calibration:
+def section(file: Path, **others: object) -> Calibration:
     table = {"parameter": "young_modulus_factor", "source": "file", "file": str(file), "draws": 20}
     return Calibration.model_validate(table | others)
 
 
-def scenario_with(folder: Path, calibration: str) -> Path:
-    """The shipped scenario with another table `calibration`."""
+def scenario_with(folder: Path, name: str) -> Path:
+    """The shipped scenario with a calibration file."""
     begin, end = TEXT.index("[calibration]"), TEXT.index("[truth]")
-    path = folder / "mine.toml"
-    path.write_text(f"{TEXT[:begin]}[calibration]\n{calibration}\n\n{TEXT[end:]}", encoding="utf-8")
-    return path
+    table = f'[calibration]\nparameter = "young_modulus_factor"\nsource = "file"\nfile = "{name}"\n\n'
+    return written(folder, TEXT[:begin] + table + TEXT[end:])
 
 
-def test_draws_come_from_the_samples(file: Path) -> None:
+def test_draws_come_from_the_samples(file):
     result = load_calibration(file)
     for name in ("young_modulus_factor", "servo_mass"):
         draws = draw_parameter(section(file, parameter=name), 3)
         assert draws.name == name
         assert set(draws.values.tolist()) <= set(result.draws_of(name).tolist())
         assert len(draws.values) == 20
-        assert draws.mean == result.mean(name)
-        assert draws.standard_deviation == result.standard_deviation(name)
+        assert (draws.mean, draws.standard_deviation) == (result.mean(name), result.standard_deviation(name))
         assert "Wing 7 (é)" in draws.source
-    again = draw_parameter(section(file), 3)
-    np.testing.assert_array_equal(again.values, draw_parameter(section(file), 3).values)
-    assert not np.array_equal(again.values, draw_parameter(section(file), 4).values)
+    again, same, other = (draw_parameter(section(file), seed).values for seed in (3, 3, 4))
+    np.testing.assert_array_equal(again, same)
+    assert not np.array_equal(again, other)
     everything = draw_parameter(section(file, draws=40), 3).values
     np.testing.assert_array_equal(np.sort(everything), np.sort(result.draws_of("young_modulus_factor")))
-
-
-def test_a_parameter_that_the_file_has_not(file: Path) -> None:
     with pytest.raises(CalibrationRecordError, match="no samples of `wall_thickness`"):
         draw_parameter(section(file, parameter="wall_thickness"), 0)
 
 
-def test_the_records_are_plain_and_the_same_for_the_same_file(file: Path) -> None:
+def test_the_records_are_plain_and_the_same_for_the_same_file(file, make_calibration):
     result = load_calibration(file)
     text = to_json(run_record(result, "young_modulus_factor"))
     assert text == to_json(run_record(load_calibration(file), "young_modulus_factor"))
@@ -101,45 +91,26 @@ def test_the_records_are_plain_and_the_same_for_the_same_file(file: Path) -> Non
     assert state["unit"] == "kg"
     assert state["standard_deviation"] == pytest.approx(result.standard_deviation("servo_mass"))
     assert state["interval_95"] == pytest.approx(np.quantile(result.samples[:, 1], [0.025, 0.975]))
-    np.testing.assert_allclose(
-        plain_record(result)["correlation"]["matrix"],
-        np.corrcoef(result.samples[:, :5], rowvar=False),
-        atol=1e-12,
-    )
+    correlation = np.corrcoef(result.samples[:, :5], rowvar=False)
+    np.testing.assert_allclose(plain_record(result)["correlation"]["matrix"], correlation, atol=1e-12)
     grid, density = (np.array(record["posterior"][name]) for name in ("grid", "density"))
     assert np.trapezoid(density, grid) == pytest.approx(1.0, abs=0.05)
     assert "'Wing 7 (é)'" in description(result)
     assert f"servo_mass {result.mean('servo_mass'):.6g} +- " in description(result)
+    single = run_record(make_calibration(count=1), "young_modulus_factor")  # figures that do not vary
+    to_json(single)
+    assert single["posterior"] == {}
+    assert single["correlation"]["matrix"] == np.eye(5).tolist()
 
 
-def test_a_figure_that_does_not_vary_is_kept_too(make_calibration: MakeCalibration) -> None:
-    result = make_calibration(count=1)
-    record = run_record(result, "young_modulus_factor")
-    to_json(record)
-    assert record["posterior"] == {}
-    assert record["correlation"]["matrix"] == np.eye(5).tolist()
-
-
-def test_the_schema(tmp_path: Path) -> None:
-    table = tomllib.loads(TEXT)
-    table["calibration"] = {"parameter": "young_modulus_factor", "source": "file"}
-    with pytest.raises(ScenarioError, match="source `file` needs `file`"):
-        parse_scenario(table, "mine.toml")
-    table["calibration"] = {"parameter": "e", "source": "fixed", "mean": 1.0, "file": "x.nc"}
-    with pytest.raises(ScenarioError, match="`file` belongs to the calibration source `file`"):
-        parse_scenario(table, "mine.toml")
-
-
-def test_paths_start_at_the_scenario_and_leave_no_trace_of_the_machine(file: Path) -> None:
-    text = 'parameter = "young_modulus_factor"\nsource = "file"\nfile = "my wing.nc"'
-    path = scenario_with(file.parent, text)
-    scenario = resolve_scenario(load_scenario(path), Overrides())
+def test_paths_start_at_the_scenario_and_leave_no_trace_of_the_machine(file):
+    scenario = resolve_scenario(load_scenario(scenario_with(file.parent, "my wing.nc")), Overrides())
     assert scenario.calibration.file == str(file)
     assert (scenario.asset.kind, scenario.belief.kind) == ("calibration", "calibration")
-    portable = portable_scenario(scenario)
+    portable = scenario.portable()
     assert portable.calibration.file == "asset/calibration.nc"
     assert str(file.parent) not in json.dumps(portable.to_dict())
-    located = located_scenario(portable, Path("/elsewhere"))
+    located = portable.moved(Path("/elsewhere"))
     assert located.calibration.file == "/elsewhere/asset/calibration.nc"
     source = asset_source(scenario)
     assert isinstance(scenario.asset.source(scenario), FmuSource)
@@ -148,34 +119,49 @@ def test_paths_start_at_the_scenario_and_leave_no_trace_of_the_machine(file: Pat
     assert source.files()["asset/calibration.nc"] == file.read_bytes()
 
 
-def test_the_option_stands_over_the_scenario(file: Path, tmp_path: Path) -> None:
+def test_the_option_stands_over_the_scenario(file, tmp_path):
     loaded = load_scenario("level_turns")
     scenario = resolve_scenario(loaded, Overrides(calibration=file))
     assert (scenario.calibration.source, scenario.calibration.file) == ("file", str(file))
     assert scenario.calibration.draws == loaded.scenario.calibration.draws
     assert scenario.asset.parameters == loaded.scenario.asset.parameters  # the truth stays the scenario's
-    mine = scenario_with(tmp_path, 'parameter = "young_modulus_factor"\nsource = "file"\nfile = "other.nc"')
-    scenario = resolve_scenario(load_scenario(mine), Overrides(calibration=file))
-    assert scenario.calibration.file == str(file)
+    mine = load_scenario(scenario_with(tmp_path, "other.nc"))
+    assert resolve_scenario(mine, Overrides(calibration=file)).calibration.file == str(file)
+    pump = load_scenario("pump_wear")
+    of_ssp = resolve_scenario(pump, Overrides(ssp=tmp_path / "pump.ssp")).asset
+    assert (of_ssp.kind, of_ssp.parameters) == ("ssp", pump.scenario.asset.parameters)
 
 
-def test_what_is_refused_before_a_folder_is_made(file: Path, tmp_path: Path, library_file: Path) -> None:
-    loaded = load_scenario("level_turns")
+def test_what_is_refused_before_a_folder_is_made(file, tmp_path, library_file):
+    loaded, nothing = load_scenario("level_turns"), Overrides()
     with pytest.raises(MissionInputError, match="a strain library brings its own samples"):
         resolve_scenario(loaded, Overrides(calibration=file, strain_library=library_file))
-    text = TEXT.replace('design = "uav_wing"', 'design = "calibration"')
-    (tmp_path / "no.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(MissionInputError, match="there is no calibration file: give --calibration"):
-        resolve_scenario(load_scenario(tmp_path / "no.toml"), Overrides())
+    design = ('design = "uav_wing"', 'design = "calibration"')
+    for text, words in (
+        (TEXT.replace(*design), "there is no calibration file: give --calibration"),
+        (text_of("three_fmus", design), "the design of a calibration is asked for, and there is no"),
+    ):
+        with pytest.raises(MissionInputError, match=words):
+            resolve_scenario(load_scenario(written(tmp_path, text)), nothing)
     damaged = tmp_path / "damaged.nc"
     damaged.write_bytes(file.read_bytes()[:9000])
-    for path, word in ((damaged, "damaged"), (tmp_path / "missing.nc", "not there")):
-        with pytest.raises(CalibrationRecordError, match=word):
+    for path, words in ((damaged, "damaged"), (tmp_path / "missing.nc", "not there")):
+        with pytest.raises(CalibrationRecordError, match=words):
             asset_source(resolve_scenario(loaded, Overrides(calibration=path))).check()
+    table = table_of("level_turns")
+    for calibration, words in (
+        ({"parameter": "young_modulus_factor", "source": "file"}, "source `file` needs `file`"),
+        (
+            {"parameter": "e", "source": "fixed", "mean": 1.0, "file": "x.nc"},
+            "`file` belongs to the calibration source `file`",
+        ),
+    ):
+        with pytest.raises(ScenarioError, match=words):
+            parse_scenario(table | {"calibration": calibration}, "mine.toml")
 
 
 @pytest.mark.long
-def test_the_wing_among_several_fmus_is_tailored_too(file: Path, tmp_path: Path) -> None:
+def test_the_wing_among_several_fmus_is_tailored_too(file, tmp_path):
     scenario = resolve_scenario(load_scenario("three_fmus"), Overrides(calibration=file))
     assert [component.design for component in scenario.asset.component] == [None, "calibration", None]
     source = asset_source(scenario)
@@ -186,66 +172,35 @@ def test_the_wing_among_several_fmus_is_tailored_too(file: Path, tmp_path: Path)
     with zipfile.ZipFile(tmp_path / "run" / "asset" / "components" / "wing.fmu") as archive:
         record = json.loads(archive.read("resources/calibration.json"))
     assert record["asset"] == "Wing 7 (é)"
-    moved = located_scenario(portable_scenario(scenario), tmp_path / "run")
+    moved = scenario.portable().moved(tmp_path / "run")
     assert moved.asset.component[1].design == "calibration"
 
 
-def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file: Path, tmp_path: Path) -> None:
-    text = scenario_files()["three_fmus"].read_text(encoding="utf-8")
-    assert text.count('design = "uav_wing"') == 2
-    path = tmp_path / "shared.toml"
-    path.write_text(text.replace('design = "uav_wing"', 'design = "my.toml"'), encoding="utf-8")
-    scenario = resolve_scenario(load_scenario(path), Overrides(calibration=file))
+def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file, tmp_path):
+    design = ('design = "uav_wing"', 'design = "my.toml"')
+    text = edited(text_of("three_fmus"), design, design)
+    scenario = resolve_scenario(load_scenario(written(tmp_path, text)), Overrides(calibration=file))
     assert scenario.belief.kind == "calibration"
     assert scenario.asset.component[1].design == "calibration"
     asset_source(scenario).check()
 
 
-def test_a_component_cannot_have_the_design_of_a_calibration_that_is_not_there(tmp_path: Path) -> None:
-    text = scenario_files()["three_fmus"].read_text(encoding="utf-8")
-    path = tmp_path / "mine.toml"
-    path.write_text(text.replace('design = "uav_wing"', 'design = "calibration"', 1), encoding="utf-8")
-    with pytest.raises(MissionInputError, match="the design of a calibration is asked for, and there is no"):
-        resolve_scenario(load_scenario(path), Overrides())
-
-
-def test_an_ssp_file_takes_the_place_of_a_script(tmp_path: Path) -> None:
-    scenario = resolve_scenario(load_scenario("pump_wear"), Overrides(ssp=tmp_path / "pump.ssp"))
-    assert scenario.asset.kind == "ssp"
-    assert scenario.asset.parameters == load_scenario("pump_wear").scenario.asset.parameters
-
-
-COUPLED = next(
-    name for name, path in scenario_files().items() if 'kind = "coupled"' in path.read_text(encoding="utf-8")
-)
+COUPLED = next(name for name in scenario_files() if 'kind = "coupled"' in text_of(name))
+UNKNOWN = r"spring 7 has the parameter nonsense, which the binding \w+ does not know; .*`uav-twin"
+OF_A_WING = r"the parameter servo_mass, which the reduced model of the design .* `uav-twin calibrate`"
 
 
 @pytest.mark.parametrize(
     ("scenario", "means", "words"),
     [
-        (
-            "level_turns",
-            {"young_modulus_factor": 1.0, "nonsense": 1.0},
-            r"spring 7 has the parameter nonsense, which the binding \w+ does not know; .*`uav-twin",
-        ),
-        (
-            "level_turns",
-            {"young_modulus_factor": 1.0, "servo_mass": 0.17},
-            r"the parameter servo_mass, which the reduced model of the design .* `uav-twin calibrate`",
-        ),
-        (
-            "level_turns",
-            {"young_modulus_factor": 1.3},
-            r"young_modulus_factor = 1\.[23]\d*, but .* 0\.9 to 1\.1",
-        ),
+        ("level_turns", {"young_modulus_factor": 1.0, "nonsense": 1.0}, UNKNOWN),
+        ("level_turns", {"young_modulus_factor": 1.0, "servo_mass": 0.17}, OF_A_WING),
+        ("level_turns", {"young_modulus_factor": 1.3}, r"factor = 1\.[23]\d*, but .* 0\.9 to 1\.1"),
         (COUPLED, {"young_modulus_factor": 1.0, "nonsense": 1.0}, "parameter nonsense, which the binding"),
     ],
 )
-def test_what_a_calibration_from_a_campaign_has_must_be_known(
-    tmp_path: Path, scenario: str, means: dict[str, float], words: str
-) -> None:
-    loaded = load_scenario(scenario_files()[scenario])
-    file = of_campaign(tmp_path / "calibration.nc", **means)
+def test_what_a_calibration_from_a_campaign_has_must_be_known(tmp_path, scenario, means, words):
+    given = Overrides(calibration=of_campaign(tmp_path / "calibration.nc", **means))
     with pytest.raises(MissionInputError, match=words):
-        new_run(loaded, tmp_path / "run", Overrides(calibration=file), report=False)
+        new_run(load_scenario(scenario), tmp_path / "run", given, report=False)
     assert not (tmp_path / "run").exists()

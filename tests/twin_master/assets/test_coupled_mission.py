@@ -1,9 +1,6 @@
-"""Coupled FMUs as the asset of a mission: as one FMU, in a worker, resumed, and from an SSP file."""
-
-from __future__ import annotations
+"""Any FMU with a binding and a scenario flies, and so do coupled ones: in a worker, resumed, from an SSP."""
 
 import shutil
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,18 +8,22 @@ import numpy as np
 import pytest
 
 from fmu_asset.door.binding import load_binding
-from fmu_asset.errors import AlgebraicLoopError, BindingError, CouplingError, FmuError, SspError
+from fmu_asset.errors import AlgebraicLoopError, BindingError, CouplingError, FmuError, FmuFileError, SspError
 from reporting.progress import SilentProgress
-from scenarios import binding_files, scenario_files
-from tests.twin_master.runs import check_same, cut_off_after
+from scenarios import binding_files
+from tests.twin_master.runs import check_same, cut_off_after, table_of, text_of, written
+from twin_master import workflow
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.system_export import export_scenario
-from twin_master.errors import FleetError, MissionInputError, ScenarioError
+from twin_master.errors import FleetError, MissionInputError, ScenarioError, TwinMasterError
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.plan import ensemble
+from twin_master.mission.loop import CheckpointFile
 from twin_master.mission.truth import Plant, Truth
 from twin_master.network.twin import build_graphical_model
+from twin_master.run_folder import read_config
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.store.writing import read_run
 from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
 
@@ -53,30 +54,23 @@ target = "outlet"
 [belief]
 kind = "asset"
 
-[calibration]"""
+"""
+BOTH = pytest.mark.parametrize("name", ["coupled_fouling", "fouling"])
 
 
 @pytest.fixture(scope="module")
 def folder(heat_exchanger: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The heat exchanger as one FMU, and as a system of one component."""
-    place = tmp_path_factory.mktemp("coupled") / "system"
-    shutil.copytree(heat_exchanger, place)
+    place = Path(shutil.copytree(heat_exchanger, tmp_path_factory.mktemp("coupled") / "system"))
     binding = (place / "binding.toml").read_text(encoding="utf-8")
-    for old, new in (
-        ('variable = "mass_flow"', 'variable = "flow"'),
-        ('variable = "wall_temperature"', 'variable = "exchanger.wall_temperature"'),
-        ('variable = "misbehaviour"', 'variable = "exchanger.misbehaviour"'),
-        ('variable = "conductance"', 'variable = "exchanger.conductance"'),
-        ('["middle", "outlet"]', '["exchanger.middle", "outlet"]'),
-        ('variable = "heat"', 'variable = "exchanger.heat"'),
-    ):
-        assert old in binding
-        binding = binding.replace(old, new)
-    (place / "coupled.toml").write_text(binding, encoding="utf-8")
+    inner = ("wall_temperature", "misbehaviour", "conductance", "heat")
+    names = [(f'variable = "{name}"', f'variable = "exchanger.{name}"') for name in inner]
+    names += [('variable = "mass_flow"', 'variable = "flow"')]
+    names += [('["middle", "outlet"]', '["exchanger.middle", "outlet"]')]
+    written(place, binding, *names, name="coupled.toml")
     text = (place / "fouling.toml").read_text(encoding="utf-8")
-    before, rest = text.split("[asset]\n")
-    _, after = rest.split("[calibration]")
-    (place / "coupled_fouling.toml").write_text(before + COUPLED + after, encoding="utf-8")
+    asset = text[text.index("[asset]") : text.index("[calibration]")]
+    written(place, text, (asset, COUPLED), name="coupled_fouling.toml")
     return place
 
 
@@ -90,23 +84,53 @@ def direct(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     }
 
 
-def changed(folder: Path, name: str, *changes: tuple[str, str]) -> Path:
-    text = (folder / "coupled_fouling.toml").read_text(encoding="utf-8")
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new, 1)
-    path = folder / f"{name}.toml"
-    path.write_text(text, encoding="utf-8")
-    return path
+def changed(
+    folder: Path, name: str, *changes: tuple[str, str], of: str = "coupled_fouling"
+) -> LoadedScenario:
+    text = (folder / f"{of}.toml").read_text(encoding="utf-8")
+    return load_scenario(written(folder, text, *changes, name=f"{name}.toml"))
 
 
 def rows(run: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted((run / "csv").iterdir())}
 
 
-def test_a_system_of_one_fmu_flies_as_the_fmu_alone(
-    folder: Path, direct: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_heat_exchanger_is_watched_and_steered(direct):
+    run = direct["fouling"]
+    tree = read_run(run)
+    observed, truth = tree["observed"], tree["truth"]
+    assert observed["temperature"].shape == (30, 2)
+    found = [observed["temperature"], observed["mass_flow"], truth["heat"], truth["state"]]
+    assert [variable.attrs["units"] for variable in found] == ["degC", "kg/s", "W", "m2.K/W"]
+    estimate = tree["smoothed"]["mean"].values[:, 0]
+    np.testing.assert_allclose(estimate[[3, 12, 25]], [0.0, 1e-4, 2e-4], atol=3e-5)
+    # The exact steady temperatures are those of the formula, not of a wing.
+    flow = observed["mass_flow"].values[0]
+    outlet = 20.0 + 60.0 * (1.0 - np.exp(-6100.0 / (4186.0 * flow)))
+    assert truth["temperature"].values[0, 1] == pytest.approx(outlet, rel=1e-12)
+    headers = [rows(run)[f"{name}.csv"].decode().splitlines()[0] for name in ("observed", "health")]
+    assert headers[0] == "step,temperature_1_degC,temperature_2_degC"
+    assert headers[1].startswith("step,fouling_true_m2.K/W")
+
+
+def test_nan_from_the_fmu_stops_the_run_which_stays_resumable(folder, tmp_path):
+    # The twin's table has two levels, so that only the flown asset misbehaves.
+    load = "wall_temperature = 80.0"
+    loaded = changed(
+        folder, "nan", (f"{load} }}", f"{load}, misbehaviour = 1.0 }}"),
+        ("levels = [0.0, 1e-4, 2e-4, 3e-4]", "levels = [0.0, 1e-4]"),
+        ("prior = [1, 0, 0, 0]", "prior = [1, 0]"), of="fouling",
+    )  # fmt: skip
+    with pytest.raises(FmuError, match=r"not finite.*outlet"):
+        new_run(loaded, tmp_path / "run")
+    config_hash = workflow.hash_record(read_config(tmp_path / "run"))
+    with CheckpointFile(tmp_path / "run", config_hash) as kept:
+        assert kept.turns == 16
+    with pytest.raises(FmuError, match=r"not finite.*outlet"):
+        resume_run(tmp_path / "run")
+
+
+def test_a_system_of_one_fmu_flies_as_the_fmu_alone(folder, direct, tmp_path):
     """In a worker and in this process."""
     assert rows(direct["coupled_fouling"]) == rows(direct["fouling"])
     loaded = load_scenario(folder / "coupled_fouling.toml")
@@ -114,23 +138,14 @@ def test_a_system_of_one_fmu_flies_as_the_fmu_alone(
     assert rows(inside) == rows(direct["fouling"])
 
 
-@pytest.mark.parametrize("name", ["coupled_fouling", "fouling"])
-def test_a_resumed_flight_is_bit_identical(
-    folder: Path, direct: dict[str, Path], tmp_path: Path, name: str
-) -> None:
+@BOTH
+def test_a_flight_is_the_same_resumed_and_from_an_ssp_file(folder, direct, tmp_path, name):
     """The FMU cannot save its state: its inputs are replayed. What is flown lies in the run folder."""
+    loaded = load_scenario(folder / f"{name}.toml")
     with cut_off_after(11):
-        new_run(load_scenario(folder / f"{name}.toml"), tmp_path / "part")
+        new_run(loaded, tmp_path / "part")
     resume_run(tmp_path / "part")
     check_same(tmp_path / "part", direct[name], "run.nc", "config.json", "summary.json", "journal.jsonl")
-
-
-@pytest.mark.parametrize("name", ["coupled_fouling", "fouling"])
-def test_an_exported_system_flies_the_same_mission(
-    folder: Path, direct: dict[str, Path], tmp_path: Path, name: str
-) -> None:
-    """From the coupled scenario and from that of one FMU; the run folder holds the SSP file."""
-    loaded = load_scenario(folder / f"{name}.toml")
     ssp = export_scenario(loaded, tmp_path / "x.ssp", replace_file=False, progress=SilentProgress())
     flown = new_run(loaded, tmp_path / "flown", Overrides(ssp=ssp)).folder
     assert rows(flown) == rows(direct[name])
@@ -139,68 +154,69 @@ def test_an_exported_system_flies_the_same_mission(
     assert rows(resume_run(flown).folder) == rows(direct[name])
 
 
-def test_what_does_not_fit_is_said_before_a_folder_is_made(folder: Path, tmp_path: Path) -> None:
-    for name, change, kind, words in (
-        ("component", ('source = "exchanger.outlet"', 'source = "boiler.outlet"'), CouplingError,
+def test_what_does_not_fit_is_said_before_a_folder_is_made(folder, tmp_path):
+    (folder / "broken.fmu").write_bytes(b"PK no archive")
+    twice = '{ conductance = 5000.0, "conductance[{1..1}]" = 1.0 }'
+    for old, new, kind, words in (
+        ('source = "exchanger.outlet"', 'source = "boiler.outlet"', CouplingError,
          r"'boiler\.outlet' begins with no component; the components are exchanger"),
-        ("variable", ('target = "exchanger.mass_flow"', 'target = "exchanger.flow"'), CouplingError,
-         "has no variable 'flow'"),
-        ("missing", ("HeatExchanger.fmu", "Missing.fmu"), MissionInputError, r"Missing\.fmu cannot be read"),
-        ("setting", ("conductance = 5000.0", "conduction = 5000.0"), CouplingError,
-         "no variable 'conduction'"),
-        ("twice", ('parameters = { conductance = 5000.0 }',
-                   'parameters = { conductance = 5000.0, "conductance[{1..1}]" = 1.0 }'), CouplingError,
-         "no variable 'conductance"),
-        ("loop", ('source = "flow"', 'source = "exchanger.heat"'), AlgebraicLoopError,
-         "close an algebraic loop"),
-        ("binding", ('target = "outlet"', 'target = "exit"'), BindingError,
+        ('target = "exchanger.mass_flow"', 'target = "exchanger.flow"', CouplingError, "no variable 'flow'"),
+        ("HeatExchanger.fmu", "Missing.fmu", MissionInputError, r"Missing\.fmu cannot be read"),
+        ("conductance = 5000.0", "conduction = 5000.0", CouplingError, "no variable 'conduction'"),
+        ("{ conductance = 5000.0 }", twice, CouplingError, "no variable 'conductance"),
+        ('source = "flow"', 'source = "exchanger.heat"', AlgebraicLoopError, "close an algebraic loop"),
+        ('target = "outlet"', 'target = "exit"', BindingError,
          "names 'outlet', which is not a variable of the system fouling"),
-        ("truth", ('kind = "scripted"', 'kind = "asset"\nstate = { fouling = "heat" }'), ScenarioError,
+        ('kind = "scripted"', 'kind = "asset"\nstate = { fouling = "heat" }', ScenarioError,
          "leaves damage, noise and faults to the asset"),
-        ("both", ('binding = "coupled.toml"', 'binding = "coupled.toml"\nfile = "x.ssp"'), ScenarioError,
-         "unknown key `asset.file`"),
-        ("neither", ('fmu = "HeatExchanger.fmu"\n', ""), ScenarioError, "needs one of `fmu` and `design`"),
-        ("kind", ('kind = "coupled"', 'kind = "fmu"\nfile = "HeatExchanger.fmu"'), ScenarioError,
+        ('"coupled.toml"', '"coupled.toml"\nfile = "x.ssp"', ScenarioError, "unknown key `asset.file`"),
+        ('fmu = "HeatExchanger.fmu"\n', "", ScenarioError, "needs one of `fmu` and `design`"),
+        ('kind = "coupled"', 'kind = "fmu"\nfile = "HeatExchanger.fmu"', ScenarioError,
          "unknown key `asset.component`"),
-        ("key", ("target = ", "to = "), ScenarioError, r"unknown key `asset\.connection\[1\]\.to`"),
-        ("seeds", ("load = {", 'seeds = ["seed"]\nload = {'), MissionInputError, "parameter seed, which"),
+        ("target = ", "to = ", ScenarioError, r"unknown key `asset\.connection\[1\]\.to`"),
+        ("load = {", 'seeds = ["seed"]\nload = {', MissionInputError, "parameter seed, which"),
+        ("count = 2", "count = 3", TwinMasterError, "2 values.*expects 3"),
+        ('role = "temperature"', 'role = "strain"', Exception, "no observation 'strain'"),
+        ("mass_flow = 0.5", "flow = 0.5", ScenarioError, "same inputs"),
+        ("conductance = 6100.0", "conduction = 6100.0", Exception, "parameter conduction.*knows conductance"),
     ):  # fmt: skip
-        path = changed(folder, name, change)
         with pytest.raises(kind, match=words) as caught:
-            new_run(load_scenario(path), tmp_path / name)
+            new_run(changed(folder, "wrong", (old, new)), tmp_path / "run")
         assert "\n" not in str(caught.value)
-    loaded = load_scenario(folder / "coupled_fouling.toml")
-    (tmp_path / "bad.ssp").write_bytes(b"nothing")
+        if kind in (TwinMasterError, Exception):  # of one FMU alike
+            with pytest.raises(kind, match=words):
+                new_run(changed(folder, "wrong", (old, new), of="fouling"), tmp_path / "run")
+    for name, kind in (("Missing", MissionInputError), ("broken", FmuFileError)):
+        other = changed(folder, "wrong", ("HeatExchanger.fmu", f"{name}.fmu"), of="fouling")
+        with pytest.raises(kind, match=rf"{name}\.fmu"):
+            new_run(other, tmp_path / "run")
+    bad, fmu = tmp_path / "bad.ssp", folder / "HeatExchanger.fmu"
+    bad.write_bytes(b"nothing")
     for overrides, words in (
-        (Overrides(fmu=folder / "HeatExchanger.fmu"), "the scenario couples several"),
-        (Overrides(ssp=tmp_path / "bad.ssp", fmu=folder / "HeatExchanger.fmu"), "give neither --fmu"),
+        (Overrides(fmu=fmu), "the scenario couples several"),
+        (Overrides(ssp=bad, fmu=fmu), "give neither --fmu"),
         (Overrides(ssp=tmp_path / "none.ssp"), "none.ssp cannot be read"),
-        (Overrides(ssp=tmp_path / "bad.ssp"), "not a sound SSP archive"),
+        (Overrides(ssp=bad), "not a sound SSP archive"),
     ):
         with pytest.raises((MissionInputError, SspError, FmuError), match=words):
-            new_run(loaded, tmp_path / "run", overrides)
+            new_run(load_scenario(folder / "coupled_fouling.toml"), tmp_path / "run", overrides)
+    text = (folder / "coupled_fouling.toml").read_text(encoding="utf-8")
+    own = '[truth]\nkind = "asset"\nstate = { fouling = "heat" }\n'
+    path = written(folder, text[: text.index("[truth]")] + own, name="own.toml")
+    with pytest.raises(MissionInputError, match="name a model for the twin in the table `belief`"):
+        new_run(load_scenario(path), tmp_path / "run")
     assert [path.name for path in tmp_path.iterdir()] == ["bad.ssp"]
 
 
-def test_an_asset_with_its_own_damage_needs_a_model_for_the_twin(folder: Path, tmp_path: Path) -> None:
-    text = (folder / "coupled_fouling.toml").read_text(encoding="utf-8")
-    text = text[: text.index("[truth]")] + '[truth]\nkind = "asset"\nstate = { fouling = "heat" }\n'
-    path = folder / "own.toml"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(MissionInputError, match="name a model for the twin in the table `belief`"):
-        new_run(load_scenario(path), tmp_path / "run")
-
-
-def test_the_schema_of_the_truth() -> None:
-    path = scenario_files()["three_fmus"]
-    table = tomllib.loads(path.read_text(encoding="utf-8"))
+def test_the_schema_of_the_truth():
+    table = table_of("three_fmus")
+    nothing = {"state": {}, "observation": None, "received": None}
     for change, words in (
         ({"state": {"z1": "z1"}}, "`truth.state` must have one entry for each state"),
         ({"kind": "random_growth"}, "belong to the kind `asset`"),
-        ({"kind": "random_growth", "state": {}, "observation": None, "received": None},
-         "`truth.noise` is missing"),
+        ({"kind": "random_growth"} | nothing, "`truth.noise` is missing"),
         ({"noise": {"standard_deviation": 1e-4}}, "leaves damage, noise and faults to the asset"),
-    ):  # fmt: skip
+    ):
         truth = {key: value for key, value in (table["truth"] | change).items() if value is not None}
         with pytest.raises(ScenarioError, match=words):
             parse_scenario(table | {"truth": truth}, "x")
@@ -211,17 +227,10 @@ def test_the_schema_of_the_truth() -> None:
 
 def shipped(name: str, tmp_path: Path, *changes: tuple[str, str]) -> LoadedScenario:
     """Return a shipped scenario with changes, and with a calibration that costs nothing."""
-    text = scenario_files()[name].read_text(encoding="utf-8")
+    text = text_of(name)
     calibration = text[text.index("[calibration]") : text.index("[truth]")]
-    text = text.replace(
-        calibration, '[calibration]\nparameter = "young_modulus_factor"\nsource = "fixed"\nmean = 1.0073\n\n'
-    )
-    for old, new in changes:
-        assert old in text, old
-        text = text.replace(old, new)
-    path = tmp_path / f"{name}.toml"
-    path.write_text(text, encoding="utf-8")
-    return load_scenario(path)
+    fixed = '[calibration]\nparameter = "young_modulus_factor"\nsource = "fixed"\nmean = 1.0073\n\n'
+    return load_scenario(written(tmp_path, text, (calibration, fixed), *changes, name=f"{name}.toml"))
 
 
 def plant_of(loaded: LoadedScenario, folder: Path) -> Plant:
@@ -235,42 +244,30 @@ def plant_of(loaded: LoadedScenario, folder: Path) -> Plant:
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-def test_three_fmus_live_the_script_of_a_scenario(tmp_path: Path) -> None:
+def test_three_fmus_live_the_script_of_a_scenario(tmp_path):
     """Damage, drift and lost gauges of failing_gauges, once as its truth and once in the FMUs: to the bit."""
-    script = {
-        1: (10, 19, "z1", 0.02), 2: (20, 20, "z1", 0.2), 3: (30, 30, "z1", 0.2),
-        4: (5, 14, "z2", 0.02), 5: (5, 5, "z2", 0.2), 6: (25, 25, "z2", 0.2),
-    }  # fmt: skip
+    script = (
+        (10, 19, "z1", 0.02), (20, 20, "z1", 0.2), (30, 30, "z1", 0.2),
+        (5, 14, "z2", 0.02), (5, 5, "z2", 0.2), (25, 25, "z2", 0.2),
+    )  # fmt: skip
     entries = ", ".join(
         f'"script[{i}].first" = {first}.0, "script[{i}].last" = {last}.0, "script[{i}].{region}" = {gain}'
-        for i, (first, last, region, gain) in script.items()
+        for i, (first, last, region, gain) in enumerate(script, start=1)
     )
     faults = (
         '"dropout_start[1]" = 28.0, "dropout_end[1]" = 1000.0, "dropout_start[{17..20}]" = 12.0, '
         '"dropout_end[{17..20}]" = 19.0, "blackout.start" = 36.0, "blackout.end" = 38.0, '
         '"drift_rate[12]" = 6e-6, "drift_start[12]" = 8.0'
     )
-    split = plant_of(
-        shipped(
-            "three_fmus",
-            tmp_path,
-            ('"probability.z1" = 0.10, "probability.z2" = 0.10', entries),
-            ('noise = 150e-6, "dropout_start[6]" = 20.0, "dropout_end[6]" = 30.0', faults),
-        ),
-        tmp_path / "split",
-    )
-    single = plant_of(
-        shipped(
-            "failing_gauges",
-            tmp_path,
-            ("standard_deviation_microstrain = 150", "standard_deviation_microstrain = 0"),
-        ),
-        tmp_path / "single",
-    )
-    controls = np.random.default_rng(3).integers(2, size=50)
+    damage = ('"probability.z1" = 0.10, "probability.z2" = 0.10', entries)
+    gauges = ('noise = 150e-6, "dropout_start[6]" = 20.0, "dropout_end[6]" = 30.0', faults)
+    quiet = ("standard_deviation_microstrain = 150", "standard_deviation_microstrain = 0")
+    split = plant_of(shipped("three_fmus", tmp_path, damage, gauges), tmp_path / "split")
+    single = plant_of(shipped("failing_gauges", tmp_path, quiet), tmp_path / "single")
+    controls = np.random.default_rng(3).integers(2, size=50).tolist()
     for step, control in enumerate(controls):
-        previous = int(controls[step - 1]) if step else None
-        ours, theirs = (plant.turn(int(control), previous) for plant in (split, single))
+        previous = controls[step - 1] if step else None
+        ours, theirs = (plant.turn(control, previous) for plant in (split, single))
         assert ours.happened is not None
         assert theirs.happened is not None
         np.testing.assert_array_equal(ours.observed, theirs.observed, err_msg=str(step))
@@ -283,7 +280,7 @@ def test_three_fmus_live_the_script_of_a_scenario(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.xdist_group("wing")
-def test_the_shipped_scenario_in_process_in_workers_and_resumed(tmp_path: Path) -> None:
+def test_the_shipped_scenario_in_process_in_workers_and_resumed(tmp_path):
     loaded = shipped("three_fmus", tmp_path, ("steps = 50", "steps = 24"))
     whole = new_run(loaded, tmp_path / "whole").folder
     inside = new_run(loaded, tmp_path / "inside", Overrides(in_process=True)).folder
@@ -301,7 +298,7 @@ def test_the_shipped_scenario_in_process_in_workers_and_resumed(tmp_path: Path) 
     assert rows(new_run(loaded, tmp_path / "ssp", Overrides(ssp=ssp)).folder) == rows(whole)
 
 
-def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path: Path) -> None:
+def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path):
     fleet = ensemble("three_fmus", range(3))
     (group,) = fleet.groups
     (scenario,) = group.scenarios
@@ -310,16 +307,12 @@ def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path: Path) 
         fly_fleet(replace(fleet, groups=(replace(group, scenarios=(seedless,)),)), tmp_path / "fleet")
 
 
-def test_the_law_of_the_shipped_damage_is_what_the_twin_believes() -> None:
+def test_the_law_of_the_shipped_damage_is_what_the_twin_believes():
     scenario = load_scenario("three_fmus").scenario
-    (damage, *_) = scenario.asset.component
-    values = damage.parameters
+    values = scenario.asset.component[0].parameters
     for control in scenario.control:
         severity = (control.values["load_factor"] / values["reference_load_factor"]) ** values["exponent"]
-        for region in ("z1", "z2"):
-            assert values[f"probability.{region}"] * severity == pytest.approx(
-                scenario.transition.probability[control.name], rel=1e-12
-            )
+        believed = pytest.approx(scenario.transition.probability[control.name], rel=1e-12)
+        assert [values[f"probability.{region}"] * severity for region in ("z1", "z2")] == [believed] * 2
     assert {factor.levels[1] - factor.levels[0] for factor in scenario.state} == {values["level"]}
-    binding = load_binding(binding_files()["three_fmus"])
-    assert binding.step_size == 1.0
+    assert load_binding(binding_files()["three_fmus"]).step_size == 1.0

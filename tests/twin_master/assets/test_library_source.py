@@ -1,60 +1,92 @@
-"""A twin that believes an observation library: what it is given, what is refused, what is said."""
+"""A twin that believes an observation library, and the pump's mission against brute force."""
 
-from __future__ import annotations
-
+import itertools
 import json
+import math
 import shutil
-import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.stats import norm
 
 from fmu_asset.packing.script import build_script_fmu
 from reporting.progress import SilentProgress
-from scenarios import asset_scripts, binding_files
-from tests.twin_master.runs import check_same, cut_off_after
-from twin_master.assets.observation_library import ObservationLibrary, load_observation_library
+from scenarios import asset_scripts
+from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded_from, table_of
+from twin_master.assets.library_source import ObservationLibrary, load_observation_library
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import InvalidObservationLibraryError, ScenarioError, TwinMasterError
-from twin_master.library.grid import SamplingGrid
 from twin_master.library.request import grid_of_scenario
 from twin_master.library.sampling import sample_library
-from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.scenario.reading import LoadedScenario, load_scenario
+from twin_master.store.writing import read_run
 from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
 
-sys.path.insert(0, str(Path(__file__).parent))
-from pump_mission import PATH, pump_table, small_pump
-
 pytestmark = pytest.mark.usefixtures("no_report")
+Float = NDArray[np.float64]
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SamplingGrid]:
-    folder = tmp_path_factory.mktemp("library")
-    grid = grid_of_scenario(
-        small_pump(), folder / "made", ["viscosity_factor=0.9:1.1:21"], progress=SilentProgress()
-    )
-    return sample_library(grid, folder / "pump.nc", workers=1).path, grid
+def pump_table() -> dict[str, Any]:
+    """Return the shipped mission cut down: five shifts, 3 x 2 levels, four draws, and sensors that fail."""
+    table = table_of("pump_wear")
+    table["mission"] |= {"steps": 5, "prediction_steps": 3}
+    table["state"][0] |= {"levels_percent": [0, 30, 60], "prior": [1, 0, 0]}
+    table["state"][1] |= {"levels_percent": [0, 60], "prior": [1, 0]}
+    table["calibration"] |= {"draws": 4}
+    table["asset"] |= {"isolated": False}
+    table["observation"] |= {"between_levels": False}  # what is enumerated below
+    table["truth"]["gains"] = [
+        {"state": "wear", "first_step": 1, "gain_percent": 20},
+        {"state": "clogging", "first_step": 3, "gain_percent": 50},
+    ]
+    table["truth"]["sensor_faults"] = [
+        {"kind": "dropout", "sensors": [1], "first_step": 1, "last_step": 1},
+        {"kind": "dropout", "sensors": "all", "first_step": 2, "last_step": 2},
+    ]
+    return table
 
 
-@pytest.fixture
-def library(made: tuple[Path, SamplingGrid]) -> ObservationLibrary:
-    return load_observation_library(made[0])
+def small_pump(**asset: Any) -> LoadedScenario:
+    """Return the small mission, with changes of its asset."""
+    table = pump_table()
+    table["asset"] |= asset
+    return loaded_from(table, "pump_wear")
 
 
 def changed(key: str, entry: object) -> LoadedScenario:
+    """Return the small mission with another entry at a key such as `state.0.unit`."""
     table = pump_table()
     *path, last = key.split(".")
-    node = table
+    node: Any = table
     for part in path:
-        node = node[int(part)] if part.isdigit() else node[part]  # type: ignore[call-overload]
+        node = node[int(part)] if part.isdigit() else node[part]
     node[last] = entry
-    return LoadedScenario(parse_scenario(table, "small_pump"), PATH, "0" * 64)
+    return loaded_from(table, "pump_wear")
 
 
-def test_a_table_over_another_parameter_grid_is_interpolated(library: ObservationLibrary) -> None:
+def sampled(folder: Path, *grid: str) -> Path:
+    """Sample the FMU of the small mission."""
+    found = grid_of_scenario(small_pump(), folder / "made", [*grid], progress=SilentProgress())
+    return sample_library(found, folder / "pump.nc", workers=1).path
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return sampled(tmp_path_factory.mktemp("library"), "viscosity_factor=0.9:1.1:21")
+
+
+@pytest.fixture
+def library(made: Path) -> ObservationLibrary:
+    return load_observation_library(made)
+
+
+def test_a_table_over_another_parameter_grid_is_interpolated(library):
     nodes = library.at_draws("viscosity_factor", library.draws[[3, 7]])
     np.testing.assert_array_equal(nodes, library.values[[3, 7]])
     between = library.at_draws("viscosity_factor", np.array([0.955]))
@@ -63,11 +95,8 @@ def test_a_table_over_another_parameter_grid_is_interpolated(library: Observatio
     assert not library.holds_draws(np.array([0.955]))
 
 
-def test_a_run_with_a_library_keeps_it_and_can_be_resumed(
-    made: tuple[Path, SamplingGrid], tmp_path: Path
-) -> None:
-    path = tmp_path / "pump.nc"
-    shutil.copy(made[0], path)
+def test_a_run_with_a_library_keeps_it_and_can_be_resumed(made, tmp_path):
+    path = Path(shutil.copy(made, tmp_path / "pump.nc"))
     whole = new_run(small_pump(), tmp_path / "whole", Overrides(library=path))
     assert not whole.origin.differ
     assert whole.origin.model == "observation library of it"
@@ -75,55 +104,48 @@ def test_a_run_with_a_library_keeps_it_and_can_be_resumed(
     assert config["scenario"]["belief"]["file"] == "asset/observation_library.nc"
     assert config["scenario"]["asset"]["kind"] == "fmu"
     assert set(config["inputs"]) == {"binding", "fmu", "observation_library"}
+    part = tmp_path / "part"
     with cut_off_after(3):
-        new_run(small_pump(), tmp_path / "part", Overrides(library=path))
+        new_run(small_pump(), part, Overrides(library=path))
     path.unlink()
-    resume_run(tmp_path / "part")
-    check_same(tmp_path / "part", tmp_path / "whole", "run.nc", "summary.json", "csv/health.csv")
-    stored = tmp_path / "part" / "asset" / "observation_library.nc"
+    resume_run(part)
+    check_same(part, whole.folder, "run.nc", "summary.json", "csv/health.csv")
+    stored = part / "asset" / "observation_library.nc"
     stored.write_bytes(stored.read_bytes()[:-200])
-    (tmp_path / "part" / "run.nc").unlink()  # of a finished run nothing is read again
+    (part / "run.nc").unlink()  # of a finished run nothing is read again
     with pytest.raises(TwinMasterError, match=r"not a whole NetCDF"):
-        resume_run(tmp_path / "part")
+        resume_run(part)
 
 
 @pytest.mark.long
-def test_a_library_of_the_same_draws_gives_the_same_run(tmp_path: Path) -> None:
-    grid = grid_of_scenario(small_pump(), tmp_path / "made", progress=SilentProgress())
-    path = sample_library(grid, tmp_path / "pump.nc", workers=1).path
+def test_a_library_of_the_same_draws_gives_the_same_run(tmp_path):
+    library = Overrides(library=sampled(tmp_path))
     new_run(small_pump(), tmp_path / "asked")
-    new_run(small_pump(), tmp_path / "sampled", Overrides(library=path))
-    for file in (tmp_path / "asked" / "csv").iterdir():
-        assert (tmp_path / "sampled" / "csv" / file.name).read_bytes() == file.read_bytes()
+    new_run(small_pump(), tmp_path / "sampled", library)
+    names = [f"csv/{file.name}" for file in (tmp_path / "asked" / "csv").iterdir()]
+    check_same(tmp_path / "sampled", tmp_path / "asked", *names)
     # With another seed the draws are others, inside the sampled range only for some.
     with pytest.raises(InvalidObservationLibraryError, match="scenario and seed"):
-        new_run(small_pump(), tmp_path / "other", Overrides(library=path, seed=3))
+        new_run(small_pump(), tmp_path / "other", Overrides(library=library.library, seed=3))
 
 
-def test_a_library_of_another_fmu_is_flown_with_a_notice(
-    made: tuple[Path, SamplingGrid], tmp_path: Path
-) -> None:
+def test_a_library_of_another_fmu_is_flown_with_a_notice(made, tmp_path):
     script = tmp_path / "gear_pump.py"
     text = asset_scripts()["gear_pump"].read_text(encoding="utf-8")
     script.write_text(text.replace("COOLING = 250.0", "COOLING = 200.0"))
     fmu = build_script_fmu(script, tmp_path / "other.fmu").path
-    outcome = new_run(small_pump(), tmp_path / "run", Overrides(library=made[0], fmu=fmu))
+    outcome = new_run(small_pump(), tmp_path / "run", Overrides(library=made, fmu=fmu))
     assert outcome.origin.differ
     assert outcome.origin.model == "observation library of another FMU"
-    figures = {figure.key: figure.value for figure in outcome.figures}
-    assert figures["model_misfit_largest"] > 1.0  # percent: the oil is hotter with less cooling
-    assert json.loads((tmp_path / "run" / "summary.json").read_text())["asset_and_model_differ"] is True
+    assert figures_of(outcome.folder)["model_misfit_largest"] > 1.0  # percent: it is hotter with less cooling
+    assert json.loads((outcome.folder / "summary.json").read_text())["asset_and_model_differ"] is True
 
 
 @pytest.mark.parametrize(
     ("key", "entry", "words"),
     [
         ("state.0.levels_percent", [0, 25, 60], "has the levels 0, 0.3, 0.6 of wear.*asks for 0.25"),
-        (
-            "control.2.values",
-            {"speed": 1900.0, "pressure": 180.0},
-            "not sampled at speed = 1900.*control boost",
-        ),
+        ("control.2.values.speed", 1900.0, "not sampled at speed = 1900.*control boost"),
         (
             "observation.unit",
             ["L/min", "N.m", "1", "bar"],
@@ -133,84 +155,56 @@ def test_a_library_of_another_fmu_is_flown_with_a_notice(
         ("state.0.unit", "percent", "has the states in clogging: 1, wear: 1"),
     ],
 )
-def test_what_a_library_lacks_is_named(
-    made: tuple[Path, SamplingGrid], tmp_path: Path, key: str, entry: object, words: str
-) -> None:
+def test_what_a_library_lacks_is_named(made, tmp_path, key, entry, words):
     with pytest.raises(InvalidObservationLibraryError, match=words):
-        new_run(changed(key, entry), tmp_path / "run", Overrides(library=made[0]))
+        new_run(changed(key, entry), tmp_path / "run", Overrides(library=made))
 
 
-def test_names_and_order_of_controls_and_states_do_not_matter(
-    made: tuple[Path, SamplingGrid], tmp_path: Path
-) -> None:
-    table = pump_table()
+def test_names_and_order_of_controls_and_states_do_not_matter(made, tmp_path):
+    table, figures = pump_table(), []
     table["state"].reverse()
     table["control"].reverse()
-    turned = LoadedScenario(parse_scenario(table, "small_pump"), PATH, "0" * 64)
-    for name, loaded in (("a", small_pump()), ("b", turned)):
-        new_run(loaded, tmp_path / name, Overrides(library=made[0]))
-    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in "ab"]
-    figures = [{f["key"]: f["value"] for f in summary["figures"]} for summary in summaries]
+    for name, loaded in (("a", small_pump()), ("b", loaded_from(table, "pump_wear"))):
+        figures.append(figures_of(new_run(loaded, tmp_path / name, Overrides(library=made)).folder))
     assert figures[0]["log_evidence"] == pytest.approx(figures[1]["log_evidence"], rel=1e-12)
     assert figures[0]["filtered_rms_error_wear"] == pytest.approx(figures[1]["filtered_rms_error_wear"])
 
 
-def test_files_that_are_no_library_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidObservationLibraryError, match="there is no observation library"):
-        load_observation_library(tmp_path / "missing.nc")
+def test_files_that_are_no_library_are_refused(made, library_file, tmp_path):
+    """Also one with a number that is none; and a scenario without an FMU cannot be sampled."""
     (tmp_path / "noise.nc").write_bytes(b"no NetCDF at all")
-    with pytest.raises(InvalidObservationLibraryError, match="not a whole NetCDF"):
-        load_observation_library(tmp_path / "noise.nc")
-    import xarray as xr
-
     xr.Dataset({"x": 1.0}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
-    with pytest.raises(InvalidObservationLibraryError, match="no observation library of this version"):
-        load_observation_library(tmp_path / "other.nc")
-
-
-@pytest.mark.parametrize("name", ["observation", "control_speed", "wear"])
-def test_a_library_with_a_number_that_is_none_is_refused(
-    made: tuple[Path, SamplingGrid], tmp_path: Path, name: str
-) -> None:
-    import xarray as xr
-
-    with xr.open_dataset(made[0], engine="h5netcdf") as opened:
-        dataset = opened.load()
-    values = dataset[name].values.copy()
-    values[(0,) * values.ndim] = np.nan
-    changed = dataset.drop_vars(name).assign({name: (dataset[name].dims, values, dataset[name].attrs)})
-    changed.to_netcdf(tmp_path / "pump.nc", engine="h5netcdf")
-    with pytest.raises(InvalidObservationLibraryError, match="finite") as caught:
-        load_observation_library(tmp_path / "pump.nc")
-    assert "\n" not in str(caught.value)
-
-
-def test_a_library_is_named_by_the_belief_and_an_fmu_by_the_asset() -> None:
-    for asset, words in (
-        ({"library": "pump.nc"}, "unknown key `asset.library`"),
-        ({"file": "pump.fmu"}, "unknown key `asset.file`"),
-        ({"kind": "fmu", "file": "pump.fmu"}, "unknown key `asset.script`"),
-    ):
-        with pytest.raises(ScenarioError, match=words):
-            small_pump(**asset)
-
-
-def test_a_scenario_without_an_fmu_cannot_be_sampled(tmp_path: Path, library_file: Path) -> None:
-    with pytest.raises(
-        InvalidObservationLibraryError, match="kind `strain_library`, and one FMU can be sampled"
-    ):
-        grid_of_scenario(
-            load_scenario("level_turns"),
-            tmp_path,
-            overrides=Overrides(strain_library=library_file),
-            progress=SilentProgress(),
-        )
-    assert binding_files()["gear_pump"].is_file()
+    cases = {
+        "missing": "there is no observation library",
+        "noise": "not a whole NetCDF",
+        "other": "no observation library of this version",
+    }
+    for name in ("observation", "control_speed", "wear"):
+        with xr.open_dataset(made, engine="h5netcdf") as opened:
+            dataset = opened.load()
+        values = dataset[name].values.copy()
+        values[(0,) * values.ndim] = np.nan
+        wrong = dataset.drop_vars(name).assign({name: (dataset[name].dims, values, dataset[name].attrs)})
+        wrong.to_netcdf(tmp_path / f"{name}.nc", engine="h5netcdf")
+        cases[name] = "finite"
+    for name, words in cases.items():
+        with pytest.raises(InvalidObservationLibraryError, match=words) as caught:
+            load_observation_library(tmp_path / f"{name}.nc")
+        assert "\n" not in str(caught.value)
+    given: dict[str, Any] = {
+        "overrides": Overrides(strain_library=library_file),
+        "progress": SilentProgress(),
+    }
+    with pytest.raises(InvalidObservationLibraryError, match="kind `strain_library`, and one FMU can be"):
+        grid_of_scenario(load_scenario("level_turns"), tmp_path, **given)
 
 
 @pytest.mark.parametrize(
     ("key", "entry", "words"),
     [
+        ("asset.library", "pump.nc", "unknown key `asset.library`"),
+        ("asset.file", "pump.fmu", "unknown key `asset.file`"),
+        ("asset.kind", "fmu", "unknown key `asset.script`"),
         ("observation.unit", ["bar"], r"`observation\.unit` must be one value, or one for each of the 4"),
         ("observation.standard_deviation", [1.0, 1.0], r"`observation\.standard_deviation` must be one"),
         ("observation.titles", ["flow"], r"`observation\.titles`"),
@@ -224,6 +218,137 @@ def test_a_scenario_without_an_fmu_cannot_be_sampled(tmp_path: Path, library_fil
         ("truth.noise", {"standard_deviation": [1.0]}, r"`truth\.noise\.standard_deviation`"),
     ],
 )
-def test_lists_of_another_length_are_refused(key: str, entry: object, words: str) -> None:
+def test_keys_and_lists_that_do_not_fit_are_refused(key, entry, words):
     with pytest.raises(ScenarioError, match=words):
         changed(key, entry)
+
+
+# ------------------------------------- brute force: every path of the state, physics and likelihood anew
+
+WEAR, CLOGGING = (0.0, 0.3, 0.6), (0.0, 0.6)
+STATES = list(itertools.product(WEAR, CLOGGING))
+CONTROLS = {"eco": (1000.0, 100.0), "normal": (1500.0, 140.0), "boost": (1800.0, 180.0)}
+WORSENING = {"eco": (0.02, 0.04), "normal": (0.04, 0.06), "boost": (0.08, 0.08)}
+NOISE = np.array([0.4, 0.5, 0.6, 0.15])
+
+
+def show(control: str, wear: float, clogging: float, viscosity: float) -> Float:
+    """Flow, torque, temperature and filter pressure drop, from the equations of docs/another_asset.md."""
+    displacement = 16e-6 / (2 * math.pi)
+    speed, load = 2 * math.pi * CONTROLS[control][0] / 60, 1e5 * CONTROLS[control][1]
+
+    def at(temperature: float) -> tuple[float, float, float]:
+        mu = viscosity * 870 * 46e-6 * (6.8 / 46) ** ((temperature - 40) / 60)
+        conductance = 1.52e-8 * displacement * (1 + wear) ** 3 / mu
+
+        def balance(flow: float) -> float:
+            drop = mu * 9e9 * flow / (1 - clogging)
+            return displacement * speed - conductance * (load + drop) - flow
+
+        flow = brentq(balance, -1e-1, 1e-1, xtol=1e-18)
+        drop = mu * 9e9 * flow / (1 - clogging)
+        return flow, drop, displacement * ((load + drop) * 1.05 + 1e5 * mu * speed)
+
+    def surplus(temperature: float) -> float:
+        flow, _, torque = at(temperature)
+        return torque * speed - load * flow - 250 * (temperature - 40)
+
+    temperature = brentq(surplus, 40, 120, xtol=1e-12)
+    flow, drop, torque = at(temperature)
+    return np.array([6e4 * flow, torque, temperature, 1e-5 * drop])
+
+
+def move(control: str, before: int, after: int) -> float:
+    """Probability that each factor stays or worsens by one level; the last level is kept."""
+    result = 1.0
+    for axis, levels in enumerate((WEAR, CLOGGING)):
+        a, b = levels.index(STATES[before][axis]), levels.index(STATES[after][axis])
+        up = WORSENING[control][axis] if a < len(levels) - 1 else 0.0
+        result *= {0: 1.0 - up, 1: up}.get(b - a, 0.0)
+    return result
+
+
+@pytest.fixture(scope="module", params=["asset", "library"])
+def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    folder = tmp_path_factory.mktemp("pump")
+    overrides = Overrides(library=sampled(folder) if request.param == "library" else None)
+    return read_run(new_run(small_pump(), folder / "run", overrides, report=False).folder)
+
+
+@pytest.fixture(scope="module")
+def shown(run: Any) -> list[Float]:
+    """What the equations say at each shift: states x draws x sensors."""
+    controls, draws = run["policy"]["control"].values, run["calibration"]["draw_value"].values
+    tables = {
+        index: np.array([[show(str(controls[index]), *state, e) for e in draws] for state in STATES])
+        for index in set(run["observed"]["control_index"].values.tolist())
+    }
+    return [tables[index] for index in run["observed"]["control_index"].values.tolist()]
+
+
+def test_filter_smoother_and_prediction_equal_enumeration(run, shown):
+    observed = run["observed"]["operation"].values
+    controls = [str(name) for name in run["policy"]["control"].values]
+    flown = [controls[index] for index in run["observed"]["control_index"].values]
+    steps = len(flown)
+    assert np.isnan(observed).sum() == 5  # one sensor once, and all of them once
+    assert len(set(flown)) > 1
+    likelihood = np.array(
+        [  # a lost sensor says nothing
+            np.nanprod(norm.pdf(seen, table, NOISE), axis=2).mean(axis=1)
+            for seen, table in zip(observed, shown, strict=True)
+        ]
+    )
+    start = STATES.index((0.0, 0.0))
+    filtered, smoothed, evidence = np.zeros((steps, 6)), np.zeros((steps, 6)), np.zeros(steps)
+    for path in itertools.product(range(len(STATES)), repeat=steps):
+        weight = float(path[0] == start)
+        for t, state in enumerate(path):
+            if t:
+                weight *= move(flown[t - 1], path[t - 1], state)
+            if weight == 0.0:
+                break
+            weight *= likelihood[t, state]
+            # A prefix is met once for each of its continuations; count it with the first of them.
+            if not any(path[t + 1 :]):
+                filtered[t, state] += weight
+                evidence[t] += weight
+        else:
+            smoothed[np.arange(steps), path] += weight
+    filtered /= filtered.sum(axis=1, keepdims=True)
+    smoothed /= smoothed.sum(axis=1, keepdims=True)
+    near = {"rtol": 1e-7, "atol": 1e-13}
+    np.testing.assert_allclose(run["filtered"]["probability"].values, filtered, **near)
+    np.testing.assert_allclose(run["smoothed"]["probability"].values, smoothed, **near)
+    ratios = np.log(evidence) - np.log(np.concatenate([[1.0], evidence[:-1]]))
+    np.testing.assert_allclose(run["filtered"]["log_evidence"].values, ratios, rtol=1e-8, atol=1e-9)
+
+    chosen = [controls[index] for index in run["policy"]["control_index"].values]
+    horizon = run["predicted"].sizes["horizon"]
+    predicted = np.zeros((horizon, len(STATES)))
+    for path in itertools.product(range(len(STATES)), repeat=horizon + 1):
+        weight = filtered[-1, path[0]]
+        for h in range(1, horizon + 1):
+            weight *= move(flown[-1] if h == 1 else chosen[path[h - 1]], path[h - 1], path[h])
+            if weight == 0.0:
+                break
+            if not any(path[h + 1 :]):
+                predicted[h - 1, path[h]] += weight
+    np.testing.assert_allclose(run["predicted"]["probability"].values[-1], predicted, **near)
+    asked = np.stack(
+        [predicted @ np.array([choice == name for choice in chosen]) for name in controls], axis=1
+    )
+    np.testing.assert_allclose(run["predicted"]["control_probability"].values[-1], asked, atol=1e-12)
+
+
+def test_rewards_are_those_of_the_sensors_that_have_a_limit(run, shown):
+    for t, values in enumerate(shown):
+        health = 1.0 - np.maximum(values[..., 2] / 50.0, values[..., 3] / 5.0)
+        seen, probability = run["observed"]["operation"].values[t], run["filtered"]["probability"].values[t]
+        reward = run["filtered"]["reward_mean"].values[t]
+        assert reward[0] == pytest.approx(probability @ health.mean(axis=1), rel=1e-8)
+        if np.isnan(seen).all():
+            assert np.isnan(reward[2])
+        else:
+            error = np.nanmean(-np.abs(seen - values) / NOISE, axis=2).mean(axis=1)
+            assert reward[2] == pytest.approx(probability @ error, rel=1e-7)

@@ -1,7 +1,5 @@
 """The wing FMU on the test bench against the reduced model on the same bench."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +35,7 @@ def fmu(wing: ReducedModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build_fmu(wing, tmp_path_factory.mktemp("bench") / "wing.fmu").path
 
 
-def test_the_fmu_is_measured_as_the_model_is(wing: ReducedModel, fmu: Path) -> None:
+def test_the_fmu_is_measured_as_the_model_is(wing, fmu):
     model = VirtualWing(wing, TRUTH)
     with FmuTestBench(fmu, TRUTH) as bench:
         ours, theirs = measure_load_test(model, 7), measure_load_test(bench, 7)
@@ -52,7 +50,7 @@ def test_the_fmu_is_measured_as_the_model_is(wing: ReducedModel, fmu: Path) -> N
             np.testing.assert_allclose(seen.signal, expected.signal, atol=1e-10 * scale)
 
 
-def test_bad_input(fmu: Path) -> None:
+def test_bad_input(fmu):
     heavy = DigitalState(servo_mass=2.0)
     with pytest.raises(FmuError, match="servo_mass"), FmuTestBench(fmu, heavy) as bench:
         bench.tip_displacement(1.0)

@@ -1,7 +1,5 @@
 """What a fleet teaches, against enumeration, closed forms and the truth."""
 
-from __future__ import annotations
-
 from itertools import product
 from pathlib import Path
 
@@ -52,7 +50,7 @@ def enumerated(scenario: Scenario, control: list[int], likelihood: np.ndarray) -
 @pytest.mark.parametrize(
     "probability", [{"2g": 0.07, "3g": 0.2}, {"2g": {"z1": 0.07, "z2": 0.3}, "3g": {"z1": 0.2, "z2": 0.01}}]
 )
-def test_evidence_of_a_twin_is_that_of_all_paths(probability: object) -> None:
+def test_evidence_of_a_twin_is_that_of_all_paths(probability):
     scenario = tiny(probability)
     worsening = Worsening.of(scenario)
     assert len(worsening.names) == (2 if "z1" not in str(probability) else 4)
@@ -74,7 +72,7 @@ def test_evidence_of_a_twin_is_that_of_all_paths(probability: object) -> None:
             assert found[twin, row] == pytest.approx(expected, abs=1e-12)
 
 
-def test_evidence_is_that_of_the_filter() -> None:
+def test_evidence_is_that_of_the_filter():
     scenario = tiny({"2g": 0.07, "3g": 0.2}, levels=5)
     model, worsening = build_graphical_model(scenario), Worsening.of(scenario)
     generator = np.random.default_rng(5)
@@ -99,7 +97,7 @@ def test_evidence_is_that_of_the_filter() -> None:
         np.testing.assert_allclose(nodes[:, node], expected, rtol=1e-12)
 
 
-def test_a_grid_has_the_moments_of_a_beta() -> None:
+def test_a_grid_has_the_moments_of_a_beta():
     from scipy.stats import beta
 
     counts = ((3, 50), (400, 3600))
@@ -120,7 +118,7 @@ def groups_of(counts: list[tuple[int, int]]) -> list[Grid]:
     return [refined(lambda p, a=a, b=b: a * np.log(p[:, 0]) + b * np.log1p(-p[:, 0]), 1) for a, b in counts]
 
 
-def test_groups_share_what_a_dense_sum_says() -> None:
+def test_groups_share_what_a_dense_sum_says():
     from scipy.stats import beta, betabinom
 
     counts = [(3, 47), (6, 44), (2, 48), (9, 41), (4, 46)]
@@ -146,7 +144,7 @@ def test_groups_share_what_a_dense_sum_says() -> None:
 
 
 @pytest.mark.parametrize("few", [(1, 249), (13, 237)])
-def test_a_group_that_is_known_well_stays_so_beside_one_of_few_twins(few: tuple[int, int]) -> None:
+def test_a_group_that_is_known_well_stays_so_beside_one_of_few_twins(few):
     many = (22_500, 427_500)
     large, _ = shared(groups_of([many, few])).groups
     p, n = many[0] / sum(many), sum(many)
@@ -156,7 +154,7 @@ def test_a_group_that_is_known_well_stays_so_beside_one_of_few_twins(few: tuple[
     assert (low, high) == pytest.approx((p - 1.96 * deviation, p + 1.96 * deviation), abs=0.1 * deviation)
 
 
-def test_groups_with_two_probabilities_are_those_of_one_where_they_do_not_meet() -> None:
+def test_groups_with_two_probabilities_are_those_of_one_where_they_do_not_meet():
     counts = [(3, 47), (6, 44), (12, 38)]
     single = shared(groups_of(counts))
     pairs = [
@@ -173,7 +171,7 @@ def test_groups_with_two_probabilities_are_those_of_one_where_they_do_not_meet()
         assert two[0].mean == pytest.approx(one[0].mean, rel=2e-2)
 
 
-def test_a_population_is_that_of_normal_members() -> None:
+def test_a_population_is_that_of_normal_members():
     generator = np.random.default_rng(8)
     nodes = np.linspace(0.94, 1.06, 61)
     own, blur = 1.01 + 0.01 * generator.standard_normal(400), 0.004
@@ -188,7 +186,7 @@ def test_a_population_is_that_of_normal_members() -> None:
 
 
 @pytest.mark.parametrize("members", [2, 5])
-def test_a_population_of_few_is_told_with_its_doubt(members: int) -> None:
+def test_a_population_of_few_is_told_with_its_doubt(members):
     """95 % intervals hold the truth, for spreads from nothing to more than expected."""
     generator = np.random.default_rng(members)
     nodes, blur, scale, fleets = np.linspace(0.94, 1.06, 31), 0.004, 0.01, 80
@@ -210,7 +208,7 @@ def grown(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple
     return fleet, fly_fleet(fleet, folder / "fleet").folder
 
 
-def test_a_fleet_learns_and_flies_what_it_has_learnt(grown: tuple[Fleet, Path], tmp_path: Path) -> None:
+def test_a_fleet_learns_and_flies_what_it_has_learnt(grown, tmp_path):
     fleet, folder = grown
     lessons = learn_fleet(folder)
     record = lessons_record(lessons)["groups"]["growing_damage"]
@@ -226,7 +224,7 @@ def test_a_fleet_learns_and_flies_what_it_has_learnt(grown: tuple[Fleet, Path], 
     assert found == pytest.approx(np.multiply(assumed, record["noise_factor"]["mean"]))
 
 
-def test_what_was_learnt_must_fit(grown: tuple[Fleet, Path], tmp_path: Path) -> None:
+def test_what_was_learnt_must_fit(grown, tmp_path):
     file = tmp_path / "learnt.toml"
     file.write_text('format = 1\n[transition]\nprobability = { "4g" = 0.1 }\n')
     with pytest.raises(MissionInputError, match="probabilities for 4g"):
@@ -239,7 +237,7 @@ def test_what_was_learnt_must_fit(grown: tuple[Fleet, Path], tmp_path: Path) -> 
         learn_fleet(tmp_path / "empty")
 
 
-def test_tables_are_not_learnt() -> None:
+def test_tables_are_not_learnt():
     table = tiny({"2g": 0.1, "3g": 0.1}).to_dict()
     rows = [[0.9, 0.1, 0.0], [0.0, 0.9, 0.1], [0.0, 0.0, 1.0]]
     tables = {control: {"z1": rows, "z2": rows} for control in ("2g", "3g")}
@@ -248,7 +246,7 @@ def test_tables_are_not_learnt() -> None:
         Worsening.of(parse_scenario(table, "tables"))
 
 
-def test_true_rates_may_differ_from_those_believed(tmp_path: Path) -> None:
+def test_true_rates_may_differ_from_those_believed(tmp_path):
     path = tmp_path / "fleet.toml"
     path.write_text(
         'format = 1\n[fleet]\nname = "slow"\n[[group]]\nname = "slow"\n'
@@ -264,7 +262,7 @@ def test_true_rates_may_differ_from_those_believed(tmp_path: Path) -> None:
         load_fleet(path)
 
 
-def test_the_report_names_who_needs_attention(grown: tuple[Fleet, Path]) -> None:
+def test_the_report_names_who_needs_attention(grown):
     fleet, folder = grown
     text = write_fleet_report(folder).read_text()
     (group,) = fleet_groups(folder).values()

@@ -1,13 +1,11 @@
 """Many real assets under watch: files that grow, topics of a broker, kills, and what is lost alone."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
 import shutil
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from functools import partial
 from http.client import HTTPConnection
@@ -18,10 +16,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from reporting.progress import SilentProgress
-from scenarios import scenario_files
+from tests.command_line import command
+from tests.twin_master.runs import journal, text_of, written
 from tests.twin_master.watch.watches import PASSWORD, Mosquitto, wait_until, write_csv
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, RunFolderExistsError
@@ -39,97 +37,98 @@ from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import kept_knowledge
 from twin_master.scenario.reading import load_scenario
-from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.opening import begin_watch
-from uav_twin.cli import app
 
 TURNS = 6
+Decision = Mapping[str, Any]
 
 
 @pytest.fixture
 def fleet_file(library_file: Path, tmp_path: Path) -> Path:
     """A fleet of three wings with a recording each; one line of one of them is garbage, one turn is late."""
-    library = f'kind = "strain_library"\nfile = "{library_file}"\n'
-    scenario = "notice = false\n" + scenario_files()["growing_damage"].read_text()
-    begin, end = scenario.index("[asset]"), scenario.index("[calibration]")
-    (tmp_path / "wing.toml").write_text(
-        scenario[:begin] + f'[asset]\n{library}\n[belief]\nkind = "asset"\n\n' + scenario[end:]
-    )
+    text = "notice = false\n" + text_of("growing_damage")
+    flown = text[text.index("[asset]") : text.index("[calibration]")]
+    library = f'[asset]\nkind = "strain_library"\nfile = "{library_file}"\n\n[belief]\nkind = "asset"\n\n'
+    written(tmp_path, text, (flown, library), name="wing.toml")
     (tmp_path / "logs").mkdir()
     noise = np.random.default_rng(3).normal(1e-3, 1e-4, (3, TURNS, 24))
     for number, rows in enumerate(noise):
-        path = write_csv(
-            tmp_path / "logs" / f"wing-{number}.csv", rows, np.ones(TURNS, dtype=int), number == 1
-        )
-        if number == 2:
-            lines = path.read_text().splitlines()
-            lines[3], lines[4] = lines[4], lines[3]
-            path.write_text("\n".join(lines) + "\n")
+        write_csv(log_of(tmp_path, number), rows, np.ones(TURNS, dtype=int), number == 1)
+    lines = log_of(tmp_path, 2).read_text().splitlines()
+    lines[3], lines[4] = lines[4], lines[3]
+    log_of(tmp_path, 2).write_text("\n".join(lines) + "\n")
     return fleet_of(tmp_path, "logs/*.csv")
 
 
-def fleet_of(folder: Path, observations: str) -> Path:
-    path = folder / "fleet.toml"
-    group = f'[[group]]\nname = "north"\nscenario = "wing.toml"\nobservations = "{observations}"\n'
-    path.write_text(f'format = 1\n[fleet]\nname = "real"\nseed = 7\n{group}')
-    return path
+def log_of(folder: Path, number: int) -> Path:
+    return folder / "logs" / f"wing-{number}.csv"
 
 
-def single(fleet_file: Path, log: Path, folder: Path) -> bytes:
-    """Return the journal of a watch of one asset alone."""
-    loaded = load_scenario(fleet_file.parent / "wing.toml")
-    watch, lock = begin_watch(loaded, folder, Overrides(seed=7), SilentProgress(), replace_run=False)
-    watch.run(file_feed(log, watch.scenario), lambda _decision: None)
-    os.close(lock)
-    return (folder / JOURNAL_NAME).read_bytes()
+def fleet_of(folder: Path, observations: str, *more: str) -> Path:
+    lines = [
+        'format = 1\nfleet = { name = "real", seed = 7 }\n[[group]]\nname = "north"\nscenario = "wing.toml"'
+    ]
+    return written(
+        folder, "\n".join([*lines, f'observations = "{observations}"', *more, ""]), name="fleet.toml"
+    )
+
+
+@pytest.fixture
+def alone(fleet_file: Path, tmp_path: Path) -> list[bytes]:
+    """The journals of watches of one asset alone."""
+    loaded, found = load_scenario(tmp_path / "wing.toml"), []
+    for number in range(3):
+        folder = tmp_path / "alone" / f"wing-{number}"
+        watch, lock = begin_watch(loaded, folder, Overrides(seed=7), SilentProgress(), replace_run=False)
+        watch.run(file_feed(log_of(tmp_path, number), watch.scenario), str)
+        os.close(lock)
+        found.append((folder / JOURNAL_NAME).read_bytes())
+    return found
 
 
 def journals(folder: Path) -> list[bytes]:
     return [path.read_bytes() for path in sorted((folder / "north").glob(f"*/{JOURNAL_NAME}"))]
 
 
-@pytest.fixture
-def alone(fleet_file: Path, tmp_path: Path) -> list[bytes]:
-    logs = sorted((tmp_path / "logs").glob("*.csv"))
-    return [single(fleet_file, log, tmp_path / "alone" / log.stem) for log in logs]
-
-
-def watched(fleet_file: Path, out: Path, stop_after: int | None = None, **given: Any) -> FleetWatch:
+def watched(fleet_file: Path, out: Path, stop_after: int | None = None) -> FleetWatch:
     """Return a fleet that was watched; where it is to stop, in the middle of it."""
     told: list[str] = []
 
-    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+    def tell(asset: WatchedAsset, _decision: Decision) -> None:
         told.append(asset.name)
         fleet.asked = len(told) == stop_after
 
-    fleet = FleetWatch(load_fleet(fleet_file), out, tell, told.append, **given)
+    fleet = FleetWatch(load_fleet(fleet_file), out, tell, told.append)
     fleet.run()
     return fleet
 
 
-def test_each_asset_has_the_journal_of_a_watch_alone(
-    fleet_file: Path, alone: list[bytes], tmp_path: Path
-) -> None:
+def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path):
     assert watched(fleet_file, tmp_path / "once").failures == {}
     assert journals(tmp_path / "once") == alone
+    again = tmp_path / "again"
     for stop in (2, 9, None):  # in the middle of assets; the last time to the end
-        watched(fleet_file, tmp_path / "again", stop)
-    assert journals(tmp_path / "again") == alone
-    state = json.loads((tmp_path / "again" / "watched.json").read_text())["assets"]
+        watched(fleet_file, again, stop)
+    assert journals(again) == alone
+    state = json.loads((again / "watched.json").read_text())["assets"]
     assert [state[f"north/wing-{number}"]["last"]["turn"] for number in range(3)] == [TURNS - 1] * 3
     with pytest.raises(RunFolderExistsError, match="another fleet"):
-        FleetWatch(load_fleet(fleet_file, seed=8), tmp_path / "again", print, print)
+        FleetWatch(load_fleet(fleet_file, seed=8), again, print, print)
+    done = command("fleet", "watch", fleet_file, "--out", tmp_path / "out", "--turns", 3)
+    assert done.returncode == 0, done.stderr
+    decisions = [json.loads(line) for line in done.stdout.splitlines()]
+    last = {decision["asset"]: decision["turn"] for decision in decisions}
+    assert last == {f"north/wing-{number}": 2 for number in range(3)}
+    assert "3 assets, 9 turns, 0 alarms" in done.stderr
 
 
-def test_files_that_grow(
-    fleet_file: Path, alone: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_grow(fleet_file, alone, tmp_path, monkeypatch):
     monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
     (tmp_path / "growing").mkdir()
     pieces = [(path.name, path.read_bytes()) for path in sorted((tmp_path / "logs").glob("*.csv"))]
-    cuts = [0.0, 0.02, 0.4, 0.77, 1.0]  # within the header, and within lines
+    cuts, looks = [0.0, 0.02, 0.4, 0.77, 1.0], list[int]()  # within the header, and within lines
 
     def grow() -> None:
         step = len(looks)
@@ -138,29 +137,28 @@ def test_files_that_grow(
             (tmp_path / "growing" / name).write_bytes(content[: int(cuts[min(step, 4)] * len(content))])
         fleet.asked = step == 8
 
-    looks: list[int] = []
-    fleet = FleetWatch(
-        load_fleet(fleet_of(tmp_path, "growing/*.csv")), tmp_path / "out", lambda *_: None, print, follow=True
-    )
+    growing = load_fleet(fleet_of(tmp_path, "growing/*.csv"))
+    fleet = FleetWatch(growing, tmp_path / "out", lambda *_: None, print, follow=True)
     fleet.run(grow)
     assert journals(tmp_path / "out") == alone
 
 
-def test_an_asset_is_lost_alone(fleet_file: Path, alone: list[bytes], tmp_path: Path) -> None:
-    (tmp_path / "logs" / "wing-0.csv").write_text("turn,colour\n0,red\n")
-    (tmp_path / "logs" / "not a name!.csv").write_text("turn\n")
-    (tmp_path / "logs" / "void.csv").write_text("")
-    fleet = watched(fleet_file, tmp_path / "out")
-    assert set(fleet.failures) == {"north/wing-0", "north/not a name!", "north/void"}
-    assert "colour" in fleet.failures["north/wing-0"]
-    assert "void.csv is empty" in fleet.failures["north/void"]
+def test_an_asset_is_lost_alone(fleet_file, alone, tmp_path):
+    for name, text in (("wing-0", "turn,colour\n0,red\n"), ("not a name!", "turn\n"), ("void", "")):
+        (tmp_path / "logs" / f"{name}.csv").write_text(text)
+    failures = watched(fleet_file, tmp_path / "out").failures
+    assert set(failures) == {"north/wing-0", "north/not a name!", "north/void"}
+    assert "colour" in failures["north/wing-0"]
+    assert "void.csv is empty" in failures["north/void"]
     assert journals(tmp_path / "out") == alone[1:]
+    none = fleet_of(tmp_path, "none/*.csv")
     with pytest.raises(FleetError, match="no recording fits"):
-        FleetWatch(load_fleet(fleet_of(tmp_path, "none/*.csv")), tmp_path / "none", print, print)
-    fleet_of(tmp_path, "logs/*.csv")
-    fleet_file.write_text(fleet_file.read_text().replace('observations = "logs/*.csv"', "count = 2"))
+        FleetWatch(load_fleet(none), tmp_path / "none", print, print)
+    flown = written(
+        tmp_path, none.read_text(), ('observations = "none/*.csv"', "count = 2"), name="fleet.toml"
+    )
     with pytest.raises(FleetError, match="north has none"):
-        FleetWatch(load_fleet(fleet_file), tmp_path / "flown", print, print)
+        FleetWatch(load_fleet(flown), tmp_path / "flown", print, print)
 
 
 @pytest.fixture
@@ -173,6 +171,11 @@ def broker(fleet_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     fleet_of(tmp_path, f"mqtt://wing@127.0.0.1:{broker.port}/wings/+")
     yield broker
     broker.stop()
+
+
+def publish(client: Any, name: str, turn: int, control: str = "2g", strain: Any = (1e-3,) * 24) -> None:
+    record = {"turn": turn, "control": control, "strain": [*strain]}
+    client.publish(f"wings/{name}", json.dumps(record), qos=1)
 
 
 def make_unwell(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
@@ -188,87 +191,75 @@ def make_unwell(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setattr(Watch, "decisions", once_unwell)
 
 
-def test_an_asset_that_was_lost_is_taken_up_again(
-    fleet_file: Path, alone: list[bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_asset_that_was_lost_is_taken_up_again(fleet_file, alone, tmp_path, monkeypatch):
     """One whose file was wrong, and one that met an error of ours; a log that is gone is awaited."""
     for name in ("SEARCH_SECONDS", "AGAIN_SECONDS"):
         monkeypatch.setattr(f"twin_master.fleet.watching.{name}", 0.0)
-    logs = [tmp_path / "logs" / f"wing-{number}.csv" for number in range(3)]
+    logs = [log_of(tmp_path, number) for number in range(3)]
     (tmp_path / "logs" / "wing-1.txt").write_text("turn,strain_1\n")  # another of that name
-    contents, at = [log.read_bytes() for log in logs], 0
+    contents, at, notes = [log.read_bytes() for log in logs], 0, list[str]()
     logs[1].write_text("turn,strian_1\n")
     make_unwell(monkeypatch, "wing-2")
 
-    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+    def tell(asset: WatchedAsset, decision: Decision) -> None:
         if asset.name == "north/wing-0" and decision["turn"] == 2 and "told_again" not in decision:
             logs[0].unlink()
 
     def mend() -> None:
         nonlocal at
         at += 1
-        if at == 3:
-            for log, content in zip(logs, contents, strict=True):
-                log.write_bytes(content)
+        for log, content in zip(logs, contents, strict=True) if at == 3 else ():
+            log.write_bytes(content)
         fleet.asked = at == 6
 
-    notes: list[str] = []
-    file = fleet_of(tmp_path, "logs/*")
-    fleet = FleetWatch(load_fleet(file), tmp_path / "out", tell, notes.append, follow=True)
+    fleet = FleetWatch(
+        load_fleet(fleet_of(tmp_path, "logs/*")), tmp_path / "out", tell, notes.append, follow=True
+    )
     fleet.run(mend)
     assert journals(tmp_path / "out") == alone
     assert fleet.failures == {"north/wing-1 of wing-1.txt": "another file has the same name."}
-    said = [note for note in notes if "is not watched" in note]
-    assert sum(note.startswith("north/wing-2 is not watched: ZeroDivisionError") for note in said) == 1
-    assert sum("strian_1" in note for note in said) == 1
+    lost = [note for note in notes if "is not watched" in note]
+    assert sum(note.startswith("north/wing-2 is not watched: ZeroDivisionError") for note in lost) == 1
+    assert sum("strian_1" in note for note in lost) == 1
     again = [note for note in notes if note.endswith("is watched again.")]
     assert sorted(again) == ["north/wing-1 is watched again.", "north/wing-2 is watched again."]
 
 
-def test_a_topic_for_each_asset(broker: Mosquitto, alone: list[bytes], tmp_path: Path) -> None:
-    heard: list[tuple[str, int]] = []
-    listener = broker.client("listener")
+def test_a_topic_for_each_asset(broker, alone, tmp_path):
+    heard, sent, told = list[tuple[str, int]](), list[int](), list[int]()
+    listener, publisher = broker.client("listener"), broker.client("publisher")
     listener.on_message = lambda _client, _data, message: heard.append(
         (message.topic, json.loads(message.payload)["turn"])
     )
     listener.subscribe("wings/+/decision", qos=1)
-    sent: list[int] = []
 
     def send() -> None:
         """Publish once the twin is connected: a kill in between, whose messages the broker keeps."""
         if notes and not sent:
             sent.append(1)
-            for number in range(2):
-                rows = (tmp_path / "logs" / f"wing-{2 * number}.csv").read_text().splitlines()[1:]
-                for row in rows:
+            for number in (0, 2):
+                for row in log_of(tmp_path, number).read_text().splitlines()[1:]:
                     turn, control, *cells = row.split(",")
-                    record = {"turn": int(turn), "control": control, "strain": [float(c) for c in cells]}
-                    publisher.publish(f"wings/wing-{2 * number}", json.dumps(record), qos=1)
+                    publish(publisher, f"wing-{number}", int(turn), control, map(float, cells))
 
-    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+    def tell(_asset: WatchedAsset, decision: Decision) -> None:
         told.append(decision["turn"])
         fleet.asked = len(told) in (4, 2 * TURNS + 1)
 
-    publisher = broker.client("publisher")
-    told: list[int] = []
     for _ in range(2):  # asked to end after four turns; one more decision for the late message
         notes: list[str] = []
         fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
         fleet.run(send)
-    kept = [[line[65:] for line in own.splitlines()[1:]] for own in journals(tmp_path / "out")]
-    for ours, theirs in zip(kept, (alone[0], alone[2]), strict=True):
-        wanted = [json.loads(line[65:]) for line in theirs.splitlines()[1:]]
-        found = [json.loads(line) for line in ours]
-        for records in (wanted, found):
-            for record in records:  # the broker sent again what the end left unacknowledged
-                del record["intake"]
-        assert found == wanted
+    for number in (0, 2):
+        name = f"wing-{number}"
+        ours, theirs = (journal(tmp_path / place / name) for place in ("out/north", "alone"))
+        for record in [*ours, *theirs]:  # the broker sent again what the end left unacknowledged
+            del record["intake"]
+        assert ours == theirs
     assert {topic for topic, _ in heard} == {"wings/wing-0/decision", "wings/wing-2/decision"}
 
 
-def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(
-    broker: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(broker, tmp_path, monkeypatch):
     monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
     make_unwell(monkeypatch, "wing-0")
     publisher, notes, told, sent = broker.client("publisher"), list[str](), list[int](), list[int]()
@@ -277,16 +268,15 @@ def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(
         if notes and not sent:
             sent.append(1)
             for turn in range(TURNS):
-                record = {"turn": turn, "control": "2g", "strain": [1e-3] * 24}
                 for name in ("late", "wing-0"):
-                    publisher.publish(f"wings/{name}", json.dumps(record), qos=1)
+                    publish(publisher, name, turn)
         boxes = fleet._sources[0]._inboxes  # type: ignore[union-attr]
         if [len(box.came) for box in boxes.values()] == [TURNS, TURNS - 3]:  # all that came meanwhile
             (north / "late").unlink(missing_ok=True)
             (north / "wing-0" / "published").write_text("")
             fleet._again = dict.fromkeys(fleet._again, 0.0)
 
-    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+    def tell(_asset: WatchedAsset, decision: Decision) -> None:
         told.append(decision["turn"])
         fleet.asked = len(told) == 2 * TURNS
 
@@ -305,25 +295,23 @@ def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(
     assert fleet.assets["north/wing-0"].keep.intake.counts.missing == 0
 
 
-def test_a_topic_that_jumps_ahead_and_is_left_alone(broker: Mosquitto, tmp_path: Path) -> None:
+def test_a_topic_that_jumps_ahead_and_is_left_alone(broker, tmp_path):
     publisher, notes, told = broker.client("publisher"), list[str](), list[tuple[str, int, int]]()
     last = 2 * TURNS_AT_ONCE  # a single message that brings more turns than a file is read at once
 
     def send() -> None:
         if notes:
             for turn in (0, *range(last, last + 20)):
-                record = {"turn": turn, "control": "2g", "strain": [1e-3] * 24}
-                publisher.publish("wings/wing-0", json.dumps(record), qos=1)
+                publish(publisher, "wing-0", turn)
             publisher.publish("wings/last", json.dumps({"turn": 0, "control": "2g"}), qos=1)
             notes.clear()
 
-    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+    def tell(asset: WatchedAsset, decision: Decision) -> None:
         told.append((asset.name, decision["turn"], decision["lost_sensors"]))
         fleet.asked = asset.name == "north/last"
 
-    fleet = FleetWatch(
-        load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append, turns=last + 1
-    )
+    planned = load_fleet(tmp_path / "fleet.toml")
+    fleet = FleetWatch(planned, tmp_path / "out", tell, notes.append, turns=last + 1)
     fleet.run(send)
     lost = [0, *[24] * (last - 1), 0]
     assert told == [*(("north/wing-0", turn, lost[turn]) for turn in range(last + 1)), ("north/last", 0, 24)]
@@ -331,78 +319,60 @@ def test_a_topic_that_jumps_ahead_and_is_left_alone(broker: Mosquitto, tmp_path:
     assert [len(inbox.came) for inbox in inboxes.values() if inbox] == [0, 0]  # nineteen came too late
 
 
-def test_an_asset_that_falls_silent_while_another_is_heard(
-    broker: Mosquitto, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, monkeypatch):
     """Also one that was watched before; and what was decided of it and never published is."""
     monkeypatch.setattr("twin_master.fleet.watching.SEARCH_SECONDS", 0.0)
     monkeypatch.setattr("twin_master.watch.mqtt.HEARTBEAT_SECONDS", 0.0)
     with (tmp_path / "wing.toml").open("a") as file:
         file.write("\n[watch]\nquiet_after_seconds = 0.5\n")
-    heard = list[dict[str, Any]]()
-    client, notes, told = broker.client("client", heard), list[str](), list[tuple[str, int, list[str]]]()
+    heard, notes, told = list[dict[str, Any]](), list[str](), list[tuple[str, int, list[str]]]()
+    client, turns = broker.client("client", heard), iter(range(1000))
     client.subscribe([("wings/+/decision", 1), ("wings/fleet/heartbeat", 1)])
-    turns = iter(range(1000))
 
     def send() -> None:
-        record = {"turn": next(turns), "control": "2g", "strain": [1e-3] * 24}
-        for name in ("one", "two") if record["turn"] == 0 else ("one",):
-            client.publish(f"wings/{name}", json.dumps(record), qos=1)
+        turn = next(turns)
+        for name in ("one", "two") if turn == 0 else ("one",):
+            publish(client, name, turn)
 
-    def tell(asset: WatchedAsset, decision: Mapping[str, Any]) -> None:
+    def tell(asset: WatchedAsset, decision: Decision) -> None:
         told.append((asset.name, decision["turn"], [notice["kind"] for notice in decision["notices"]]))
         fleet.asked = told[-1] == ("north/two", 0, ["quiet"])
+
+    def end() -> None:
+        again.asked = [one["notices"] for one in heard if one.get("turn") == 0][-1:] != [[]]
+
+    def states() -> list[str]:
+        return [one["state"] for one in heard if "state" in one]
 
     fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
     fleet.run(lambda: send() if notes else None)
     assert fleet.asked
     assert fleet.failures == {}
-    published = tmp_path / "out" / "north" / "two" / "published"
-    published.write_text("?")  # as if a kill had come before the broker had it
+    # As if a kill had come before the broker had it.
+    (tmp_path / "out" / "north" / "two" / "published").write_text("?")
     client.publish("wings/one", "no observation", qos=1).wait_for_publish(20)
     again = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", lambda *_: None, notes.append)
-
-    def end() -> None:
-        again.asked = [one["notices"] for one in heard if one.get("turn") == 0][-1:] != [[]]
-
     again.run(end)
-    wait_until(lambda: [one["state"] for one in heard if "state" in one][-1] == "ended")
+    wait_until(lambda: states()[-1] == "ended")
     client.disconnect()
-    assert [said for said in told if said[0] == "north/two"] == [
-        ("north/two", 0, []), ("north/two", 0, ["quiet"]),
-    ]  # fmt: skip
+    silent = [said for said in told if said[0] == "north/two"]
+    assert silent == [("north/two", 0, []), ("north/two", 0, ["quiet"])]
     assert all(kinds == [] for name, _, kinds in told if name == "north/one")
-    assert [one["state"] for one in heard if "state" in one][-1] == "ended"
+    assert states()[-1] == "ended"
     assert max(one["quiet"] for one in heard if "quiet" in one) == 1
 
 
-def test_the_command(fleet_file: Path, tmp_path: Path) -> None:
-    words = ["fleet", "watch", str(fleet_file), "--out", str(tmp_path / "out"), "--turns", "3"]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 0, result.output
-    decisions = [json.loads(line) for line in result.stdout.splitlines()]
-    last = {decision["asset"]: decision["turn"] for decision in decisions}
-    assert last == {f"north/wing-{number}": 2 for number in range(3)}
-    assert "3 assets, 9 turns, 0 alarms" in result.stderr
-
-
-def test_recordings_are_flown_as_a_fleet(fleet_file: Path, alone: list[bytes], tmp_path: Path) -> None:
-    (tmp_path / "logs" / "wing-0.csv").write_text(
-        "".join((tmp_path / "logs" / "wing-0.csv").read_text().splitlines(keepends=True)[:4])
-    )
-    with fleet_file.open("a") as file:
-        file.write(f"steps = {TURNS}\n")
-    outcome = fly_fleet(load_fleet(fleet_file), tmp_path / "flown", Engine(0))
+def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
+    short = log_of(tmp_path, 0)
+    short.write_text("".join(short.read_text().splitlines(keepends=True)[:4]))
+    planned = load_fleet(fleet_of(tmp_path, "logs/*.csv", f"steps = {TURNS}"))
+    outcome = fly_fleet(planned, tmp_path / "flown", Engine(0))
     group = fleet_groups(outcome.folder)["north"]
-    for row, (journal, turns) in enumerate(zip(alone, (3, TURNS, TURNS), strict=True)):
-        last: dict[int, dict[str, Any]] = {}
-        for line in journal.splitlines()[1:]:
-            record = json.loads(line[65:])
-            last[record["turn"]] = record
+    for row, turns in enumerate((3, TURNS, TURNS)):
+        last = {record["turn"]: record for record in journal(tmp_path / "alone" / f"wing-{row}")}
         assert group["control_index"].values[row].tolist() == [1] * turns + [-1] * (TURNS - turns)
         assert np.isnan(group["log_evidence"].values[row, turns:]).all()
-        wanted = np.array(last[turns - 1]["filtered"], np.float32)
-        assert np.array_equal(group["belief"].values[row], wanted)
+        assert np.array_equal(group["belief"].values[row], np.array(last[turns - 1]["filtered"], np.float32))
         for turn in range(turns):
             evidence = group["log_evidence"].values[row, turn]
             late = row == 2 and turn in (2, 3)  # written down before the late message came
@@ -416,19 +386,17 @@ def test_recordings_are_flown_as_a_fleet(fleet_file: Path, alone: list[bytes], t
     assert probability["2g"] == 0.05  # as it was assumed
     assert probability["3g"] != 0.10
     write_fleet_report(outcome.folder)
-    with fleet_file.open("a") as file:
-        file.write('[[group]]\nname = "south"\nscenario = "wing.toml"\nobservations = "none/*.csv"\n')
+    south = '[[group]]\nname = "south"\nscenario = "wing.toml"\nobservations = "none/*.csv"'
     with pytest.raises(FleetError, match="no recording fits"):
-        fly_fleet(load_fleet(fleet_file), tmp_path / "other", Engine(0))
+        fly_fleet(load_fleet(fleet_of(tmp_path, "logs/*.csv", south)), tmp_path / "other", Engine(0))
 
 
-def test_recordings_teach_what_the_flights_taught(fleet_file: Path, tmp_path: Path) -> None:
-    flown = ensemble(str(tmp_path / "wing.toml"), range(4))
-    fly_fleet(flown, tmp_path / "flown", Engine(0))
+def test_recordings_teach_what_the_flights_taught(fleet_file, tmp_path):
+    fly_fleet(ensemble(str(tmp_path / "wing.toml"), range(4)), tmp_path / "flown", Engine(0))
     group = fleet_groups(tmp_path / "flown")["growing_damage"]
     for row in range(4):
         observed = group["observed"].values[row].astype(np.float64)
-        write_csv(tmp_path / "logs" / f"wing-{row}.csv", observed, group["control_index"].values[row])
+        write_csv(log_of(tmp_path, row), observed, group["control_index"].values[row])
     fly_fleet(load_fleet(fleet_file), tmp_path / "recorded", Engine(0))
     again = fleet_groups(tmp_path / "recorded")["north"]
     assert np.array_equal(again["observed"].values, group["observed"].values)
@@ -437,32 +405,28 @@ def test_recordings_teach_what_the_flights_taught(fleet_file: Path, tmp_path: Pa
     assert [m.mean for m in first] == [m.mean for m in second]
 
 
-def ensemble_scenario(folder: Path) -> Scenario:
-    return ensemble(str(folder / "wing.toml"), range(60)).groups[0].scenarios[0]
-
-
-def test_the_store_counts_the_notices_that_watches_gave(fleet_file: Path, tmp_path: Path) -> None:
+def test_the_store_counts_the_notices_that_watches_gave(fleet_file, tmp_path):
     """And a watched asset says how probably it leaves its control, as the store does."""
-    wing, log = tmp_path / "wing.toml", tmp_path / "logs" / "wing-1.csv"
+    wing, log = tmp_path / "wing.toml", log_of(tmp_path, 1)
     wing.write_text(wing.read_text().removeprefix("notice = false\n"))
     header, *rows = log.read_text().splitlines()
     rows[2] = ",".join([*rows[2].split(",")[:-1], "OL"])
     log.write_text("\n".join([header, *rows]) + "\n")
-    with fleet_file.open("a") as file:
-        file.write(f"steps = {TURNS}\n")
+    fleet_of(tmp_path, "logs/*.csv", f"steps = {TURNS}")
     fleet = watched(fleet_file, tmp_path / "out")
     fly_fleet(load_fleet(fleet_file), tmp_path / "flown", Engine(0))
-    group = fleet_groups(tmp_path / "flown")["north"]
-    alarmed = 0
-    for row in range(3):
-        told = [n for n in fleet.assets[f"north/wing-{row}"].watch.told(0) if n[1].kind != "gauge_back"]
+    group, alarmed = fleet_groups(tmp_path / "flown")["north"], 0
+    assets = [fleet.assets[f"north/wing-{row}"] for row in range(3)]
+    for row, asset in enumerate(assets):
+        told = [n for n in asset.watch.told(0) if n[1].kind != "gauge_back"]
         for place, kind in enumerate(("alarm", "gauge_left_out")):
             turns = [turn for turn, notice in told if notice.kind == kind]
             if row != 2:  # whose late message tells of turns before it
                 assert group["notices"].values[row, place] == len(turns)
                 assert group["first_notice"].values[row, place] == min(turns, default=-1)
-        alarmed += any(notice.kind == "alarm" for _, notice in told)
-        assert fleet.assets[f"north/wing-{row}"].record().alarms == sum(n.kind == "alarm" for _, n in told)
+        alarms = sum(notice.kind == "alarm" for _, notice in told)
+        assert asset.record().alarms == alarms
+        alarmed += alarms > 0
     assert group["notices"].values[1, 1] >= 1
     assert alarmed >= 1
     assert group_figures(group)["raised an alarm"] == alarmed
@@ -471,21 +435,18 @@ def test_the_store_counts_the_notices_that_watches_gave(fleet_file: Path, tmp_pa
     config = json.loads((tmp_path / "flown" / "config.json").read_text())
     soon = leaving(tmp_path / "flown", config["fleet"]["groups"][0], group)
     state = json.loads((tmp_path / "out" / "watched.json").read_text())["assets"]
-    found = [state[f"north/wing-{row}"]["leaving"] for row in range(3)]
+    found = [state[asset.name]["leaving"] for asset in assets]
     np.testing.assert_allclose(found, soon, atol=1e-6)
     again = watched(fleet_file, tmp_path / "out")  # of which nothing is left to read
-    assert [again.assets[f"north/wing-{row}"].record().leaving for row in range(3)] == pytest.approx(found)
+    assert [again.assets[asset.name].record().leaving for asset in assets] == pytest.approx(found)
 
 
-def test_the_page_of_a_fleet(fleet_file: Path, tmp_path: Path) -> None:
-    (tmp_path / "logs" / "wing-0.csv").write_text("turn,colour\n0,red\n")
-    (tmp_path / "logs" / "wing-9.csv").write_text("turn,control\n")
-    out = tmp_path / "out"
-    watched(fleet_file, out)
-    fly_fleet(ensemble(str(tmp_path / "wing.toml"), range(60)), tmp_path / "flown", Engine(0))
-    flown = fleet_view(tmp_path / "flown")
+def test_who_needs_attention_next_comes_first(fleet_file, tmp_path):
+    flown = ensemble(str(tmp_path / "wing.toml"), range(60))
+    fly_fleet(flown, tmp_path / "flown", Engine(0))
     group = fleet_groups(tmp_path / "flown")["growing_damage"]
-    knowledge = kept_knowledge(tmp_path / "flown" / "groups" / "growing_damage", ensemble_scenario(tmp_path))
+    kept = tmp_path / "flown" / "groups" / "growing_damage"
+    knowledge = kept_knowledge(kept, flown.groups[0].scenarios[0])
     belief, control = group["belief"].values.astype(float), group["control_index"].values[:, -1]
     soon = [attention(knowledge, own[None], int(u))[0] for own, u in zip(belief, control, strict=True)]
     # Who leaves with the same percentage comes by its state.
@@ -493,48 +454,60 @@ def test_the_page_of_a_fleet(fleet_file: Path, tmp_path: Path) -> None:
     worst = np.lexsort((-group["mean"].values[:, -1].sum(axis=1), -printed))
     assert max(soon) > min(soon) + 0.1
     assert len(set(printed)) < len(set(soon))
-    table = flown.partition("Who needs attention next")[2]
+    table = fleet_view(tmp_path / "flown").partition("Who needs attention next")[2]
     assert re.findall(r"seed-\d+", table) == [f"seed-{row}" for row in worst[:50]]
     with pytest.raises(FleetError, match="holds no fleet"):
         fleet_view(tmp_path)
+
+
+@pytest.fixture
+def served(fleet_file: Path, tmp_path: Path) -> Iterator[Callable[..., tuple[int, str]]]:
+    """What asks for a page of a watched fleet, of which an asset is lost and another silent."""
+    log_of(tmp_path, 0).write_text("turn,colour\n0,red\n")
+    log_of(tmp_path, 9).write_text("turn,control\n")
+    watched(fleet_file, tmp_path / "out")
     address, ended = Queue[str](), Event()
-    serving = Thread(target=serve_fleet, args=(out, 0, address.put, lambda: not ended.is_set()))
+    given = (tmp_path / "out", 0, address.put, lambda: not ended.is_set())
+    serving = Thread(target=serve_fleet, args=given)
     serving.start()
-    try:
-        port = int(address.get(timeout=20).rstrip("/").rpartition(":")[2])
+    port = int(address.get(timeout=20).rstrip("/").rpartition(":")[2])
 
-        def asked(path: str, host: str = "localhost") -> tuple[int, str]:
-            connection = HTTPConnection("127.0.0.1", port, timeout=20)
-            connection.request("GET", path, headers={"Host": host})
-            with closing(connection), connection.getresponse() as answer:
-                return answer.status, answer.read().decode()
+    def asked(path: str, host: str = "localhost") -> tuple[int, str]:
+        connection = HTTPConnection("127.0.0.1", port, timeout=20)
+        connection.request("GET", path, headers={"Host": host})
+        with closing(connection), connection.getresponse() as answer:
+            return answer.status, answer.read().decode()
 
-        status, page = asked("/")
-        assert status == 200
-        assert "wing-1" in page
-        assert "colour" in page  # why the other one is not watched
-        assert "1 of 4 assets are not watched" in page
-        assert "Without a turn yet: 1 asset (north/wing-9)" in page
-        assert "<strong>1</strong><span>messages refused" in page
-        assert asked("/version") == (200, "0")
-        assert asked("/", "evil.example")[0] == 404
-        state = json.loads((out / "watched.json").read_text())
-        state["assets"]["north/wing-1"]["alarms"] = 1234
-        (out / "watched.json").write_text(json.dumps(state))
-        for _ in range(100):
-            if asked("/version") == (200, "1"):
-                break
-            ended.wait(0.05)
-        assert "1234" in asked("/")[1]
-        last = state["assets"]["north/wing-1"]["last"]
-        for change, sentence in (
-            (last["health"].popitem, "watched.json: the health of an asset of north"),
-            (partial(last.pop, "health"), "watched.json: 'assets.last.health' is missing"),
-        ):
-            change()
-            (out / "watched.json").write_text(json.dumps(state))
-            with pytest.raises(FleetError, match=sentence):
-                fleet_view(out)
-    finally:
-        ended.set()
-        serving.join()
+    yield asked
+    ended.set()
+    serving.join()
+
+
+def test_the_page_of_a_fleet(served, tmp_path):
+    status, page = served("/")
+    assert status == 200
+    for words in (
+        "wing-1",
+        "colour",  # why the other one is not watched
+        "1 of 4 assets are not watched",
+        "Without a turn yet: 1 asset (north/wing-9)",
+        "<strong>1</strong><span>messages refused",
+    ):
+        assert words in page
+    assert served("/version") == (200, "0")
+    assert served("/", "evil.example")[0] == 404
+    file = tmp_path / "out" / "watched.json"
+    state = json.loads(file.read_text())
+    asset = state["assets"]["north/wing-1"]
+    asset["alarms"] = 1234
+    file.write_text(json.dumps(state))
+    wait_until(lambda: served("/version") == (200, "1"))
+    assert "1234" in served("/")[1]
+    for change, sentence in (
+        (asset["last"]["health"].popitem, "watched.json: the health of an asset of north"),
+        (partial(asset["last"].pop, "health"), "watched.json: 'assets.last.health' is missing"),
+    ):
+        change()
+        file.write_text(json.dumps(state))
+        with pytest.raises(FleetError, match=sentence):
+            fleet_view(tmp_path / "out")

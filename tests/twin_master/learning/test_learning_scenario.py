@@ -1,17 +1,27 @@
-"""`[learning]` in a scenario: what is read and refused, and the shipped wing that was never calibrated."""
+"""`[learning]` and `[notice]` in a scenario: what is read and refused, and what a run leaves of notices."""
 
+import json
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from scenarios import scenario_files
+from tests.command_line import said
+from tests.twin_master.runs import check_same, figures_of, journal, text_of, written
 from twin_master.errors import TwinMasterError
+from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import Knowledge, prepare_twin
 from twin_master.network.estimator import ExactFilter
 from twin_master.network.twin import build_graphical_model
-from twin_master.scenario.reading import load_scenario
+from twin_master.report.page import render_page
+from twin_master.report.reading import open_run, read_run
+from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.scenario.tables import Noticing
+from twin_master.workflow import resume as resume_run
 
-TEXT = scenario_files()["level_turns_learning"].read_text()
+TEXT = text_of("level_turns_learning")
 
 
 @pytest.fixture(scope="module")
@@ -19,12 +29,10 @@ def knowledge() -> Knowledge:
     return prepare_twin("level_turns_learning")
 
 
-def test_a_twin_learns_a_soft_wing_and_the_noise_of_its_gauges(knowledge: Knowledge) -> None:
-    from numpy.random import default_rng
-
+def test_a_twin_learns_a_soft_wing_and_the_noise_of_its_gauges(knowledge):
     soft = int(knowledge.draws.values.argmin())
     shown = knowledge.sensor_model.value_per_draw[soft, 0, 1]
-    random, twin = default_rng(0), knowledge.twin()
+    random, twin = np.random.default_rng(0), knowledge.twin()
     for _ in range(30):
         turn = twin.turn(shown + 150e-6 * random.normal(size=24), "3g")
     e = turn.learnt["young_modulus_factor"]
@@ -35,13 +43,13 @@ def test_a_twin_learns_a_soft_wing_and_the_noise_of_its_gauges(knowledge: Knowle
     assert sum(scale.lower < 1.2 < scale.upper for scale in scales) >= 18
 
 
-def test_without_the_table_the_filter_is_the_exact_one() -> None:
+def test_without_the_table_the_filter_is_the_exact_one():
     loaded = load_scenario("level_turns")
     assert "learning" not in loaded.scenario.to_dict()
     assert isinstance(prepare_twin("paper_level_turns").twin().estimator, ExactFilter)
 
 
-def test_a_factor_on_the_transitions_multiplies_the_probability_to_leave() -> None:
+def test_a_factor_on_the_transitions_multiplies_the_probability_to_leave():
     scenario = load_scenario("level_turns").scenario
     once, thrice = (build_graphical_model(scenario, factor).transition.matrix for factor in (1.0, 3.0))
     assert thrice[1, 0, 1] == pytest.approx(0.3 * 0.7)
@@ -49,26 +57,148 @@ def test_a_factor_on_the_transitions_multiplies_the_probability_to_leave() -> No
     assert thrice.sum(axis=-1) == pytest.approx(1.0)
 
 
+NOISE, NOTICE = "noise_degrees = 10 ", "threshold = 100 "
+
+
 @pytest.mark.parametrize(
-    ("line", "sentence"),
+    ("old", "new", "sentence"),
     [
-        ("transition_factors = [1.0]", "two or more factors"),
-        ("transition_factors = [2.0, 1.0]", "must increase"),
-        ("gauge_gain_percent = [1.0, 2.0]", "one for each of the 24 sensors"),
-        ("noise_degrees = 2.0", "greater than 2"),
-        ("colour = true", "colour"),
+        (NOISE, "transition_factors = [1.0]", "two or more factors"),
+        (NOISE, "transition_factors = [2.0, 1.0]", "must increase"),
+        (NOISE, "gauge_gain_percent = [1.0, 2.0]", "one for each of the 24 sensors"),
+        (NOISE, "noise_degrees = 2.0", "greater than 2"),
+        (NOISE, "colour = true", "colour"),
+        (NOTICE, "threshold = 1.0", "greater than 1"),
+        (NOTICE, "gauge_gain_percent = 60", "less than or equal to 0.4"),
+        (NOTICE, "absurd_deviations = 1", "greater than or equal to 3"),
+        (NOTICE, "prior = 0.5", "less than 0.5"),
+        (NOTICE, "colour = true", "colour"),
     ],
 )
-def test_what_cannot_be_learnt_is_refused_in_a_sentence(tmp_path: Path, line: str, sentence: str) -> None:
-    file = tmp_path / "mine.toml"
-    file.write_text(TEXT.replace("noise_degrees = 10 ", line + " "))
+def test_what_cannot_be_learnt_or_noticed_is_refused_in_a_sentence(tmp_path, old, new, sentence):
     with pytest.raises(TwinMasterError, match=sentence):
-        load_scenario(file)
+        load_scenario(written(tmp_path, TEXT, (old, f"{new} ")))
 
 
-def test_more_transitions_than_there_can_be_are_refused(tmp_path: Path) -> None:
-    file = tmp_path / "mine.toml"
-    file.write_text(TEXT.replace("noise_degrees = 10 ", "transition_factors = [1.0, 11.0] "))
+def test_more_transitions_than_there_can_be_are_refused(tmp_path):
+    file = written(tmp_path, TEXT, (NOISE, "transition_factors = [1.0, 11.0] "))
     knowledge = prepare_twin(load_scenario(file))
     with pytest.raises(TwinMasterError, match=r"smaller `learning.transition_factors`"):
         knowledge.twin()
+
+
+FAULTS = """
+[[truth.sensor_faults]]
+kind = "drift"
+sensors = [5]
+first_step = 0
+rate_microstrain_per_step = 100
+
+[[truth.sensor_faults]]
+kind = "drift"
+sensors = [12]
+first_step = 3
+rate_microstrain_per_step = 1e14
+
+# What the figures"""
+
+
+def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
+    assert dict(Noticing()) == vars(Noticing())
+    for name in scenario_files():
+        loaded = load_scenario(name)
+        # what two measure is the filter alone, and inspections stand beside what notices watch
+        off = name in ("paper_level_turns", "model_mismatch", "inspected_wing")
+        assert loaded.scenario.notice == (None if off else Noticing()), name
+        assert not loaded.remark
+        written = loaded.scenario.to_dict()
+        assert ("notice" in written) is not off
+        assert parse_scenario(written, name).notice == loaded.scenario.notice  # as a run folder says it
+    text = scenario_files()["level_turns"].read_text()
+    file = tmp_path / "mine.toml"
+    for old, new, remark in (
+        ("[transition]", 'average_over_draws = "inside"\n[transition]', "each sensor has a parameter of"),
+        ("[0, 20, 40, 60, 80]\nprior = [1, 0, 0, 0, 0]", f"{[*range(90)]}\nprior = {[1] + [0] * 89}",
+         "they take 11,664,000 numbers a turn, more than 1,000,000"),
+    ):  # fmt: skip
+        file.write_text(text.replace(old, new))
+        assert load_scenario(file).scenario.notice is None
+        assert remark in load_scenario(file).remark
+        file.write_text(text.replace(old, new).replace("format = 2", "format = 2\nnotice = false"))
+        assert not load_scenario(file).remark
+
+
+def test_sensors_with_parameters_of_their_own_are_refused(tmp_path):
+    learning = TEXT[TEXT.index("[learning]") : TEXT.index("[notice]")]
+    inside = ("[transition]", 'average_over_draws = "inside"\n[transition]')
+    file = written(tmp_path, TEXT, (learning, ""), inside)
+    with pytest.raises(TwinMasterError, match=r"`notice` needs `observation.average_over_draws` `outside`"):
+        load_scenario(file)
+
+
+@pytest.fixture(scope="module")
+def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    changes = ("# What the figures", FAULTS), ("steps = 50", "steps = 9"), ("draws = 60", "draws = 8")
+    levels = ("count = 24\n", "count = 24\nbetween_levels = false\n")
+    return written(tmp_path_factory.mktemp("notice"), TEXT, *changes, levels)
+
+
+@pytest.fixture(scope="module")
+def folder(scenario: Path) -> Path:
+    run = scenario.parent / "run"
+    (scenario.parent / "said.txt").write_text(said("run", scenario, "--out", run, "--no-report"))
+    return run
+
+
+def test_the_search_for_causes_is_named_for_a_wing_alone():
+    for name, searched in (("watched_wing", True), ("three_regions", False), ("pump_wear", False)):
+        assert load_scenario(name).scenario.searchable is searched
+
+
+def test_the_console_names_turn_gauge_and_the_command(folder):
+    text = (folder.parent / "said.txt").read_text()
+    alarm = next(line for line in text.splitlines() if line.startswith("Turn ") and "gauge 5" in line)
+    assert f"to find the cause: uav-twin discrepancy run --from-run {folder}" in alarm
+    assert "Turn 3: gauge 12 shows 1e+14 microstrain, and no state can show less than" in text
+
+
+def test_journal_store_and_summary_agree(folder):
+    notices = json.loads((folder / "summary.json").read_text())["notices"]
+    assert {n["kind"] for n in notices} == {"gauge_left_out", "alarm", "hypothesis"}
+    assert {(n["kind"], *n["sensors"]) for n in notices} >= {("gauge_left_out", 12), ("alarm", 5)}
+    lines = journal(folder)
+    assert [{"turn": line["turn"]} | n for line in lines for n in line.get("notices", ())] == notices
+    kept = open_run(folder)["notice"].to_dataset()
+    for name, values in kept.data_vars.items():
+        assert [line["suspicion"][name] for line in lines] == values.values.tolist()
+    np.testing.assert_array_equal(kept["left_out"].sel(sensor=12), [0, 0, 0, 1, 1, 1, 1, 1, 1])
+    alarm = next(n["turn"] for n in notices if n["kind"] == "alarm")
+    figures = figures_of(folder)
+    assert figures["alarm_step"] == alarm
+    assert figures["gauge_off"] == kept["gauge_off"].values[-1]
+    decided = [line["suspicion"]["decided_by"] for line in lines]
+    assert figures["decided_by"] == decided[-1]
+    assert decided[0] == "model"
+    assert "gauge 5 off" in decided
+    told = lines[-1]["suspicion"]["hypotheses"]
+    assert told["none of these"] == pytest.approx(kept["none_of_these"].values[-1], rel=1e-12)
+    assert sum(told.values()) == pytest.approx(1.0, abs=0.03)
+
+
+def test_the_report_has_the_alarm(folder):
+    text = render_page(read_run(folder), {}, {})
+    assert "gauge 5 shows too much" in text
+    decided = read_run(folder).summary["figures"][-1]
+    assert decided["key"] == "decided_by"
+    assert f"what decides its control is: {decided['value']}" in text
+    assert "gauge 12 shows 1e+14 microstrain" in text
+
+
+def test_a_run_that_was_cut_off_ends_the_same(folder):
+    cut = Path(shutil.copytree(folder, folder.parent / "cut"))
+    lines = (cut / JOURNAL_NAME).read_text().splitlines(keepends=True)
+    (cut / JOURNAL_NAME).write_text("".join(lines[:6]))
+    for name in ("run.nc", "summary.json"):
+        (cut / name).unlink()
+    resume_run(cut, report=False)
+    check_same(cut, folder, "run.nc", "summary.json")

@@ -10,10 +10,9 @@ import pytest
 import xarray as xr
 from scipy.special import gammaln
 from scipy.stats import invgamma
-from typer.testing import CliRunner
 
-from scenarios import scenario_files
-from twin_master.mission.journal import JOURNAL_NAME
+from tests.command_line import said
+from tests.twin_master.runs import journal, text_of, written
 from twin_master.mission.preparation import prepare_twin
 from twin_master.mission.turns import History, Reading, Turn
 from twin_master.report.learnt import asset_rows, learnt_figure, sensor_rows
@@ -22,7 +21,6 @@ from twin_master.report.reading import open_run, read_run
 from twin_master.scenario.reading import load_scenario
 from twin_master.viewer.flight import Flight
 from twin_master.watch.replay import gap_of
-from uav_twin.cli import app
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 TURNS = 9
@@ -30,22 +28,19 @@ TURNS = 9
 
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    file = tmp_path_factory.mktemp("learnt") / "mine.toml"
-    text = scenario_files()["level_turns_learning"].read_text().replace("steps = 50", f"steps = {TURNS}")
     offsets = [50.0] * 23 + [0.0]
     learnt = f"gauge_gain_percent = 2\ngauge_offset_microstrain = {offsets}\n"
     learnt += "transition_factors = [0.5, 1, 2]\n"
-    text = text.replace("count = 24\n", "count = 24\nbetween_levels = false\n")
-    file.write_text(text.replace("draws = 60", "draws = 8").replace("[learning]\n", "[learning]\n" + learnt))
-    return file
+    changes = ("steps = 50", f"steps = {TURNS}"), ("draws = 60", "draws = 8")
+    levels = ("count = 24\n", "count = 24\nbetween_levels = false\n")
+    text = text_of("level_turns_learning", *changes, levels, ("[learning]\n", "[learning]\n" + learnt))
+    return written(tmp_path_factory.mktemp("learnt"), text)
 
 
 @pytest.fixture(scope="module")
 def folder(scenario: Path) -> Path:
     run = scenario.parent / "run"
-    result = CliRunner().invoke(app, ["run", str(scenario), "--out", str(run), "--no-report", "--json"])
-    assert result.exit_code == 0, result.output
-    (scenario.parent / "said.json").write_text(result.stdout)
+    (scenario.parent / "said.json").write_text(said("run", scenario, "--out", run, "--no-report", "--json"))
     return run
 
 
@@ -71,14 +66,14 @@ def value_of(learnt: xr.Dataset, name: str, moment: str) -> np.ndarray[Any, Any]
     return (values.sel(sensor=int(sensor)) if sensor else values).values
 
 
-def test_the_store_holds_what_the_twin_said_in_every_turn(folder: Path, learnt: xr.Dataset) -> None:
-    lines = [json.loads(line[65:])["learnt"] for line in (folder / JOURNAL_NAME).read_text().splitlines()[1:]]
+def test_the_store_holds_what_the_twin_said_in_every_turn(folder, learnt):
+    lines = [line["learnt"] for line in journal(folder)]
     assert len(lines) == TURNS
     assert len(lines[0]) == 1 + 1 + 24 + 24 + 23  # parameter, transitions, noise, gain, offset
     for name in lines[0]:
         for moment in MOMENTS:
-            said = [line[name][moment] for line in lines]
-            np.testing.assert_array_equal(value_of(learnt, name, moment), said)
+            told = [line[name][moment] for line in lines]
+            np.testing.assert_array_equal(value_of(learnt, name, moment), told)
     assert np.isnan(learnt["gauge_offset_mean"].sel(sensor=24)).all()
     assert learnt["gauge_offset_prior_upper"].sel(sensor=1) > 0
     for variable in learnt.data_vars.values():
@@ -86,7 +81,7 @@ def test_the_store_holds_what_the_twin_said_in_every_turn(folder: Path, learnt: 
         assert variable.attrs["long_name"]
 
 
-def test_the_prior_is_that_of_the_scenario(learnt: xr.Dataset, run: xr.DataTree) -> None:
+def test_the_prior_is_that_of_the_scenario(learnt, run):
     draws = run["calibration"]["draw_value"].values
     mean, wide = (learnt[f"young_modulus_factor_prior_{name}"].item() for name in MOMENTS[:2])
     assert mean == pytest.approx(draws.mean(), abs=0.1 * draws.std())  # between the draws as well
@@ -102,7 +97,7 @@ def test_the_prior_is_that_of_the_scenario(learnt: xr.Dataset, run: xr.DataTree)
     assert gain == pytest.approx(0.02 * np.sqrt(squared.mean()))
 
 
-def test_the_truth_stands_where_the_scenario_tells_it(run: xr.DataTree) -> None:
+def test_the_truth_stands_where_the_scenario_tells_it(run):
     truth = run["truth"].to_dataset()
     assert float(truth["young_modulus_factor"]) == 0.95
     np.testing.assert_allclose(truth["noise_scale"], 150 / 125)
@@ -110,9 +105,7 @@ def test_the_truth_stands_where_the_scenario_tells_it(run: xr.DataTree) -> None:
     assert "transition_factor" not in truth  # scripted damage has no probability
 
 
-def test_the_summary_says_what_was_learnt_and_what_was_believed_before(
-    scenario: Path, folder: Path, learnt: xr.Dataset, summary: dict[str, Any]
-) -> None:
+def test_the_summary_says_what_was_learnt_and_what_was_believed_before(scenario, folder, learnt, summary):
     figures = {figure["key"]: figure for figure in summary["figures"]}
     assert tuple(figures) == load_scenario(scenario).scenario.figure_names
     assert figures["young_modulus_factor_mean"]["value"] == learnt["young_modulus_factor_mean"].values[-1]
@@ -124,15 +117,15 @@ def test_the_summary_says_what_was_learnt_and_what_was_believed_before(
     most = int(np.argmax(abs(last["gauge_gain_mean"].values) / last["gauge_gain_standard_deviation"].values))
     assert figures["gauge_gain_most"]["title"] == f"gain error learnt, gauge {most + 1} (departs most)"
     assert figures["gauge_gain_most"]["value"] == pytest.approx(100 * last["gauge_gain_mean"].values[most])
-    said = json.loads((folder.parent / "said.json").read_text())
-    assert said["learnt"] == summary["learnt"]
+    told = json.loads((folder.parent / "said.json").read_text())
+    assert told["learnt"] == summary["learnt"]
     noise = summary["learnt"]["noise_scale"]
     assert noise["posterior"]["upper"] == last["noise_scale_upper"].values.tolist()
     assert noise["truth"] == [1.2] * 24
     assert summary["learnt"]["gauge_offset"]["posterior"]["mean"][23] is None
 
 
-def test_the_report_draws_and_lists_what_was_learnt(folder: Path, learnt: xr.Dataset) -> None:
+def test_the_report_draws_and_lists_what_was_learnt(folder, learnt):
     record = read_run(folder)
     figure = learnt_figure(record)
     assert len(figure.axes) == 2 + 3 * 2
@@ -149,9 +142,7 @@ def test_the_report_draws_and_lists_what_was_learnt(folder: Path, learnt: xr.Dat
     assert "posterior mean of the Young" not in text
 
 
-def test_what_the_gauges_are_expected_to_show_is_what_was_learnt(
-    run: xr.DataTree, learnt: xr.Dataset
-) -> None:
+def test_what_the_gauges_are_expected_to_show_is_what_was_learnt(run, learnt):
     filtered = run["filtered"].to_dataset()
     noise = 1e6 * filtered["noise_standard_deviation"].values
     np.testing.assert_allclose(noise, 125 * learnt["noise_scale_mean"].values, rtol=0.05)
@@ -166,7 +157,7 @@ def test_what_the_gauges_are_expected_to_show_is_what_was_learnt(
     assert np.median(ahead) == pytest.approx(1.0, abs=0.02)
 
 
-def test_the_view_shows_what_was_learnt(folder: Path, run: xr.DataTree) -> None:
+def test_the_view_shows_what_was_learnt(folder, run):
     """From the posterior of each quantity alone, which the journal tells."""
     flight, filtered = Flight(folder), run["filtered"].to_dataset()
     flight.update()
@@ -186,7 +177,7 @@ def test_the_view_shows_what_was_learnt(folder: Path, run: xr.DataTree) -> None:
     assert learnt < 0.06 < 0.3 < off()  # as calibrated
 
 
-def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario: Path, run: xr.DataTree) -> None:
+def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario, run):
     knowledge = prepare_twin(str(scenario))
     history = History(twin := knowledge.twin(), 24)
     observed = run["observed"].to_dataset()
@@ -197,13 +188,9 @@ def test_the_gap_of_a_model_is_that_of_what_was_learnt(scenario: Path, run: xr.D
     assert gap["rms_residual"] == pytest.approx(np.sqrt(np.mean(residual**2)))
 
 
-def test_a_watch_keeps_the_last_turns_of_what_it_learnt(
-    scenario: Path, folder: Path, learnt: xr.Dataset
-) -> None:
+def test_a_watch_keeps_the_last_turns_of_what_it_learnt(scenario, folder, learnt):
     out = folder.parent / "watch"
-    arguments = ["watch", str(scenario), "--observations", str(folder), "--out", str(out), "--no-report"]
-    said = CliRunner().invoke(app, [*arguments, "--last", "4"])
-    assert said.exit_code == 0, said.output
+    said("watch", scenario, "--observations", folder, "--out", out, "--no-report", "--last", 4)
     watched = open_run(out)["learnt"].to_dataset()
     assert watched["step"].values.tolist() == [5, 6, 7, 8]
     for name, flown in learnt.data_vars.items():

@@ -68,7 +68,7 @@ def drawn(random: np.random.Generator, turns: int, gauges: int = 3, width: float
     return np.array(rows)
 
 
-def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state() -> None:
+def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
     model, sensors = small()
     inner = ExactFilter(model, sensors)
     seen = drawn(np.random.default_rng(3), 12)
@@ -102,7 +102,7 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state() -> None:
     assert watchful().smoothed([]).shape == (0, 3)
 
 
-def test_shares_of_hypotheses_switch_as_their_chain_says() -> None:
+def test_shares_of_hypotheses_switch_as_their_chain_says():
     begins = np.log(0.5 * np.concatenate([[0.0, 0.0, 1.0], np.full(4, 0.25)]) + 1e-300)
     share = at_first(0.01, begins)
     np.testing.assert_allclose(np.exp(share), [0.99, 0.0, 0.005, *[0.00125] * 4], atol=1e-15)
@@ -121,7 +121,7 @@ def test_shares_of_hypotheses_switch_as_their_chain_says() -> None:
     assert np.exp(share).sum() == pytest.approx(1.0, abs=1e-12)
 
 
-def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch):
     """Where the noise is known and gains are not learnt, against the sum over every course of events."""
     monkeypatch.setattr("twin_master.learning.monitor._REACH", (0.0,) * 4)
     turns, seen = 4, drawn(np.random.default_rng(8), 4)
@@ -154,7 +154,7 @@ def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch
         assert found.log_evidence_gauge[gauge] == pytest.approx(expected, abs=1e-5)
 
 
-def test_the_first_evidence_is_a_ratio_of_two_sums() -> None:
+def test_the_first_evidence_is_a_ratio_of_two_sums():
     sensors = small()[1]
     row = sensors.value_per_draw[0, 0, 0] * [1.0, 1.3, 1.0]
     found = run(watchful(), row[None])[0].suspicion
@@ -178,7 +178,7 @@ def test_the_first_evidence_is_a_ratio_of_two_sums() -> None:
 
 
 @pytest.mark.parametrize("turns", [1, 7])
-def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_model(turns: int) -> None:
+def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_model(turns):
     """What Ville's inequality needs, by quadrature over the next observation, after any past."""
     estimator = watchful(1)
     seen = drawn(np.random.default_rng(turns), turns, 1)
@@ -203,7 +203,7 @@ def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_m
 
 
 @pytest.mark.parametrize("width", [0.0, 1.0, 10.0])
-def test_false_alarms_are_rarer_than_the_threshold_says(width: float) -> None:
+def test_false_alarms_are_rarer_than_the_threshold_says(width):
     """The noise is what the model says, and its sums of squares are expected ones: what that costs."""
     estimator, random = watchful(width=width), np.random.default_rng(5)
     largest = []
@@ -220,9 +220,7 @@ def test_false_alarms_are_rarer_than_the_threshold_says(width: float) -> None:
     lost=st.lists(st.lists(st.booleans(), min_size=2, max_size=2), min_size=1, max_size=6),
     factor=st.sampled_from([-1e20, -1.0, 0.0, 1.0, 1.2, 3.0, 1e20]),
 )
-def test_probabilities_stay_probabilities_whatever_is_lost_or_shown(
-    lost: list[list[bool]], factor: float
-) -> None:
+def test_probabilities_stay_probabilities_whatever_is_lost_or_shown(lost, factor):
     seen = factor * drawn(np.random.default_rng(2), len(lost), 2)
     estimates = run(watchful(2), np.where(np.array(lost), np.nan, seen))
     for estimate in estimates:
@@ -247,9 +245,7 @@ EXTREME = st.floats(allow_nan=False, allow_infinity=False) | st.sampled_from([5e
 
 @settings(max_examples=60, deadline=None)
 @given(rows=st.lists(st.tuples(EXTREME, EXTREME), min_size=1, max_size=6), late=st.integers(0, 6))
-def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(
-    rows: list[tuple[float, float]], late: int
-) -> None:
+def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, late):
     ordinary = drawn(np.random.default_rng(2), 4, 2)
     for twin in twins().values():
         for number, row in enumerate([ordinary[0], *rows, *ordinary[1:]]):
@@ -263,7 +259,7 @@ def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(
             line_of(belief_record(turn))  # which holds no NaN and no infinity
 
 
-def test_a_turn_without_readings_changes_no_evidence() -> None:
+def test_a_turn_without_readings_changes_no_evidence():
     seen = drawn(np.random.default_rng(4), 6)
     seen[-1] = np.nan
     before, after = (estimate.suspicion for estimate in run(watchful(), seen)[-2:])
@@ -273,7 +269,7 @@ def test_a_turn_without_readings_changes_no_evidence() -> None:
     assert after.log_evidence_none == pytest.approx(before.log_evidence_none, abs=1e-6)
 
 
-def test_a_late_observation_tells_what_it_brings_to_light_in_its_turn() -> None:
+def test_a_late_observation_tells_what_it_brings_to_light_in_its_turn():
     model, sensors = small()
     twin = Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful(), lag=8)
     seen = drawn(np.random.default_rng(5), 10)
@@ -290,7 +286,7 @@ def test_a_late_observation_tells_what_it_brings_to_light_in_its_turn() -> None:
     assert "Turn 5: gauge 2 shows 1e+09" in told.notices[0].sentence
 
 
-def test_a_model_that_takes_the_place_of_another_begins_without_suspicion() -> None:
+def test_a_model_that_takes_the_place_of_another_begins_without_suspicion():
     model, sensors = small()
     taught = GaussianSensorModel(1.2 * sensors.value_per_draw, 1.0)
     other = WatchfulEstimator(ExactFilter(model, taught), taught, DRAWS)
@@ -304,7 +300,7 @@ def test_a_model_that_takes_the_place_of_another_begins_without_suspicion() -> N
     assert not after.notices
 
 
-def test_too_many_states_are_refused_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_states_are_refused_in_a_sentence(monkeypatch):
     monkeypatch.setattr("twin_master.learning.monitor._LARGEST", 71)
     with pytest.raises(InvalidModelError, match=r"3 states and 2 draws for each of 12 faults .* leave out"):
         watchful()
@@ -343,9 +339,7 @@ def fly(
 @pytest.mark.parametrize(
     ("gauge", "gain", "begin", "word"), [(5, 0.2, 0, "much"), (17, -0.2, 0, "little"), (3, 0.2, 15, "much")]
 )
-def test_a_gauge_that_is_off_is_named(
-    wing: Knowledge, gauge: int, gain: float, begin: int, word: str
-) -> None:
+def test_a_gauge_that_is_off_is_named(wing, gauge, gain, begin, word):
     estimates = fly(wing, begin + 25, {gauge: gain}, begin)
     alarms = [notice for estimate in estimates for notice in estimate.notices if notice.kind == "alarm"]
     assert [alarm.sensors for alarm in alarms] == [(gauge,)]
@@ -361,7 +355,7 @@ def test_a_gauge_that_is_off_is_named(
     assert last.gauge_off > 0.5
 
 
-def test_an_alarm_names_no_command_where_none_looks_for_causes(wing: Knowledge) -> None:
+def test_an_alarm_names_no_command_where_none_looks_for_causes(wing):
     words = Words(names=tuple(f"place {number}" for number in range(1, 25)), command="")
     estimates = fly(wing, 12, {5: 0.3}, words=words)
     alarm = next(n.sentence for estimate in estimates for n in estimate.notices if n.kind == "alarm")
@@ -369,7 +363,7 @@ def test_an_alarm_names_no_command_where_none_looks_for_causes(wing: Knowledge) 
     assert alarm.endswith("against the model, alarm from 100)")
 
 
-def test_an_absurd_gauge_is_left_out_with_a_word(wing: Knowledge) -> None:
+def test_an_absurd_gauge_is_left_out_with_a_word(wing):
     estimator = WatchfulEstimator(wing.twin().estimator, wing.sensor_model, wing.draws.values)
     random, before, estimates = np.random.default_rng(1), None, []
     for turn in range(12):
@@ -387,7 +381,7 @@ def test_an_absurd_gauge_is_left_out_with_a_word(wing: Knowledge) -> None:
 
 
 @pytest.mark.parametrize(("between", "alarmed"), [(True, 0), (False, 10)])
-def test_damage_between_two_levels_raises_no_alarm(between: bool, alarmed: int) -> None:
+def test_damage_between_two_levels_raises_no_alarm(between, alarmed):
     """Ten flights of the panel with a stiffener that grows soft between two levels, and nothing else."""
     panel = at_levels("stiffened_panel", between)
     sensors, shape = panel.sensor_model, panel.model.states.shape
@@ -407,7 +401,7 @@ def test_damage_between_two_levels_raises_no_alarm(between: bool, alarmed: int) 
 
 
 @pytest.mark.parametrize("between", [False, True])
-def test_belief_and_decision_follow_what_holds_now(between: bool) -> None:
+def test_belief_and_decision_follow_what_holds_now(between):
     """A gauge comes loose while damage grows and is mended; later half of the gauges are off for a while."""
     wing = at_levels("paper_level_turns", between)
     scenario = wing.scenario.model_copy(update={"notice": Noticing()})
@@ -452,7 +446,7 @@ def test_belief_and_decision_follow_what_holds_now(between: bool) -> None:
     assert "no state explains the gauges, none is believed, and the control is the safest" in sentences[-2]
 
 
-def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named(wing: Knowledge) -> None:
+def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named(wing):
     assert wing.scenario.control_names[wing.safest] == "2g"
     planner = wing.scenario.planner.model_copy(update={"safest": "3g"})
     named = replace(wing, scenario=wing.scenario.model_copy(update={"planner": planner}))

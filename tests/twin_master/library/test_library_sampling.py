@@ -1,7 +1,5 @@
 """Sampling an FMU into an observation library: values, processes, kills, memories, crashes."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
@@ -18,31 +16,19 @@ from hypothesis import strategies as st
 
 from fmu_asset.errors import FmuCallError, FmuTimeoutError, FmuWorkerError
 from fmu_asset.packing.script import build_script_fmu
-from twin_master.assets.observation_library import load_observation_library
+from twin_master.assets.library_source import load_observation_library
 from twin_master.errors import InvalidObservationLibraryError
 from twin_master.library.grid import SamplingGrid
 from twin_master.library.request import grid_of_fmu, parse_grid
 from twin_master.library.sampling import blocks_folder, sample_library
 
 BINDING = """
-[binding]
-name = "wayward"
-step_size = 1.0
-[control.push]
-variable = "push"
-unit = "N"
-[control.mode]
-variable = "mode"
-unit = "1"
-[health.wear]
-variable = "wear"
-unit = "1"
-[parameter.gain]
-variable = "gain"
-unit = "1"
-[observation.lever]
-variables = ["shown", "double"]
-unit = ["m", "mm"]
+binding = { name = "wayward", step_size = 1.0 }
+control.push = { variable = "push", unit = "N" }
+control.mode = { variable = "mode", unit = "1" }
+health.wear = { variable = "wear", unit = "1" }
+parameter.gain = { variable = "gain", unit = "1" }
+observation.lever = { variables = ["shown", "double"], unit = ["m", "mm"] }
 """
 FINE, LAG, COUNT, DIE, SLEEP, REFUSE, SLOW = (float(mode) for mode in range(7))
 WEAR, GAIN, PUSH = (0.0, 0.25, 0.5), (0.9, 1.0, 1.1), (2.0, 4.0)
@@ -66,9 +52,7 @@ def grid(files: tuple[Path, Path], mode: float = FINE, **changes: object) -> Sam
     return replace(grid_of_fmu(*files, texts), **changes)  # type: ignore[arg-type]
 
 
-def test_the_library_holds_what_the_formula_says_with_names_and_units(
-    files: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_the_library_holds_what_the_formula_says_with_names_and_units(files, tmp_path):
     outcome = sample_library(grid(files), tmp_path / "lever.nc", workers=1)
     expected = np.array([[[g * p / (1.0 + w) for p in PUSH] for w in WEAR] for g in GAIN])
     np.testing.assert_allclose(outcome.library.values[..., 0], expected, rtol=1e-15)
@@ -88,7 +72,7 @@ def test_the_library_holds_what_the_formula_says_with_names_and_units(
     )  # fmt: skip
 
 
-def test_the_bytes_do_not_depend_on_the_number_of_processes(files: tuple[Path, Path], tmp_path: Path) -> None:
+def test_the_bytes_do_not_depend_on_the_number_of_processes(files, tmp_path):
     many = grid(files, draws=tuple(np.linspace(0.8, 1.2, 30)))
     paths = [sample_library(many, tmp_path / f"{n}.nc", workers=n).path for n in (1, 3)]
     assert paths[0].read_bytes() == paths[1].read_bytes()
@@ -106,9 +90,7 @@ def heard_interruptions() -> Iterator[None]:
 @pytest.mark.parametrize(
     "signals", [pytest.param([signal.SIGKILL], marks=pytest.mark.long), [signal.SIGINT, signal.SIGKILL]]
 )
-def test_what_an_interrupted_sampling_finished_is_kept(
-    files: tuple[Path, Path], tmp_path: Path, signals: list[signal.Signals]
-) -> None:
+def test_what_an_interrupted_sampling_finished_is_kept(files, tmp_path, signals):
     slow = grid(files, SLOW, draws=tuple(np.linspace(0.8, 1.2, 20)))
     whole = sample_library(slow, tmp_path / "whole.nc", workers=2)
     fmu, binding = files
@@ -140,9 +122,7 @@ def test_what_an_interrupted_sampling_finished_is_kept(
     assert out.read_bytes() == whole.path.read_bytes()
 
 
-def test_a_damaged_block_is_sampled_again(
-    files: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_damaged_block_is_sampled_again(files, tmp_path, monkeypatch):
     whole = sample_library(grid(files), tmp_path / "whole.nc", workers=1)
 
     def full_disk(*_: object) -> None:
@@ -159,9 +139,7 @@ def test_a_damaged_block_is_sampled_again(
     assert out.read_bytes() == whole.path.read_bytes()
 
 
-def test_an_fmu_that_remembers_is_refused_and_sampled_from_a_fresh_start(
-    files: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_an_fmu_that_remembers_is_refused_and_sampled_from_a_fresh_start(files, tmp_path):
     for mode in (LAG, COUNT):
         with pytest.raises(
             InvalidObservationLibraryError, match=r"remembers earlier steps: at wear = .*--settle"
@@ -178,9 +156,7 @@ def test_an_fmu_that_remembers_is_refused_and_sampled_from_a_fresh_start(
     assert settled.library.settling_steps == 40
 
 
-def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(
-    files: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(files, tmp_path):
     out = tmp_path / "lever.nc"
     with pytest.raises(
         FmuCallError, match=r"at wear = 0\.5, control push = [24], mode = 5, gain = 0\.9: .*Discard"
@@ -195,9 +171,7 @@ def test_a_refused_point_a_crash_and_a_hanging_fmu_are_one_sentence_each(
     assert not out.exists()
 
 
-def test_what_does_not_fit_is_named_before_anything_is_started(
-    files: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_what_does_not_fit_is_named_before_anything_is_started(files, tmp_path):
     out = tmp_path / "lever.nc"
     for changes, words in (
         (
@@ -232,12 +206,12 @@ def test_what_does_not_fit_is_named_before_anything_is_started(
         ("wear=nan", "must give numbers"),
     ],
 )
-def test_a_grid_that_is_none_is_refused(files: tuple[Path, Path], text: str, words: str) -> None:
+def test_a_grid_that_is_none_is_refused(files, text, words):
     with pytest.raises(InvalidObservationLibraryError, match=words):
         grid_of_fmu(*files, [text])
 
 
-def test_grids_are_read(files: tuple[Path, Path]) -> None:
+def test_grids_are_read(files):
     from fmu_asset.door.binding import load_binding
 
     found = parse_grid(["health.wear=0:1:5", "push=1,2", "gain=3"], load_binding(files[1]))
@@ -247,7 +221,7 @@ def test_grids_are_read(files: tuple[Path, Path]) -> None:
 
 
 @given(st.integers(1, 40), st.lists(st.integers(1, 12), min_size=1, max_size=3), st.integers(1, 6))
-def test_blocks_cover_every_point_once(draws: int, levels: list[int], controls: int) -> None:
+def test_blocks_cover_every_point_once(draws, levels, controls):
     made = SamplingGrid(
         "f", "b", "r", "p", tuple(range(draws)), {str(k): tuple(range(n)) for k, n in enumerate(levels)},
         {str(k): {} for k in range(controls)},

@@ -1,13 +1,10 @@
 """A wing that is inspected and repaired: actions in a scenario, flown, planned on the belief."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,8 +14,8 @@ from scipy.stats import norm
 import uav_twin
 from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
-from scenarios import scenario_files
-from tests.command_line import call
+from tests.command_line import refused, said
+from tests.twin_master.runs import edited, text_of, written
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError, PlanningError, ScenarioError
 from twin_master.fleet.plan import load_fleet
@@ -40,7 +37,7 @@ from twin_master.mission.preparation import (
     knowledge_of,
     prepare_knowledge,
 )
-from twin_master.mission.side_by_side import fly_side_by_side
+from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.estimator import Carried, Estimator, ExactFilter
 from twin_master.network.planner import BeliefPolicy, rationed
 from twin_master.network.transition import TransitionModel
@@ -49,27 +46,40 @@ from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import Noticing
 
-TEXT = scenario_files()["inspected_wing"].read_text(encoding="utf-8")
+TEXT = text_of("inspected_wing", ("notice = false", ""))
 INSPECT, REPAIR_1 = 2, 3
 
 
 def scenario(*changes: tuple[str, str], **planner: Any) -> Scenario:
-    text = TEXT.replace("notice = false", "")
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new, 1)
-    table = tomllib.loads(text)
+    table = tomllib.loads(edited(TEXT, *changes))
     table["planner"] |= planner
     return parse_scenario(table, "x")
 
 
 @cache
 def knowledge(policy: str = "mode") -> Knowledge:
-    written = scenario(policy=policy)
+    return known_of(scenario(policy=policy))
+
+
+def known_of(written: Scenario) -> Knowledge:
     return prepare_knowledge(written, ReducedModelSource(written, reduced_model(load_design())), 3)
 
 
-def test_an_action_is_a_control_with_a_price_that_reads_back() -> None:
+def following(known: Knowledge, policy: BeliefPolicy, written: Scenario | None = None) -> Knowledge:
+    """Return the same knowledge with a policy on the belief."""
+    per_draw = known.sensor_model.value_per_draw
+    return knowledge_of(written or known.scenario, known.model, known.draws, per_draw, policy)
+
+
+def side_by_side(known: Knowledge, seeds: int) -> Flights:
+    return fly_side_by_side(known, [known.truth(seed) for seed in range(seeds)], [asset_of(known)] * seeds)
+
+
+def asset_of(known: Knowledge) -> Any:
+    return ReducedModelSource(known.scenario, reduced_model(load_design())).open()
+
+
+def test_an_action_is_a_control_with_a_price_that_reads_back():
     written = scenario()
     assert written.control_names == ("2g", "3g", "inspect", "repair_1", "repair_2")
     assert written.control[INSPECT].values == {"load_factor": 2.0}
@@ -80,7 +90,7 @@ def test_an_action_is_a_control_with_a_price_that_reads_back() -> None:
     assert own.transition.probability["inspect"] == 0.0
 
 
-def test_a_repair_follows_the_growth_of_its_turn() -> None:
+def test_a_repair_follows_the_growth_of_its_turn():
     moved = knowledge().model.transition
     row = moved.row(REPAIR_1, 4 * 5 + 1).reshape(5, 5)
     assert row[0] == pytest.approx([0.0, 0.95, 0.05, 0.0, 0.0])
@@ -104,14 +114,14 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_what_is_wrong_with_an_action_is_said_in_one_sentence(case: str) -> None:
+def test_what_is_wrong_with_an_action_is_said_in_one_sentence(case):
     old, new, words = WRONG[case]
     with pytest.raises(ScenarioError) as error:
         scenario((old, new))
     assert all(word in str(error.value) for word in words), error.value
 
 
-def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_turn() -> None:
+def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_turn():
     known = knowledge()
     row = np.full(26, np.nan)
     row[24] = 0.37
@@ -124,7 +134,7 @@ def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_turn() -> None:
 
 
 @pytest.mark.parametrize("gauges", [True, False])
-def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(gauges: bool) -> None:
+def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(gauges):
     known = knowledge()
     model, sensors = known.model, known.sensor_model
     exact = ExactFilter(model, sensors, "x")
@@ -147,15 +157,11 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
     assert found[0].filtered.max() > 0.3  # something was told
 
 
-def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = TEXT.replace("notice = false", "").replace("steps = 120", "steps = 12")
-    path, policy = tmp_path / "mine.toml", tmp_path / "policy.npz"
-    path.write_text(text.replace("[planner]", "[learning]\n[notice]\n[planner]"), encoding="utf-8")
+def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(tmp_path):
+    learning = ("steps = 120", "steps = 12"), ("[planner]", "[learning]\n[notice]\n[planner]")
+    path, policy = written(tmp_path, TEXT, *learning), tmp_path / "policy.npz"
     write_policy(policy, BeliefPolicy(np.ones((1, 25)), np.array([INSPECT])), knowledge().model)
-    words = ("run", path, "--policy", policy, "--out", tmp_path / "run", "--no-report")
-    assert call(monkeypatch, *words) == 0
+    said("run", path, "--policy", policy, "--out", tmp_path / "run", "--no-report")
     run = open_run(tmp_path / "run")
     observed, truth = run["observed"], run["truth"]
     inspected = observed["control_index"].values == INSPECT
@@ -168,15 +174,10 @@ def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(
     assert "notice" in run
 
 
-def asset_of(known: Knowledge) -> Any:
-    return ReducedModelSource(known.scenario, reduced_model(load_design())).open()
-
-
-def test_missions_side_by_side_are_those_alone_with_readings_and_repairs() -> None:
+def test_missions_side_by_side_are_those_alone_with_readings_and_repairs():
     known = knowledge("qmdp")
-    truths = [known.truth(seed) for seed in range(3)]
-    together = fly_side_by_side(known, truths, [asset_of(known)] * 3)
-    alone = fly(known.scenario, known.twin(), known.plant(truths[1], asset_of(known)))
+    together = side_by_side(known, 3)
+    alone = fly(known.scenario, known.twin(), known.plant(known.truth(1), asset_of(known)))
     assert np.array_equal(together.control_index[1], alone.control_index)
     assert np.array_equal(together.filtered[1], alone.filtered)
     for states, controls in zip(together.state, together.control_index, strict=True):
@@ -184,16 +185,14 @@ def test_missions_side_by_side_are_those_alone_with_readings_and_repairs() -> No
     assert (together.control_index == REPAIR_1).any()
 
 
-def test_an_action_that_ends_ends_the_mission() -> None:
+def test_an_action_that_ends_ends_the_mission():
     written = scenario(('repairs = ["z2"]', "ends = true"), ("cost = 3.0\nrepairs", "cost = 0.0\nrepairs"))
-    known = prepare_knowledge(written, ReducedModelSource(written, reduced_model(load_design())), 3)
-    stopping = BeliefPolicy(np.ones((1, 25)), np.array([4]))
-    stop = knowledge_of(written, known.model, known.draws, known.sensor_model.value_per_draw, stopping)
+    known = known_of(written)
+    stop = following(known, BeliefPolicy(np.ones((1, 25)), np.array([4])))
     flown = fly(written, stop.twin(), stop.plant(stop.truth(1), asset_of(stop)))
     assert flown.control_index.tolist() == [1, 4]
     assert "decided on `repair_2`" in flown.notices[-1][1].sentence
-    many = fly_side_by_side(stop, [stop.truth(1)], [asset_of(stop)])
-    assert many.ended[0] == flown.notices[-1][1].sentence
+    assert side_by_side(stop, 2).ended[1] == flown.notices[-1][1].sentence
     value = known.plan.action_value[:, 4]
     assert value == pytest.approx(known.planning_reward[:, 4])  # and nothing behind it
 
@@ -205,13 +204,10 @@ def planned() -> tuple[Any, Any]:
     return problem, expected_plan(known.scenario, problem, known.rewards)[0]
 
 
-def test_flown_missions_bring_the_return_that_was_promised() -> None:
+def test_flown_missions_bring_the_return_that_was_promised():
     known, (problem, plan) = knowledge(), planned()
-    found = knowledge_of(
-        known.scenario, known.model, known.draws, known.sensor_model.value_per_draw, plan.policy
-    )
     count = 300
-    flown = fly_side_by_side(found, [found.truth(seed) for seed in range(count)], [asset_of(found)] * count)
+    flown = side_by_side(following(known, plan.policy), count)
     levels = np.rint(flown.state * 5.0).astype(int)
     place = levels[..., 0] * 5 + levels[..., 1]
     reward = known.planning_reward[place, flown.control_index]
@@ -224,7 +220,7 @@ def test_flown_missions_bring_the_return_that_was_promised() -> None:
     assert 0.05 < inspections < 0.3
 
 
-def test_a_limit_is_kept_by_the_plan() -> None:
+def test_a_limit_is_kept_by_the_plan():
     known, (problem, plan) = knowledge(), planned()
     free = risk_of(known.scenario, problem, known.rewards, plan.policy)
     limited = scenario(policy="belief", limit_probability=round(0.6 * free, 4))
@@ -234,13 +230,12 @@ def test_a_limit_is_kept_by_the_plan() -> None:
     assert promised(limited, problem, careful.policy).mean < promised(limited, problem, plan.policy).mean
 
 
-def test_a_policy_file_is_flown_and_kept_with_what_the_twin_knew(tmp_path: Path) -> None:
+def test_a_policy_file_is_flown_and_kept_with_what_the_twin_knew(tmp_path):
     known, (_, plan) = knowledge(), planned()
     write_policy(tmp_path / "policy.npz", plan.policy, known.model)
     policy = read_policy(tmp_path / "policy.npz", known.model)
     assert np.array_equal(policy.vectors, plan.policy.vectors)
-    found = knowledge_of(known.scenario, known.model, known.draws, known.sensor_model.value_per_draw, policy)
-    keep_knowledge(tmp_path, found)
+    keep_knowledge(tmp_path, following(known, policy))
     again = kept_knowledge(tmp_path, known.scenario).plan.on_belief
     assert again is not None
     assert np.array_equal(again.vectors, policy.vectors)
@@ -249,22 +244,18 @@ def test_a_policy_file_is_flown_and_kept_with_what_the_twin_knew(tmp_path: Path)
         read_policy(tmp_path / "other.npz", known.model)
 
 
-def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path):
     policy, picture = tmp_path / "policy.npz", tmp_path / "plan.svg"
     words = ("plan", "inspected_wing", "--out", policy, "--picture", picture, "--value-of", "inspect")
-    assert call(monkeypatch, *words, "--json") == 0
-    record = json.loads(capsys.readouterr().out)
+    record = json.loads(said(*words, "--json"))
     assert record["lower"] < record["upper"]
     assert record["value"]["mean"] > record["value"]["half_width"] > 0.0
     assert policy.stat().st_size > 1000
     assert picture.read_bytes().startswith(b"<?xml")
-    assert call(monkeypatch, "plan", "inspected_wing", "--value-of", "25") == 1
-    assert "`25` came" in capsys.readouterr().err
+    assert "`25` came" in refused("plan", "inspected_wing", "--value-of", "25")
 
 
-def test_inspections_of_a_fleet_go_where_they_are_worth_most() -> None:
+def test_inspections_of_a_fleet_go_where_they_are_worth_most():
     known, (_, plan) = knowledge(), planned()
     ahead = np.random.default_rng(0).dirichlet(np.full(25, 0.3), 60)
     model = replace(known.model, transition=TransitionModel((np.tile(np.eye(25), (5, 1, 1)),)))
@@ -282,44 +273,28 @@ def test_inspections_of_a_fleet_go_where_they_are_worth_most() -> None:
     assert np.array_equal(np.delete(few, wanting), np.delete(chosen, wanting))
 
 
-def test_a_budget_of_inspections_is_kept_in_every_turn() -> None:
+def test_a_budget_of_inspections_is_kept_in_every_turn():
     known, (_, plan) = knowledge(), planned()
     settings = known.scenario.planner.model_copy(update={"inspections_a_turn": 3})
     written = known.scenario.model_copy(update={"planner": settings})
-    found = knowledge_of(written, known.model, known.draws, known.sensor_model.value_per_draw, plan.policy)
-    flown = fly_side_by_side(found, [found.truth(seed) for seed in range(40)], [asset_of(found)] * 40)
+    flown = side_by_side(following(known, plan.policy, written), 40)
     inspections = (flown.control_index == INSPECT).sum(axis=0)
     assert inspections.max() == 3
 
 
-FLEET = """format = 1
-[fleet]
-name = "inspected"
-shard = {shard}
-[[group]]
-name = "all"
-scenario = "inspected_wing"
-count = 30
-inspections_a_turn = 2
-"""
-
-
-def test_a_fleet_shares_its_inspections_in_one_shard(tmp_path: Path) -> None:
-    path = tmp_path / "fleet.toml"
-    path.write_text(FLEET.format(shard=20), encoding="utf-8")
+def test_a_fleet_shares_its_inspections_in_one_shard(tmp_path):
+    text = 'format = 1\nfleet = { name = "inspected", shard = 20 }\n[[group]]\nname = "all"\n'
+    text += 'scenario = "inspected_wing"\ncount = 30\ninspections_a_turn = 2\n'
     with pytest.raises(FleetError, match="`shard` be 30 or more"):
-        load_fleet(path)
-    path.write_text(FLEET.format(shard=30), encoding="utf-8")
-    assert load_fleet(path).groups[0].scenarios[0].planner.inspections_a_turn == 2
+        load_fleet(written(tmp_path, text))
+    fleet = load_fleet(written(tmp_path, text, ("shard = 20", "shard = 30")))
+    assert fleet.groups[0].scenarios[0].planner.inspections_a_turn == 2
 
 
-def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path: Path) -> None:
-    text = (
-        TEXT[: TEXT.index("# What flies.")]
-        + TEXT[TEXT.index("# What the twin believes") : TEXT.index("[truth]")]
-    )
-    path = tmp_path / "watched.toml"
-    path.write_text(text, encoding="utf-8")
+def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path):
+    text = text_of("inspected_wing")
+    flown = text[text.index("# What flies.") : text.index("# What the twin believes")]
+    path = written(tmp_path, text[: text.index("[truth]")], (flown, ""))
     known = knowledge()
     plant = known.plant(known.truth(2), asset_of(known))
     told: list[dict[str, Any]] = []
@@ -345,10 +320,7 @@ def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path: Path) -
 
     uav_twin.watch(path, messages(), tmp_path / "watch", decide=decide, report=False)
     assert "inspect" in controls
-    known_plan = knowledge_of(
-        known.scenario, known.model, known.draws, known.sensor_model.value_per_draw, planned()[1].policy
-    )
-    twin = known_plan.twin()
+    twin = following(known, planned()[1].policy).twin()
     for row, decision, control in zip(rows, told, controls[:-1], strict=True):
         turn = twin.turn(row, control)
         mean = known.model.states.mean(turn.filtered)

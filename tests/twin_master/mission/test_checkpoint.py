@@ -1,7 +1,5 @@
 """The checkpoint: what goes in comes out to the last bit, and one that was changed is refused."""
 
-from __future__ import annotations
-
 import resource
 import signal
 from pathlib import Path
@@ -52,8 +50,9 @@ def read(folder: Path, config_hash: str = "abc") -> Checkpoint | None:
         return file.checkpoint
 
 
-def test_round_trip_is_exact(tmp_path: Path) -> None:
+def test_round_trip_is_exact(tmp_path):
     turns = flown(3)
+    assert read(tmp_path) is None
     write(tmp_path, turns)
     found = read(tmp_path)
     assert found is not None
@@ -68,11 +67,7 @@ def test_round_trip_is_exact(tmp_path: Path) -> None:
     assert found.asset_state == 3 * STATE
 
 
-def test_none_before_the_first_turn(tmp_path: Path) -> None:
-    assert read(tmp_path) is None
-
-
-def test_a_line_cut_off_anywhere_is_flown_again(tmp_path: Path) -> None:
+def test_a_line_cut_off_anywhere_is_flown_again(tmp_path):
     turns = flown(4)
     whole = write(tmp_path, turns)
     ends = [n + 1 for n, byte in enumerate(whole) if byte == ord("\n")]
@@ -86,7 +81,7 @@ def test_a_line_cut_off_anywhere_is_flown_again(tmp_path: Path) -> None:
         assert (tmp_path / JOURNAL_NAME).read_bytes() == whole
 
 
-def test_a_changed_or_foreign_checkpoint_is_refused(tmp_path: Path) -> None:
+def test_a_changed_or_foreign_checkpoint_is_refused(tmp_path):
     whole = write(tmp_path, flown(3))
     with pytest.raises(NotResumableError, match="another configuration"):
         read(tmp_path, "other")
@@ -108,9 +103,7 @@ def test_a_changed_or_foreign_checkpoint_is_refused(tmp_path: Path) -> None:
             read(tmp_path)
 
 
-def test_large_states_are_kept_less_often_and_their_turns_flown_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_states_are_kept_less_often_and_their_turns_flown_again(tmp_path, monkeypatch):
     monkeypatch.setattr(checkpoint, "STATE_ALLOWANCE", 300)
     monkeypatch.setattr(checkpoint, "STATE_SHARE", 30)
     content = np.random.default_rng(1).bytes(100)  # 144 characters in the file
@@ -125,7 +118,7 @@ def test_large_states_are_kept_less_often_and_their_turns_flown_again(
     assert (tmp_path / JOURNAL_NAME).read_bytes() == whole
 
 
-def test_a_full_disk_leaves_the_turns_before(tmp_path: Path) -> None:
+def test_a_full_disk_leaves_the_turns_before(tmp_path):
     turns = flown(3)
     size = len(write(tmp_path, turns[:2]))
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -1,7 +1,5 @@
 """A run whose FMU crashes, hangs or lies stops with one sentence, and goes on when the cause is gone."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +8,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
-from tests.twin_master.runs import check_same
+from fmu_asset.errors import FmuMemoryError, FmuTimeoutError, FmuWorkerError
+from tests.twin_master.runs import check_same, written
 from twin_master.environment import ScenarioEnvironment
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.plan import ensemble
@@ -26,64 +24,23 @@ from twin_master.workflow import resume as resume_run
 pytestmark = pytest.mark.usefixtures("no_report")
 
 BINDING = """
-[binding]
-name = "hostile"
-step_size = 1.0
-
-[control.u]
-variable = "u"
-unit = "m/s"
-
-[health.d]
-variable = "d"
-unit = "1"
-
-[parameter.k]
-variable = "k"
-unit = "1"
-
-[observation.y]
-variables = "y"
-unit = "m"
-
-[limits]
-step_time = 3.0
-memory = 400.0
+binding = { name = "hostile", step_size = 1.0 }
+control.u = { variable = "u", unit = "m/s" }
+health.d = { variable = "d", unit = "1" }
+parameter.k = { variable = "k", unit = "1" }
+observation.y = { variables = "y", unit = "m" }
 """
 SCENARIO = """
 format = 2
-
-[mission]
-name = "hostile"
-steps = 30
-prediction_steps = 3
-first_control = "low"
-seed = 4
-
-[[state]]
-name = "d"
-title = "damage"
-unit = "1"
-levels = [0.0, 0.2, 0.4]
-prior = [1, 0, 0]
-
-[[control]]
-name = "low"
-values = { u = 2.0 }
-
-[[control]]
-name = "high"
-values = { u = 4.0 }
-
-[observation]
-role = "y"
-count = 1
-unit = "m"
-standard_deviation = 0.1
-
-[transition]
-kind = "independent_worsening"
-probability = { low = 0.05, high = 0.1 }
+mission = { name = "hostile", steps = 30, prediction_steps = 3, first_control = "low", seed = 4 }
+state = [{ name = "d", title = "damage", unit = "1", levels = [0.0, 0.2, 0.4], prior = [1, 0, 0] }]
+control = [{ name = "low", values = { u = 2.0 } }, { name = "high", values = { u = 4.0 } }]
+observation = { role = "y", count = 1, unit = "m", standard_deviation = 0.1 }
+transition = { kind = "independent_worsening", probability = { low = 0.05, high = 0.1 } }
+planner = { gamma = 0.8 }
+asset = { kind = "fmu", file = "FMU", binding = "binding.toml" }
+belief = { kind = "asset" }
+calibration = { parameter = "k", source = "normal", mean = 1.0, standard_deviation = 0.01, draws = 5 }
 
 [rewards]
 health_limit = 80.0
@@ -91,37 +48,16 @@ error_scale = 0.5
 control = { low = -0.2, high = 0.2 }
 control_weight = 1.0
 
-[planner]
-gamma = 0.8
-
-[asset]
-kind = "fmu"
-file = "FMU"
-binding = "binding.toml"
-
-[belief]
-kind = "asset"
-
-[calibration]
-parameter = "k"
-source = "normal"
-mean = 1.0
-standard_deviation = 0.01
-draws = 5
-
 [truth]
 kind = "scripted"
 gains = [{ state = "d", first_step = 8, gain = 0.2 }]
-
-[truth.noise]
-standard_deviation = 0.1
+noise = { standard_deviation = 0.1 }
 """
 
 
-def scenario(folder: Path, fmu: Path) -> Any:
-    (folder / "binding.toml").write_text(BINDING, encoding="utf-8")
-    (folder / "scenario.toml").write_text(SCENARIO.replace("FMU", str(fmu)), encoding="utf-8")
-    return load_scenario(folder / "scenario.toml")
+def scenario(folder: Path, fmu: Path, *changes: tuple[str, str], binding: str = BINDING) -> Any:
+    written(folder, binding, name="binding.toml")
+    return load_scenario(written(folder, SCENARIO, ("FMU", str(fmu)), *changes, name="scenario.toml"))
 
 
 @pytest.mark.parametrize(
@@ -130,22 +66,14 @@ def scenario(folder: Path, fmu: Path) -> Any:
         pytest.param("SEGFAULT", FmuWorkerError, r"step 20 from t = 20 s: .*SIGSEGV", marks=pytest.mark.long),
         ("HANG", FmuTimeoutError, r"step 20 from t = 20 s: .*longer than 3 s for the step"),
         pytest.param(
-            "LEAK_IN_STEP", FmuMemoryError, r"more than the limit of 400 MiB", marks=pytest.mark.long
+            "LEAK_IN_STEP", FmuMemoryError, "more than the limit of 400 MiB", marks=pytest.mark.long
         ),
     ],
 )
-def test_a_run_is_resumed_once_the_cause_is_gone(
-    foreign_fmu: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    what: str,
-    kind: type[FmuError],
-    sentence: str,
-) -> None:
-    fmu = foreign_fmu("hostile2", what, "STATELESS", "AFTER=20")
-    flag = tmp_path / "flag"
+def test_a_run_is_resumed_once_the_cause_is_gone(foreign_fmu, tmp_path, monkeypatch, what, kind, sentence):
+    fmu, flag = foreign_fmu("hostile2", what, "STATELESS", "AFTER=20"), tmp_path / "flag"
     monkeypatch.setenv("HOSTILE_FLAG", str(flag))
-    loaded = scenario(tmp_path, fmu)
+    loaded = scenario(tmp_path, fmu, binding=f"{BINDING}limits = {{ step_time = 3.0, memory = 400.0 }}\n")
     whole = new_run(loaded, tmp_path / "whole").folder
     flag.touch()
     with pytest.raises(kind, match=sentence):
@@ -158,8 +86,9 @@ def test_a_run_is_resumed_once_the_cause_is_gone(
 
 
 def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
-    foreign_fmu: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    foreign_fmu, tmp_path, monkeypatch
+):
+    """In a run, a fleet and an environment."""
     fmu, flag = foreign_fmu("hostile2", "ENDS", "STATELESS", "AFTER=20"), tmp_path / "flag"
     monkeypatch.setenv("HOSTILE_FLAG", str(flag))
     loaded = scenario(tmp_path, fmu)
@@ -176,16 +105,15 @@ def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
                 np.testing.assert_array_equal(short[name].values, long[name].values[:20])
         assert short["truth/sensor_status"].shape == (20, 1)
     assert resume_run(part.folder).notices == part.notices
-    flown = fly_fleet(ensemble(str(tmp_path / "scenario.toml"), range(4, 5)), tmp_path / "fleet")
-    assert flown.failures == {}
-    (told,) = flown.ended.values()
-    assert told == said.replace(f"{part.folder}/", "")
-    (group,) = fleet_groups(flown.folder).values()
+    fleet = fly_fleet(ensemble(str(tmp_path / "scenario.toml"), range(4, 5)), tmp_path / "fleet")
+    assert fleet.failures == {}
+    assert [*fleet.ended.values()] == [said.replace(f"{part.folder}/", "")]
+    (group,) = fleet_groups(fleet.folder).values()
     assert group["status"].values.tolist() == [ENDED]
     assert (group["control_index"].values >= 0).sum() == 20
     assert np.isfinite(group["belief"].values).all()
     assert np.isfinite(group["credible"].values).all()
-    assert "1 of 1 assets ended their simulation" in write_fleet_report(flown.folder).read_text()
+    assert "1 of 1 assets ended their simulation" in write_fleet_report(fleet.folder).read_text()
     with ScenarioEnvironment(loaded) as environment:
         environment.reset(seed=4)
         seen = [environment.step(0) for _ in range(20)]
@@ -195,52 +123,30 @@ def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
             environment.step(0)
 
 
-ARRAY_BINDING = """
-[binding]
-name = "array"
-step_size = 1.0
-
-[control.u]
-variable = "u[1]"
-unit = "1"
-
-[health.d]
-variable = "u[2]"
-unit = "1"
-
-[parameter.k]
-variable = "gain"
-unit = "1"
-
-[observation.y]
-variables = "y"
-unit = "m"
-
-[record]
-variables = ["calls", "y"]
+ARRAY = """
+binding = { name = "array", step_size = 1.0 }
+control.u = { variable = "u[1]", unit = "1" }
+health.d = { variable = "u[2]", unit = "1" }
+parameter.k = { variable = "gain", unit = "1" }
+observation.y = { variables = "y", unit = "m" }
+record.variables = ["state/calls", "y"]
 """
 
 
-def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu: Any, tmp_path: Path) -> None:
+def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu, tmp_path):
     """Its outputs grow with every step, so that only the way through twin, store and names is looked at."""
     fmu = foreign_fmu.changed("array3", "names", ('name="calls"', 'name="state/calls"'))
-    (tmp_path / "binding.toml").write_text(
-        ARRAY_BINDING.replace('"calls"', '"state/calls"'), encoding="utf-8"
+    changes = ("steps = 30", "steps = 3"), *[("standard_deviation = 0.1", "standard_deviation = 0.05")] * 2
+    two, three = (
+        scenario(tmp_path, fmu, *changes, ("count = 1", f"count = {count}"), binding=ARRAY)
+        for count in (2, 3)
     )
-    text = (
-        SCENARIO.replace("FMU", str(fmu)).replace("count = 1", "count = 2").replace("steps = 30", "steps = 3")
-    )
-    text = text.replace("standard_deviation = 0.1", "standard_deviation = 0.05")
-    (tmp_path / "scenario.toml").write_text(text, encoding="utf-8")
-    folder = new_run(load_scenario(tmp_path / "scenario.toml"), tmp_path / "run").folder
-    tree = read_run(folder)
-    truth = tree["truth"]
+    truth = read_run(new_run(two, tmp_path / "run").folder)["truth"]
     assert truth["state_calls"].values.tolist() == [1.0, 2.0, 3.0]
     assert truth["y[1]"].attrs["units"] == "mm"
     assert truth["y"].attrs["units"] == "m"
     assert truth["y"].shape == (3, 2)
-    assert truth["y"].values[:, 1].tolist() == pytest.approx((1e-3 * truth["y[2]"].values).tolist())
-    (tmp_path / "scenario.toml").write_text(text.replace("count = 2", "count = 3"), encoding="utf-8")
+    np.testing.assert_allclose(truth["y"].values[:, 1], 1e-3 * truth["y[2]"].values, rtol=1e-6)
     with pytest.raises(Exception, match=r"observes 2 values of `y`, and the scenario expects 3"):
-        new_run(load_scenario(tmp_path / "scenario.toml"), tmp_path / "other")
+        new_run(three, tmp_path / "other")
     assert not (tmp_path / "other").exists()

@@ -1,6 +1,4 @@
-"""The mission loop: timing, resuming at every turn, and what stops it."""
-
-from __future__ import annotations
+"""The mission loop and its truth: timing, history, growth, faults, resuming at every turn, what stops it."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,70 +7,64 @@ import numpy as np
 import pytest
 
 from benchmarks.seeds import fly_seeds
-from twin_master.assets.interface import AssetReading, StatelessAsset
-from twin_master.assets.strain_library import load_strain_library
+from tests.twin_master.runs import of_library, table_of
+from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import AssetOutputError, NotResumableError
 from twin_master.mission.loop import Checkpoint, fly
-from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.preparation import Knowledge
+from twin_master.mission.truth import SensorStatus, Truth
 from twin_master.mission.turns import History, Turn
-from twin_master.scenario.reading import load_scenario
+from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.seeds import PURPOSES, generator
 
-
-@pytest.fixture(params=["level_turns", "growing_damage", "failing_gauges"])
-def source(request: pytest.FixtureRequest, library_file: Path) -> StrainLibrarySource:
-    scenario = load_scenario(request.param).scenario
-    return StrainLibrarySource(scenario, load_strain_library(library_file), "h")
-
-
-def knowledge_of(source: StrainLibrarySource) -> Knowledge:
-    return prepare_knowledge(source._scenario, source, 3)
-
-
-def of_the_paper(library: Path, seed: int = 1) -> tuple[Scenario, StrainLibrarySource, Knowledge]:
-    scenario = load_scenario("paper_level_turns").scenario
-    source = StrainLibrarySource(scenario, load_strain_library(library), "h")
-    return scenario, source, prepare_knowledge(scenario, source, seed)
-
-
-def flown(source: StrainLibrarySource, knowledge: Knowledge, seed: int = 3, **options: object) -> History:
-    plant = knowledge.plant(knowledge.truth(seed), source.open())
-    return fly(knowledge.scenario, knowledge.twin(), plant, **options)  # type: ignore[arg-type]
-
-
+Known = tuple[Knowledge, StrainLibrarySource]
+Kept = list[tuple[Turn, bytes]]
 ARRAYS = (
     "observed", "control_index", "filtered", "log_evidence", "smoothed", "predicted", "decision_probability",
     "state",
 )  # fmt: skip
 
 
-def same(first: History, second: History) -> bool:
-    pairs = [(getattr(first, name), getattr(second, name)) for name in ARRAYS]
-    return all(np.array_equal(one, other, equal_nan=True) for one, other in pairs)
+@pytest.fixture(scope="module")
+def paper(library_file: Path) -> Known:
+    return of_library("paper_level_turns", library_file, 1)
 
 
-def stopped(kept: list[tuple[Turn, bytes]]) -> Checkpoint:
+def flown(known: Known, seed: int = 3, asset: StatelessAsset | None = None, **options: object) -> History:
+    knowledge, source = known
+    plant = knowledge.plant(knowledge.truth(seed), asset or source.open())
+    return fly(knowledge.scenario, knowledge.twin(), plant, **options)  # type: ignore[arg-type]
+
+
+def stopped(kept: Kept) -> Checkpoint:
     turns = [turn for turn, _ in kept]
     decided = [turn.concluded.next_control for turn in turns]
     return Checkpoint([turn.reading for turn in turns], decided, kept[-1][1])
 
 
-def test_resuming_after_any_turn_is_bit_identical(source: StrainLibrarySource) -> None:
-    knowledge = knowledge_of(source)
-    kept: list[tuple[Turn, bytes]] = []
-    whole = flown(source, knowledge, keep=lambda *told: kept.append(told))
+@pytest.mark.parametrize("name", ["level_turns", "growing_damage", "failing_gauges"])
+def test_resuming_after_any_turn_is_bit_identical(name, library_file):
+    known, kept = of_library(name, library_file), Kept()
+    whole = flown(known, keep=lambda *told: kept.append(told))
     assert len(kept) == 50
     for turns in (1, 2, 17, 49, 50):
-        rest = flown(source, knowledge, checkpoint=stopped(kept[:turns]))
+        rest = flown(known, checkpoint=stopped(kept[:turns]))
         assert rest.resumed_at == turns
         assert np.all((rest.seconds > 0.0).any(axis=1) == (np.arange(50) >= turns))
-        assert same(whole, rest)
+        for array in ARRAYS:
+            np.testing.assert_array_equal(getattr(rest, array), getattr(whole, array))
+    altered = stopped(kept[:10])
+    altered.decided[4] = 1 - altered.decided[4]
+    with pytest.raises(NotResumableError, match="after turn 4"):
+        flown(known, checkpoint=altered)
 
 
-def test_timing_of_a_turn(library_file: Path) -> None:
-    """Control u_t is in force while d_t, the gain of step t included, is observed."""
-    scenario, source, knowledge = of_the_paper(library_file)
+def test_timing_of_a_turn(paper):
+    """Control u_t is in force while d_t, the gain of step t included, is observed; noise alone is added."""
+    knowledge, source = paper
     asked: list[tuple[float, float, float]] = []
     inner = source.open()
 
@@ -80,72 +72,104 @@ def test_timing_of_a_turn(library_file: Path) -> None:
         asked.append((control["load_factor"], health["z1"], health["z2"]))
         return inner.step(control, health)
 
-    plant = knowledge.plant(knowledge.truth(1), StatelessAsset(observe))
-    flight = fly(scenario, knowledge.twin(), plant)
+    flight = flown(paper, 1, StatelessAsset(observe))
     assert asked[0] == (3.0, 0.0, 0.0)
     assert asked[5][1:] == (0.0, 0.22)
     assert asked[30][1:] == (0.6, 0.6)
     assert [load for load, _, _ in asked] == [(2.0, 3.0)[index] for index in flight.control_index]
     for step in range(49):  # u_{t+1} is the mode of the policy at the state as observed at t
         assert flight.control_index[step + 1] == np.argmax(flight.filtered[step] @ knowledge.plan.policy)
-
-
-def test_the_observation_is_the_truth_with_noise_and_nothing_else_reaches_the_twin(
-    library_file: Path,
-) -> None:
-    _, source, knowledge = of_the_paper(library_file)
-    flight = flown(source, knowledge, 1)
     residual = flight.observed - flight.observation
     np.testing.assert_allclose(residual, knowledge.truth(1).noise, atol=1e-12)
-    twin = knowledge.twin()
+    twin = knowledge.twin()  # nothing else reaches it
     again = [twin.turn(row, int(u)) for row, u in zip(flight.observed, flight.control_index, strict=True)]
     np.testing.assert_array_equal([turn.filtered for turn in again], flight.filtered)
     np.testing.assert_array_equal(twin.smoothed(), flight.smoothed)
 
 
-def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(library_file: Path) -> None:
-    scenario, source, knowledge = of_the_paper(library_file)
-    inner = source.open()
-    count = 0
+def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(paper):
+    inner, kept = paper[1].open(), Kept()
 
     def broken(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        nonlocal count
-        count += 1
         values = inner.step(control, health).values
-        if count == 4:
-            values[7] = np.nan
+        values[7] = np.nan if len(kept) == 3 else values[7]
         return AssetReading(values)
 
-    kept: list[Turn] = []
-    plant = knowledge.plant(knowledge.truth(1), StatelessAsset(broken))
+    def short(_control: object, _health: object) -> AssetReading:
+        return AssetReading(np.zeros(3))
+
     with pytest.raises(AssetOutputError, match=r"step 3: .*NaN.*`strain` 8 under the control `3g`"):
-        fly(scenario, knowledge.twin(), plant, keep=lambda turn, _state: kept.append(turn))
-    assert len(kept) == 3
-    short = knowledge.plant(
-        knowledge.truth(1), StatelessAsset(lambda _control, _health: AssetReading(np.zeros(3)))
-    )
+        flown(paper, 1, StatelessAsset(broken), keep=lambda *told: kept.append(told))
     with pytest.raises(AssetOutputError, match="expects 24 values"):
-        fly(scenario, knowledge.twin(), short)
+        flown(paper, 1, StatelessAsset(short))
 
 
-def test_a_checkpoint_whose_decisions_do_not_follow_is_refused(library_file: Path) -> None:
-    _, source, knowledge = of_the_paper(library_file)
-    kept: list[tuple[Turn, bytes]] = []
-    flown(source, knowledge, keep=lambda *told: kept.append(told))
-    altered = stopped(kept[:10])
-    altered.decided[4] = 1 - altered.decided[4]
-    with pytest.raises(NotResumableError, match="after turn 4"):
-        flown(source, knowledge, checkpoint=altered)
-
-
-def test_study_on_the_published_library(published_library: Path) -> None:
+def test_study_on_the_published_library(published_library):
     """Policy and reliability of the reference twin; the bars are those of 300 missions, widened for 60."""
-    scenario, source, knowledge = of_the_paper(published_library, 0)
+    knowledge, source = of_library("paper_level_turns", published_library, 0)
     z1 = knowledge.model.states.coordinates[:, 0]
     np.testing.assert_array_equal(knowledge.plan.control_index, np.where(z1 < 0.59, 1, 0))
     margin = (knowledge.plan.action_value[:, 1] - knowledge.plan.action_value[:, 0]).reshape(5, 5)
-    np.testing.assert_allclose(margin[2:4, 0], [0.007, -0.059], atol=1e-3)
-    study = fly_seeds(scenario, source, range(60))
+    np.testing.assert_allclose(margin[2:4], np.repeat([[0.007], [-0.059]], 5, axis=1), atol=5e-4)
+    study = fly_seeds(knowledge.scenario, source, range(60))
     assert study.within(2).value >= 0.95
     assert study.early_fallback.value <= 0.2
     assert np.all([study.rms(0).value <= 0.045, study.rms(1).value <= 0.13])
+
+
+def truth_of(scenario: Scenario | str, seed: int = 1) -> Truth:
+    found = load_scenario(scenario).scenario if isinstance(scenario, str) else scenario
+    return Truth(found, build_graphical_model(found), seed)
+
+
+def test_the_papers_history():
+    truth = truth_of("level_turns")
+    history = np.array([truth.state(step, None, None) for step in range(50)])
+    # Written out from the text: z1 gains 2 at 10..19 and 20 at 20 and 30, z2 2 at 5..14 and 20 at 5 and 25.
+    z1 = [0] * 10 + list(range(2, 21, 2)) + [40] * 10 + [60] * 20
+    z2 = [0] * 5 + list(range(22, 41, 2)) + [40] * 10 + [60] * 25
+    np.testing.assert_array_equal(history, np.array([z1, z2]).T / 100.0)
+
+
+def test_random_growth_follows_the_transitions_of_the_control():
+    scenario = load_scenario("growing_damage").scenario
+    model, worse = build_graphical_model(scenario), np.zeros((2, 2))
+    for seed in range(60):
+        truth = Truth(scenario, model, seed)
+        for control in (0, 1):
+            state = truth.state(0, None, None)
+            for step in range(1, 50):
+                new = truth.state(step, state, control)
+                assert np.all((new == state) | np.isclose(new, state + 0.2))
+                worse[control] += [np.sum((new > state)[state < 0.79]), np.sum(state < 0.79)]
+                state = new
+    rate = worse[:, 0] / worse[:, 1]
+    error = np.sqrt(rate * (1 - rate) / worse[:, 1])
+    assert np.all(np.abs(rate - [0.05, 0.10]) < 4 * error)
+
+
+def test_the_same_seed_meets_the_same_noise_whatever_else_is_drawn():
+    noise = truth_of("level_turns", 7).noise
+    np.testing.assert_array_equal(noise, truth_of("growing_damage", 7).noise)
+    assert not np.array_equal(noise, truth_of("level_turns", 8).noise)
+    assert noise.std() == pytest.approx(150e-6, rel=0.05)
+    assert len({generator(3, purpose).random() for purpose in PURPOSES}) == len(PURPOSES)
+
+
+def test_faults():
+    truth = truth_of("failing_gauges")
+    lost, healthy = SensorStatus.LOST, SensorStatus.HEALTHY
+    for part, status in (
+        (np.s_[36:38], lost), (np.s_[12:19, 16:20], lost), (np.s_[28:, 0], lost), (np.s_[:12, 16], healthy),
+        (np.s_[8, 11], SensorStatus.DRIFTING), (np.s_[36, 11], lost),
+    ):  # fmt: skip
+        assert np.all(truth.status[part] == status)
+    np.testing.assert_allclose(truth.drift[:10, 11], [0] * 8 + [6e-6, 12e-6])
+    table = table_of("failing_gauges")
+    table["truth"]["noise"] = {"standard_deviation_microstrain": 0}
+    truth, value = truth_of(parse_scenario(table, "quiet")), np.full(24, 1e-3)
+    sensed = truth.sense(13, value)
+    assert np.isnan(sensed[16:20]).all()
+    assert sensed[11] == pytest.approx(1e-3 + 36e-6)
+    assert np.all(value == 1e-3)
+    assert np.isnan(truth.sense(36, value)).all()

@@ -1,11 +1,8 @@
 """Which sensors tell most, against exhaustive search and integrals."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import meshio
@@ -19,7 +16,7 @@ from fe.structure.location import on_surface
 from fe.structure.mesh_file import read_mesh
 from fe.wing.design import load_design
 from scenarios import structure_files
-from tests.command_line import call
+from tests.command_line import refused, said
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import MissionInputError
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
@@ -33,7 +30,7 @@ def knowledge() -> Knowledge:
     return prepare_knowledge(scenario, ReducedModelSource(scenario, reduced_model(load_design())), 3)
 
 
-def test_the_information_of_a_sensor_is_that_of_an_integral() -> None:
+def test_the_information_of_a_sensor_is_that_of_an_integral():
     means, rng = np.array([0.0, 1.0, 3.0]), np.random.default_rng(0)
     state = np.arange(60_000) % 3
     shown = means[state] + rng.standard_normal(len(state))
@@ -47,7 +44,7 @@ def test_the_information_of_a_sensor_is_that_of_an_integral() -> None:
     assert readings.information([0]) == pytest.approx(exact, abs=0.01)
 
 
-def test_what_moves_all_sensors_together_is_a_covariance() -> None:
+def test_what_moves_all_sensors_together_is_a_covariance():
     rng = np.random.default_rng(1)
     moved, residual = rng.normal(size=(2, 3, 2)), rng.normal(size=(4, 2, 3))
     state = np.array([0, 1, 0, 1])
@@ -63,7 +60,7 @@ def test_what_moves_all_sensors_together_is_a_covariance() -> None:
     assert found == pytest.approx(1.0 + np.log2(posterior[np.arange(4), state]).mean(), rel=1e-12)
 
 
-def test_three_of_twenty_four_are_those_of_an_exhaustive_search() -> None:
+def test_three_of_twenty_four_are_those_of_an_exhaustive_search():
     readings = drawn_readings(knowledge())
     found = chosen_sensors(readings, range(24), 3)
     told = {
@@ -78,7 +75,7 @@ def test_three_of_twenty_four_are_those_of_an_exhaustive_search() -> None:
         chosen_sensors(readings, [0, 1], 3)
 
 
-def test_a_gauge_beside_a_region_separates_it_and_the_other_region_is_hardly_told() -> None:
+def test_a_gauge_beside_a_region_separates_it_and_the_other_region_is_hardly_told():
     known = knowledge()
     readings = drawn_readings(known)
     apart = separations(known, readings, range(24))
@@ -88,79 +85,52 @@ def test_a_gauge_beside_a_region_separates_it_and_the_other_region_is_hardly_tol
     assert all(fewer[place] <= far + 1e-9 for place, far in apart.items())
 
 
-def test_the_command_chooses_draws_and_names_what_is_not_separated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_chooses_draws_and_names_what_is_not_separated(tmp_path):
     picture, points = tmp_path / "design.png", tmp_path / "gauges.vtu"
-    words = (
-        "design",
-        "level_turns",
-        "--sensors",
-        2,
-        "--among",
-        "1,17,24",
-        "--picture",
-        picture,
-        "--vtu",
-        points,
-    )
-    assert call(monkeypatch, *words, "--json") == 0
-    record = json.loads(capsys.readouterr().out)
+    words = ("design", "level_turns", "--sensors", 2, "--among")
+    record = json.loads(said(*words, "1,17,24", "--picture", picture, "--vtu", points, "--json"))
     assert record["sensors"] == ["17", "24"]
     assert "z2 of 0 % from 20 %" in record["not_separated"]
     assert picture.read_bytes().startswith(b"\x89PNG")
     rank = meshio.read(points).point_data["rank"]
     assert rank[[16, 23]].tolist() == [1.0, 2.0]
     assert rank.sum() == 3.0
-    assert call(monkeypatch, "design", "level_turns", "--sensors", 2, "--among", "1,99") == 1
-    assert "`1,99` came" in capsys.readouterr().err
+    assert "`1,99` came" in refused(*words, "1,99")
 
 
-def designed(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str | Path | int
-) -> dict[str, Any]:
-    assert call(monkeypatch, "design", "stiffened_panel", *words, "--json") == 0, capsys.readouterr().err
-    record: dict[str, Any] = json.loads(capsys.readouterr().out)
+def designed(*words: object) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads(said("design", "stiffened_panel", *words, "--json"))
     return record
 
 
-def test_gauges_may_be_anywhere_on_the_surface_of_a_structure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_gauges_may_be_anywhere_on_the_surface_of_a_structure(tmp_path):
     points, picture = tmp_path / "gauges.vtu", tmp_path / "design.svg"
-    declared = designed(monkeypatch, capsys, "--sensors", 2)
-    found = designed(
-        monkeypatch, capsys, "--sensors", 2, "--candidates", 10, "--vtu", points, "--picture", picture
-    )
+    declared = designed("--sensors", 2)
+    found = designed("--sensors", 2, "--candidates", 10, "--vtu", points, "--picture", picture)
     assert found["of_all"] > declared["of_all"]
     assert found["information"][-1] > declared["information"][-1]
     cloud = meshio.read(points)
     assert len(cloud.points) == 6 + 3 * 10
     mesh = read_mesh(structure_files()["stiffened_panel"].with_suffix(".msh"), 1e-3, "mm")
     places = cloud.points[6::3]
-    off = [on_surface(mesh, place, "it").distance for place in places]
-    assert max(off) < 1e-9
+    assert max(on_surface(mesh, place, "it").distance for place in places) < 1e-9
     apart = np.linalg.norm(places[:, None] - places, axis=2) + np.eye(10)
     assert apart.min() > 0.02  # of a panel of 0.3 m by 0.2 m
     assert picture.read_bytes().startswith(b"<?xml")
 
 
-def test_a_listed_candidate_tells_what_the_same_gauge_of_the_file_does(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_listed_candidate_tells_what_the_same_gauge_of_the_file_does(tmp_path):
     listed = tmp_path / "more.toml"
     listed.write_text(
         '[[gauge]]\nname = "twin_of_end"\npoint = [40, 50, -20]\ndirection = [1, 0, 0]\nlength = 5\n'
         '[[rosette]]\nname = "r"\npoint = [150, 100, 2]\naxes = [[1, 0, 0], [0, 1, 0]]\nangles = [0, 90]\n'
     )
     words = ("--sensors", 1, "--candidates", listed, "--among")
-    same, own = (designed(monkeypatch, capsys, *words, name) for name in ("twin_of_end", "end 1"))
-    assert same["of_all"] == pytest.approx(own["of_all"], rel=0.05)  # the noise is drawn anew
-    other = designed(monkeypatch, capsys, *words, "stiffener 1")
-    assert abs(other["of_all"] - own["of_all"]) > 0.1 * own["of_all"]
-    assert designed(monkeypatch, capsys, *words, "r_b,skin across")["sensors"][0] in ("r_b", "skin across")
+    same, own, other = (designed(*words, name)["of_all"] for name in ("twin_of_end", "end 1", "stiffener 1"))
+    assert same == pytest.approx(own, rel=0.05)  # the noise is drawn anew
+    assert abs(other - own) > 0.1 * own
+    assert designed(*words, "r_b,skin across")["sensors"][0] in ("r_b", "skin across")
     listed.write_text("gauge = 3\n")
-    assert call(monkeypatch, "design", "stiffened_panel", *words, "end 1") == 1
-    assert "more.toml" in capsys.readouterr().err
-    assert call(monkeypatch, "design", "level_turns", "--sensors", 2, "--candidates", 5) == 1
-    assert "a structure from a mesh" in capsys.readouterr().err
+    assert "more.toml" in refused("design", "stiffened_panel", *words, "end 1")
+    shell = refused("design", "level_turns", "--sensors", 2, "--candidates", 5)
+    assert "a structure from a mesh" in shell

@@ -1,7 +1,5 @@
 """Twins flown side by side against the same twins flown alone: equal to the last bit."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -10,14 +8,13 @@ import numpy as np
 import pytest
 
 from fmu_asset.errors import FmuEndedError
-from twin_master.assets.interface import AssetReading, StatelessAsset
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from tests.twin_master.runs import of_library
+from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.errors import AssetOutputError
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import ENDED, FLOWN, in_credible_set, outcomes_of
 from twin_master.mission.loop import fly
-from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.truth import DamageGrowth
 from twin_master.network.graphical_model import GraphicalModel
@@ -31,11 +28,10 @@ def known(name: str, library_file: Path, decide_on: str = "filtered") -> tuple[K
     scenario = load_scenario(name).scenario
     planner = scenario.planner.model_copy(update={"decide_on": decide_on})
     mission = scenario.mission.model_copy(update={"steps": 35})
-    scenario = scenario.model_copy(update={"planner": planner, "mission": mission, "notice": None})
-    source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
+    knowledge, source = of_library(name, library_file, planner=planner, mission=mission, notice=None)
     asset = source.open()
     assert isinstance(asset, StatelessAsset)
-    return prepare_knowledge(scenario, source, 3), asset
+    return knowledge, asset
 
 
 def same(first: Flights, second: Flights) -> bool:
@@ -48,18 +44,17 @@ def same(first: Flights, second: Flights) -> bool:
     ("name", "decide_on"),
     [("level_turns", "filtered"), ("growing_damage", "predicted"), ("failing_gauges", "filtered")],
 )
-def test_each_twin_flies_what_it_flies_alone(name: str, decide_on: str, library_file: Path) -> None:
+def test_each_twin_flies_what_it_flies_alone(name, decide_on, library_file):
     knowledge, asset = known(name, library_file, decide_on)
     truths = [knowledge.truth(seed) for seed in range(5)]
     together = fly_side_by_side(knowledge, truths, [asset] * 5)
     assert same(together, fly_one_by_one(knowledge, truths, lambda *_: asset))
     for cut in (1, 2):
-        halves = [
-            fly_side_by_side(knowledge, some, [asset] * len(some)) for some in (truths[:cut], truths[cut:])
-        ]
-        for name in ARRAYS:
-            joined = np.concatenate([getattr(half, name) for half in halves])
-            assert np.array_equal(getattr(together, name), joined, equal_nan=True)
+        parts = truths[:cut], truths[cut:]
+        halves = [fly_side_by_side(knowledge, some, [asset] * len(some)) for some in parts]
+        for array in ARRAYS:
+            joined = np.concatenate([getattr(half, array) for half in halves])
+            np.testing.assert_array_equal(getattr(together, array), joined)
     alone = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truths[4], asset))
     assert np.array_equal(alone.control_index, together.control_index[4])
     assert len(np.unique(together.state[:, -1], axis=0)) > 1 or name != "growing_damage"
@@ -69,43 +64,32 @@ class Remembering:
     """An asset that is none of `StatelessAsset`, so that it is driven by a plant of its own."""
 
     def __init__(self, asset: StatelessAsset) -> None:
-        self._asset = asset
-        self.units: dict[str, str] = {}
-
-    def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        return self._asset.step(control, health)
+        self.step, self.units = asset.step, dict[str, str]()
+        self.restore_state, self.close = (lambda _state: None), (lambda: None)
 
     def save_state(self) -> bytes:
         return b""
 
-    def restore_state(self, state: bytes) -> None:
-        pass
 
-    def close(self) -> None:
-        pass
+def until_soft(asset: StatelessAsset, error: Exception) -> StatelessAsset:
+    """An asset that raises an error once its first region has lost 40 %."""
 
+    def step(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
+        if health["z1"] >= 0.4:
+            raise error
+        return asset.step(control, health)
 
-def test_an_asset_with_a_memory_flies_the_same(library_file: Path) -> None:
-    knowledge, asset = known("growing_damage", library_file)
-    truths = [knowledge.truth(seed) for seed in (7, 8)]
-    plain = fly_side_by_side(knowledge, truths, [asset] * 2)
-    assert same(plain, fly_side_by_side(knowledge, truths, [Remembering(asset), Remembering(asset)]))
+    return StatelessAsset(step)
 
 
-@pytest.mark.parametrize("remembering", [False, True])
-def test_an_asset_that_fails_does_not_touch_the_others(remembering: bool, library_file: Path) -> None:
+@pytest.mark.parametrize("driven", [lambda asset: asset, Remembering])
+def test_an_asset_that_fails_does_not_touch_the_others(driven, library_file):
     knowledge, asset = known("growing_damage", library_file)
     truths = [knowledge.truth(seed) for seed in range(6)]
     whole = fly_side_by_side(knowledge, truths, [asset] * 6)
-
-    def refusing(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        if health["z1"] >= 0.4:
-            raise AssetOutputError("too soft")
-        return asset.step(control, health)
-
-    made = StatelessAsset(refusing)
-    assets = [Remembering(made) for _ in truths] if remembering else [made] * 6
-    found = fly_side_by_side(knowledge, truths, assets)
+    assert same(whole, fly_side_by_side(knowledge, truths, [driven(asset) for _ in truths]))
+    soft = until_soft(asset, AssetOutputError("too soft"))
+    found = fly_side_by_side(knowledge, truths, [driven(soft) for _ in truths])
     softened = whole.state[:, :, 0] >= 0.4 - 1e-9
     assert [text != "" for text in found.failure] == softened.any(axis=1).tolist()
     assert 0 < sum(text != "" for text in found.failure) < 6
@@ -116,16 +100,10 @@ def test_an_asset_that_fails_does_not_touch_the_others(remembering: bool, librar
         assert (found.control_index[twin, end:] == -1).all()
 
 
-def test_an_asset_that_ends_keeps_what_it_has_flown(library_file: Path) -> None:
+def test_an_asset_that_ends_keeps_what_it_has_flown(library_file):
     knowledge, asset = known("growing_damage", library_file)
     truths = [knowledge.truth(seed) for seed in range(3)]
-
-    def ending(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        if health["z1"] >= 0.4:
-            raise FmuEndedError("It asked to end.", time=1.0)
-        return asset.step(control, health)
-
-    assets = [Remembering(StatelessAsset(ending)) for _ in truths]
+    assets = [Remembering(until_soft(asset, FmuEndedError("It asked to end.", time=1.0))) for _ in truths]
     found = fly_side_by_side(knowledge, truths, assets)
     assert same(found, fly_one_by_one(knowledge, truths, lambda twin, _: assets[twin]))
     flown = (found.control_index >= 0).sum(axis=1)
@@ -137,12 +115,11 @@ def test_an_asset_that_ends_keeps_what_it_has_flown(library_file: Path) -> None:
     assert kept["status"].tolist() == [ENDED if text else FLOWN for text in found.ended]
     for row, turns in enumerate(flown):
         np.testing.assert_array_equal(kept["belief"][row], found.filtered[row, turns - 1].astype("f4"))
-        short = found.filtered[row, :turns], found.state[row, :turns]
-        inside = in_credible_set(knowledge.model, *short)
+        inside = in_credible_set(knowledge.model, found.filtered[row, :turns], found.state[row, :turns])
         assert kept["credible"][row] == np.float32(inside.mean())
 
 
-def test_an_impossible_observation_ends_one_flight_only(library_file: Path) -> None:
+def test_an_impossible_observation_ends_one_flight_only(library_file):
     knowledge, asset = known("level_turns", library_file)
     truths = [knowledge.truth(seed) for seed in range(2)]
     truths[1].noise[4] = 1e200
@@ -154,28 +131,19 @@ def test_an_impossible_observation_ends_one_flight_only(library_file: Path) -> N
     assert "step 4" in found.failure[1]
 
 
-def test_a_product_of_tables_flies_the_same(library_file: Path) -> None:
+def test_a_product_of_tables_flies_the_same_and_damage_grows_as_the_model_says(library_file):
     knowledge, asset = known("growing_damage", library_file)
     model = knowledge.model
     tables = model.transition.blocks[0].reshape(2, 5, 5, 5, 5)
-    first = tables[:, :, 0].sum(axis=-1)
-    second = tables[:, 0].sum(axis=2)
-    product = replace(knowledge, model=GraphicalModel(
-        model.states, model.controls, model.prior, TransitionModel((first, second))
-    ))  # fmt: skip
+    moves = TransitionModel((tables[:, :, 0].sum(axis=-1), tables[:, 0].sum(axis=2)))
+    graph = GraphicalModel(model.states, model.controls, model.prior, moves)
+    product = replace(knowledge, model=graph)
     assert product.model.transition.is_product
     truths = [product.truth(seed) for seed in range(2)]
-    assert same(
-        fly_side_by_side(product, truths, [asset] * 2), fly_one_by_one(product, truths, lambda *_: asset)
-    )
-
-
-def test_damage_grows_with_the_probabilities_of_the_model(library_file: Path) -> None:
-    knowledge, _ = known("growing_damage", library_file)
-    growth = DamageGrowth(knowledge.model)
-    uniform = (np.arange(2000) + 0.5) / 2000
+    together = fly_side_by_side(product, truths, [asset] * 2)
+    assert same(together, fly_one_by_one(product, truths, lambda *_: asset))
+    growth, uniform = DamageGrowth(model), (np.arange(2000) + 0.5) / 2000
     for control in (0, 1):
-        row = knowledge.model.transition.row(control, 6)
-        before = np.full(len(uniform), control), np.full(len(uniform), 6)
-        found = np.bincount(growth.following(*before, uniform), minlength=25)
-        np.testing.assert_allclose(found / 2000, row, atol=1.5 / 2000)
+        row = model.transition.row(control, 6)
+        found = growth.following(np.full(len(uniform), control), np.full(len(uniform), 6), uniform)
+        np.testing.assert_allclose(np.bincount(found, minlength=25) / 2000, row, atol=1.5 / 2000)

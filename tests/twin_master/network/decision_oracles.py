@@ -1,7 +1,5 @@
 """Independent answers for tests of inference: enumeration, arbitrary precision, variable elimination."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import warnings

@@ -1,7 +1,5 @@
 """Planning on the belief against enumeration, a fine grid of beliefs, and values that were published."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 
@@ -49,7 +47,7 @@ def enumerated(problem: DecisionProblem, belief: np.ndarray, turns: int) -> floa
 
 
 @pytest.mark.parametrize(("discount", "published"), [(0.75, 1.933), (0.95, 19.3713)])
-def test_the_tiger_is_worth_what_was_published(discount: float, published: float) -> None:
+def test_the_tiger_is_worth_what_was_published(discount, published):
     plan = plan_on_belief(tiger(discount), gap=1e-4, most_beliefs=5000)
     assert plan.lower - 5e-4 <= published <= plan.upper + 5e-4
     assert plan.upper - plan.lower <= 1e-4 * plan.upper
@@ -60,7 +58,7 @@ STORM = {"tiger": (19.3711, 19.3716), "maze of 4 x 3": (1.8490, 1.9066)}
 
 
 @pytest.mark.parametrize("name", STORM)
-def test_an_independent_solver_finds_the_same_value(name: str) -> None:
+def test_an_independent_solver_finds_the_same_value(name):
     below, above = STORM[name]
     plan = plan_on_belief(PROBLEMS[name]())
     assert plan.lower <= above
@@ -70,7 +68,7 @@ def test_an_independent_solver_finds_the_same_value(name: str) -> None:
 
 @pytest.mark.parametrize("moves_first", [False, True])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_bounds_hold_what_is_enumerated(seed: int, moves_first: bool) -> None:
+def test_the_bounds_hold_what_is_enumerated(seed, moves_first):
     problem = drawn(seed, 3, moves_first, discount=0.3)
     turns = 4
     rest = 0.3**turns * np.abs(problem.reward).max() / 0.7
@@ -84,7 +82,7 @@ def test_the_bounds_hold_what_is_enumerated(seed: int, moves_first: bool) -> Non
 
 @pytest.mark.parametrize("moves_first", [False, True])
 @pytest.mark.parametrize("seed", [3, 4, 5])
-def test_the_value_is_that_on_a_fine_grid_of_beliefs(seed: int, moves_first: bool) -> None:
+def test_the_value_is_that_on_a_fine_grid_of_beliefs(seed, moves_first):
     problem = drawn(seed, 2, moves_first)
     grid = np.linspace(0.0, 1.0, 2001)
     value = np.zeros_like(grid)
@@ -107,7 +105,7 @@ def test_the_value_is_that_on_a_fine_grid_of_beliefs(seed: int, moves_first: boo
 
 
 @pytest.mark.parametrize("moves_first", [False, True])
-def test_simulated_missions_bring_what_the_plan_promises(moves_first: bool) -> None:
+def test_simulated_missions_bring_what_the_plan_promises(moves_first):
     problem = drawn(6, 4, moves_first)
     plan = plan_on_belief(problem, gap=1e-3)
     rng = np.random.default_rng(0)
@@ -118,7 +116,7 @@ def test_simulated_missions_bring_what_the_plan_promises(moves_first: bool) -> N
     assert plan.upper <= problem.prior @ known.value + 1e-9
 
 
-def test_the_difference_of_two_rules_varies_little_from_mission_to_mission() -> None:
+def test_the_difference_of_two_rules_varies_little_from_mission_to_mission():
     problem = drawn(6, 4, moves_first=False)
     known = value_iteration(problem.transition, problem.reward, problem.discount).action_value
 
@@ -133,7 +131,7 @@ def test_the_difference_of_two_rules_varies_little_from_mission_to_mission() -> 
     assert (first - second).std() < 0.4  # rewards that are drawn with the states differ by 1.4
 
 
-def test_a_product_of_tables_is_planned_as_the_table_of_all_states() -> None:
+def test_a_product_of_tables_is_planned_as_the_table_of_all_states():
     rng = np.random.default_rng(7)
     factors = tuple(rng.dirichlet(np.ones(3), (2, 3)) for _ in range(2))
     product = TransitionModel(factors)
@@ -147,18 +145,16 @@ def test_a_product_of_tables_is_planned_as_the_table_of_all_states() -> None:
     assert first.upper == pytest.approx(second.upper, rel=1e-9)
 
 
-def test_a_problem_whose_tables_do_not_fit_is_refused() -> None:
+def test_a_problem_whose_tables_do_not_fit_is_refused():
     problem = tiger(0.9)
     with pytest.raises(PlanningError, match="sum to one"):
         replace(problem, likelihood=(problem.likelihood[0] * 0.5, *problem.likelihood[1:]))
-    with pytest.raises(PlanningError, match="expected rewards of shape"):
+    with pytest.raises(PlanningError, match="expected likelihoods of controls of shape"):
         replace(problem, likelihood=problem.likelihood[:2])
 
 
 @pytest.mark.parametrize("limit", ["_LARGEST", "_MOST_PARTS"])
-def test_where_bounds_cannot_settle_more_beliefs_are_visited(
-    limit: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_where_bounds_cannot_settle_more_beliefs_are_visited(limit, monkeypatch):
     problem = drawn(6, 4, moves_first=False)
     visited: list[int] = []
     for most in (np.inf, 0.0):

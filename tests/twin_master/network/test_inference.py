@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pickle
 import sys
 from pathlib import Path
@@ -237,10 +235,10 @@ ZEROS = np.zeros((3, 25))
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda: filter_sequence(MODEL, [1, 1], ZEROS), r"expected shape \(2, 25\)"),
+        (lambda: filter_sequence(MODEL, [1, 1], ZEROS), r"of shape \(2, 25\)"),
         (lambda: filter_sequence(MODEL, [1, 2], ZEROS[:2]), "between 0 and 1"),
-        (lambda: filter_sequence(MODEL, 1, ZEROS[0]), "one control for each step"),
-        (lambda: smooth(MODEL, [[1]], ZEROS[None, :1]), "one control for each step"),
+        (lambda: filter_sequence(MODEL, 1, ZEROS[0]), r"controls of shape \(steps,\)"),
+        (lambda: smooth(MODEL, [[1]], ZEROS[None, :1]), r"controls of shape \(steps,\)"),
         (lambda: filter_step(MODEL, None, 1, ZEROS[0]), "both or neither"),
         (lambda: predict(MODEL, np.ones(3), 0, POLICY, 1), r"belief of shape \(25,\)"),
         (lambda: predict(MODEL, np.ones(25), 0, POLICY, -1), "horizon of 0 or more"),

@@ -1,10 +1,7 @@
 """What does not fit in memory, or is no noise of a sensor, is refused before it is built."""
 
-from __future__ import annotations
-
 import tomllib
 import tracemalloc
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,12 +37,12 @@ def six_factors() -> LoadedScenario:
     return LoadedScenario(parse_scenario(table, "x"), scenario_files()["level_turns"], "")
 
 
-def test_the_memory_of_this_machine_is_known() -> None:
+def test_the_memory_of_this_machine_is_known():
     assert 5e7 < memory_left() < 1e14
 
 
 @pytest.mark.usefixtures("small_machine")
-def test_too_many_states_are_refused_before_anything_is_built() -> None:
+def test_too_many_states_are_refused_before_anything_is_built():
     loaded = six_factors()
     tracemalloc.start()
     try:
@@ -61,7 +58,7 @@ def test_too_many_states_are_refused_before_anything_is_built() -> None:
 
 
 @pytest.mark.usefixtures("small_machine")
-def test_too_many_draws_are_refused_with_their_size() -> None:
+def test_too_many_draws_are_refused_with_their_size():
     scenario = parse_scenario(tomllib.loads(TEXT.replace("draws = 100", "draws = 1000000")), "x")
     with pytest.raises(InvalidModelError, match=r"76.8 GB for 1000000 draws of 24 sensors"):
         check_scenario_fits(scenario)
@@ -69,7 +66,7 @@ def test_too_many_draws_are_refused_with_their_size() -> None:
 
 
 @pytest.mark.usefixtures("small_machine")
-def test_the_table_of_all_states_is_refused_too() -> None:
+def test_the_table_of_all_states_is_refused_too():
     table = worsening_table(5, 0.1)
     product = TransitionModel.from_factors([[table] * 6] * 2)
     with pytest.raises(InvalidModelError, match="15625 states under 2 controls"):
@@ -80,9 +77,7 @@ def test_the_table_of_all_states_is_refused_too() -> None:
 @pytest.mark.parametrize(
     ("key", "number"), [("observation.standard_deviation", 125), ("truth.noise.standard_deviation", 150)]
 )
-def test_a_noise_whose_unit_was_forgotten_is_refused(
-    key: str, number: int, tmp_path: Path, library_file: Path
-) -> None:
+def test_a_noise_whose_unit_was_forgotten_is_refused(key, number, tmp_path, library_file):
     old = f"standard_deviation_microstrain = {number}"
     assert old in TEXT
     path = tmp_path / "blind.toml"
@@ -97,7 +92,7 @@ def test_a_noise_whose_unit_was_forgotten_is_refused(
         assert word in str(caught.value), str(caught.value)
 
 
-def test_only_a_noise_beyond_all_that_its_kind_of_sensor_shows_is_refused() -> None:
+def test_only_a_noise_beyond_all_that_its_kind_of_sensor_shows_is_refused():
     predicted = np.zeros((1, 2, 1, 3))
     predicted[0, :, 0, 0] = 1e-3, 2e-3
     predicted[0, :, 0, 2] = 300.0

@@ -1,7 +1,5 @@
 """Transitions as products of blocks: equal to one table of all states, however small the probabilities."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

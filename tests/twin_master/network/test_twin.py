@@ -1,7 +1,5 @@
 """The twin: the model that a scenario describes, and what it concludes from turn to turn."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +11,7 @@ from scipy.stats import binom
 
 from fe.runtime.kept_arrays import arrays_to_bytes
 from scenarios import scenario_files
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.errors import ImpossibleObservation, InvalidModelError
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.network.estimator import Carried, Estimate, ExactFilter, Learnt
@@ -31,7 +28,7 @@ def knowledge(library_file: Path) -> Knowledge:
     )
 
 
-def test_the_model_of_the_paper() -> None:
+def test_the_model_of_the_paper():
     model = build_graphical_model(load_scenario("level_turns").scenario)
     assert model.states.names == ("z1", "z2")
     assert model.prior[0] == 1.0
@@ -45,7 +42,7 @@ def test_the_model_of_the_paper() -> None:
         assert matrix[control, index((0.8, 0.8)), index((0.8, 0.8))] == 1.0
 
 
-def test_probabilities_may_differ_between_states_and_tables_may_be_given() -> None:
+def test_probabilities_may_differ_between_states_and_tables_may_be_given():
     table = tomllib.loads(scenario_files()["level_turns"].read_text(encoding="utf-8"))
     table["transition"]["probability"]["3g"] = {"z1": 0.3, "z2": 0.0}
     model = build_graphical_model(parse_scenario(table, "x"))
@@ -66,7 +63,7 @@ def test_probabilities_may_differ_between_states_and_tables_may_be_given() -> No
     assert model.transition.matrix[0, at((0.8, 0.0)), at((0.0, 0.2))] == pytest.approx(0.125)
 
 
-def test_turn_by_turn_equals_the_whole_sequence(knowledge: Knowledge) -> None:
+def test_turn_by_turn_equals_the_whole_sequence(knowledge):
     generator = np.random.default_rng(0)
     controls = np.array([1, 1, 0, 1, 0, 0])
     observed = knowledge.sensor_model.mean[[0, 0, 5, 6, 6, 12], controls]
@@ -97,7 +94,7 @@ def decided(knowledge: Knowledge, rule: Literal["filtered", "predicted"], turns:
     return [twin.turn(blind, 1) for _ in range(turns)][-1]
 
 
-def test_the_two_rules_of_decision_differ_where_the_belief_tips_within_one_turn(knowledge: Knowledge) -> None:
+def test_the_two_rules_of_decision_differ_where_the_belief_tips_within_one_turn(knowledge):
     """The policy is 2g from z1 = 60 %, three levels up; nothing is seen, so z1 is binomial with p = 0.1.
 
     After 26 transitions p(z1 >= 60 %) = 0.489, after 27 it is 0.515.
@@ -121,7 +118,7 @@ def test_the_two_rules_of_decision_differ_where_the_belief_tips_within_one_turn(
         )
 
 
-def test_an_impossible_observation_names_twin_step_and_sensors(knowledge: Knowledge) -> None:
+def test_an_impossible_observation_names_twin_step_and_sensors(knowledge):
     twin = knowledge.twin()
     good = knowledge.sensor_model.mean[0, 1].copy()
     twin.turn(good, 1)
@@ -154,7 +151,7 @@ def same_turn(first: TwinTurn, second: TwinTurn) -> bool:
     )
 
 
-def test_a_twin_has_no_last_turn_and_smooths_over_its_lag(knowledge: Knowledge, seen: np.ndarray) -> None:
+def test_a_twin_has_no_last_turn_and_smooths_over_its_lag(knowledge, seen):
     """The smoother of a lag is that of the whole history: it needs no likelihood from before."""
     bounded, whole = knowledge.twin(lag=5), knowledge.twin()
     for count, row in enumerate(seen, start=1):
@@ -166,7 +163,7 @@ def test_a_twin_has_no_last_turn_and_smooths_over_its_lag(knowledge: Knowledge, 
 
 
 @pytest.mark.parametrize("late", [0, 30, 34, 39])
-def test_what_comes_late_is_put_in_its_place(knowledge: Knowledge, seen: np.ndarray, late: int) -> None:
+def test_what_comes_late_is_put_in_its_place(knowledge, seen, late):
     lag = None if late == 0 else 9
     clean, twin = knowledge.twin(lag=lag), knowledge.twin(lag=lag)
     for turn, row in enumerate(seen):
@@ -178,7 +175,7 @@ def test_what_comes_late_is_put_in_its_place(knowledge: Knowledge, seen: np.ndar
     np.testing.assert_array_equal(twin.turn(seen[0], 0).filtered, clean.turn(seen[0], 0).filtered)
 
 
-def test_a_turn_that_is_not_kept_cannot_be_revised(knowledge: Knowledge, seen: np.ndarray) -> None:
+def test_a_turn_that_is_not_kept_cannot_be_revised(knowledge, seen):
     twin = knowledge.twin(lag=4)
     for row in seen[:10]:
         twin.turn(row)
@@ -191,7 +188,7 @@ def test_a_turn_that_is_not_kept_cannot_be_revised(knowledge: Knowledge, seen: n
     assert twin.save_state() == state
 
 
-def test_a_stored_twin_goes_on_to_the_last_bit(knowledge: Knowledge, seen: np.ndarray) -> None:
+def test_a_stored_twin_goes_on_to_the_last_bit(knowledge, seen):
     twin = knowledge.twin(lag=6)
     for row in seen[:20]:
         twin.turn(row)
@@ -206,7 +203,7 @@ def test_a_stored_twin_goes_on_to_the_last_bit(knowledge: Knowledge, seen: np.nd
             other.restore_state(damaged)
 
 
-def test_own_policy_planner_sensor_model_and_estimator(knowledge: Knowledge, seen: np.ndarray) -> None:
+def test_own_policy_planner_sensor_model_and_estimator(knowledge, seen):
     class Tenfold:
         """A sensor model of a user's own: no residuals, only a likelihood."""
 

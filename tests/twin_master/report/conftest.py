@@ -5,24 +5,26 @@ from pathlib import Path
 import pytest
 import xarray as xr
 
-from tests.twin_master.report import synthetic_run
+from tests.twin_master.report.drawn import flown, stored
 from twin_master.report import page as report
-from twin_master.report.reading import Run, read_run
+from twin_master.report.reading import Run
 
 
 @pytest.fixture(scope="session")
-def tree() -> xr.DataTree:
-    return synthetic_run.build_tree()
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The paper's mission, with what the FMU of a wing would have monitored."""
+    run = flown(tmp_path_factory.mktemp("flown") / "wing")
+    monitored = {
+        name: ("step", [value] * run.steps, {"units": unit})
+        for name, value, unit in (("strain_error_bound", 1.2e-6, "1"), ("tip_displacement", 0.18, "m"))
+    }
+    run.tree["truth"] = xr.DataTree(run.tree["truth"].to_dataset().assign(monitored))
+    return run
 
 
 @pytest.fixture(scope="session")
-def folder(tmp_path_factory: pytest.TempPathFactory, tree: xr.DataTree) -> Path:
-    return synthetic_run.write_run(tmp_path_factory.mktemp("runs") / "run", tree)
-
-
-@pytest.fixture(scope="session")
-def run(folder: Path) -> Run:
-    return read_run(folder)
+def folder(tmp_path_factory: pytest.TempPathFactory, run: Run) -> Path:
+    return stored(run, tmp_path_factory.mktemp("runs") / "run")
 
 
 @pytest.fixture

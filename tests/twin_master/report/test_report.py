@@ -1,10 +1,10 @@
 """The report shows what the run holds, is reproducible, and refuses a damaged run with one sentence."""
 
 import errno
+import html
 import json
 import os
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,78 +14,164 @@ import xarray as xr
 from numpy.testing import assert_allclose, assert_array_equal
 
 from calibration.result.plain import run_record
-from calibration.result.record import Calibration
 from reporting.errors import DiskFullError
 from reporting.figures import to_svg
 from reporting.words import number
-from tests.twin_master.report import synthetic_run
-from tests.twin_master.report.drawn import line, panel
-from tests.twin_master.report.synthetic_run import altered, rescripted
+from tests.twin_master.report.drawn import altered, flown, line, panel, rescripted, stored
 from twin_master.errors import RunFolderError
 from twin_master.report import page as report
 from twin_master.report.calibration import true_value
 from twin_master.report.check import predictive_check
 from twin_master.report.mission import default_now, mission_figure
+from twin_master.report.opening import opening_sentences
 from twin_master.report.page import lost_ranges, turn_ranges
 from twin_master.report.reading import Run, read_run
 from twin_master.run_folder import to_json
+from twin_master.scenario.reading import load_scenario
+from twin_master.store.mission_result import LearntQuantity
+from twin_master.store.summary import Fallback, _fallback_figures
+
+DRAWING = b'<svg viewBox="0 0 1 1"></svg>'
 
 
-def text_of(folder: Path) -> str:
-    return report.write_report(folder).read_text(encoding="utf-8")
+def text_of(run: Run, place: Path) -> str:
+    """Return the page of a run that is written into a folder."""
+    return report.write_report(stored(run, place)).read_text(encoding="utf-8")
 
 
-def without(tree: xr.DataTree, missing: str) -> xr.DataTree:
-    """A run without a group, or without a variable: GROUP/VARIABLE."""
-    part = xr.DataTree.from_dict({name: tree[name].to_dataset() for name in tree.children})
-    group, _, variable = missing.partition("/")
-    if variable:
-        part[group] = xr.DataTree(part[group].to_dataset().drop_vars(variable))
-    else:
-        del part[group]
-    return part
+# ------------------------------------------------------------------------- the sentences at its head
+
+REGION = "the stiffness loss of region 1"
+KEPT = "The twin kept 3g at every turn"
+REACHED = f"; {REGION} reached the 60 % from which the policy leaves 3g at turn 30."
 
 
-@pytest.mark.parametrize("now", [0, 7, 18, 49])
-def test_smoothing_up_to_a_turn_equals_a_mission_that_ended_there(run: Run, now: int) -> None:
-    shorter = synthetic_run.build_tree(steps=now + 1)
-    assert_array_equal(shorter["filtered/probability"].values, run["filtered/probability"][: now + 1])
-    assert_allclose(run.smoothed_until(now), shorter["smoothed/probability"].values, atol=1e-12)
+def test_the_page_begins_with_what_was_decided_believed_and_explained(run):
+    decided, believed, explained = opening_sentences(run)
+    assert decided.startswith("The twin fell back from 3g to 2g at turn 31, one turn after")
+    both = np.where(run.model.states.coordinates.sum(axis=1) > 0.59, 0, 1)
+    left = opening_sentences(altered(run, policy__control_index=both))[0]
+    assert left == "The twin left 3g for 2g at turn 31."  # by a policy of both states
+    mean, deviation = (100 * run[f"filtered/{name}"][-1, 0] for name in ("mean", "standard_deviation"))
+    low, high = max(mean - 2 * deviation, 0.0), min(mean + 2 * deviation, 80.0)
+    assert f"puts {REGION} at {mean:.1f} % ({low:.1f} to {high:.1f}, truth 60)" in believed
+    # 150 µε of noise, 125 assumed
+    assert f"{predictive_check(run).standard_deviation:.3g} times as far as it assumes" in explained
+    text = html.unescape(report.render_page(run, {}, {})).replace("\N{NO-BREAK SPACE}", " ")
+    assert " ".join(opening_sentences(run)) in " ".join(text.split())
+
+
+def first_sentence(run: Run, *gentle: int, level: float = 0.6, **changes: np.ndarray | None) -> str:
+    """The first sentence of a run that flew 2g at these turns, by a policy that leaves 3g from a level on."""
+    control = np.ones(50, dtype=np.int64)
+    control[list(gentle)] = 0
+    policy = np.where(run.model.states.coordinates[:, 0] > level - 0.01, 0, 1)
+    given = {"observed__control_index": control, "policy__control_index": policy}
+    return opening_sentences(altered(run, **given, **changes))[0]
+
+
+@pytest.mark.parametrize(
+    ("gentle", "changes", "said"),
+    [
+        (range(30, 50), {}, f"The twin fell back from 3g to 2g at turn 30, when {REGION} had reached 60 %."),
+        ((), {}, f"{KEPT}{REACHED}"),
+        (
+            (), {"truth__state": np.zeros((50, 2))},
+            f"{KEPT}; {REGION} never reached the 60 % from which the policy leaves 3g.",
+        ),
+        (range(12, 50), {}, f"The twin left 3g for 2g at turn 12{REACHED}"),
+        (
+            range(31, 50), {},
+            f"The twin fell back from 3g to 2g at turn 31, one turn after {REGION} had reached 60 %.",
+        ),
+        (
+            (33, *range(40, 50)), {},
+            "The twin left 3g for 2g at turn 33, left 2g for 3g at turn 34, left 3g for 2g at turn 40; "
+            f"the first change came 3 turns after {REGION} had reached 60 %.",
+        ),
+        (
+            range(1, 50), {"level": 0.0},
+            "The twin left 3g for 2g at turn 1; the policy leaves 3g in every state.",
+        ),
+        ((), {"truth": None}, f"{KEPT}."),
+    ],
+)  # fmt: skip
+def test_the_first_sentence_follows_the_record(run, gentle, changes, said):
+    assert first_sentence(run, *gentle, **changes) == said  # type: ignore[arg-type]
+
+
+def test_of_a_real_asset_nothing_is_said_but_what_was_recorded(run):
+    watched = replace(altered(run, truth=None), config={**run.config, "watched": True})
+    observed = watched.tree["observed"].to_dataset()
+    watched.tree["observed"] = observed.assign_coords(step=observed["step"] + 1000)
+    obeyed = np.tile([0.1, 0.9], (50, 1))
+    obeyed[30:] = [0.8, 0.2]  # asked for 2g from turn 31 on
+    left = first_sentence(watched, *range(31, 50), filtered__decision_probability=obeyed)
+    assert left == "The asset left 3g for 2g at turn 1031."
+    kept = first_sentence(watched, filtered__decision_probability=obeyed)
+    assert kept == "The asset kept 3g at every turn; at 19 turns the twin had asked for another control."
+    assert "truth" not in " ".join(opening_sentences(watched))
+
+
+def test_the_last_sentence_judges_the_scatter_and_what_was_learnt_is_said(run):
+    random, expected, noise = np.random.default_rng(3), run["filtered/quantity_mean"], 125e-6
+    known = altered(run, filtered__quantity_standard_deviation=np.zeros_like(expected))
+    draws = random.standard_normal(expected.shape)
+
+    def sentences(scatter: np.ndarray) -> tuple[str, ...]:
+        return tuple(opening_sentences(altered(known, observed__strain=expected + noise * scatter)))
+
+    within = "The twin's model explains the observations within the noise that it assumes: 9"
+    assert sentences(draws)[-1].startswith(within)
+    assert sentences(0.5 * draws)[-1].endswith("its intervals are wider than they need be.")
+    assert sentences(2.0 * draws)[-1].endswith("the noise is larger, or the model is off.")
+    draws[:, 6] += 1.4  # one gauge is off, and the others hide it
+    assert "intervals, but" in sentences(draws)[-1]
+    assert sentences(draws)[-1].endswith("% of those of gauge 7.")
+    assert len(sentences(np.full_like(draws, np.nan))) == 2
+    course, name = np.tile([1.02, 0.004, 1.01, 1.03], (50, 1)), "Young modulus factor"
+    learnt = LearntQuantity("young_modulus_factor", name, "", course, course[0], np.array(1.025))
+    changed = replace(run)
+    vars(changed)["learnt"] = (learnt,)
+    said = opening_sentences(changed)[1]
+    assert said.endswith("; it learnt the Young modulus factor: 1.020 (1.012 to 1.028, truth 1.025).")
+
+
+# ----------------------------------------------------------------------------------------- the page
+
+
+@pytest.mark.parametrize("now", [0, 18])
+def test_smoothing_up_to_a_turn_equals_a_mission_that_ended_there(run, tmp_path, now):
+    shorter = flown(tmp_path / "short", steps=now + 1)
+    assert_array_equal(shorter["filtered/probability"], run["filtered/probability"][: now + 1])
+    assert_allclose(run.smoothed_until(now), shorter["smoothed/probability"], atol=1e-12)
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_another_model_is_told_before_anything_else(tmp_path: Path, tree: xr.DataTree) -> None:
-    place = synthetic_run.write_run(tmp_path / "run", tree)
-    assert "model differ" not in text_of(place)
+def test_origins_and_references_are_told_where_there_are_any(run, tmp_path):
+    text = text_of(run, tmp_path / "same")
+    assert "model differ" not in text
+    assert "source of the reference" in text
+    figures = [figure | {"reference": None} for figure in run.summary["figures"]]
     origin = {"asset": "strain library", "twin_model": "reduced model", "asset_and_model_differ": True}
-    (place / "summary.json").write_text(json.dumps(synthetic_run.summary() | origin))
-    text = text_of(place)
+    summary = {**run.summary, "figures": figures, **origin}
+    text = text_of(replace(run, summary=summary), tmp_path / "other")
     assert "differ: flown was the strain library, and the twin believes the reduced model." in text
+    assert "reference</th>" not in text
 
 
-@pytest.fixture(scope="module")
-def page(folder: Path) -> Path:
-    return report.write_report(folder)
-
-
-def test_equal_runs_give_equal_bytes(folder: Path, page: Path, tmp_path: Path, tree: xr.DataTree) -> None:
-    other = synthetic_run.write_run(tmp_path / "elsewhere", tree)
+def test_the_page_needs_nothing_from_outside_and_equal_runs_give_equal_bytes(run, folder, tmp_path):
+    page = report.write_report(folder).read_bytes()
+    other = stored(run, tmp_path / "elsewhere")
     (other / "timing.json").write_text('{"total_seconds": 4.321}')
-    second = report.write_report(other)
-    contents = []
-    for place in (folder, other):
-        drawings = {path.name: path.read_bytes() for path in (place / "figures").iterdir()}
-        contents.append((drawings, (place / "report.html").read_bytes()))
-    assert contents[0] == contents[1]
-    assert set(contents[0][0]) == {
+    assert report.write_report(other).read_bytes() == page
+    drawings = [{path.name: path.read_bytes() for path in (f / "figures").iterdir()} for f in (folder, other)]
+    assert drawings[0] == drawings[1]
+    assert set(drawings[0]) == {
         "mission_now.svg", "mission_now.png", "mission_whole.svg", "belief.svg", "policy.svg", "check.svg",
         "calibration.svg", "network.svg",
     }  # fmt: skip
-    assert page.read_bytes() == second.read_bytes()
-
-
-def test_the_page_needs_nothing_from_outside(folder: Path, page: Path) -> None:
-    text = page.read_text(encoding="utf-8")
+    text = page.decode("utf-8")
     assert "http://" not in text
     assert "https://" not in text
     assert text.count("<script>") == text.count("<script") == 1
@@ -95,63 +181,38 @@ def test_the_page_needs_nothing_from_outside(folder: Path, page: Path) -> None:
     assert str(folder) not in text
     assert re.search(r"largest tip displacement</td><td>0.18\sm<", text)
     assert re.search(r"largest strain error bound</td><td>1.2\sµε<", text)
-    for word in ("Kapteyn", "seed 5", "policy leaves the first control from z1", "timing.json"):
+    for word in ("Kapteyn", "seed 2021", "policy leaves the first control from z1", "timing.json"):
         assert word in text
 
 
-@pytest.mark.usefixtures("no_drawing")
-def test_figures_without_references_have_no_column_for_them(tmp_path: Path, tree: xr.DataTree) -> None:
-    place = synthetic_run.write_run(tmp_path / "run", tree)
-    assert "source of the reference" in text_of(place)
-    content = json.loads((place / "summary.json").read_text(encoding="utf-8"))
-    for figure in content["figures"]:
-        figure["reference"] = None
-    (place / "summary.json").write_text(json.dumps(content))
-    assert "reference</th>" not in text_of(place)
-
-
-def test_captions_tell_the_decision_and_what_it_rests_on(
-    folder: Path, tmp_path: Path, tree: xr.DataTree
-) -> None:
-    asked = 100 * tree["filtered/decision_probability"].values[18, 1]
+def test_captions_tell_the_decision_and_what_it_rests_on(run, folder, tmp_path):
+    asked = run["filtered/decision_probability"][18, 1]
     sentence = "At the end of turn 18 the twin decided on 3g for the next one: the policy asks for it with "
     captions = {figure.name: figure.caption for figure in report.report_figures(folder, 18)}
-    assert (
-        f"{sentence}probability {asked / 100:.2f} in the state as just observed." in captions["mission_now"]
-    )
-    place = synthetic_run.write_run(tmp_path / "run", tree)
-    config = json.loads((place / "config.json").read_text())
-    config["scenario"]["planner"]["decide_on"] = "predicted"
-    (place / "config.json").write_text(json.dumps(config))
-    caption = next(report.report_figures(place, 18)).caption
-    assert "in the state predicted for that turn." in caption
+    assert f"{sentence}probability {asked:.2f} in the state as just observed." in captions["mission_now"]
+    place = stored(rescripted(run, planner={"decide_on": "predicted"}), tmp_path / "run")
+    assert "in the state predicted for that turn." in next(report.report_figures(place, 18)).caption
 
 
-def test_words() -> None:
+def test_words():
     assert turn_ranges([4]) == "turn 4"
     assert turn_ranges([4, 5, 6, 9]) == "turns 4–6, 9"
-    assert number(None) == "—"
-    assert number(-0.123456) == "−0.12346"
-    assert number(3) == "3"
-    assert number(True) == "yes"
+    assert [number(value) for value in (None, -0.123456, 3, True)] == ["—", "−0.12346", "3", "yes"]
 
 
-def test_the_present_is_chosen_before_the_first_change_of_control(run: Run) -> None:
+def test_the_present_is_chosen_before_the_first_change_of_control(run):
     def now(control: np.ndarray) -> int:
         return default_now(altered(run, observed__control_index=control))
 
     turns = np.arange(50)
-    assert default_now(run) == 18
+    assert default_now(run) == 28
     assert now(np.zeros(50)) == 33
     for change in (1, 2, 5):  # of which nothing would be seen before it
         assert now(np.where(turns < change, 1, 0)) == 33
     assert now(np.where(turns < 6, 1, 0)) == 3
 
 
-def test_a_fallback_that_came_before_the_damage_has_no_delay() -> None:
-    from twin_master.scenario.reading import load_scenario
-    from twin_master.store.summary import Fallback, _fallback_figures
-
+def test_a_fallback_that_came_before_the_damage_has_no_delay():
     scenario = load_scenario("level_turns").scenario
 
     def values(*steps: int | None) -> list[object]:
@@ -164,129 +225,109 @@ def test_a_fallback_that_came_before_the_damage_has_no_delay() -> None:
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_what_nobody_knows_is_left_out(tmp_path: Path, tree: xr.DataTree) -> None:
-    place = synthetic_run.write_run(tmp_path / "run", without(tree, "truth"))
-    (place / "summary.json").unlink()
-    text = text_of(place)
+def test_what_nobody_knows_is_left_out(run, tmp_path):
+    text = text_of(replace(altered(run, truth=None), summary={}), tmp_path / "run")
     assert text.count("<figure") == 7
     assert "truth" not in text.replace("the truth, which", "")
 
 
 @pytest.mark.usefixtures("no_drawing")
 @pytest.mark.parametrize(("steps", "horizon"), [(1, 10), (12, 10), (2, 3), (3, 1)])
-def test_short_missions(tmp_path: Path, steps: int, horizon: int) -> None:
-    short = synthetic_run.build_tree(steps=steps, horizon=horizon, sensors=5)
-    assert f"{steps} turns" in text_of(synthetic_run.write_run(tmp_path / "run", short))
+def test_short_missions(run, tmp_path, steps, horizon):
+    part = {"step": slice(steps), "horizon": slice(horizon), "sensor": slice(5)}
+    tree = run.tree.isel(part, missing_dims="ignore")
+    short = rescripted(replace(run, tree=tree), observation={"count": 5})
+    assert f"{steps} turns" in text_of(short, tmp_path / "run")
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_lost_gauges_are_told_and_marked(tmp_path: Path) -> None:
-    place = synthetic_run.write_run(tmp_path / "run", synthetic_run.build_tree(lost=True))
-    run = read_run(place)
-    assert lost_ranges(run) == "gauges 17, 18, 19, 20 at turns 12–18; all gauges at turns 3–4"
-    assert "the belief followed the dynamics alone" in text_of(place)
-    axes = panel(mission_figure(run, 49, [16]), "Gauge 17")
+def test_lost_gauges_are_told_and_marked(run, tmp_path):
+    """Also one that never reports, and a run without any observation."""
+    observed = run.observed.copy()
+    observed[12:19, 16:20] = observed[3:5] = np.nan
+    lost = altered(run, observed__strain=observed)
+    assert lost_ranges(lost) == "gauges 17, 18, 19, 20 at turns 12–18; all gauges at turns 3–4"
+    assert "the belief followed the dynamics alone" in text_of(lost, tmp_path / "run")
+    axes = panel(mission_figure(lost, 49, [16]), "Gauge 17")
     assert_array_equal(line(axes, "lost")[:, 0], [3, 4, *range(12, 19)])
-    assert predictive_check(run).count[16] == 50 - 2 - 7
-
-
-@pytest.mark.usefixtures("no_drawing")
-def test_a_gauge_that_never_reports_and_a_run_without_any_observation(
-    tmp_path: Path, tree: xr.DataTree
-) -> None:
+    assert predictive_check(lost).count[16] == 50 - 2 - 7
     for name, sensors in (("one", slice(4, 5)), ("all", slice(None))):
-        changed = tree.copy(deep=True)
-        changed["observed/strain"].values[:, sensors] = np.nan
-        assert "Observations lost" in text_of(synthetic_run.write_run(tmp_path / name, changed))
+        observed[:, sensors] = np.nan
+        assert "Observations lost" in text_of(altered(run, observed__strain=observed), tmp_path / name)
 
 
-def test_a_calibration_file_shows_its_wing(
-    run: Run, make_calibration: Callable[..., Calibration], tree: xr.DataTree
-) -> None:
+def test_a_calibration_file_shows_its_wing(run, make_calibration):
     wing = make_calibration(young_modulus_factor=1.05)
-    draws = wing.draws_of("young_modulus_factor")
     tree = altered(run).tree
-    tree["calibration"] = xr.Dataset({"draw_value": ("draw", draws)})
-    asset = run.config["scenario"]["asset"] | {"design": "calibration", "parameters": {}}
+    tree["calibration"] = xr.Dataset({"draw_value": ("draw", wing.draws_of("young_modulus_factor"))})
     kept = json.loads(to_json(run_record(wing, "young_modulus_factor")))
-    flown = rescripted(replace(run, tree=tree, calibration=kept), asset=asset)
+    scenario = load_scenario("level_turns").scenario
+    plain = replace(run, tree=tree, calibration=kept, scenario=scenario)
+    flown = rescripted(plain, asset={"design": "calibration", "parameters": {}})
     mean, wide = wing.mean("young_modulus_factor"), wing.standard_deviation("young_modulus_factor")
     assert true_value(flown) == mean  # the FMU starts at the mean
-    drawing = {"calibration": b'<svg viewBox="0 0 1 1"></svg>'}
-    page = report.render_page(flown, drawing, {"calibration": ("", "")})
+    page = report.render_page(flown, {"calibration": DRAWING}, {"calibration": ("", "")})
     assert "The calibrated wing: Wing 7 (é)" in page
     servo = wing.mean("servo_mass"), wing.standard_deviation("servo_mass")
     assert f'{number(servo[0])}</td><td class="number">{number(servo[1])}' in page
     assert "the model of another asset" not in page
-    other = rescripted(flown, asset=asset | {"parameters": {"young_modulus_factor": 1.0}})
+    other = rescripted(flown, asset={"parameters": {"young_modulus_factor": 1.0}})
     assert true_value(other) == 1.0
     page = " ".join(report.render_page(other, {}, {}).split())
     off = abs(1.0 - mean) / wide
-    assert (
-        f"The true Young modulus factor of the asset flown is 1, {off:.1f} standard deviations from" in page
-    )
+    sentence = f"The true Young modulus factor of the asset flown is 1, {off:.1f} standard deviations from"
+    assert sentence in page
     assert "the model of another asset" in page
 
 
+# ------------------------------------------------------------------------------- what is refused
+
 BROKEN = {
-    "no run": (lambda folder: (folder / "run.nc").unlink(), r"holds no run\.nc"),
-    "empty": (lambda folder: (folder / "run.nc").write_bytes(b""), "damaged"),
-    "text": (lambda folder: (folder / "run.nc").write_bytes(b"not a run"), "damaged"),
-    "half a configuration": (
-        lambda folder: (folder / "config.json").write_text('{"half": '),
-        r"config\.json",
-    ),
-    "a list": (lambda folder: (folder / "config.json").write_text("[1]"), r"config\.json"),
-    "no configuration": (lambda folder: (folder / "config.json").unlink(), r"config\.json.*fly it again"),
+    "no run": ("run.nc", None, r"holds no run\.nc"),
+    "empty": ("run.nc", b"", "damaged"),
+    "text": ("run.nc", b"not a run", "damaged"),
+    "half a configuration": ("config.json", b'{"half": ', r"config\.json"),
+    "a list": ("config.json", b"[1]", r"config\.json"),
+    "no configuration": ("config.json", None, r"config\.json.*fly it again"),
 }
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_damaged_run_gives_one_sentence(tmp_path: Path, tree: xr.DataTree, name: str) -> None:
-    place = synthetic_run.write_run(tmp_path / "run", tree)
-    change, sentence = BROKEN[name]
-    change(place)
+def test_a_damaged_run_gives_one_sentence(run, tmp_path, name):
+    place = stored(run, tmp_path / "run")
+    file, content, sentence = BROKEN[name]
+    (place / file).unlink() if content is None else (place / file).write_bytes(content)
     with pytest.raises(RunFolderError, match=sentence) as caught:
         report.write_report(place)
     assert "\n" not in str(caught.value)
     assert not (place / "report.html").exists()
 
 
-@pytest.mark.parametrize("missing", ["filtered", "filtered/probability", "observed", "policy/action_value"])
-def test_another_layout_gives_one_sentence(tmp_path: Path, tree: xr.DataTree, missing: str) -> None:
-    with pytest.raises(RunFolderError, match="layout of a run"):
-        read_run(synthetic_run.write_run(tmp_path / "run", without(tree, missing)))
-
-
-def test_other_axes_give_one_sentence(tmp_path: Path, tree: xr.DataTree) -> None:
-    changed = tree.copy()
-    renamed = tree["filtered"].to_dataset().rename({"step": "time"})
-    del changed["filtered"]
-    changed["filtered"] = xr.DataTree(renamed)
+def test_another_layout_and_other_axes_give_one_sentence(run, tmp_path):
+    for missing in ("filtered", "filtered__probability", "observed", "policy__action_value"):
+        with pytest.raises(RunFolderError, match="layout of a run"):
+            read_run(stored(altered(run, **{missing: None}), tmp_path / missing))
+    changed = altered(run)
+    changed.tree["filtered"] = xr.DataTree(run.tree["filtered"].to_dataset().rename({"step": "time"}))
     with pytest.raises(RunFolderError, match="has the axes"):
-        read_run(synthetic_run.write_run(tmp_path / "run", changed))
+        read_run(stored(changed, tmp_path / "axes"))
 
 
-def test_a_run_that_was_cut_off_anywhere_is_one_sentence(folder: Path, tmp_path: Path) -> None:
+def test_a_run_that_was_cut_off_anywhere_is_one_sentence(folder, tmp_path):
     whole = (folder / "run.nc").read_bytes()
     (tmp_path / "config.json").write_bytes((folder / "config.json").read_bytes())
     for length in (1, 100, 2_000, len(whole) // 3, len(whole) - 10):
         (tmp_path / "run.nc").write_bytes(whole[:length])
         with pytest.raises(RunFolderError, match=r"damaged.* resume the run or fly it again\.$"):
             read_run(tmp_path)
-
-
-@pytest.mark.parametrize("now", [-1, 50])
-def test_the_present_must_be_a_turn_of_the_run(folder: Path, now: int) -> None:
-    with pytest.raises(RunFolderError, match=r"must lie in 0\.\.49"):
-        report.write_report(folder, now=now)
+    for now in (-1, 50):
+        with pytest.raises(RunFolderError, match=r"must lie in 0\.\.49"):
+            report.write_report(folder, now=now)
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_a_full_disk_keeps_the_old_report(
-    tmp_path: Path, tree: xr.DataTree, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place = synthetic_run.write_run(tmp_path / "run", tree)
+def test_a_full_disk_keeps_the_old_report(run, tmp_path, monkeypatch):
+    place = stored(run, tmp_path / "run")
     (place / "report.html").write_text("old")
 
     def fail(descriptor: int) -> None:
@@ -299,7 +340,7 @@ def test_a_full_disk_keeps_the_old_report(
     assert list((place / "figures").iterdir()) == []
 
 
-def test_a_title_that_would_be_broken_mathematics(run: Run) -> None:
+def test_a_title_that_would_be_broken_mathematics(run):
     titles = [f"gauge ${number}^" for number in range(1, 25)]
     odd = rescripted(run, state={"title": r"loss of $\frac{1$"}, observation={"titles": titles})
     assert to_svg(mission_figure(odd, 20))

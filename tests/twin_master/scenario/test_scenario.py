@@ -1,23 +1,29 @@
-"""The schema of scenario files: what is read, and the sentence for whatever is wrong."""
+"""The schema of scenario files: what is read, the sentence for whatever is wrong, kinds, and format 1."""
 
-from __future__ import annotations
-
-import tomllib
 from pathlib import Path
+from typing import Any, ClassVar, Literal
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from reporting.progress import SilentProgress
 from scenarios import scenario_files
+from tests.twin_master.runs import table_of, text_of, written
+from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, FlownAndBelieved, StatelessAsset
+from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import ScenarioError, TwinMasterError, UnknownScenarioError
-from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.mission.preparation import prepare_knowledge
+from twin_master.network.graphical_model import worsening_table
+from twin_master.scenario.asset import AssetSection, BeliefSection
+from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 
-TEXT = scenario_files()["level_turns"].read_text(encoding="utf-8")
+TEXT = text_of("level_turns")
 
 
-def test_units_of_keys_are_honoured_and_everything_inside_is_si() -> None:
+def test_units_of_keys_are_honoured_and_everything_inside_is_si():
     scenario = load_scenario("level_turns").scenario
     assert scenario.state[0].levels == (0.0, 0.2, 0.4, 0.6, 0.8)
     assert scenario.observation.standard_deviation == 125e-6
@@ -25,17 +31,14 @@ def test_units_of_keys_are_honoured_and_everything_inside_is_si() -> None:
     assert scenario.rewards.health_limit == 2500e-6
     assert scenario.truth.gains[0].gain == 0.02
     assert load_scenario("failing_gauges").scenario.truth.sensor_faults[-1].rate == 6e-6
-
-
-def test_the_rule_of_decisions_is_a_key_of_the_scenario() -> None:
-    table = tomllib.loads(TEXT)
+    table = table_of("level_turns")
     assert parse_scenario(table, "x").planner.decide_on == "filtered"
     table["planner"]["decide_on"] = "predicted"
     assert parse_scenario(table, "x").planner.decide_on == "predicted"
 
 
 @pytest.mark.parametrize("name", sorted(scenario_files()))
-def test_resolved_scenario_reads_back(name: str) -> None:
+def test_resolved_scenario_reads_back(name):
     scenario = load_scenario(name).scenario
     assert scenario.mission.name == name
     assert parse_scenario(scenario.to_dict(), "config.json") == scenario
@@ -92,11 +95,9 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", sorted(BROKEN))
-def test_whatever_is_wrong_is_named_in_one_sentence(case: str, tmp_path: Path) -> None:
+def test_whatever_is_wrong_is_named_in_one_sentence(case, tmp_path):
     old, new, words = BROKEN[case]
-    assert old in TEXT
-    path = tmp_path / "mine.toml"
-    path.write_text(TEXT.replace(old, new, 1), encoding="utf-8")
+    path = written(tmp_path, TEXT, (old, new))
     with pytest.raises(ScenarioError) as caught:
         load_scenario(path)
     sentence = str(caught.value)
@@ -106,26 +107,16 @@ def test_whatever_is_wrong_is_named_in_one_sentence(case: str, tmp_path: Path) -
         assert word in sentence, sentence
 
 
-def test_sensor_faults_name_sensors_that_exist(tmp_path: Path) -> None:
-    text = scenario_files()["failing_gauges"].read_text(encoding="utf-8")
-    path = tmp_path / "mine.toml"
-    path.write_text(text.replace("sensors = [12]", "sensors = [25]"), encoding="utf-8")
-    with pytest.raises(ScenarioError, match="from 1 to 24, and 25 came"):
-        load_scenario(path)
-
-
-def test_a_key_with_and_without_unit_is_refused() -> None:
-    table = tomllib.loads(TEXT)
-    table["observation"]["standard_deviation"] = 1e-4
-    with pytest.raises(ScenarioError, match="both given"):
-        parse_scenario(table, "mine.toml")
-
-
-def test_not_toml_and_not_there(tmp_path: Path) -> None:
-    path = tmp_path / "broken.toml"
-    path.write_text("format = = 1", encoding="utf-8")
-    with pytest.raises(ScenarioError, match="is not valid TOML"):
-        load_scenario(path)
+def test_files_that_are_none_or_name_what_is_not_there(tmp_path):
+    faults = text_of("failing_gauges", ("sensors = [12]", "sensors = [25]"))
+    for text, sentence in (
+        (faults, "from 1 to 24, and 25 came"),
+        ("format = = 1", "is not valid TOML"),
+        ("x = " + 20_000 * "[" + 20_000 * "]", r"mine\.toml"),
+        ("x = " + 20_000 * "{a=" + "1" + 20_000 * "}", r"mine\.toml"),
+    ):
+        with pytest.raises(ScenarioError, match=sentence):
+            load_scenario(written(tmp_path, text))
     with pytest.raises(UnknownScenarioError, match="level_turns"):
         load_scenario("level_turn")
 
@@ -138,38 +129,21 @@ def test_not_toml_and_not_there(tmp_path: Path) -> None:
         ("observation", "standard_deviation_microstrain", 10**400,
          ["observation.standard_deviation_microstrain", "finite"]),
         ("rewards", "health_weight", 10**5000, ["rewards.health_weight", "thousands of digits"]),
+        ("observation", "standard_deviation", 1e-4, ["both given"]),  # with and without unit
     ],
-    ids=["seed", "long_seed", "deviation", "long_weight"],
+    ids=["seed", "long_seed", "deviation", "long_weight", "both"],
 )  # fmt: skip
-def test_numbers_that_no_file_or_float_holds_are_refused(
-    section: str, key: str, value: int, words: list[str]
-) -> None:
-    table = tomllib.loads(TEXT)
+def test_numbers_that_no_file_or_float_holds_or_come_twice_are_refused(section, key, value, words):
+    table = table_of("level_turns")
     table[section][key] = value
     with pytest.raises(ScenarioError) as caught:
         parse_scenario(table, "mine.toml")
-    for word in words:
-        assert word in str(caught.value)
+    assert all(word in str(caught.value) for word in words), caught.value
 
 
-def test_a_deeply_nested_file_is_refused_in_a_sentence(tmp_path: Path) -> None:
-    path = tmp_path / "deep.toml"
-    for text in ("x = " + 20_000 * "[" + 20_000 * "]", "x = " + 20_000 * "{a=" + "1" + 20_000 * "}"):
-        path.write_text(text, encoding="utf-8")
-        with pytest.raises(ScenarioError, match=r"deep\.toml"):
-            load_scenario(path)
-
-
-def test_tables_are_checked() -> None:
-    table = tomllib.loads(TEXT)
-    good = [
-        [0.9, 0.1, 0, 0, 0],
-        [0, 0.9, 0.1, 0, 0],
-        [0, 0, 0.9, 0.1, 0],
-        [0, 0, 0, 0.9, 0.1],
-        [0, 0, 0, 0, 1],
-    ]
-    tables = {name: {"z1": [list(map(float, r)) for r in good], "z2": good} for name in ("2g", "3g")}
+def test_tables_are_checked():
+    table, good = table_of("level_turns"), worsening_table(5, 0.1).tolist()
+    tables = {name: {"z1": [[*row] for row in good], "z2": good} for name in ("2g", "3g")}
     table["transition"] = {"kind": "independent_tables", "tables": tables}
     assert parse_scenario(table, "x").transition.tables["2g"]["z1"][0][1] == 0.1
     tables["2g"]["z1"][1][1] = 0.8
@@ -188,8 +162,8 @@ def test_tables_are_checked() -> None:
     ), inner, max_size=4),
     max_leaves=12,
 ))  # fmt: skip
-def test_no_table_whatsoever_raises_anything_but_a_sentence(table: object) -> None:
-    base = tomllib.loads(TEXT)
+def test_no_table_whatsoever_raises_anything_but_a_sentence(table):
+    base = table_of("level_turns")
     candidates = [table] if isinstance(table, dict) else []
     candidates += [base | {key: table} for key in Scenario.model_fields]
     for candidate in candidates:
@@ -199,3 +173,140 @@ def test_no_table_whatsoever_raises_anything_but_a_sentence(table: object) -> No
         except TwinMasterError as error:
             sentence = str(error)
         assert sentence.startswith("x.toml")
+
+
+# ---------------------------- the kinds, a kind of one's own, and files of format 1
+
+WING = {"young_modulus_factor": 1.0073}
+OLD = {
+    "level_turns": {"kind": "fmu", "design": "uav_wing", "binding": "uav_wing", "parameters": WING},
+    "model_mismatch": {"kind": "strain_library", "design": "uav_wing", "observation_model": "design"},
+    "pump_wear": {"script": "gear_pump", "binding": "gear_pump", "parameters": {"viscosity_factor": 1.02}},
+}
+
+
+def of_format_1(name: str, asset: dict[str, Any]) -> Scenario:
+    table = table_of(name) | {"format": 1, "asset": asset}
+    del table["belief"]
+    return parse_scenario(table, "old.toml")
+
+
+@pytest.mark.parametrize("name", sorted(OLD))
+def test_a_file_of_format_1_means_what_it_meant(name):
+    assert of_format_1(name, OLD[name]) == parse_scenario(table_of(name), name)
+
+
+def test_all_of_several_fmus_is_read_from_format_1():
+    new = table_of("three_fmus")
+    old = new["asset"] | {"design": "uav_wing", "observation_model": None, "patch": None, "isolated": True}
+    assert of_format_1("three_fmus", old) == parse_scenario(table_of("three_fmus"), "three_fmus")
+
+
+@pytest.mark.parametrize(
+    ("asset", "flown", "believed"),
+    [
+        ({"file": "a.fmu", "binding": "b.toml"}, "fmu", "asset"),
+        ({"file": "a.fmu", "binding": "b.toml", "design": "uav_wing"}, "fmu", "design"),
+        ({"design": "calibration", "binding": "uav_wing", "patch": "p"}, "calibration", "calibration"),
+        ({"design": "w.toml", "binding": "uav_wing", "observation_model": "asset"}, "design", "asset"),
+        ({"kind": "coupled", "file": "a.ssp", "binding": "b.toml"}, "ssp", "asset"),
+        ({"script": "gear_pump", "binding": "b", "observation_model": "library", "library": "l.nc"},
+         "script", "library"),
+    ],
+)  # fmt: skip
+def test_every_combination_of_format_1_has_its_kinds(asset, flown, believed):
+    scenario = of_format_1("level_turns", asset)
+    assert (scenario.asset.kind, scenario.belief.kind) == (flown, believed)
+
+
+def test_what_is_wrong_with_format_1_stays_wrong():
+    for asset, words in (
+        ({"kind": "glider"}, "`kind` must be one of"),
+        ({"design": "uav_wing"}, "asset.binding"),
+        ({"kind": "strain_library", "observation_model": "design"}, "belief.design"),
+        ("wing", "asset"),
+    ):
+        with pytest.raises(ScenarioError, match=words):
+            of_format_1("level_turns", asset)  # type: ignore[arg-type]
+
+
+def test_the_kinds():
+    assert {*AssetSection.kinds()} >= {
+        "design", "calibration", "fmu", "script", "coupled", "ssp", "strain_library",
+    }  # fmt: skip
+    assert {*BeliefSection.kinds()} >= {"asset", "design", "calibration", "library", "strain_library"}
+
+
+class Bellows(AssetSection):
+    """A kind of one's own, in one class: a spring whose damage states soften it, its own source."""
+
+    kind: Literal["bellows"] = "bellows"
+    stiffness: float
+    units: ClassVar = {}
+
+    def source(self, scenario: Scenario) -> Any:
+        return BellowsSource(scenario, self)
+
+
+class BellowsSource(AssetSource):
+    """What is made of it; it is believed as well."""
+
+    label = "bellows"
+
+    def __init__(self, scenario: Scenario, section: Bellows) -> None:
+        super().__init__(scenario)
+        self.section, self.count = section, scenario.observation.count
+
+    def observation_table(self, draws: Any, model: Any) -> Any:
+        loads = np.array([control.values["load_factor"] for control in self._scenario.control])
+        left = 1.0 - model.states.coordinates.mean(axis=1)
+        table = loads / (self.section.stiffness * draws.values[:, None, None] * left[None, :, None])
+        return np.repeat(table[..., None], self.count, axis=-1)
+
+    def open(self) -> Asset:
+        return StatelessAsset(lambda control, health: AssetReading(np.zeros(self.count)))
+
+
+def test_a_kind_of_one_s_own_is_one_class(tmp_path):
+    table = table_of("level_turns") | {
+        "asset": {"kind": "bellows", "stiffness": 900.0},
+        "belief": {"kind": "asset"},
+        "calibration": {"parameter": "k", "source": "fixed", "mean": 1.0},
+        "reference": [],
+    }
+    loaded = LoadedScenario(parse_scenario(table, "mine.toml"), tmp_path / "mine.toml", "")
+    scenario = resolve_scenario(loaded, Overrides(seed=3))
+    assert parse_scenario(scenario.to_dict(), "config.json") == scenario
+    source = asset_source(scenario)
+    source.prepare(tmp_path, SilentProgress())
+    knowledge = prepare_knowledge(scenario, source, 3)
+    assert knowledge.sensor_model.mean[0, 1, 0] == pytest.approx(3.0 / 900.0)
+    with pytest.raises(ScenarioError, match=r"unknown key `asset.stifness`.*kind, stiffness"):
+        parse_scenario(table | {"asset": {"kind": "bellows", "stifness": 1.0}}, "mine.toml")
+
+
+def test_a_twin_may_believe_another_wing_than_the_one_that_flies(tmp_path):
+    (tmp_path / "other.toml").write_text("", encoding="utf-8")
+    table = table_of("level_turns")
+    table["belief"]["design"] = "other.toml"
+    loaded = LoadedScenario(parse_scenario(table, "x"), tmp_path / "x.toml", "")
+    scenario = resolve_scenario(loaded, Overrides())
+    assert scenario.belief.design == str(tmp_path / "other.toml")  # type: ignore[attr-defined]
+    files = asset_source(scenario).files()
+    assert files["asset/design.toml"] == b""
+    assert files["asset/flown_design.toml"] != b""
+    there = scenario.portable().moved(Path("/there"))
+    assert there.belief.design == "/there/asset/design.toml"  # type: ignore[attr-defined]
+    assert there.asset.design == "uav_wing"  # type: ignore[attr-defined]
+
+
+def test_a_strain_library_may_be_believed_of_an_fmu(library_file, tmp_path):
+    table = table_of("level_turns")
+    table["belief"] = {"kind": "strain_library", "file": str(library_file)}
+    loaded = LoadedScenario(parse_scenario(table, "x"), tmp_path / "x.toml", "")
+    source = asset_source(resolve_scenario(loaded, Overrides()))
+    source.check()
+    assert source.origin == FlownAndBelieved(
+        "FMU of the reduced model of the design UAV wing", "strain library", differ=True
+    )
+    assert len(source.draws(0).values) == 5

@@ -1,7 +1,5 @@
 """The run store: bytes that depend on nothing but the mission, tables and figures, whole files or none."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace
@@ -11,10 +9,8 @@ import numpy as np
 import pytest
 
 from reporting.errors import DamagedFileError, FileNotWrittenError
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from tests.twin_master.runs import of_library
 from twin_master.mission.loop import fly
-from twin_master.mission.preparation import prepare_knowledge
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Reference
@@ -30,17 +26,13 @@ def result(library_file: Path) -> MissionResult:
 
 
 def flown(name: str, library_file: Path) -> MissionResult:
-    scenario = load_scenario(name).scenario
-    source = StrainLibrarySource(scenario, load_strain_library(library_file), "h")
-    knowledge = prepare_knowledge(scenario, source, 3)
+    knowledge, source = of_library(name, library_file)
     truth = knowledge.truth(3)
-    flight = fly(scenario, knowledge.twin(), knowledge.plant(truth, source.open()))
-    return MissionResult(scenario, knowledge, flight, truth)
+    flight = fly(knowledge.scenario, knowledge.twin(), knowledge.plant(truth, source.open()))
+    return MissionResult(knowledge.scenario, knowledge, flight, truth)
 
 
-def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(
-    result: MissionResult, tmp_path: Path
-) -> None:
+def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(result, tmp_path):
     groups = groups_of(result)
     first = write_run(tmp_path / "a", groups, {"seed": 3}).read_bytes()
     assert write_run(tmp_path / "b", groups_of(result), {"seed": 3}).read_bytes() == first
@@ -54,7 +46,7 @@ def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(
     np.testing.assert_array_equal(read["observed"]["strain"], result.flight.observed)
 
 
-def test_what_is_stored_agrees_with_itself(result: MissionResult, tmp_path: Path) -> None:
+def test_what_is_stored_agrees_with_itself(result, tmp_path):
     write_run(tmp_path, groups_of(result), {})
     tree = read_run(tmp_path)
     filtered, predicted = tree["filtered"].to_dataset(), tree["predicted"].to_dataset()
@@ -78,7 +70,7 @@ def test_what_is_stored_agrees_with_itself(result: MissionResult, tmp_path: Path
     assert set(drifting[8:36]) == {2}
 
 
-def test_tables_are_in_the_units_of_their_headers(result: MissionResult) -> None:
+def test_tables_are_in_the_units_of_their_headers(result):
     tables = tables_of(groups_of(result), "strain")
     health = list(csv.DictReader(tables["health"].splitlines()))
     assert [float(row["z1_true_percent"]) for row in health[8:13]] == [0, 0, 2, 4, 6]
@@ -95,7 +87,7 @@ def test_tables_are_in_the_units_of_their_headers(result: MissionResult) -> None
     assert decisions[36]["error_reward"] == ""
 
 
-def test_summary_keeps_each_figure_beside_its_reference(tmp_path: Path) -> None:
+def test_summary_keeps_each_figure_beside_its_reference(tmp_path):
     figure = Figure("a", "title", 1.5, "steps", 2.0, "somebody")
     path = write_summary(tmp_path, [figure, Figure("b", "none", None)], {"seed": 3})
     record = json.loads(path.read_text(encoding="utf-8"))
@@ -107,7 +99,7 @@ def test_summary_keeps_each_figure_beside_its_reference(tmp_path: Path) -> None:
     assert record["figures"][1]["value"] is None
 
 
-def test_damaged_and_unwritable(result: MissionResult, tmp_path: Path) -> None:
+def test_damaged_and_unwritable(result, tmp_path):
     write_run(tmp_path, groups_of(result), {})
     content = (tmp_path / "run.nc").read_bytes()
     (tmp_path / "run.nc").write_bytes(content[:1000])
@@ -132,39 +124,31 @@ def controls(*gentle: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("gentle", "delay", "early"),
+    ("gentle", "truth", "delay", "early"),
     [
-        (range(31, 50), 1, None),
-        (range(33, 50), 3, None),
-        ([*range(25, 27), *range(32, 50)], 2, 25),
-        (range(29, 50), 0, 29),
-        ([], None, None),
+        (range(31, 50), TRUTH, 1, None),
+        (range(33, 50), TRUTH, 3, None),
+        ([*range(25, 27), *range(32, 50)], TRUTH, 2, 25),
+        (range(29, 50), TRUTH, 0, 29),
+        ([], TRUTH, None, None),
+        ([12], np.zeros((50, 2)), None, 12),  # no damage calls for it
     ],
 )
-def test_fallback(gentle: range | list[int], delay: int | None, early: int | None) -> None:
-    found = find_fallback(MODEL.states, POLICY, 1, controls(*gentle), TRUTH)
+def test_fallback(gentle, truth, delay, early):
+    found = find_fallback(MODEL.states, POLICY, 1, controls(*gentle), truth)
     assert (found.switch_state, found.switch_level) == ("z1", 0.6)
-    assert found.called_for_step == 30
-    assert found.delay == delay
-    assert found.early_step == early
+    assert found.called_for_step == (30 if truth.any() else None)
+    assert (found.delay, found.early_step) == (delay, early)
 
 
-def test_a_policy_of_several_states_or_none_has_no_switch() -> None:
+def test_a_policy_of_several_states_or_none_has_no_switch():
     both = np.where(MODEL.states.coordinates.sum(axis=1) > 0.59, 0, 1)
     for policy in (both, np.ones(25, dtype=np.int64)):
         found = find_fallback(MODEL.states, policy, 1, controls(31), TRUTH)
-        assert found.switch_state is None
-        assert found.delay is None
+        assert (found.switch_state, found.delay) == (None, None)
 
 
-def test_no_damage_calls_for_no_fallback() -> None:
-    found = find_fallback(MODEL.states, POLICY, 1, controls(12), np.zeros((50, 2)))
-    assert found.called_for_step is None
-    assert found.early_step == 12
-    assert found.delay is None
-
-
-def test_rms_error_of_a_certain_belief() -> None:
+def test_rms_error_of_a_certain_belief():
     belief = np.tile(MODEL.states.certain((0.2, 0.4)), (50, 1))
     error = filtered_rms_error(MODEL, belief, TRUTH)
     expected = np.sqrt([np.mean((0.2 - TRUTH[:, 0]) ** 2), 0.4**2])
@@ -176,28 +160,24 @@ def each(request: pytest.FixtureRequest, library_file: Path) -> MissionResult:
     return flown(request.param, library_file)
 
 
-def test_every_figure_is_one_that_a_reference_can_name(each: MissionResult) -> None:
+def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(each):
     turns = []
     for turn in each.flight.turns:
         happened = turn.reading.happened._replace(monitors={"strain_error_bound": 2e-6})
         turns.append(replace(turn, reading=replace(turn.reading, happened=happened)))
-    complete = replace(each, flight=replace(each.flight, turns=turns))
-    figures = summarise(complete, np.zeros((50, 3)))
-    assert tuple(figure.key for figure in figures) == each.scenario.figure_names
-
-
-def test_figures_stand_beside_the_references_of_the_scenario(each: MissionResult) -> None:
     references = (
         Reference(figure="fallback_delay", value="1 or 2", source="somewhere"),
         Reference(figure="mean_reward_error", value=-0.4, source="elsewhere"),
     )
     scenario = each.scenario.model_copy(update={"reference": references})
-    figures = summarise(replace(each, scenario=scenario), np.zeros((50, 3)))
+    complete = replace(each, scenario=scenario, flight=replace(each.flight, turns=turns))
+    figures = summarise(complete, np.zeros((50, 3)))
+    assert tuple(figure.key for figure in figures) == each.scenario.figure_names
     found = {f.key: (f.reference, f.reference_source) for f in figures if f.reference is not None}
     assert found == {"fallback_delay": ("1 or 2", "somewhere"), "mean_reward_error": (-0.4, "elsewhere")}
 
 
-def test_a_change_of_control_is_said_in_words() -> None:
+def test_a_change_of_control_is_said_in_words():
     names = ("2g", "3g", "rest")
     assert control_changes(names, np.array([1, 1, 1]), "turn") == "flew 3g at every turn"
     assert control_changes(names, np.array([1, 1, 0, 0]), "turn") == "left 3g for 2g at turn 2"

@@ -1,7 +1,5 @@
 """The view of a flight: its numbers against those of the run, its protocol, its page in a real browser."""
 
-from __future__ import annotations
-
 import io
 import json
 import os
@@ -16,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http.client import HTTPConnection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,8 +23,8 @@ from benchmarks.browser import CHROMIUM, open_browser
 from fe.wing.design import SHIPPED_DESIGN, load_design
 from reporting.figures import new_figure, to_svg
 from reporting.files import atomic_write_bytes
-from reporting.progress import SilentProgress
 from tests.command_line import command
+from tests.twin_master.runs import check_same
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import RunFolderError
@@ -55,10 +54,7 @@ TOLD = {
 @pytest.fixture(scope="module")
 def run(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("view") / "run"
-    new_run(
-        load_scenario("level_turns"), folder, Overrides(strain_library=library_file), report=False,
-        progress=SilentProgress(),
-    )  # fmt: skip
+    new_run(load_scenario("level_turns"), folder, Overrides(strain_library=library_file), report=False)
     # The gauges of the library are those of the shipped wing: with its design the page shows them from above.
     shutil.copy(SHIPPED_DESIGN, folder / DESIGN_COPY)
     return folder
@@ -72,8 +68,7 @@ def lines(run: Path) -> list[bytes]:
 @pytest.fixture
 def begun(run: Path, tmp_path: Path) -> Path:
     """The run before its first turn."""
-    folder = tmp_path / "begun"
-    shutil.copytree(run, folder)
+    folder = Path(shutil.copytree(run, tmp_path / "begun"))
     (folder / JOURNAL_NAME).unlink()
     (folder / "run.nc").unlink()
     return folder
@@ -100,7 +95,7 @@ def asked(first: int = 0, end: int = 0, turn: int = LATEST, **changed: int) -> R
     return Request(first=first, end=end, turn=turn, **given)
 
 
-def test_every_number_is_that_of_the_run(run: Path) -> None:
+def test_every_number_is_that_of_the_run(run):
     flight, stored = whole(run), open_run(run)
     assert flight.turns == TURNS
     believed, expected = flight.believed(0, TURNS), flight.predicted(28)
@@ -125,7 +120,7 @@ def test_every_number_is_that_of_the_run(run: Path) -> None:
     np.testing.assert_array_equal(flight.truth(0, TURNS), stored["truth"]["state"].values)
 
 
-def test_turns_are_seen_as_soon_as_their_lines_are_whole(run: Path, begun: Path, lines: list[bytes]) -> None:
+def test_turns_are_seen_as_soon_as_their_lines_are_whole(run, begun, lines):
     flight = Flight(begun)
     assert not flight.update()
     add(begun, *lines[:3], lines[3][:40])
@@ -140,7 +135,7 @@ def test_turns_are_seen_as_soon_as_their_lines_are_whole(run: Path, begun: Path,
     )
 
 
-def test_turns_that_were_taken_back_are_forgotten(begun: Path, lines: list[bytes]) -> None:
+def test_turns_that_were_taken_back_are_forgotten(begun, lines):
     add(begun, *lines[:21])
     flight = whole(begun)
     number = flight.number
@@ -148,55 +143,45 @@ def test_turns_that_were_taken_back_are_forgotten(begun: Path, lines: list[bytes
     flight.update()
     assert (flight.turns, flight.number) == (10, number + 1)
     # A viewer that holds the twenty turns is told all ten again.
-    answer = json.loads(str(teller_of(flight).answer(asked(0, 20, flight=number, shown=19, count=20))))
+    answer = told(teller_of(flight), 0, 20, flight=number, shown=19, count=20)
     assert (answer["first"], answer["count"], len(answer["past"]["control"])) == (0, 10, 10)
 
 
-def test_a_changed_line_ends_the_view_with_its_turn(begun: Path, lines: list[bytes]) -> None:
+def test_a_changed_line_ends_the_view_with_its_turn(begun, lines):
     add(begun, *lines[:5], lines[5].replace(b'"turn": 4', b'"turn": 5'), *lines[6:])
     with pytest.raises(RunFolderError, match=r"line 6 of the journal .* was changed or is damaged"):
         whole(begun)
 
 
-def test_an_observation_that_came_late_stands_in_its_turn(begun: Path, lines: list[bytes]) -> None:
+def test_an_observation_that_came_late_stands_in_its_turn(begun, lines, monkeypatch):
+    """And turns beyond those kept are read again and are the same."""
     turns = [json.loads(line[65:]) for line in lines[1:]]
     missed = turns[6] | {"observed": [None] * 24}
+    late = turns[9] | {"observation_turn": 6, "observed": turns[6]["observed"]}
     add(begun, lines[0], *map(line_of, [*turns[:6], missed, *turns[7:10]]))
     flight = whole(begun)
     number = flight.number
-    late = turns[9] | {"observation_turn": 6, "observed": turns[6]["observed"]}
     add(begun, line_of(late | {"filtered": turns[20]["filtered"]}))
     assert flight.update()
     assert (flight.turns, flight.number) == (10, number + 1)
     expected = [turn["observed"] for turn in turns[:10]]
     np.testing.assert_array_equal(flight.observed(0, 10), np.array(expected, dtype=float))
-    assert [turn.filtered.tolist() for turn in flight.seen(8, 10)] == [
-        turns[8]["filtered"],
-        turns[20]["filtered"],
-    ]
-    add(begun, line_of(turns[30]))
-    with pytest.raises(RunFolderError, match="tells turn 30 where 10 was expected"):
-        flight.update()
-
-
-def test_turns_beyond_those_kept_are_read_again_and_are_the_same(
-    begun: Path, lines: list[bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    turns = [json.loads(line[65:]) for line in lines[1:]]
-    missed = turns[6] | {"observed": [None] * 24}
-    late = turns[9] | {"observation_turn": 6, "observed": turns[6]["observed"]}
-    told = [*turns[:6], missed, *turns[7:10], late, {"model": {}}, *turns[10:20]]
-    add(begun, lines[0], *map(line_of, told))
+    last = [turn.filtered.tolist() for turn in flight.seen(8, 10)]
+    assert last == [turns[8]["filtered"], turns[20]["filtered"]]
+    add(begun, *map(line_of, [{"model": {}}, *turns[10:20]]))
     flight, parts = whole(begun), ((0, 20), (5, 8), (0, 2), (18, 20))
-    expected, seen = [flight.believed(*part) for part in parts], flight.seen(0, 20)
+    believed, seen = [flight.believed(*part) for part in parts], flight.seen(0, 20)
     monkeypatch.setattr("twin_master.viewer.flight.TURNS_KEPT", 3)
     few = whole(begun)
     assert few.turns == flight.turns == 20
-    for part, belief in zip(parts, expected, strict=True):
+    for part, belief in zip(parts, believed, strict=True):
         for name, values in vars(few.believed(*part)).items():
             np.testing.assert_array_equal(values, getattr(belief, name))
     assert [turn.notices for turn in few.seen(0, 20)] == [turn.notices for turn in seen]
     assert len(few._kept) == 3
+    add(begun, line_of(turns[30]))
+    with pytest.raises(RunFolderError, match="tells turn 30 where 20 was expected"):
+        flight.update()
     journal = begun / JOURNAL_NAME
     journal.rename(begun / "before")
     journal.write_bytes(b"".join(lines[:4]))  # another flight
@@ -205,9 +190,7 @@ def test_turns_beyond_those_kept_are_read_again_and_are_the_same(
     assert few.turns == 3
 
 
-def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown(
-    begun: Path, lines: list[bytes]
-) -> None:
+def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown(begun, lines):
     add(begun, *lines)
     flight = whole(begun)
     before, number = flight.believed(0, 5).sensor_mean, flight.number
@@ -222,7 +205,7 @@ def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PK\x05\x06" + bytes(18), b"no archive"])
-def test_without_what_the_twin_knew_nothing_is_shown(begun: Path, content: bytes | None) -> None:
+def test_without_what_the_twin_knew_nothing_is_shown(begun, content):
     (begun / KNOWLEDGE_NAME).unlink()
     if content is not None:
         (begun / KNOWLEDGE_NAME).write_bytes(content)
@@ -230,30 +213,31 @@ def test_without_what_the_twin_knew_nothing_is_shown(begun: Path, content: bytes
         Flight(begun)
 
 
-def test_a_viewer_is_told_what_it_misses_and_nothing_else(run: Path) -> None:
-    teller = teller_of(whole(run))
-    everything = json.loads(str(teller.answer(asked())))
+def told(teller: Teller, *words: int, **changed: int) -> dict[str, Any]:
+    answer: dict[str, Any] = json.loads(str(teller.answer(asked(*words, **changed))))
+    return answer
+
+
+def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
+    flight = whole(run)
+    teller = teller_of(flight)
+    everything = told(teller)
     assert (everything["turn"], everything["first"], everything["count"]) == (TURNS - 1, 0, TURNS)
     number = everything["flight"]
-    missed = json.loads(str(teller.answer(asked(0, 30, flight=number, shown=29, count=30))))
+    missed = told(teller, 0, 30, flight=number, shown=29, count=30)
     assert missed["first"] == 30
     np.testing.assert_allclose(missed["past"]["state"], everything["past"]["state"][30:], rtol=1e-12)
     assert teller.answer(asked(0, TURNS, flight=number, shown=TURNS - 1, count=TURNS)) is None
-    back = json.loads(str(teller.answer(asked(0, TURNS, 7, flight=number, shown=8, count=TURNS))))
+    back = told(teller, 0, TURNS, 7, flight=number, shown=8, count=TURNS)
     assert (back["turn"], back["past"]) == (7, None)
     assert len(back["ahead"]["state"]) == 10
-
-
-def test_printed_units_and_bands(run: Path) -> None:
-    flight = whole(run)
-    answer = json.loads(str(teller_of(flight).answer(asked(turn=28))))
+    # In printed units, with their bands.
+    answer = told(teller, turn=28)
     past, believed = answer["past"], flight.believed(0, 29)
     np.testing.assert_allclose(past["state"], 100.0 * believed.state_mean)
     np.testing.assert_allclose(past["observed"], 1e6 * flight.observed(0, 29))
-    np.testing.assert_allclose(
-        np.subtract(past["sensor_upper"], past["sensor_lower"]),
-        2 * 1.959963984540054e6 * believed.sensor_deviation,
-    )
+    width = np.subtract(past["sensor_upper"], past["sensor_lower"])
+    np.testing.assert_allclose(width, 2 * 1.959963984540054e6 * believed.sensor_deviation)
     assert np.min(past["state_lower"]) >= 0.0
     assert np.max(past["state_upper"]) <= 80.0
     assert answer["ahead"]["reward"][0][2] is None  # no error reward of a turn to come
@@ -263,12 +247,12 @@ def test_printed_units_and_bands(run: Path) -> None:
     "text",
     ["", "[]", "[" * 4000, "{}", '{"number": 1}', "x" * 100, json.dumps(asked().__dict__ | {"turn": 1.5})],
 )
-def test_a_request_of_another_form_is_refused(text: str) -> None:
+def test_a_request_of_another_form_is_refused(text):
     with pytest.raises(ValueError, match=r"for Request"):
         parse_request(text)
 
 
-def test_the_wing_stands_in_its_place(run: Path) -> None:
+def test_the_wing_stands_in_its_place(run):
     flight, design = Flight(run), load_design()
     planform = scene_of(run, flight.knowledge).planform
     assert planform is not None
@@ -313,7 +297,7 @@ def check_that_only_this_machine_is_served(address: str) -> None:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
-def test_the_page_in_a_browser(begun: Path, lines: list[bytes], tmp_path: Path) -> None:
+def test_the_page_in_a_browser(begun, lines, tmp_path):
     add(begun, *lines[:31])
     with open_browser() as browser, served(begun) as address:
         check_that_only_this_machine_is_served(address)
@@ -381,12 +365,11 @@ def test_the_page_in_a_browser(begun: Path, lines: list[bytes], tmp_path: Path) 
             assert all(url.startswith((address, "data:", "about:")) for url in tab.requests)
 
 
-def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file: Path, run: Path, tmp_path: Path) -> None:
-    command = ["run", "level_turns", "--out", str(tmp_path / "run"), "--strain-library", str(library_file)]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "uav_twin", *command, "--no-report", "--view"],
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
+def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file, run, tmp_path):
+    words = ["run", "level_turns", "--out", tmp_path / "run", "--strain-library", library_file, "--no-report"]
+    line = [sys.executable, "-m", "uav_twin", *map(str, words), "--view"]
+    null, pipe = subprocess.DEVNULL, subprocess.PIPE
+    process = subprocess.Popen(line, stdout=null, stderr=pipe, text=True, start_new_session=True)
     assert process.stderr is not None
     said = ""
     while "http://127.0.0.1" not in said or "stays until Ctrl-C" not in said:
@@ -396,11 +379,10 @@ def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file: Path, run: P
     os.killpg(process.pid, signal.SIGINT)
     assert process.wait(90.0) == 0, process.stderr.read()
     process.stderr.close()
-    for name in ("run.nc", JOURNAL_NAME, KNOWLEDGE_NAME, "config.json"):
-        assert (tmp_path / "run" / name).read_bytes() == (run / name).read_bytes(), name
+    check_same(tmp_path / "run", run, "run.nc", JOURNAL_NAME, KNOWLEDGE_NAME, "config.json")
 
 
-def test_a_folder_without_a_run_is_one_sentence(tmp_path: Path) -> None:
+def test_a_folder_without_a_run_is_one_sentence(tmp_path):
     result = command("view", tmp_path / "none")
     assert result.returncode == 1
     assert result.stderr.startswith(f"there is no run folder {tmp_path / 'none'}")

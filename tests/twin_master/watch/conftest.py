@@ -1,7 +1,5 @@
 """A wing and its watches, made once."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import replace

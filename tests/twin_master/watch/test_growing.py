@@ -1,7 +1,5 @@
 """Logs that grow while they are read, rotated by logrotate and by hand: no row is lost or read twice."""
 
-from __future__ import annotations
-
 import logging
 import os
 import shutil
@@ -16,12 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.twin_master.watch.watches import begun, lines, write_csv
-from twin_master.mission.turns import History
+from tests.twin_master.runs import journal
+from tests.twin_master.watch.watches import begun, ran, write_csv
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
 from twin_master.watch.growing import RECOGNISED_BY
-from twin_master.watch.intake import Counts
 from twin_master.watch.message import Message, Refused
 
 pytestmark = pytest.mark.xdist_group("watches")
@@ -40,17 +37,15 @@ def append(path: Path, text: str) -> None:
         file.write(text)
 
 
-def logrotate(*directives: str) -> Rotation:
+def logrotate(directive: str) -> Rotation:
     """Return what rotates a log by the real logrotate."""
 
     def rotate(path: Path) -> None:
         config, state = path.with_name("logrotate.conf"), path.with_name("logrotate.state")
-        text = "\n".join(["rotate 9", "nomail", *directives])
-        config.write_text(f"{path} {{\n{text}\n}}\n")
+        config.write_text(f"{path} {{\nrotate 9\nnomail\n{directive}\n}}\n")
         config.chmod(0o644)
-        subprocess.run(
-            [str(LOGROTATE), "--force", "--state", str(state), str(config)], check=True, capture_output=True
-        )
+        words = [str(LOGROTATE), "--force", "--state", str(state), str(config)]
+        subprocess.run(words, check=True, capture_output=True)
 
     return rotate
 
@@ -79,9 +74,9 @@ def moved(path: Path) -> None:
 
 ROTATIONS: dict[str, Rotation] = {
     "create": logrotate("create"),
-    "dated": dated,
     "absent": logrotate("nocreate"),
     "copytruncate": logrotate("copytruncate"),
+    "dated": dated,
     "python": renamed,
     "moved": moved,
 }
@@ -94,14 +89,14 @@ def ways(*names: str) -> list[Any]:
     return [pytest.param(name, marks=absent if name in by_logrotate else ()) for name in names]
 
 
-def new(messages: Iterator[tuple[Message | Refused | None, str]]) -> list[int | str]:
+Feeding = Iterator[tuple[Message | Refused | None, str]]
+Begun = Callable[..., tuple[Path, Feeding]]
+
+
+def new(messages: Feeding) -> list[int | str]:
     """Return the turns that have come, and in the place of what was refused its text."""
     came = takewhile(lambda fed: fed[0] is not None, messages)
     return [fed.turn if isinstance(fed, Message) and fed.turn is not None else text for fed, text in came]
-
-
-Feeding = Iterator[tuple[Message | Refused | None, str]]
-Begun = Callable[..., tuple[Path, Feeding]]
 
 
 @pytest.fixture
@@ -120,7 +115,7 @@ def begun_log(base: Watch, tmp_path: Path) -> Begun:
 
 @pytest.mark.parametrize("header", [HEADER, ""], ids=["header", "no header"])
 @pytest.mark.parametrize("rotation", ways(*ROTATIONS))
-def test_no_row_is_lost_in_a_rotation(begun_log: Begun, rotation: str, header: str) -> None:
+def test_no_row_is_lost_in_a_rotation(begun_log, rotation, header):
     rotate, cut = ROTATIONS[rotation], rotation == "copytruncate"
     path, messages = begun_log(0, 1)
     append(path, row(2) + row(3)[:4])  # not read before it is rotated
@@ -142,7 +137,7 @@ def test_no_row_is_lost_in_a_rotation(begun_log: Begun, rotation: str, header: s
 
 
 @pytest.mark.parametrize("way", ways("logging", "copytruncate"))
-def test_a_writer_that_does_not_wait_for_its_reader(begun_log: Begun, way: str) -> None:
+def test_a_writer_that_does_not_wait_for_its_reader(begun_log, way):
     (path, messages), turns = begun_log(), 4000
     handler = RotatingFileHandler(path, maxBytes=2000 if way == "logging" else 0, backupCount=1000)
 
@@ -163,7 +158,7 @@ def test_a_writer_that_does_not_wait_for_its_reader(begun_log: Begun, way: str) 
     assert len(list(path.parent.glob("log.csv.*"))) >= (30 if way == "logging" else 8)
 
 
-def test_columns_of_a_new_file_are_read_again(begun_log: Begun) -> None:
+def test_columns_of_a_new_file_are_read_again(begun_log):
     """Also behind several rotations between two looks."""
     path, messages = begun_log(0)
     for turn in (1, 2, 3):
@@ -176,7 +171,7 @@ def test_columns_of_a_new_file_are_read_again(begun_log: Begun) -> None:
     assert [told.turn for told in turns if isinstance(told, Message)] == [1, 2, 3]
 
 
-def test_half_rows_are_waited_for_and_those_of_a_dead_writer_end_with_their_file(begun_log: Begun) -> None:
+def test_half_rows_are_waited_for_and_those_of_a_dead_writer_end_with_their_file(begun_log):
     path, messages = begun_log()
     for character in row(0)[:-1]:
         append(path, character)
@@ -188,30 +183,25 @@ def test_half_rows_are_waited_for_and_those_of_a_dead_writer_end_with_their_file
     assert new(messages) == ["1,2e", 1, 2]
 
 
-def test_a_cut_without_a_copy_is_told(begun_log: Begun) -> None:
-    path, messages = begun_log(0, 1)
+@pytest.mark.parametrize(
+    ("turns", "left"),
+    [
+        ([0, 1], [*range(2, 9)]),  # longer than before: it is known by its rows
+        ([*range(3 * RECOGNISED_BY)], [*range(2 * RECOGNISED_BY)]),  # it begins as before: known by its size
+    ],
+)
+def test_a_cut_without_a_copy_is_told(begun_log, turns, left):
+    path, messages = begun_log(*turns)
     size = path.stat().st_size
-    path.write_text(HEADER + "".join(map(row, range(2, 9))))  # longer than before: it is known by its rows
-    refused, _ = next(messages)
-    assert str(refused) == (
+    path.write_text(HEADER + "".join(map(row, left)))
+    assert str(next(messages)[0]) == (
         f"log.csv was cut at byte {size}, and no copy is beside it: what stood behind that and was not read "
         "yet is lost"
     )
-    assert new(messages) == list(range(2, 9))
+    assert new(messages) == left
 
 
-def test_a_log_that_lost_its_end_is_told_of(begun_log: Begun) -> None:
-    """It still begins as before, and is known by its size alone."""
-    turns = [*range(3 * RECOGNISED_BY)]
-    path, messages = begun_log(*turns)
-    size, kept = path.stat().st_size, turns[: 2 * RECOGNISED_BY]
-    path.write_text(HEADER + "".join(map(row, kept)))
-    refused, _ = next(messages)
-    assert f"cut at byte {size}" in str(refused)
-    assert new(messages) == kept
-
-
-def test_a_copy_in_the_place_of_a_log_is_read_on(begun_log: Begun) -> None:
+def test_a_copy_in_the_place_of_a_log_is_read_on(begun_log):
     """As rsync does it: another file, which begins with the same rows."""
     path, messages = begun_log(0, 1)
     fresh = path.with_name("fresh")
@@ -221,14 +211,12 @@ def test_a_copy_in_the_place_of_a_log_is_read_on(begun_log: Begun) -> None:
 
 
 @pytest.mark.parametrize("rotation", ways("create", "copytruncate"))
-def test_a_watch_that_was_down_takes_up_a_rotated_log(
-    base: Watch, mission: History, tmp_path: Path, rotation: str
-) -> None:
+def test_a_watch_that_was_down_takes_up_a_rotated_log(base, mission, tmp_path, rotation):
     recorded = write_csv(tmp_path / "m.csv", mission.observed, mission.control_index)
-    never = begun(base, tmp_path / "never")
-    watched(never, CsvFeed(recorded, never.scenario), 50)
+    never, watch = begun(base, tmp_path / "never"), begun(base, tmp_path / "watch")
+    ran(never, CsvFeed(recorded, never.scenario), 50)
     header, *rows = recorded.read_text().splitlines(keepends=True)
-    path, watch = tmp_path / "log.csv", begun(base, tmp_path / "watch")
+    path = tmp_path / "log.csv"
     path.write_text(header)
     for turn, text in enumerate(rows):
         if turn in (15, 30, 33):
@@ -236,14 +224,10 @@ def test_a_watch_that_was_down_takes_up_a_rotated_log(
             append(path, header)
         append(path, text)
         if turn in (13, 17, 20, 29, 49):  # else it is down
-            counts = watched(watch, CsvFeed(path, watch.scenario, follow=True), turn + 1 - turn % 4)
+            counts = ran(watch, CsvFeed(path, watch.scenario, follow=True), turn + 1 - turn % 4)
     assert (counts.received, counts.missing, counts.duplicates, counts.rejected) == (49, 0, 0, 0)
-    for one, other in zip(lines(never), lines(watch), strict=False):
+    for one, other in zip(journal(never.folder), journal(watch.folder), strict=False):
         for record in (one, other):
             del record["intake"]["source"]
             record.pop("standing", None)
         assert one == other
-
-
-def watched(watch: Watch, feed: CsvFeed, turns: int) -> Counts:
-    return watch.run(feed, lambda _decision: None, turns=turns)

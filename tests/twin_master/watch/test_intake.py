@@ -1,7 +1,5 @@
 """What a publisher sends: put in its place, or refused; never a change of the past, never an end."""
 
-from __future__ import annotations
-
 import io
 import json
 import random
@@ -15,27 +13,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from twin_master.assets.strain_library import load_strain_library
-from twin_master.assets.strain_library_source import StrainLibrarySource
+from tests.twin_master.runs import of_library
 from twin_master.mission.loop import operate
-from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.preparation import Knowledge
 from twin_master.network.twin import Twin
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import WatchSection
 from twin_master.watch import feeds
-from twin_master.watch.intake import Intake, RejectedFile
+from twin_master.watch.intake import Feed, Intake, RejectedFile
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 
 TURNS = 60
+NAMES = [f"strain_{number}" for number in range(1, 25)]
 
 
 @pytest.fixture(scope="module")
 def knowledge(library_file: Path) -> Knowledge:
-    scenario = load_scenario("level_turns").scenario
-    scenario = scenario.model_copy(update={"watch": WatchSection(lag=20, longest_gap=30)})
-    return prepare_knowledge(
-        scenario, StrainLibrarySource(scenario, load_strain_library(library_file), "h"), 0
-    )
+    return of_library("level_turns", library_file, 0, watch=WatchSection(lag=20, longest_gap=30))[0]
 
 
 @pytest.fixture(scope="module")
@@ -45,15 +39,32 @@ def strains(knowledge: Knowledge) -> np.ndarray:
     return knowledge.sensor_model.mean[np.arange(TURNS) // 13 * 6, 1] + 150e-6 * noise
 
 
-def message(turn: int, row: np.ndarray, **others: object) -> bytes:
+@pytest.fixture(scope="module")
+def clean(strains: np.ndarray) -> list[bytes]:
+    """Their messages."""
+    return [message(row, turn=turn) for turn, row in enumerate(strains)]
+
+
+@pytest.fixture(scope="module")
+def expected(knowledge: Knowledge, clean: list[bytes]) -> Twin:
+    """What the clean messages end in."""
+    return watched(knowledge, clean)[0]
+
+
+def message(row: np.ndarray, **others: object) -> bytes:
     shown = [None if np.isnan(value) else value for value in row.tolist()]
-    return json.dumps({"turn": turn, "control": "3g", "strain": shown, **others}).encode() + b"\n"
+    return json.dumps({"control": "3g", "strain": shown, **others}).encode() + b"\n"
+
+
+def intake_of(
+    knowledge: Knowledge, lines: list[bytes], rejected: Path | None = None, feed: Feed | None = None
+) -> Intake:
+    feed = feed or feeds.JsonLinesFeed(knowledge.scenario, io.BytesIO(b"".join(lines)))
+    return Intake(knowledge.scenario, feed, RejectedFile(rejected))
 
 
 def watched(knowledge: Knowledge, lines: list[bytes], rejected: Path | None = None) -> tuple[Twin, Intake]:
-    feed = feeds.JsonLinesFeed(knowledge.scenario, io.BytesIO(b"".join(lines)))
-    intake = Intake(knowledge.scenario, feed, RejectedFile(rejected))
-    twin = knowledge.twin(lag=20)
+    intake, twin = intake_of(knowledge, lines, rejected), knowledge.twin(lag=20)
     for _ in operate(twin, intake):
         pass
     return twin, intake
@@ -64,37 +75,30 @@ def same(first: Twin, second: Twin) -> bool:
 
 
 def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
-    knowledge: Knowledge, strains: np.ndarray, tmp_path: Path
-) -> None:
-    clean = [message(turn, row) for turn, row in enumerate(strains)]
-    expected, _ = watched(knowledge, clean)
+    knowledge, strains, clean, expected, tmp_path
+):
     chance = random.Random(5)
     order = sorted(range(TURNS), key=lambda turn: turn + (chance.random() < 0.2) * chance.randint(1, 15))
     lines: list[bytes] = []
     for turn in order:
-        lines.append(clean[turn])
-        if chance.random() < 0.2:
-            lines.append(clean[turn])
+        lines += [clean[turn]] * (1 + (chance.random() < 0.2))
         if chance.random() < 0.2:
             lines.append(chance.randbytes(40).replace(b"\n", b"") + b"\n")
-    lines += [clean[TURNS - 1]] * 3
-    twin, intake = watched(knowledge, lines, tmp_path / "rejected.jsonl")
+    twin, intake = watched(knowledge, [*lines, *[clean[TURNS - 1]] * 3], tmp_path / "rejected.jsonl")
     assert same(twin, expected)
-    assert intake.counts.late >= 5
-    assert intake.counts.duplicates >= 5
-    refused = [json.loads(line) for line in (tmp_path / "rejected.jsonl").read_text().splitlines()]
-    assert len(refused) == intake.counts.rejected >= 5
-    assert all(record["reason"] and record["text"] for record in refused)
+    assert min(intake.counts.late, intake.counts.duplicates, intake.counts.rejected) >= 5
     assert intake.counts.missing == 0
+    refused = [json.loads(line) for line in (tmp_path / "rejected.jsonl").read_text().splitlines()]
+    assert len(refused) == intake.counts.rejected
+    assert all(record["reason"] and record["text"] for record in refused)
     # A turn that never came is predicted through, and its sensors may come one by one.
     parts = [line for turn, line in enumerate(clean) if turn != 50]
     gap, counted = watched(knowledge, parts)
     assert counted.counts.missing == 1
     assert not same(gap, expected)
-    half = strains[50].copy()
-    half[::2] = np.nan
-    other = np.where(np.isnan(half), strains[50], np.nan)
-    assert same(watched(knowledge, [*parts, message(50, half), message(50, other)])[0], expected)
+    even = np.arange(24) % 2 == 0
+    halves = [message(np.where(lost, np.nan, strains[50]), turn=50) for lost in (even, ~even)]
+    assert same(watched(knowledge, [*parts, *halves])[0], expected)
 
 
 @pytest.mark.parametrize(
@@ -117,34 +121,25 @@ def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
         ({"unit": 3}, "`unit` is the name of a unit"),
     ],
 )
-def test_what_is_refused_changes_nothing(
-    knowledge: Knowledge, strains: np.ndarray, tmp_path: Path, sent: dict[str, object], reason: str
-) -> None:
-    clean = [message(turn, row) for turn, row in enumerate(strains)]
+def test_what_is_refused_changes_nothing(knowledge, clean, expected, tmp_path, sent, reason):
     line = json.dumps(sent).encode() + b"\n"
     twin, intake = watched(knowledge, [*clean, line], tmp_path / "rejected.jsonl")
-    assert same(twin, watched(knowledge, clean)[0])
+    assert same(twin, expected)
     assert intake.counts.rejected == 1
     assert reason in json.loads((tmp_path / "rejected.jsonl").read_text())["reason"]
 
 
-@settings(max_examples=150, deadline=None)
-@given(
-    st.one_of(
-        st.binary(max_size=60),
-        st.recursive(
-            st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
-            lambda inner: (
-                st.lists(inner, max_size=3)
-                | st.dictionaries(
-                    st.sampled_from(["turn", "time", "strain", "strain_1", "unit", "control"]), inner
-                )
-            ),
-            max_leaves=6,
-        ).map(lambda value: json.dumps(value).encode()),
-    )
+KEYS = st.sampled_from(["turn", "time", "strain", "strain_1", "unit", "control"])
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner),
+    max_leaves=6,
 )
-def test_anything_is_an_observation_or_refused(content: bytes) -> None:
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.binary(max_size=60) | ANYTHING.map(lambda value: json.dumps(value).encode()))
+def test_anything_is_an_observation_or_refused(content):
     reader = MessageReader(load_scenario("level_turns").scenario)
     try:
         found = reader.parse(content)
@@ -155,17 +150,14 @@ def test_anything_is_an_observation_or_refused(content: bytes) -> None:
 
 
 def test_a_flood_and_messages_of_ten_megabytes_are_counted_and_forgotten(
-    knowledge: Knowledge, strains: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    knowledge, clean, expected, tmp_path, monkeypatch
+):
     monkeypatch.setattr("twin_master.watch.intake.REJECTED_KEPT", 50)
     big = b'{"strain_1": "' + b"x" * 10_000_000 + b'"}\n'
     deep = b'{"strain": ' + b"[" * (LARGEST_MESSAGE // 4) + b"\n"
     flood = [big, deep, b"\xff\xfe{\n", b"NaN\n", b'{"turn": NaN}\n', b'{"turn": 1e999}\n'] * 3
-    lines = [message(turn, row) for turn, row in enumerate(strains)]
-    expected, _ = watched(knowledge, lines)
-    twin, intake = watched(
-        knowledge, [*lines[:30], *flood * 1, *[b"{}x\n"] * 300, *lines[30:]], tmp_path / "r"
-    )
+    lines = [*clean[:30], *flood, *[b"{}x\n"] * 300, *clean[30:]]
+    twin, intake = watched(knowledge, lines, tmp_path / "r")
     assert same(twin, expected)
     assert intake.counts.rejected == 318
     content = (tmp_path / "r").read_text().splitlines()
@@ -180,32 +172,23 @@ def timed(knowledge: Knowledge) -> Knowledge:
     return replace(knowledge, scenario=knowledge.scenario.model_copy(update={"watch": section}))
 
 
-def at(time: float, row: np.ndarray) -> bytes:
-    return json.dumps({"time": time, "control": "3g", "strain": row.tolist()}).encode() + b"\n"
-
-
 def taken_up(knowledge: Knowledge, state: object, line: bytes) -> Intake:
-    feed = feeds.JsonLinesFeed(knowledge.scenario, io.BytesIO(line))
-    intake = Intake(knowledge.scenario, feed, RejectedFile(None))
+    intake = intake_of(knowledge, [line])
     intake.restore(json.loads(json.dumps(state)))
     return intake
 
 
+RIGHT = [1.7e9 + 0.5 * turn for turn in range(8)]
+
+
 @pytest.mark.parametrize(
-    "times",
-    [
-        [0.0, *(1.7e9 + 0.5 * turn for turn in range(1, 8))],  # its clock was not yet set
-        [1.7e308, *(1.7e9 + 0.5 * turn for turn in range(1, 8))],
-        [1.7e9, 4e9, *(1.7e9 + 0.5 * turn for turn in range(2, 8))],
-    ],
-)
-def test_a_clock_that_is_set_after_the_first_turn_spoils_none(
-    timed: Knowledge, strains: np.ndarray, times: list[float]
-) -> None:
-    lines = [at(time, row) for time, row in zip(times, strains, strict=False)]
+    "times", [[0.0, *RIGHT[1:]], [1.7e308, *RIGHT[1:]], [1.7e9, 4e9, *RIGHT[2:]]]
+)  # whose clock was not yet set
+def test_a_clock_that_is_set_after_the_first_turn_spoils_none(timed, strains, clean, times):
+    lines = [message(row, time=time) for time, row in zip(times, strains, strict=False)]
     twin, intake = watched(timed, lines)
     assert (twin.turns, intake.counts.rejected, intake.counts.missing) == (8, 0, 0)
-    assert same(twin, watched(timed, [message(turn, row) for turn, row in enumerate(strains[:8])])[0])
+    assert same(twin, watched(timed, clean[:8])[0])
     # Two turns have agreed about the time: another such clock is refused, also by a watch that is taken up.
     again = taken_up(timed, intake.state(), b'{"time": 9e9, "strain_1": 1e-4}\n')
     assert again.read(twin) is None
@@ -217,9 +200,9 @@ def test_a_clock_that_is_set_after_the_first_turn_spoils_none(
     np.testing.assert_array_equal(reading.observed, strains[1])
 
 
-def test_times_stand_for_turns(timed: Knowledge, strains: np.ndarray) -> None:
+def test_times_stand_for_turns(timed, strains):
     times = [1.7e9 + 0.5 * turn + 0.1 * (turn % 3 - 1) for turn in range(10)]
-    lines = [at(time, row) for time, row in zip(times, strains, strict=False)]
+    lines = [message(row, time=time) for time, row in zip(times, strains, strict=False)]
     del lines[4]
     twin, intake = watched(timed, lines)
     assert (twin.turns, intake.counts.missing) == (10, 1)
@@ -228,7 +211,7 @@ def test_times_stand_for_turns(timed: Knowledge, strains: np.ndarray) -> None:
     assert watched(timed, [*lines, early, endless])[1].counts.rejected == 2
 
 
-def test_units_and_names(knowledge: Knowledge) -> None:
+def test_units_and_names(knowledge):
     reader = MessageReader(knowledge.scenario)
     for name, value in (
         ("strain_3", 8.12e-4),
@@ -240,64 +223,60 @@ def test_units_and_names(knowledge: Knowledge) -> None:
         found = reader.read({name: value}).observed
         assert found[2] == pytest.approx(8.12e-4, rel=1e-15)
         assert np.isnan(found).sum() == 23
-    pump = MessageReader(load_scenario("pump_wear").scenario)
-    unit = load_scenario("pump_wear").scenario.observation.sensor_units[0]
-    name = next(iter(pump._index))
-    assert pump.read({f"{name} [k{unit}]": 2.0}).observed[0] == 2000.0
+    scenario = load_scenario("pump_wear").scenario
+    pump, unit = MessageReader(scenario), scenario.observation.sensor_units[0]
+    assert pump.read({f"{next(iter(pump._index))} [k{unit}]": 2.0}).observed[0] == 2000.0
 
 
-def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_path: Path) -> None:
+def test_csv_as_people_write_it(knowledge, strains, tmp_path):
     path = tmp_path / "gauges.csv"
-    names = ",".join(f"strain_{number}_microstrain" for number in range(1, 25))
-    rows = [
-        f"{turn},3g," + ",".join(repr(v) for v in (1e6 * row).tolist()) for turn, row in enumerate(strains)
-    ]
+
+    def feed(text: str, scenario: Any = knowledge.scenario) -> feeds.CsvFeed:
+        path.write_text(text, encoding="utf-8")
+        return feeds.CsvFeed(path, scenario)
+
+    def messages(text: str) -> list[Any]:
+        return [fed[0] for fed in feed(text).messages(None)]
+
+    rows = [f"{turn},3g," + ",".join(map(repr, (1e6 * row).tolist())) for turn, row in enumerate(strains)]
     rows[7] = rows[7].replace(repr(float(1e6 * strains[7, 4])), "nan")
     rows[9] = "9,3g" + "," * 24
     rows[11] = "eleven,3g,0.0" + "," * 23
     rows[12] = "12,3g"
-    path.write_text("﻿step,control," + names + "\r\n" + "\r\n".join(rows), encoding="utf-8")
-
-    def messages(place: Any = None) -> list[Message | Refused | None]:
-        return [fed[0] for fed in feeds.CsvFeed(path, knowledge.scenario).messages(place)]
-
-    found = messages()
+    names = ",".join(f"{name}_microstrain" for name in NAMES)
+    text = "\ufeffstep,control," + names + "\r\n" + "\r\n".join(rows)
+    found = messages(text)
     assert len(found) == TURNS
-    refused = [turn for turn, fed in enumerate(found) if isinstance(fed, Refused)]
-    assert refused == [11, 12]
+    assert [turn for turn, fed in enumerate(found) if isinstance(fed, Refused)] == [11, 12]
     for turn, fed in enumerate(found):
         if not isinstance(fed, Refused):
-            assert fed.turn == turn
-            assert fed.control == 1
+            assert (fed.turn, fed.control) == (turn, 1)
             lost = np.isnan(fed.observed)
             assert lost.sum() == {7: 1, 9: 24}.get(turn, 0)
             np.testing.assert_allclose(fed.observed[~lost], strains[turn][~lost], rtol=1e-15)
-    feed = feeds.CsvFeed(path, knowledge.scenario)
-    assert len(list(islice(feed.messages(None), 50))) == 50
-    assert len(messages(feed.place)) == TURNS - 50
-    path.write_text("time,strain_2,strain_1_microstrain\n0.5,0.6,5\n,1e-4,inf\n,nan,5\n", encoding="utf-8")
-    units, infinite, fine = (cast(Message, found) for found in messages())
+    read = feed(text)
+    assert len(list(islice(read.messages(None), 50))) == 50
+    assert len([*feed(text).messages(read.place)]) == TURNS - 50
+    text = "time,strain_2,strain_1_microstrain\n0.5,0.6,5\n,1e-4,inf\n,nan,5\n"
+    units, infinite, fine = cast(list[Message], messages(text))
     assert units.unreadable == {1: "0.6; give its unit, such as `strain_2_microstrain`"}
     assert (infinite.observed[1], infinite.unreadable) == (1e-4, {0: '"inf"'})
     np.testing.assert_allclose(fine.observed[:2], [5e-6, np.nan], rtol=1e-15)
-    path.write_text("turn,_rain,strain_1\n12.0,wet,1e-4\n12.5,wet,1e-4\n", encoding="utf-8")
-    whole, half = messages()
-    assert isinstance(whole, Message)
+    whole, half = messages("turn,_rain,strain_1\n12.0,wet,1e-4\n12.5,wet,1e-4\n")
     assert (whole.turn, whole.observed[0]) == (12, 1e-4)
     assert "no number" in str(half)
     path.write_bytes(b'strain_1\n"' + b"x" * 200_000 + b'"\na\r"b\n\xff\n')
-    assert all(isinstance(found, Refused) for found in messages())
-    for twice in ("strain_1,strain_1_1", "turn,step,strain_1"):
-        path.write_text(f"{twice}\n", encoding="utf-8")
-        with pytest.raises(Exception, match="two columns say the same"):
-            feeds.CsvFeed(path, knowledge.scenario)
-    path.write_text("step,strian_1\n1,2\n", encoding="utf-8")
-    with pytest.raises(Exception, match=r"gauges.csv: the column `strian_1` is no sensor.*`turn`, `time`"):
-        feeds.CsvFeed(path, knowledge.scenario)
-    section = WatchSection(allow_unknown=True)
-    allowing = knowledge.scenario.model_copy(update={"watch": section})
-    path.write_text("step,strian_1,strain_2\n1,2,1e-4\n", encoding="utf-8")
-    ((passed, _),) = feeds.CsvFeed(path, allowing).messages(None)
+    refused = feeds.CsvFeed(path, knowledge.scenario).messages(None)
+    assert all(isinstance(fed[0], Refused) for fed in refused)
+    for header, sentence in (
+        ("strain_1,strain_1_1\n", "two columns say the same"),
+        ("turn,step,strain_1\n", "two columns say the same"),
+        ("step,strian_1\n1,2\n", r"gauges.csv: the column `strian_1` is no sensor.*`turn`, `time`"),
+    ):
+        with pytest.raises(Exception, match=sentence):
+            feed(header)
+    allowing = knowledge.scenario.model_copy(update={"watch": WatchSection(allow_unknown=True)})
+    ((passed, _),) = feed("step,strian_1,strain_2\n1,2,1e-4\n", allowing).messages(None)
     assert isinstance(passed, Message)
     assert (passed.observed[1], np.isnan(passed.observed).sum(), passed.unreadable) == (1e-4, 23, {})
     assert MessageReader(allowing).parse(b'{"strian_1": 2, "strain_2": 1e-4}').observed[1] == 1e-4
@@ -320,17 +299,14 @@ def test_csv_as_people_write_it(knowledge: Knowledge, strains: np.ndarray, tmp_p
         ("1e8", "1e+08; give its unit"),
     ],
 )
-def test_an_unreadable_gauge_is_lost_alone_and_named_once(
-    knowledge: Knowledge, strains: np.ndarray, tmp_path: Path, text: str, shown: str
-) -> None:
+def test_an_unreadable_gauge_is_lost_alone_and_named_once(knowledge, strains, tmp_path, text, shown):
     """As a list, under its name, and as a cell; through a watch that is taken up in the middle of it."""
-    names = [f"strain_{number}" for number in range(1, 25)]
     lines: dict[str, list[bytes]] = {"list": [], "names": [], "lost": []}
-    cells = ["turn,control," + ",".join(names)]
+    cells = ["turn,control," + ",".join(NAMES)]
     for turn, row in enumerate(strains[:9]):
         begin, values = f'{{"turn": {turn}, "control": "3g"', [repr(value) for value in row.tolist()]
         values[4] = text if 3 <= turn < 6 else values[4]
-        told = [f', "{name}": {value}' for name, value in zip(names, values, strict=True)]
+        told = [f', "{name}": {value}' for name, value in zip(NAMES, values, strict=True)]
         lines["list"].append(f'{begin}, "strain": [{", ".join(values)}]}}\n'.encode())
         lines["names"].append(f"{begin}{''.join(told)}}}\n".encode())
         told[4] = "" if 3 <= turn < 6 else told[4]
@@ -343,10 +319,8 @@ def test_an_unreadable_gauge_is_lost_alone_and_named_once(
     for name in ("list", "names", "csv"):
         twin, state, notices = knowledge.twin(lag=20), None, []
         for part in (slice(0, 5), slice(5, 9)):
-            feed: feeds.CsvFeed | feeds.JsonLinesFeed = feeds.CsvFeed(path, knowledge.scenario)
-            if name != "csv":
-                feed = feeds.JsonLinesFeed(knowledge.scenario, io.BytesIO(b"".join(lines[name][part])))
-            intake = Intake(knowledge.scenario, feed, RejectedFile(None))
+            csv = feeds.CsvFeed(path, knowledge.scenario) if name == "csv" else None
+            intake = intake_of(knowledge, lines.get(name, [])[part], feed=csv)
             intake.restore(state)
             for _ in operate(twin, intake):
                 notices += [(intake.observation_turn, notice) for notice in intake.notices]
@@ -355,8 +329,7 @@ def test_an_unreadable_gauge_is_lost_alone_and_named_once(
             state = json.loads(json.dumps(intake.state()))
         assert same(twin, expected)
         assert (intake.counts.received, intake.counts.rejected) == (9, 0)
-        assert [(turn, notice.kind, notice.sensors) for turn, notice in notices] == [
-            (3, "gauge_left_out", (5,)), (6, "gauge_back", (5,)),
-        ]  # fmt: skip
+        said = [(turn, notice.kind, notice.sensors) for turn, notice in notices]
+        assert said == [(3, "gauge_left_out", (5,)), (6, "gauge_back", (5,))]
         assert "3: gauge 5 shows " in notices[0][1].sentence
         assert name == "csv" or shown in notices[0][1].sentence

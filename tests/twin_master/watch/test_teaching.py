@@ -1,7 +1,5 @@
 """A watch that is taught: it asks for the cause, tries what is named, and adopts what explains more."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
@@ -13,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from discrepancy.catalogue.library import library
 from discrepancy.models.lumped import LumpedModel
@@ -22,17 +19,15 @@ from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
 from discrepancy.workflow import investigate
-from fe.runtime.patch import ModelPatch, PowerStiffness, SensorGain
-from fmu_asset.packing.patch_file import SCHEMA
-from scenarios import scenario_files
+from fe.runtime.patch import ModelPatch, PowerStiffness
+from tests.command_line import refused
 from tests.discrepancy.rigs import ORIGIN
-from tests.twin_master.watch.watches import lines, watchful
-from twin_master.errors import MissionInputError
+from tests.kept import FMU, ROOT, kept_folder
+from tests.twin_master.runs import check_same, journal, text_of, written
+from tests.twin_master.watch.watches import of_gauge, patch_of, ran, viewed, watchful
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
-from twin_master.mission.turns import History
 from twin_master.network.inference import known_control
-from twin_master.viewer.flight import Flight as SeenFlight
 from twin_master.viewer.messages import Request, Teller
 from twin_master.viewer.scene import scene_of
 from twin_master.watch.feeds import CsvFeed
@@ -40,7 +35,6 @@ from twin_master.watch.folder import Patched, Watch
 from twin_master.watch.replay import replay
 from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence
 from twin_master.watch.trial import Judge, Outcome, patched_model, policy_change
-from uav_twin.cli import app
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
 
@@ -62,11 +56,6 @@ place.rename(out)
 """
 
 
-def patch_of(gain: float, channel: str = "g5") -> dict[str, Any]:
-    effects = [{"id": "loose", "primitives": ModelPatch((SensorGain(channel, gain),)).to_list()}]
-    return {"schema": SCHEMA, "effects": effects, "channels": {channel: f"strain[{channel[1:]}]"}}
-
-
 def search(watch: Watch, place: Path, kind: str | None, gain: float, gate: str = "-") -> Search:
     answer, script = place / f"{kind}_{gain}.json", place / "answer.py"
     answer.write_text(json.dumps([kind, patch_of(gain)]))
@@ -74,15 +63,13 @@ def search(watch: Watch, place: Path, kind: str | None, gain: float, gate: str =
     return Search(watch.folder, 7, (sys.executable, str(script), str(answer), gate))
 
 
-def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
-    base: Watch, mission: History, loose: Path, tmp_path: Path
-) -> None:
+def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, loose, tmp_path):
     (tmp_path / "whole").mkdir()
     watch = watchful(base, tmp_path / "whole" / "watch")
     decisions: list[dict[str, Any]] = []
     told = search(watch, tmp_path, "named", -0.3)
     watch.run(CsvFeed(loose, watch.scenario), lambda d: decisions.append(dict(d)), search=told)
-    records = lines(watch)
+    records = journal(watch.folder)
     (verdict,) = [record["verdict"] for record in records if "verdict" in record]
     (model,) = [record["model"] for record in records if "model" in record]
     alarm = next(d for d in decisions for n in d["notices"] if n["kind"] == "alarm")
@@ -102,63 +89,57 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(
     # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
     last = records[-1]["filtered"]
     assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2
-    assert seen(watch).pictures == []  # turns show no motion, and no force in it
+    assert viewed(watch).pictures == []  # turns show no motion, and no force in it
     # Stopped within the trial, and after the adoption: the same journal.
     stopped = watchful(base, tmp_path / "stopped")
     asked = verdict["to_turn"]
     for end in (asked + 5, asked + 15, None):
-        stopped.run(
-            CsvFeed(loose, stopped.scenario), lambda _d: None, turns=end,
-            search=search(stopped, tmp_path, "named", -0.3),
-        )  # fmt: skip
-        journal = (stopped.folder / JOURNAL_NAME).read_bytes()
+        told = search(stopped, tmp_path, "named", -0.3)
+        stopped.run(CsvFeed(loose, stopped.scenario), str, turns=end, search=told)
         again = watchful(stopped, tmp_path / f"{end}")
-        assert (again.folder / JOURNAL_NAME).read_bytes() == journal
+        check_same(again.folder, stopped.folder, JOURNAL_NAME)
         stopped = again
-    assert journal == (watch.folder / JOURNAL_NAME).read_bytes()
+    check_same(stopped.folder, watch.folder, JOURNAL_NAME)
 
 
-def seen(watch: Watch) -> SeenFlight:
-    """Return a watch as viewers see it."""
-    flight = SeenFlight(watch.folder)
-    while flight.update():
-        pass
-    return flight
-
-
-def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(
-    base: Watch, recorded: Path, tmp_path: Path
-) -> None:
+def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(base, recorded, tmp_path):
     """Releases on the ground, of the first mode as one mass, show a cubic spring at the tip."""
-    rig = LumpedModel.load("single_mass_rig")
-    tip = rig.description.port[0].model_copy(update={"name": "tip"})
-    rig = LumpedModel(rig.description.model_copy(update={"port": (tip,)}))
-    plan = plan_for(rig, ("displacement", "leaf_strain"), "mass")
-    hidden = ModelPatch((PowerStiffness("tip", 2.0, 3.0, 0, 0.02),))
-    campaign = example_campaign(rig, "ringdown", 3, replace(plan, duration=0.5 * plan.duration), hidden)
-    few = [item for item in library() if item.identifier in ("cubic_stiffness", "coulomb_friction")]
-    found = investigate(campaign, rig, few)
-    assert found.verdict.kind is VerdictKind.NAMED
-    write_verdict_folder(tmp_path / "verdict", ReportInput(found, ORIGIN))
+
+    def motion_verdict() -> str:
+        rig = LumpedModel.load("single_mass_rig")
+        tip = rig.description.port[0].model_copy(update={"name": "tip"})
+        rig = LumpedModel(rig.description.model_copy(update={"port": (tip,)}))
+        plan = plan_for(rig, ("displacement", "leaf_strain"), "mass")
+        hidden = ModelPatch((PowerStiffness("tip", 2.0, 3.0, 0, 0.02),))
+        campaign = example_campaign(rig, "ringdown", 3, replace(plan, duration=0.5 * plan.duration), hidden)
+        few = [item for item in library() if item.identifier in ("cubic_stiffness", "coulomb_friction")]
+        found = investigate(campaign, rig, few)
+        assert found.verdict.kind is VerdictKind.NAMED
+        write_verdict_folder(folder, ReportInput(found, ORIGIN))
+        return found.verdict.sentence
+
+    folder = tmp_path / "motion_verdict"
+    places = (*FMU, ROOT / "calibration", ROOT / "discrepancy", Path(__file__))
+    sentence = kept_folder(folder, motion_verdict, places)
     watch = watchful(base, tmp_path / "watch")
-    watch.run(CsvFeed(recorded, watch.scenario), lambda _d: None, turns=20)
-    assert seen(watch).pictures == []  # turns are no motion
-    given = Patched(tmp_path / "verdict" / "patch.json", 15)
-    watch.run(CsvFeed(recorded, watch.scenario), lambda _d: None, turns=25, patched=given)
-    shutil.rmtree(tmp_path / "verdict")
-    flight = seen(watch)
+    ran(watch, CsvFeed(recorded, watch.scenario), 20)
+    assert viewed(watch).pictures == []  # turns are no motion
+    given = Patched(folder / "patch.json", 15)
+    watch.run(CsvFeed(recorded, watch.scenario), str, turns=25, patched=given)
+    shutil.rmtree(folder)
+    flight = viewed(watch)
     (picture,) = flight.pictures
     teller = Teller(flight, scene_of(watch.folder, flight.knowledge))
     assert b"<svg" in picture.drawing.read_bytes()
     asked = Request(number=1, flight=-1, first=0, end=0, turn=18, shown=-1, count=-1)
     assert json.loads(str(teller.answer(asked)))["picture"] is None  # as was known at the time
     shown = json.loads(str(teller.answer(asked.model_copy(update={"turn": 19}))))["picture"]
-    assert shown["said"] == found.verdict.sentence
+    assert shown["said"] == sentence
     (picture.drawing.parent.parent / "verdict.json").write_text("{}")
-    assert seen(watch).pictures == []
+    assert viewed(watch).pictures == []
 
 
-def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base: Watch, loose: Path, tmp_path: Path) -> None:
+def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path):
     for kind, gain, sentence in (
         ("named", 0.3, "and is not adopted."),
         ("named", -0.002, "nats of evidence, 3 are needed, and is not adopted."),
@@ -167,15 +148,15 @@ def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base: Watch, loose: Pa
     ):
         watch = watchful(base, tmp_path / f"{kind}{gain}")
         finder = search(watch, tmp_path, kind, gain)
-        watch.run(CsvFeed(loose, watch.scenario), lambda _d: None, turns=44, search=finder)
-        records = lines(watch)
+        watch.run(CsvFeed(loose, watch.scenario), str, turns=44, search=finder)
+        records = journal(watch.folder)
         assert not any("model" in record for record in records)
         notices = [n["sentence"] for record in records for n in record.get("notices", [])]
         assert any(sentence in text for text in notices)
         assert sum("searched for the cause" in text for text in notices) == 2
 
 
-def test_live_turns_do_not_wait_for_the_search(base: Watch, loose: Path, tmp_path: Path) -> None:
+def test_live_turns_do_not_wait_for_the_search(base, loose, tmp_path):
     watch = watchful(base, tmp_path / "watch")
     feed, gate = CsvFeed(loose, watch.scenario), tmp_path / "gate"
     feed.replayable = False  # as a broker
@@ -190,14 +171,12 @@ def test_live_turns_do_not_wait_for_the_search(base: Watch, loose: Path, tmp_pat
                 time.sleep(0.02)
 
     watch.run(feed, decide, search=finder)
-    (verdict, *_) = [record for record in lines(watch) if "verdict" in record]
+    (verdict, *_) = [record for record in journal(watch.folder) if "verdict" in record]
     assert (verdict["turn"], verdict["verdict"]["turn"]) == (40, 40)
     assert verdict["verdict"]["to_turn"] < 35
 
 
-def test_live_turns_do_not_wait_for_the_patched_model(
-    base: Watch, mission: History, loose: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_live_turns_do_not_wait_for_the_patched_model(base, mission, loose, tmp_path, monkeypatch):
     """It is built beside them, and believed behind the turn that the journal says, to the bit."""
     judges: list[Judge] = []
 
@@ -216,7 +195,7 @@ def test_live_turns_do_not_wait_for_the_patched_model(
 
     def decide(decision: Any) -> None:
         nonlocal trial_end
-        verdict = next((record["verdict"] for record in lines(watch) if "verdict" in record), None)
+        verdict = next((record["verdict"] for record in journal(watch.folder) if "verdict" in record), None)
         teaching = watch.folder / "teaching"
         while verdict is None and teaching.is_dir() and not [*teaching.glob("turns*/verdict.json")]:
             time.sleep(0.02)
@@ -226,7 +205,7 @@ def test_live_turns_do_not_wait_for_the_patched_model(
                 time.sleep(0.02)
 
     watch.run(feed, decide, search=finder)
-    model = next(record for record in lines(watch) if "model" in record)
+    model = next(record for record in journal(watch.folder) if "model" in record)
     assert model["turn"] == trial_end + 3
     assert model["model"]["from_turn"] < 20
     assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
@@ -239,13 +218,13 @@ def test_live_turns_do_not_wait_for_the_patched_model(
             knew.restore_state(twin.save_state())
             twin = knew
         found = twin.turn(row, int(mission.control_index[number]))
-    assert lines(watch)[-1]["filtered"] == found.filtered.tolist()
+    assert journal(watch.folder)[-1]["filtered"] == found.filtered.tolist()
     again = watchful(watch, tmp_path / "again")
     twins = [replay(one._path, one.models, one.scenario.watch.lag)[0].twin for one in (again, watch)]
     assert twins[0].save_state() == twins[1].save_state()
 
 
-def test_a_policy_that_changes_is_told(base: Watch) -> None:
+def test_a_policy_that_changes_is_told(base):
     known = base.models[0].knowledge
     states, sharp = known.model.states, known.scenario.control_names.index("3g")
     z1, z2 = states.coordinates.T
@@ -265,12 +244,9 @@ def test_a_policy_that_changes_is_told(base: Watch) -> None:
         assert trial_sentence({"kind": kind, "from_turn": 3}, outcome, "turn").endswith(f". {sentence}")
 
 
-def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(
-    base: Watch, mission: History, tmp_path: Path
-) -> None:
+def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(base, mission, tmp_path):
     """Gauge 17 is strained most: were its readings the strain, 3g would be left at z1 80 % only."""
-    file = tmp_path / "patch.json"
-    file.write_text(json.dumps(patch_of(-0.12, "g17")))
+    file = of_gauge(tmp_path / "patch.json", -0.12, "g17")
     known, taught = base.models[0].knowledge, patched_model(base.scenario, file, 0).knowledge
     keep_knowledge(tmp_path, taught)
     for read in (taught, kept_knowledge(tmp_path, taught.scenario)):
@@ -292,7 +268,7 @@ def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[st
     return {"turn": number, "notices": list(alarms), "suspicion": {"log_evidence_none": evidence}}
 
 
-def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns() -> None:
+def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns():
     teaching = Teaching(100.0)
     alarm = {"kind": "alarm", "sentence": "a", "since": 3}
     for number in range(12):
@@ -318,20 +294,16 @@ def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns() -> None:
     assert teaching.question == Question(8, 49)  # the alarm of the new model, and not before it was believed
 
 
-def test_a_second_patch_stands_beside_the_first(tmp_path: Path) -> None:
-    for number, channel in enumerate(("g5", "g7")):
-        (tmp_path / str(number)).write_text(json.dumps(patch_of(-0.1, channel)))
-    both = json.loads(both_patches(tmp_path / "0", tmp_path / "1"))
+def test_a_second_patch_stands_beside_the_first(tmp_path):
+    first, second = (of_gauge(tmp_path / channel, -0.1, channel) for channel in ("g5", "g7"))
+    both = json.loads(both_patches(first, second))
     assert [effect["primitives"][0]["channel"] for effect in both["effects"]] == ["g5", "g7"]
     assert both["channels"] == {"g5": "strain[5]", "g7": "strain[7]"}
-    assert both_patches(None, tmp_path / "1") == (tmp_path / "1").read_bytes()
+    assert both_patches(None, second) == second.read_bytes()
 
 
-def test_teaching_is_refused_at_the_start_where_nothing_could_look_for_a_cause(tmp_path: Path) -> None:
-    scenario = tmp_path / "bracket.toml"
-    scenario.write_text(scenario_files()["bracket"].read_text(encoding="utf-8") + "\n[notice]\n")
-    words = ["watch", str(scenario), "--observations", "-", "--out", str(tmp_path / "w"), "--teach"]
-    result = CliRunner().invoke(app, words)
-    assert isinstance(result.exception, MissionInputError)
-    assert "this scenario has the role strain under z_heel, z_arm" in str(result.exception)
-    assert not (tmp_path / "w").exists()
+def test_teaching_is_refused_at_the_start_where_nothing_could_look_for_a_cause(tmp_path):
+    scenario, out = written(tmp_path, text_of("bracket") + "\n[notice]\n"), tmp_path / "w"
+    words = ("watch", scenario, "--observations", "-", "--out", out, "--teach")
+    assert "this scenario has the role strain under z_heel, z_arm" in refused(*words)
+    assert not out.exists()

@@ -1,10 +1,10 @@
 """Watches without a calibration of their own, recordings, and a broker."""
 
-from __future__ import annotations
-
 import copy
 import json
+import os
 import shutil
+import signal
 import socket
 import subprocess
 import time
@@ -16,9 +16,13 @@ from typing import Any
 import numpy as np
 from paho.mqtt import client as paho
 
-from twin_master.mission.journal import JOURNAL_NAME, records
+from fe.runtime.patch import ModelPatch, SensorGain
+from fmu_asset.packing.patch_file import SCHEMA
+from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.tables import Noticing
+from twin_master.viewer.flight import Flight
 from twin_master.watch.folder import Watch
+from twin_master.watch.intake import Counts, Feed
 from twin_master.watch.replay import BelievedModel
 
 
@@ -57,14 +61,56 @@ def soon_quiet(watch: Watch) -> Watch:
     return watch
 
 
+def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Counts:
+    """Run a watch up to each number of turns (None: to the end); return the last counts."""
+    for turns in stops or (None,):
+        counts = watch.run(feed, lambda _decision: time.sleep(pause), turns=turns)
+    return counts
+
+
+def killed_at(watch: Watch, size: int, run: Callable[[], object]) -> bool:
+    """Run in a process of its own, killed once the journal has a size; return whether it was killed."""
+    journal, child = watch.folder / JOURNAL_NAME, os.fork()
+    if not child:
+        try:
+            run()
+            os._exit(0)
+        finally:
+            os._exit(1)
+    while not (ended := os.waitpid(child, os.WNOHANG))[0]:
+        if journal.exists() and journal.stat().st_size >= size:
+            os.kill(child, signal.SIGKILL)
+            ended = os.waitpid(child, 0)
+            break
+        time.sleep(0.0005)
+    assert ended[1] in (0, signal.SIGKILL)
+    return ended[1] == signal.SIGKILL
+
+
+def viewed(watch: Watch) -> Flight:
+    """Return a watch as viewers see it."""
+    flight = Flight(watch.folder)
+    while flight.update():
+        pass
+    return flight
+
+
+def patch_of(gain: float, channel: str = "g5") -> dict[str, Any]:
+    """Return a patch in which a gauge shows too much by a share."""
+    effects = [{"id": "loose", "primitives": ModelPatch((SensorGain(channel, gain),)).to_list()}]
+    return {"schema": SCHEMA, "effects": effects, "channels": {channel: f"strain[{channel[1:]}]"}}
+
+
+def of_gauge(path: Path, gain: float, channel: str = "g5") -> Path:
+    """Write such a patch."""
+    path.write_text(json.dumps(patch_of(gain, channel)))
+    return path
+
+
 def wait_until(found: Callable[[], object]) -> None:
     limit = time.monotonic() + 60.0
     while not found() and time.monotonic() < limit:
         time.sleep(0.02)
-
-
-def lines(watch: Watch) -> list[dict[str, Any]]:
-    return [record for record, *_ in records(watch.folder / JOURNAL_NAME)]
 
 
 PASSWORD = "a password"
@@ -73,27 +119,24 @@ PASSWORD = "a password"
 class Mosquitto:
     """A broker on the loopback that wants a user, or TLS, and keeps its sessions when it stops."""
 
-    def __init__(self, folder: Path, *further: str, tls: bool = False) -> None:
+    def __init__(self, folder: Path, *, tls: bool = False) -> None:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.port = probe.getsockname()[1]
         self.folder, self.tls = folder, tls
         self.authority = folder / "certificate.pem"
         self.let_in(PASSWORD)
+        self.further: list[str] = []
         self.lines = [
             f"listener {self.port} 127.0.0.1", "allow_anonymous false", f"password_file {folder / 'users'}",
             "persistence true", f"persistence_location {folder}/", "max_queued_messages 10000", "user root",
         ]  # fmt: skip
         if tls:
-            command = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2"
-            subprocess.run(
-                ["openssl", *command.split(), "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1",
-                 "-subj", "/CN=localhost",
-                 "-keyout", str(folder / "key.pem"), "-out", str(self.authority)],
-                check=True, capture_output=True,
-            )  # fmt: skip
+            words = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2"
+            words += " -addext subjectAltName=DNS:localhost,IP:127.0.0.1 -subj /CN=localhost"
+            files = ["-keyout", str(folder / "key.pem"), "-out", str(self.authority)]
+            subprocess.run([*words.split(), *files], check=True, capture_output=True)
             self.lines += [f"certfile {self.authority}", f"keyfile {folder / 'key.pem'}"]
-        self.further = [*further]
         self.start()
 
     def let_in(self, password: str) -> None:
@@ -102,10 +145,9 @@ class Mosquitto:
         subprocess.run(users, check=True, capture_output=True)
 
     def start(self) -> None:
-        (self.folder / "mosquitto.conf").write_text("\n".join([*self.lines, *self.further, ""]))
-        self.process = subprocess.Popen(
-            ["mosquitto", "-c", str(self.folder / "mosquitto.conf")], stderr=subprocess.DEVNULL
-        )
+        config = self.folder / "mosquitto.conf"
+        config.write_text("\n".join([*self.lines, *self.further, ""]))
+        self.process = subprocess.Popen(["mosquitto", "-c", str(config)], stderr=subprocess.DEVNULL)
         for _ in range(400):
             try:
                 socket.create_connection(("127.0.0.1", self.port), 1.0).close()
@@ -116,6 +158,10 @@ class Mosquitto:
     def stop(self) -> None:
         self.process.terminate()
         self.process.wait(20)
+
+    def again(self) -> None:
+        self.stop()
+        self.start()
 
     def client(self, name: str, heard: list[Any] | None = None) -> Any:
         """Return a client whose session lasts, and that hears what its topics say."""

@@ -1,0 +1,372 @@
+"""A structure as a model by its modes: any from a mesh or matrices, and the wing with its patches."""
+
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import inv
+
+from calibration.errors import CalibrationError
+from calibration.joint.wing_table import wing_priors
+from calibration.result.file import load_calibration
+from calibration.result.record import STATE, ParameterPrior
+from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
+from discrepancy.errors import ModelError
+from discrepancy.models.acting import Acting, Shown, place_among, shown_rows
+from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
+from discrepancy.models.linear_system import Resting, springs
+from discrepancy.models.scales import PortScale
+from discrepancy.models.second_order import SecondOrderSystem
+from discrepancy.models.system_model import Case, State, SystemModel
+from fe.reduction.model_cache import patch_arrays
+from fe.runtime import patch as changes
+from fe.runtime.errors import FiniteElementError
+from fe.runtime.motion import PLANFORM, STATION_PORTS
+from fe.runtime.patch import INTERNAL_FORCES, PRIMITIVES, SENSORS, ModelPatch, PointMass, Primitive
+from fe.runtime.patch_arrays import PatchArrays
+from fe.runtime.patched_wing import MODE_COUNT, ON_MODES, PatchedWing, motion_basis
+from fe.runtime.reduced import ReducedModel, ReducedState, dense_sum
+from fe.runtime.state import Losses, wing_names
+from fe.runtime.wing_rows import LOAD_PLACE, PORTS, strain_gauge
+from fe.wing.design import WingDesign, load_design
+from reporting.progress import Progress
+
+LOAD_FACTOR = "load_factor"
+"""Control that is the load factor of flights."""
+DEVIATION = 0.25
+"""Standard deviation of a parameter whose calibration is not known, as a share of its range."""
+SAME = 1e-9
+"""Difference of two rows, relative to the largest entry, that is rounding."""
+SHIPPED_PRIOR = {
+    "young_modulus_factor": (1.0073, 0.0103),
+    "servo_mass": (0.1685, 0.0041),
+    "pitot_mass": (0.1350, 0.0083),
+    "damping_alpha": (1.03, 0.37),
+    "damping_beta": (7.56e-4, 1.84e-4),
+}
+"""Mean and standard deviation of the calibrated state of the shipped wing (docs/calibration.md): e of the
+paper, its masses, and the damping of the joint posterior, whose spread holds the measurement too."""
+
+
+ROTATING_PORT = "root"
+Prior = Mapping[str, tuple[float, float]]
+"""Means and standard deviations of calibrated parameters, by the names of `STATE`."""
+Design = WingDesign | None
+
+
+class StructureModel(SystemModel):
+    """A structure from a mesh or matrices; its parameters and free masses have `DEVIATION`.
+
+    A control in N is a force, and where a load of it meets a displacement output along it there is a port,
+    which has the name of that. Other controls are nominal but for the load factor, which is zero where none
+    is recorded; constant loads always act.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The structure.
+
+    Raises
+    ------
+    ModelError
+        If no control is a force or a load factor.
+    """
+
+    def __init__(self, model: ReducedModel) -> None:
+        nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
+        self.model, self.name, self.regions = model, model.name, model.regions
+        self.parameters = tuple(
+            ParameterPrior(name, unit, nominal[name], DEVIATION * (high - low), low, high)
+            for names, unit in ((model.parameters, "1"), (model.masses, "kg"))
+            for name in names
+            for low, high in [model.validity[name]]
+        )
+        units = zip(model.controls, model.control_units, strict=True)
+        self.forces = tuple(name for name, unit in units if unit == "N")
+        if not self.forces and LOAD_FACTOR not in model.controls:
+            raise ModelError(
+                f"The structure {model.name} has no control in N and no load_factor, and a campaign needs a "
+                'load that is recorded: give a [[control]] with unit = "N" and a [[load]] of 1 N tied to it, '
+                "or a [[control]] load_factor."
+            )
+        if LOAD_FACTOR not in model.controls:
+            self.kinds -= {TrialKind.FLIGHT}
+        self.reference, self.load_places = (*self.forces, LOAD_FACTOR)[0], self.forces
+        self.largest_force = 0.5 * min((model.validity[name][1] for name in self.forces), default=np.inf)
+        _, outputs, accelerations = model.rows
+        strains, displacements = np.split(outputs, [len(model.gauges)])
+        named = (
+            (model.gauges, Quantity.STRAIN, strains),
+            (model.displacements, Quantity.DISPLACEMENT, displacements),
+            (model.accelerations, Quantity.ACCELERATION, accelerations),
+        )
+        self.quantities = {name: quantity for names, quantity, _ in named for name in names}
+        self._rows = {name: row for names, _, rows in named for name, row in zip(names, rows, strict=True)}
+        self._systems = Memory()
+        along = [self._load(self.prior_mean(), force) for force in self.forces]
+        self.port_rows = {
+            name: row
+            for push in along
+            for name, row in zip(model.displacements, displacements, strict=True)
+            if np.abs(row - push).max() <= SAME * np.abs(push).max()
+        }
+        self.port_names = tuple(self.port_rows)
+
+    def _at(self, parameters: FloatArray, controls: Mapping[str, float], losses: Losses = ()) -> FloatArray:
+        """Return the values that the structure is made at; controls that are left out are nominal."""
+        names = (*self.model.parameters, *self.model.masses)
+        return self.model.vector({**dict(zip(names, parameters.tolist(), strict=True)), **controls}, losses)
+
+    def _pull(self, parameters: FloatArray, controls: Mapping[str, float]) -> FloatArray:
+        """Return the load (n,) under controls."""
+        return np.asarray(self.model.rows[0] @ self.model.load_coefficients(self._at(parameters, controls)))
+
+    def _load(self, parameters: FloatArray, control: str) -> FloatArray:
+        """Return what one of a control adds to the load (n,)."""
+        none = dict.fromkeys(self.model.controls, 0.0)
+        return self._pull(parameters, none | {control: 1.0}) - self._pull(parameters, none)
+
+    def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
+        """Return what outputs show.
+
+        Loads that always act shift what a motion shows.
+        """
+        found = shown_rows((self._rows[output] for output, _ in outputs), outputs)
+        always = self._always(case.state.parameters)
+        if acting is None or not always.any():
+            return found
+        still = self.system(case.state).flexibility(always)
+        return [item._replace(constant=float(item.rows[0] @ still)) for item in found]
+
+    def supports(self, primitive: type[Primitive]) -> bool:
+        """Whether the structure can carry a primitive: sensors, laws at its ports, errors of its forces."""
+        forces = primitive is changes.LoadGain and bool(self.forces)
+        return primitive in SENSORS or forces or (primitive in INTERNAL_FORCES and bool(self.port_names))
+
+    def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
+        """Return the load (n,) of 1 N of a force, or, where there is none, of the load factor.
+
+        Raises
+        ------
+        ModelError
+            If there is no such force, or none is named of several.
+        """
+        return self._load(state.parameters, place_among(self.forces or (LOAD_FACTOR,), place, self.what))
+
+    def lift(self, state: State, change: ModelPatch) -> FloatArray:
+        """Return the loads (2, n) of the load factor and of its square, which is zero."""
+        row = self._load(state.parameters, LOAD_FACTOR)
+        return np.stack((row, np.zeros_like(row)))
+
+    def _always(self, parameters: FloatArray) -> FloatArray:
+        """Return the load (n,) of constant loads and of controls that no trial records."""
+        recorded = {name: 0.0 for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls}
+        return self._pull(parameters, recorded)
+
+    def constant(self, case: Case) -> FloatArray:
+        """Return the load (n,) that always acts at rest; in motion it is in what is shown."""
+        return self._always(case.state.parameters) * (not case.trial.is_dynamic)
+
+    def system(self, state: State) -> SecondOrderSystem:
+        """Return the structure at parameters and losses, in the coordinates of `ReducedModel.at`.
+
+        Raises
+        ------
+        OutsideModelError
+            If one lies outside the validity box of the reduced model.
+        """
+        parameters, losses, *_ = state
+        key = parameters.tobytes(), losses
+        return self._systems.get(key, lambda: self._made(self._at(parameters, {}, losses)))
+
+    def _made(self, vector: FloatArray) -> SecondOrderSystem:
+        model, state = self.model, ReducedState(self.model, vector)
+        size, moving = len(state.shapes), model.modal_stiffness.shape[1]
+        theta = model.stiffness_coefficients(vector)
+        mass, stiffness, compliance = np.zeros((3, size, size))
+        cross = dense_sum(model.mass_coefficients(vector), model.cross_mass)
+        mass[:moving, :moving], mass[:moving, moving:] = state.modes.mass, cross
+        mass[moving:, :moving] = cross.T
+        stiffness[:moving, :moving] = dense_sum(theta, model.modal_stiffness)
+        compliance[moving:, moving:] = inv(dense_sum(theta, model.static_stiffness))
+        alpha, beta = model.damping
+        modes = 2.0 * np.pi * state.modes.frequency, np.ascontiguousarray(state.shapes), model.mode_count
+        return SecondOrderSystem(
+            mass, alpha * mass + beta * stiffness, stiffness, self.port_rows, model.mode_count, float(beta),
+            known=modes, compliance=compliance,
+        )  # fmt: skip
+
+
+class WingModel(SystemModel):
+    """The wing in the states and under the structural patches that are asked for, each made once.
+
+    Parameters
+    ----------
+    arrays : PatchArrays
+        The wing for patches.
+    name : str
+        For people.
+    prior : mapping of str to (float, float)
+        Mean and standard deviation of the calibrated parameters, by the names of
+        `calibration.result.record.STATE`.
+    design : WingDesign, optional
+        What the arrays were made of.
+
+    Notes
+    -----
+    Load places are "tip_load" or (y [m], chord fraction). Outputs are strain[k], tip_displacement,
+    load_point_displacement and displacement[y, x].
+    """
+
+    missing = STATION_PORTS
+    components = 3
+    reference = LOAD_PLACE
+
+    def __init__(
+        self, arrays: PatchArrays, name: str = "wing", prior: Prior = SHIPPED_PRIOR, design: Design = None
+    ) -> None:
+        self.design = design
+        self.wing = wing = PatchedWing(arrays)
+        box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
+        self.name, self.parameters = name, wing_priors(box, **prior)
+        self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
+        self.port_names, self._row = tuple(PORTS), cache(wing.output_row)
+        self._stiffnesses, self._systems, self._rows, self._answers = (Memory() for _ in range(4))
+
+    @classmethod
+    def shipped(cls, progress: Progress | None = None) -> "WingModel":
+        """Return the shipped wing with the calibration that the documentation states."""
+        return cls.of_design(None, progress)
+
+    @classmethod
+    def of_design(cls, path: Path | str | None, progress: Progress | None = None) -> "WingModel":
+        """Return the wing of a design file, calibrated as the shipped wing is.
+
+        Raises
+        ------
+        ModelError
+            If it cannot be read, modelled or reduced.
+        """
+        try:
+            design = load_design(path)
+            return cls(patch_arrays(design, progress), design.name, design=design)
+        except FiniteElementError as cause:
+            raise ModelError(str(cause)) from cause
+
+    @classmethod
+    def of_calibration(cls, path: Path | str, progress: Progress | None = None) -> "WingModel":
+        """Return the wing of a calibration, its posterior as prior.
+
+        Raises
+        ------
+        ModelError
+            If the calibration cannot be read, or its wing not be modelled.
+        """
+        try:
+            result = load_calibration(path)
+            prior = {name: (result.mean(name), float(np.std(result.draws_of(name)))) for name in STATE}
+            design = result.wing_design
+            return cls(patch_arrays(design, progress), result.asset, prior, design)
+        except (FiniteElementError, CalibrationError, OSError) as cause:
+            raise ModelError(f"The calibration {path} cannot be used: {cause}") from cause
+
+    # ------------------------------------------------------------ outputs, ports and loads
+
+    def output_quantity(self, output: str) -> Quantity | None:
+        """Return what an output is, or None if there is no such output."""
+        if self._row(output) is None:
+            return None
+        return Quantity.STRAIN if output.startswith("strain") else Quantity.DISPLACEMENT
+
+    def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
+        """Return what outputs show; `component` 1 and 2: transverse and shear strain."""
+        known = (self._row(output, component) for output, _ in outputs)
+        rows = self._rows.get((outputs, component), lambda: np.array([*known]).reshape(-1, self.wing.size))
+        factors = self.wing.strain_factors(case.patch.of(changes.LocalStiffnessLoss))
+        if factors is not None:
+            gauges = np.array([strain_gauge(output) for output, _ in outputs])
+            rows = rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
+        return shown_rows(rows if acting is None or acting.basis is None else rows @ acting.basis, outputs)
+
+    @property
+    def shown_outputs(self) -> tuple[str, ...]:
+        """Its outputs, for a sentence."""
+        places = f"displacement[y, x] with y from 0 to {self.wing.span:g} m and x the chord fraction"
+        gauges = f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}]"
+        return gauges, "tip_displacement", "load_point_displacement", places
+
+    def supports(self, primitive: type[Primitive]) -> bool:
+        """Whether the wing can carry a primitive; it can carry all but forces by a formula in time."""
+        return primitive in PRIMITIVES.values() and primitive is not changes.PortLoad
+
+    def turns(self, port: str) -> bool | None:
+        """Return whether a port turns; the others move up and down."""
+        return port == ROTATING_PORT
+
+    def at_ports(self, forces: ModelPatch) -> ModelPatch:
+        """Return forces as they act at ports of `port_rows`."""
+        return self.wing.internal_forces(forces)
+
+    def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
+        """Return the load (n,) of 1 N at a place; raises `InvalidPatchError` if it is off the wing."""
+        return self.wing.force_row(place, change)
+
+    def lift(self, state: State, change: ModelPatch) -> FloatArray:
+        """Return the parts (2, n) of the lift."""
+        return self.wing.load_parts(change)
+
+    def constant(self, case: Case) -> FloatArray:
+        """Return nothing (n,): what always acts is in the zeros of readings."""
+        return np.zeros(self.wing.size)
+
+    def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
+        """Return the scales of a force over the planform, from those of its mean and the first mode."""
+        share = self.wing.planform[1]
+        motion = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
+        ratio = motion / float(share @ motion)
+        by_place = tuple(zip(share.tolist(), ratio.tolist(), strict=True))
+        return {PLANFORM: replace(ports["span"], spread=by_place)}
+
+    # ------------------------------------------------------------ structure
+
+    def rest(self, state: State) -> Resting:
+        """Return what gives the rest in a state."""
+        key, (_, solve) = _stiffness_key(state), self._stiffness(state)
+        return lambda loads: self._answers.get((key, loads.tobytes()), lambda: solve(loads.T).T)
+
+    def _stiffness(self, state: State) -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
+        """Return the stiffness (n, n) in a state, and what gives K^-1 loads (n, k)."""
+
+        def make() -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
+            matrix = self.wing.stiffness(float(state.parameters[0]), *state[1:4])
+            return matrix, springs(matrix)
+
+        return self._stiffnesses.get(_stiffness_key(state), make)
+
+    def system(self, state: State) -> SecondOrderSystem:
+        """Return the wing as it moves when let go, or pushed, at a place under forces at ports."""
+        masses, held = state.structure.of(PointMass), self.wing.held_ports(state.ports)
+        place = state.place or self.reference
+
+        def make() -> SecondOrderSystem:
+            _, servo, pitot, alpha, beta = state.parameters.tolist()
+            (stiffness, solve), mass = self._stiffness(state), self.wing.mass(servo, pitot, masses)
+            still = solve(np.vstack((self.wing.force_row(place), *held.values())).T)
+            basis = motion_basis(solve, mass, self.wing.arrays.start_shapes, still)
+            inertia, small = basis.T @ mass @ basis, basis.T @ stiffness @ basis
+            inertia, small = 0.5 * (inertia + inertia.T), 0.5 * (small + small.T)
+            rows = {port: row @ basis for port, row in held.items()}
+            damping = alpha * inertia + beta * small
+            return SecondOrderSystem(inertia, damping, small, rows, MODE_COUNT, beta, ON_MODES, basis=basis)
+
+        further = (masses.primitives, state.parameters[1:].tobytes(), place, tuple(held))
+        return self._systems.get((_stiffness_key(state), further), make)
+
+
+def _stiffness_key(state: State) -> Hashable:
+    """Return what the stiffness of a state depends on; primitives of other kinds are passed over."""
+    kept = state.structure.of(changes.RootCompliance, changes.LocalStiffnessLoss, changes.ModulusTemperature)
+    warmer = state.warmer if len(kept.of(changes.ModulusTemperature)) else 0.0
+    return float(state.parameters[0]), state.losses, kept.primitives, warmer

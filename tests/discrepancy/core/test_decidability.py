@@ -1,0 +1,291 @@
+"""What campaigns cannot decide, before any data: the known confusion groups."""
+
+from dataclasses import replace
+from math import inf, log
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
+
+from benchmarks.cantilever import Cantilever, campaign
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, TrialKind
+from discrepancy.fits.candidate import Term
+from discrepancy.judgement.next_experiment import (
+    Proposal,
+    mutual_information,
+    next_experiments,
+    oscillates,
+    proposals,
+)
+from discrepancy.judgement.separability import CONFUSED, _groups, as_predicted, separability
+from discrepancy.report.check_tables import group_lines
+from tests.discrepancy.rigs import model_of
+from tests.refusals import Inputs
+
+from . import kit
+
+KNOWN = {"stiffness_factor": (1.0, 1e-4), "joint_factor": (1.0, 1e-4), "damping_factor": (1.0, 0.1)}
+
+
+def group_of(found, identifier):
+    """Return the confusion group of an effect, itself alone if it has none."""
+    return next((group for group in found.groups if identifier in group), (identifier,))
+
+
+def decided(model, given, *effects):
+    return separability(given, model, kit.problem_of(given, model).setting, kit.chosen(*effects))
+
+
+def test_ringdown_of_one_mode_cannot_tell_mass_root_and_clock():
+    """And none of them from the stiffness, where that is not known from calibration."""
+    model = model_of(Inputs(__file__).text("one_mode.toml"))
+    channel = Channel("x", Quantity.DISPLACEMENT, "displacement", NoiseRecord(2e-5, inf))
+    trial = kit.blank_trial(
+        "release", TrialKind.RINGDOWN, ("x",), 0.02 * np.arange(200), load_place="mass",
+        release=Release(0.01, 0.02, mode_count=1),
+    )  # fmt: skip
+    effects = ("point_mass", "root_compliance", "clock_error")
+    exact = Campaign("", {"x": channel}, (trial,), None, {"stiffness_factor": (1.0, 1e-4)}, "")
+    found = decided(model, exact, *effects)
+    assert set(group_of(found, "point_mass")) == set(effects)
+    assert all(item.distance > 100.0 for item in found.detectability)  # seen they are
+    hidden = decided(model, replace(exact, parameters={"stiffness_factor": (1.0, 0.1)}), *effects)
+    for seen, item in zip(found.detectability, hidden.detectability, strict=True):
+        if item.effect.identifier != "clock_error":  # its time zero shows
+            assert item.distance < 1e-3 * seen.distance
+
+
+def test_a_release_of_unknown_state_shows_effects_as_one_from_rest_does():
+    """Its data say how it begins; from rest nothing would move, and every effect would be seen "never"."""
+    bench = kit.chain_bench(static=False, amplitudes=(0.02, 0.012))
+    measured = bench.measured(3)
+    free = tuple(replace(trial, release=replace(trial.release, at_rest=False)) for trial in measured.trials)
+    known, found = (
+        decided(bench.model, replace(measured, trials=trials), "quadratic_damping", "coulomb_friction")
+        for trials in (measured.trials, free)
+    )
+    for one, other in zip(known.detectability, found.detectability, strict=True):
+        assert 0.5 < other.detectable / one.detectable < 5.0
+    nothing = replace(found, identifiers=(), distance=np.zeros((0, 0)), groups=())
+    assert "none of the effects" in group_lines(nothing)[0]
+
+
+def test_static_displacement_cannot_tell_root_load_place_and_load_cell():
+    """Static strain takes the root out of that group: it turns without straining."""
+    effects = ("root_compliance", "load_place", "load_cell")
+    loose = {**KNOWN, "stiffness_factor": (1.0, 5.0)}
+    for channels, known, group in (
+        (("x3",), KNOWN, set(effects)),
+        (("x3", "g1", "g2"), KNOWN, {"root_compliance"}),
+        (("x3",), loose, None),
+    ):
+        test = kit.chain_bench(amplitudes=(), static_channels=channels, gain_deviation=0.0)
+        campaign = replace(test.campaign, parameters=known)
+        found = decided(test.model, campaign, *effects[: 3 if group else 2])
+        if group:
+            assert all(item.distance > 100.0 for item in found.detectability)
+            assert set(group_of(found, "root_compliance")) == group
+        else:
+            assert all(item.distance < CONFUSED for item in found.detectability)
+
+
+@pytest.mark.parametrize(
+    ("kind", "group"),
+    [
+        (TrialKind.STATIC, {"gauge_gain", "gauge_misalignment", "local_stiffness_loss"}),
+        (TrialKind.FLIGHT, {"washout", "inertia_relief"}),
+    ],
+)
+def test_one_gauge_at_one_load_factor_cannot_tell(kind, group):
+    """One gauge of the cantilever, whose modulus is known: damage beside it, or relief beside lift."""
+    given, model = campaign(), Cantilever()
+    name = next(key for key, item in given.channels.items() if item.quantity is Quantity.STRAIN)
+    trials = []
+    for trial in (item for item in given.trials if item.kind is kind):
+        column = [trial.channels.index(name)]
+        level = np.full_like(trial.load_factor, 2.0 if kind is TrialKind.FLIGHT else 0.0)
+        part = {"channels": (name,), "values": trial.values[:, column], "used": trial.used[:, column]}
+        trials.append(replace(trial, **part, load_factor=level))
+    channels = {name: replace(given.channels[name], gain_deviation=0.0)}
+    known = {item.name: (item.mean, 1e-4 * item.mean) for item in model.parameters}
+    one = replace(given, channels=channels, trials=tuple(trials), parameters=known)
+    assert set(group_of(decided(model, one, *group), min(group))) == group
+
+
+def test_a_whole_laboratory_test_separates():
+    """And measured values do not count; what cannot be tested says why."""
+    identifiers = (
+        "point_mass", "root_compliance", "quadratic_damping", "coulomb_friction", "load_cell", "gauge_gain",
+    )  # fmt: skip
+    found, other, again = (
+        decided(kit.BENCH.model, given, *identifiers, "washout")
+        for given in (kit.BENCH.campaign, kit.BENCH.measured(1), kit.BENCH.measured(2))
+    )
+    np.testing.assert_allclose(other.distance, again.distance, rtol=1e-6)
+    assert found.groups == ()
+    assert set(found.identifiers) == set(identifiers)
+    np.testing.assert_array_equal(np.diag(found.distance), 0.0)
+    for item in found.detectability:
+        assert bool(item.reason) is (item.effect.identifier == "washout")
+        assert item.reason or item.detectable < item.typical
+    assert group_of(found, "gauge_gain") == ("gauge_gain",)
+
+
+def test_an_effect_that_nobody_sees_is_not_confused_with_all_others():
+    """A gain of a millionth is within the noise of anything; at a size that is seen, of none."""
+    *others, gauge = kit.chosen("root_compliance", "quadratic_damping", "gauge_gain")
+    (gain,) = gauge.parameters
+    small = replace(gain.prior, low=1e-4 * gain.prior.low, high=1e-4 * gain.prior.high)
+    effects = [*others, replace(gauge, parameters=(replace(gain, prior=small),))]
+    found = separability(kit.BENCH.campaign, kit.BENCH.model, kit.BENCH.setting, effects)
+    assert 1e-6 < found.detectability[-1].distance < 0.1 * CONFUSED
+    assert "gauge_gain" in found.identifiers
+    assert found.groups == ()
+
+
+@pytest.mark.parametrize(
+    ("near", "groups"),
+    [
+        ((), ()),
+        (((0, 1),), (("a", "b"),)),
+        (((0, 1), (1, 3)), (("a", "b", "d"),)),
+        (((0, 2), (1, 3)), (("a", "c"), ("b", "d"))),
+    ],
+)
+def test_groups_are_connected_sets(near, groups):
+    distance = np.full((4, 4), 100.0)
+    for i, j in near:
+        distance[i, j] = CONFUSED - 1.0  # one direction suffices
+    assert _groups(("a", "b", "c", "d"), distance) == groups
+
+
+def test_an_unknown_noise_is_taken_as_a_thousandth_of_the_range():
+    """Detectable sizes are finite, and those of a stated deviation of that size."""
+    given, model = kit.BENCH.measured(1), kit.BENCH.model
+    blank = kit.with_noise(kit.problem_of(given, model), **dict.fromkeys(given.channels))
+    ideal = as_predicted(blank.campaign, model, blank.setting)
+    found, again = (
+        decided(model, replace(blank.campaign, channels=channels), "gauge_gain", "quadratic_damping")
+        for channels in (blank.campaign.channels, ideal.channels)
+    )
+    for one, other in zip(found.detectability, again.detectability, strict=True):
+        assert 0.0 < one.detectable < inf
+        assert one.detectable == pytest.approx(other.detectable, rel=0.05)
+
+
+# ---------------------------------------------------------------- which experiment decides
+
+# ---------------------------------------------------------------- which experiment decides
+
+
+HALF = np.array([0.5, 0.5])
+
+
+def one_reading(shift):
+    """One reading of unit noise; two hypotheses: nothing, or an offset of `shift` noise deviations."""
+    channel = Channel("y1", Quantity.DISPLACEMENT, "y1", kit.NOISE)
+    trial = kit.blank_trial("one", TrialKind.STATIC, ("y1",), np.array([1.0]))
+    trial = replace(trial, values=np.full((1, 1), 1.5))
+    tight = {"slope": (1.0, 1e-9), "curvature": (0.5, 1e-9)}
+    problem = kit.problem_of(Campaign("", {"y1": channel}, (trial,), None, tight, ""), kit.ClosedForm())
+    none = kit.fitted(problem)
+    other = kit.fitted(problem, Term(kit.offset_effect(deviation=0.02), "y1"))
+    point = replace(none.point, effect=np.array([shift]))
+    known = replace(other, point=point, covariance=np.diag([1.0, 1.0, 1e-12]))
+    return problem, Proposal(trial, "", "", 1.0), [none, known]
+
+
+@pytest.mark.parametrize("shift", [0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("weight", [0.5, 0.2])
+def test_information_of_one_reading_against_quadrature(shift, weight):
+    problem, proposal, fits = one_reading(shift)
+    weights = np.array([weight, 1.0 - weight])
+    got = mutual_information(problem, proposal, fits, weights)
+
+    def density(y):
+        parts = weights * norm.pdf(y, [0.0, shift])
+        share = parts / parts.sum()
+        return float(np.sum(parts * (np.log(share) - np.log(weights))))
+
+    exact, _ = quad(density, -8.0, 8.0 + shift)
+    entropy = -float(weights @ np.log(weights))
+    assert 0.0 <= got <= entropy
+    # 300 outcomes each: standard error about 0.02
+    assert got == pytest.approx(exact, abs=0.06)
+
+
+def test_information_has_its_limits():
+    problem, proposal, fits = one_reading(40.0)
+    assert mutual_information(problem, proposal, fits, HALF) == pytest.approx(log(2.0), abs=1e-6)
+    assert mutual_information(problem, proposal, [fits[0], fits[0]], HALF) == pytest.approx(0.0, abs=1e-9)
+    weights = np.array([0.2, 0.3, 0.5])
+    three = [fits[0], fits[1], fits[1]]
+    merged = -0.2 * log(0.2) - 0.8 * log(0.8)
+    assert mutual_information(problem, proposal, three, weights) == pytest.approx(merged, abs=1e-6)
+    # what a nuisance hides tells nothing: an offset of two deviations under a free zero
+    problem, proposal, fits = one_reading(2.0)
+    channels = {"y1": replace(problem.campaign.channels["y1"], offset_deviation=inf)}
+    free = kit.problem_of(replace(problem.campaign, channels=channels), problem.model)
+    assert mutual_information(free, proposal, fits, HALF) < 0.02
+
+
+def test_another_amplitude_decides_between_amplitude_and_time():
+    """Stiffening with amplitude and drift with time look alike in releases from one amplitude."""
+    test = kit.chain_bench(static=False, amplitudes=(0.01, 0.01), samples=160)
+    problem = test.problem(3, test.patch("cubic_stiffness", {"stiffening": 0.01}, "end"))
+    stiffening, drift = kit.chosen("cubic_stiffness", "stiffness_drift")
+    fits = [kit.fitted(problem, term) for term in (Term(stiffening, "end"), Term(drift))]
+    information = {
+        item.trial.name: mutual_information(problem, item, fits, HALF)
+        for item in proposals(problem.campaign, problem)
+    }
+    assert all(0.0 <= value <= log(2.0) + 1e-9 for value in information.values())
+    same = Proposal(problem.campaign.trials[0], "", "", 1.0)
+    twice = information["release at twice the largest amplitude so far"]
+    assert twice > mutual_information(problem, same, fits, HALF)
+    assert twice > 0.95 * log(2.0)
+    best, again = (next_experiments(problem, [(item, 0.5) for item in fits]) for _ in range(2))
+    assert best
+    # a longer record may do as well, for less; of all repetitions another amplitude comes first
+    assert "amplitude" in next(item.description for item in best if item.cost >= 1.0)
+    assert list(best) == sorted(best, key=lambda item: -item.information / item.cost)
+    assert again == best  # seeded
+
+
+def test_proposals_are_trials_of_the_kinds_that_were_done():
+    """A longer record is one of what swings."""
+    problem = kit.BENCH.problem(1)
+    found = list(proposals(problem.campaign, problem))
+    assert {item.trial.kind for item in found} == {TrialKind.STATIC, TrialKind.RINGDOWN}
+    assert len({item.description for item in found}) == len(found)
+    for item in found:
+        assert item.cost > 0.0
+        assert len(item.trial.time) == len(item.trial.values)
+    longer = next(item.trial for item in found if item.trial.name == "longer record")
+    before = max((t for t in problem.campaign.trials if t.release), key=lambda t: t.release.displacement)
+    assert longer.interval == pytest.approx(before.interval)
+    assert len(longer.time) == 3 * len(before.time)
+    none = kit.fitted(problem)
+    assert oscillates(problem, none)
+    decay = tuple(
+        replace(part, response=np.exp(-data.trial.time)[:, np.newaxis] * np.ones(part.response.shape[1]))
+        for data, part in zip(problem.trials, none.linearisations, strict=True)
+    )
+    assert not oscillates(problem, replace(none, linearisations=decay))
+    names = [item.trial.name for item in proposals(problem.campaign, problem, swings=False)]
+    assert names
+    assert "longer record" not in names
+
+
+def test_without_a_record_the_rest_stands_for_the_noise():
+    """The information does not depend on the scale that stands in for an unknown noise."""
+    found = []
+    for noise in (kit.NOISE, None):
+        problem = kit.closed_problem(seed=13, effect=0.05, noise=noise)
+        fits = [kit.fitted(problem, *terms, iterations=40) for terms in ((kit.OFFSET,), ())]
+        found.append(
+            mutual_information(problem, Proposal(problem.campaign.trials[0], "", "", 1.0), fits, HALF)
+        )
+    assert 0.0 < found[0] < log(2.0)
+    assert found[1] == pytest.approx(found[0], abs=0.1)

@@ -1,0 +1,339 @@
+"""Fits against dense linear algebra: columns of the Jacobian, evidence, posterior, leverage."""
+
+from dataclasses import replace
+from math import inf, log, pi
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import multivariate_normal
+
+from discrepancy.campaign.records import NoiseRecord
+from discrepancy.errors import FitError
+from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Term
+from discrepancy.fits.elimination import Cholesky
+from discrepancy.fits.fitting import fit
+
+from . import kit
+
+STEP = 1e-4
+TOLERANCE = 0.03  # of the column's norm: the code's one-sided step by nuisances is 1e-2 of a prior deviation
+BOTH = Candidate((kit.OFFSET, kit.DRIFT))
+
+
+def coloured_record(deviation=0.02, interval=0.01):
+    generator = np.random.default_rng(11)
+    samples, state = np.empty(3000), 0.0
+    for n in range(len(samples)):
+        state = 0.7 * state + generator.standard_normal()
+        samples[n] = deviation * np.sqrt(1.0 - 0.49) * state
+    return NoiseRecord(float(samples.std()), 2999.0, samples, interval, "pre-trigger")
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+def check(problem, candidate, effect=None, tolerance=TOLERANCE, spread=0.5):
+    """Compare every column of the Jacobian with central differences of the residual."""
+    linear = kit.Linear(problem, candidate)
+    x = spread * np.random.default_rng(1).standard_normal(linear.size)
+    if effect is not None:
+        x[problem.shared.size : problem.shared.size + candidate.size] = effect
+    point = linear.point(x)
+    steps = STEP * np.eye(linear.size)
+    numerical = np.stack([(linear.residual(x - e) - linear.residual(x + e)) / (2.0 * STEP) for e in steps])
+    columns = np.zeros_like(numerical)
+    at, first = 0, problem.shared.size + candidate.size
+    for number, data in enumerate(problem.trials):
+        parts = problem.linearise(number, point, candidate)
+        derivatives = problem.derivatives(number, point, parts, candidate)
+        (local, shared), index = derivatives.dense(), derivatives.index
+        counts = (data.weight > 0.0).ravel()
+        assert np.all(local[:, ~counts] == 0.0)
+        assert np.all(shared[:, ~counts] == 0.0)
+        stop = at + int(counts.sum())
+        columns[index, at:stop] = shared[:, counts]
+        columns[first : first + len(local), at:stop] = local[:, counts]
+        at, first = stop, first + len(local)
+    for number, (have, want) in enumerate(zip(columns, numerical, strict=True)):
+        error = np.linalg.norm(have - want)
+        assert error <= tolerance * np.linalg.norm(want) + 1e-9, f"unknown {number}: {error}"
+
+
+@pytest.mark.parametrize("at_rest", [True, False])
+@pytest.mark.parametrize("noise", [kit.NOISE, coloured_record()], ids=["white", "coloured"])
+def test_derivatives_by_all_unknowns_of_the_closed_form(at_rest, noise):
+    """Parameters, gains, zeros, initial state, time zero, health of every load level, effect."""
+    problem = kit.closed_problem(
+        bent=True, noise=noise, gain_deviation=0.1, health=True, at_rest=at_rest, time_zero=0.003,
+        left_out={0: ((2, 1),), 2: ((0, 0), (30, 2), (59, 1))}, samples=80,
+    )  # fmt: skip
+    applies = noise.samples is not None
+    assert all(problem.noise[name].applies(0.01) is applies for name in problem.channel_names)
+    check(problem, BOTH)
+
+
+@pytest.mark.parametrize(
+    ("identifier", "place", "tolerance", "free"),
+    [
+        ("coulomb_friction", "joint", 0.1, False),  # sticking ends at a sample or the next: not smooth
+        ("quadratic_damping", "end", TOLERANCE, False),
+        ("quadratic_damping", "end", 0.06, True),
+        ("cubic_stiffness", "joint", TOLERANCE, False),
+        ("point_mass", "", TOLERANCE, False),
+        ("root_compliance", "", TOLERANCE, False),
+        ("gauge_gain", "g1", TOLERANCE, False),
+        ("clock_error", "", TOLERANCE, False),
+    ],
+)
+def test_derivatives_by_effects_on_the_chain(identifier, place, tolerance, free):
+    (effect,) = kit.chosen(identifier)
+    candidate = Candidate((Term(effect, place, free_shape=free),))
+    assert candidate.size == len(effect.parameters) + free * len(effect.shape)
+    about, spread = (candidate.start() + 0.1, 0.2) if free else (0.3, 0.3)
+    check(kit.BENCH.problem(1), candidate, effect=about, spread=spread, tolerance=tolerance)
+
+
+def test_chord_steps_are_exact_at_the_base_and_second_order_away():
+    """A chord response differs from the true one by the square of the distance from the base."""
+    problem = kit.BENCH.problem(1)
+    candidate = Candidate((Term(kit.chosen("gauge_gain")[0], "g1"),))
+    none = kit.fitted(problem)
+    number = len(problem.trials) - 1
+    generator = np.random.default_rng(0)
+    shared = generator.standard_normal(problem.shared.size)
+    local = generator.standard_normal(none.point.local[number].size)
+    errors = []
+    for size in (0.0, 0.02, 0.04):
+        moved = (*none.point.local[:number], none.point.local[number] + size * local)
+        point = replace(
+            none.point, shared=none.point.shared + size * shared, local=moved, effect=np.array([0.3])
+        )
+        chord = problem.linearise(number, point, candidate, none, derivatives=False).response
+        exact = problem.linearise(number, point, candidate, derivatives=False).response
+        errors.append(float(np.abs((chord - exact) / problem.trials[number].deviation).max()))
+    assert errors[0] < 1e-9
+    assert errors[1] < 0.05 * float(np.abs(shared).max())
+    assert errors[2] < 4.5 * errors[1]
+
+
+def test_derivatives_by_an_effect_have_no_curvature_in_them():
+    """Of an effect on frequencies nuisances leave less than a one-sided difference errs by."""
+    problem = kit.BENCH.problem(4, kit.BENCH.patch("root_compliance", {"compliance_share": 0.3}))
+    candidate = Candidate((Term(kit.chosen("root_compliance")[0]),))
+    point = problem.start(candidate)
+
+    def response(number, move):
+        patch = candidate.patch(problem.setting, point.effect + move)
+        return problem.response(number, point.shared, point.local[number], patch)[0]
+
+    rings = [n for n, data in enumerate(problem.trials) if data.trial.is_dynamic]
+    assert rings
+    for number in rings:
+        exact = (response(number, STEP) - response(number, -STEP)) / (2.0 * STEP)
+        one_sided = (response(number, PARAMETER_STEP) - response(number, 0.0)) / PARAMETER_STEP
+        found = problem.linearise(number, point, candidate).effect[0]
+        size = np.linalg.norm(exact)
+        assert np.linalg.norm(one_sided - exact) > 2e-3 * size
+        assert np.linalg.norm(found - exact) < 1e-4 * size
+
+
+def test_samples_that_do_not_count_change_nothing():
+    """Readings left out, and what the whitening filter smears of them, weigh zero whatever they are."""
+    problem = kit.closed_problem(noise=coloured_record(), left_out={2: ((30, 1), (31, 1)), 0: ((3, 0),)})
+    wild = tuple(
+        replace(trial, values=np.where(trial.used, trial.values, 1e6)) for trial in problem.campaign.trials
+    )
+    other = kit.problem_of(replace(problem.campaign, trials=wild), problem.model)
+    linear = kit.Linear(problem)
+    point = linear.point(0.3 * np.random.default_rng(0).standard_normal(linear.size))
+    for number in range(len(problem.trials)):
+        first, second = (
+            p.residual(number, point, p.linearise(number, point, Candidate(), derivatives=False).response)
+            for p in (problem, other)
+        )
+        np.testing.assert_allclose(first, second, atol=1e-9)
+
+
+def test_products_by_channel_are_those_of_all_readings():
+    """J W J^T, J d and the trace of J^T covariance J by channel, beside the same with dense matrices."""
+    problem = kit.closed_problem(
+        bent=True, noise=coloured_record(), gain_deviation=0.1, health=True, time_zero=0.003,
+        left_out={1: ((3, 1),)}, samples=80,
+    )  # fmt: skip
+    generator, linear = np.random.default_rng(2), kit.Linear(problem, BOTH)
+    point = linear.point(generator.standard_normal(linear.size))
+    for number, data in enumerate(problem.trials):
+        found = problem.derivatives(number, point, problem.linearise(number, point, BOTH), BOTH)
+        dense, products = np.vstack(found.dense()), found.products()
+        count = len(data.trial.channels)
+        weights = generator.uniform(0.5, 2.0, count)
+        every = np.tile(weights, dense.shape[1] // count)
+        readings = generator.standard_normal((count, dense.shape[1] // count))
+        only = np.zeros_like(readings)
+        only[1] = readings[1]
+        for got, wanted in (
+            (found.normal(products, weights), (dense * every) @ dense.T),
+            (found.onto(readings), dense @ readings.T.ravel()),
+            (found.onto(readings[1:2], [1]), dense @ only.T.ravel()),
+        ):
+            np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-9)
+        root = generator.standard_normal((found.size, found.size))
+        leverage = np.einsum("kn,kl,ln->n", dense, root @ root.T, dense) * every
+        spread = found.spread(products, weights, root @ root.T)
+        wanted = leverage.reshape(-1, count).sum(axis=0)
+        np.testing.assert_allclose(spread, wanted, rtol=1e-10, atol=1e-9)
+
+
+# ---------------------------------------------------------------- evidence and posterior
+
+
+@pytest.mark.parametrize(
+    ("terms", "zeros"), [((), 0.05), ((kit.OFFSET,), 0.05), ((kit.OFFSET, kit.DRIFT), 0.05), ((), inf)]
+)
+def test_evidence_mean_and_covariance_are_the_gaussian_ones(terms, zeros):
+    problem = kit.closed_problem(seed=3, effect=0.1, offset_deviation=zeros)
+    found = kit.fitted(problem, *terms)
+    linear = kit.Linear(problem, found.candidate)
+    y, a, hessian = linear.dense()
+    mean, covariance = np.linalg.solve(hessian, a.T @ y), np.linalg.inv(hessian)
+    x = np.concatenate((found.point.shared, found.point.effect, *found.point.local))
+    shared = problem.shared.size + len(terms)
+    assert found.converged
+    # a fit ends where a step promises less than CONVERGED, 0.01 nats
+    assert float((x - mean) @ hessian @ (x - mean)) < 0.02
+    np.testing.assert_allclose(found.covariance, covariance[:shared, :shared], rtol=1e-6, atol=1e-12)
+    if zeros == inf:  # free zeros are least squares; their evidence is beside another hypothesis' only
+        assert 0.0 in linear.precision
+        return
+    exact = multivariate_normal(np.zeros(len(y)), np.eye(len(y)) + a @ a.T).logpdf(y)
+    assert found.log_evidence - 0.5 * len(y) * log(2.0 * pi) == pytest.approx(exact, abs=0.01)
+
+
+def test_local_unknowns_are_eliminated_without_loss():
+    """Leverage of each channel is the trace of the dense hat matrix; its sum is what the unknowns took."""
+    problem = kit.closed_problem(seed=5, left_out={2: ((4, 1), (17, 0))}, at_rest=False)
+    found = kit.fitted(problem, kit.OFFSET, kit.DRIFT)
+    linear = kit.Linear(problem, BOTH)
+    _, a, hessian = linear.dense()
+    leverage = np.einsum("ni,ni->n", a, np.linalg.solve(hessian, a.T).T)
+    np.testing.assert_allclose(found.spent, np.bincount(linear.groups, leverage, minlength=3), rtol=1e-8)
+    prior = float(np.trace(np.linalg.solve(hessian, np.diag(linear.precision))))
+    assert found.spent.sum() == pytest.approx(linear.size - prior, rel=1e-8)
+    assert problem.counts.sum() == len(leverage)
+
+
+def test_evidence_with_flat_priors_is_the_limit_of_wide_ones():
+    """A flat zero adds a constant to every hypothesis: differences are those of wide priors."""
+    flat = kit.closed_problem(seed=9, offset_deviation=inf)
+    channels = {name: replace(item, offset_deviation=100.0) for name, item in flat.campaign.channels.items()}
+    term = Term(kit.drift_effect(exponent=3.0, deviation=0.1), "y2")
+    one, other = (
+        kit.fitted(problem, term).log_evidence - kit.fitted(problem).log_evidence
+        for problem in (flat, kit.problem_of(replace(flat.campaign, channels=channels), flat.model))
+    )
+    assert abs(one) > 0.1
+    assert one == pytest.approx(other, abs=0.02)
+
+
+@pytest.mark.parametrize("freedom", [10.0, 200.0])
+def test_misfit_is_the_noise_variance_integrated_out(freedom):
+    """Quadrature over sigma^2 ~ scaled inverse chi-square (n0, s0^2) of the Gaussian likelihood."""
+    problem = kit.closed_problem(noise=NoiseRecord(0.02, freedom))
+    count = problem.counts[0]
+
+    def integrated(total):
+        def log_integrand(v):  # v = ln sigma^2
+            return -0.5 * (freedom + count) * v - 0.5 * (freedom + total) * np.exp(-v)
+
+        peak = log((freedom + total) / (freedom + count))
+        top = log_integrand(peak)
+        area, _ = quad(lambda v: np.exp(log_integrand(v) - top), peak - 4.0, peak + 4.0)
+        return -(top + log(area))
+
+    sums = [np.array([s, 0.0, 0.0]) for s in (0.5 * count, count, 3.0 * count)]
+    values = [problem.misfit(s) - integrated(float(s[0])) for s in sums]
+    np.testing.assert_allclose(values, values[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("freedom", [8.0, 50.0, 0.0])
+def test_evidence_with_unknown_variance_against_quadrature(freedom):
+    """One unknown (an offset), everything else exact: the evidence is an integral over one number."""
+    problem = kit.closed_problem(
+        seed=2, effect=0.05, offset_deviation=0.0, kinds=("static",),
+        parameters={"slope": (1.0, 1e-9), "curvature": (0.5, 1e-9)},
+        noise=NoiseRecord(0.02, freedom) if freedom else None,
+    )  # fmt: skip
+    found = kit.fitted(problem, Term(kit.offset_effect(deviation=0.1), "y1"))
+    linear = kit.Linear(problem, found.candidate)
+
+    def log_joint(u):
+        x = np.zeros(linear.size)
+        x[problem.shared.size] = u
+        sums = np.bincount(linear.groups, linear.residual(x) ** 2, minlength=3)
+        return -problem.misfit(sums) - 0.5 * u * u - 0.5 * log(2.0 * pi)
+
+    centre, width = found.point.effect[0], float(np.sqrt(found.effect_covariance[0, 0]))
+    top = log_joint(centre)
+    area, _ = quad(lambda u: np.exp(log_joint(u) - top), centre - 12.0 * width, centre + 12.0 * width)
+    # parameters that are known exactly leave their unit prior to the evidence: nothing
+    assert found.log_evidence == pytest.approx(top + log(area), abs=0.06)
+
+
+def test_without_a_noise_record_the_scale_does_not_matter():
+    """-ln L = n/2 ln RSS: the odds of two hypotheses stay when all residuals are counted in another unit."""
+    problem = kit.closed_problem(seed=6, effect=0.1, noise=None)
+    assert np.all(problem.freedom == 0.0)
+    sums = np.array([30.0, 40.0, 50.0])
+    rise = problem.misfit(4.0 * sums) - problem.misfit(sums)
+    assert rise == pytest.approx(0.5 * problem.counts.sum() * log(4.0))
+    np.testing.assert_allclose(problem.precisions(sums), problem.counts / sums)
+
+
+# ---------------------------------------------------------------- far from the truth
+
+
+@pytest.mark.parametrize("share", [0.01, 0.03])
+def test_fits_reach_the_optimum_from_next_to_no_effect(share):
+    """The frequency has to move by many widths of the likelihood, and nuisances hold it back at first."""
+    values = {"compliance_share": share}
+    problem = kit.BENCH.problem(4, kit.BENCH.patch("root_compliance", values))
+    (effect,) = kit.chosen("root_compliance")
+    candidate = Candidate((Term(effect),))
+    truth = np.array([item.prior.normal(values[item.name]) for item in effect.parameters])
+    none = kit.fitted(problem)
+    near, far = (
+        fit(problem, candidate, replace(none.point, effect=start), iterations=40)
+        for start in (truth, np.r_[-5.0, truth[1:]])
+    )
+    assert near.converged
+    assert far.converged
+    assert far.objective == pytest.approx(near.objective, abs=0.2)
+    deviation = np.sqrt(np.diag(near.effect_covariance))
+    np.testing.assert_allclose(far.point.effect, near.point.effect, atol=0.3 * deviation.max())
+    assert none.objective > near.objective + 25.0
+
+
+def test_differences_reach_as_far_as_a_parameter_may_lie():
+    """An effect that is known to a thousandth of its prior keeps that deviation whatever the first step."""
+    problem = kit.BENCH.problem(4, kit.BENCH.patch("root_compliance", {"compliance_share": 0.3}))
+    found = kit.fitted(problem, Term(kit.chosen("root_compliance")[0]), iterations=40)
+    deviation = float(np.sqrt(found.effect_covariance[0, 0]))
+    step = replace(found.point, effect=found.point.effect + deviation)
+    moved = fit(problem, found.candidate, step, iterations=40)
+    assert moved.objective == pytest.approx(found.objective, abs=0.05)
+    assert float(np.sqrt(moved.effect_covariance[0, 0])) == pytest.approx(deviation, rel=0.05)
+
+
+def test_a_factor_solves_and_a_curvature_that_is_none_is_refused():
+    generator = np.random.default_rng(4)
+    root = generator.standard_normal((4, 6))
+    matrix, right = root @ root.T, generator.standard_normal((4, 2))
+    found = Cholesky.of(matrix)
+    np.testing.assert_allclose(matrix @ found.solve(right), right, atol=1e-10)
+    np.testing.assert_allclose(found.half(right).T @ found.half(right), right.T @ found.solve(right))
+    assert found.log_determinant == pytest.approx(np.linalg.slogdet(matrix)[1])
+    assert Cholesky.of(np.zeros((0, 0))).solve(np.zeros((0, 2))).shape == (0, 2)
+    for wrong in (np.nan, np.inf, -1.0):
+        with pytest.raises(FitError, match=r"not finite|singular"):
+            Cholesky.of(np.diag([1.0, wrong]))

@@ -1,0 +1,299 @@
+"""Fits from far off: phases that slip, valleys, other optima, and errors too small to be names."""
+
+from dataclasses import replace
+from math import inf
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from benchmarks.cantilever import Cantilever, campaign
+from discrepancy.campaign.records import NoiseRecord, TrialKind
+from discrepancy.catalogue.entry import Prior
+from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
+from discrepancy.errors import DiscrepancyError, FitError
+from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.fitting import attempt, fit
+from discrepancy.fits.other_optima import elsewhere
+from discrepancy.fits.screening import Screen
+from discrepancy.judgement.separability import _distance
+from discrepancy.models.interface import Conditions
+from discrepancy.models.sensing import observe
+from discrepancy.search.growing_records import Beginnings, gap_row
+from discrepancy.search.honest_evidence import left_by, refitted, widened
+from discrepancy.search.hypotheses import are_related
+from discrepancy.verdict import VerdictKind
+from discrepancy.workflow import investigate
+from fe.runtime.patch import ModelPatch, PowerStiffness
+from tests.discrepancy.rigs import FEW, measured
+from tests.refusals import Inputs
+
+from . import kit
+
+
+@pytest.mark.parametrize(
+    ("hidden", "values", "taken"),
+    [
+        ("joint_micro_slip", {"stiffness_share": 0.3, "slip_ratio": 0.2}, "bouc_wen_hysteresis"),
+        pytest.param(
+            "bouc_wen_hysteresis", {"stiffness_share": 0.3, "yield_ratio": 0.3}, "joint_micro_slip",
+            marks=pytest.mark.long,
+        ),
+    ],
+)  # fmt: skip
+def test_a_relative_is_reached_from_what_is_taken_for_it(hidden, values, taken):
+    problem = kit.BENCH.problem(3, kit.BENCH.patch(hidden, values, "joint"))
+    right, wrong = kit.chosen(hidden, taken)
+
+    def near(effect, scaled):
+        candidate = Candidate((Term(effect, "joint"),))
+        start = replace(problem.start(candidate), effect=np.array(scaled))
+        return fit(problem, candidate, start, iterations=40)
+
+    best = near(right, [item.prior.normal(values[item.name]) for item in right.parameters])
+    imitation = near(wrong, [0.0] * 2)
+    assert imitation.objective > best.objective + 20.0
+    related = [effect for effect in kit.CATALOGUE if are_related(effect, wrong)]
+    assert right in related
+    assert wrong not in related
+    first = min(Beginnings(problem).related(imitation, related), key=lambda item: item.objective)
+    assert first.candidate.identifiers == (hidden,)
+    assert first.objective == pytest.approx(best.objective, abs=0.1)
+
+
+@pytest.mark.parametrize("place", [0.8, 1.2, 1.8])
+def test_a_mass_is_found_on_the_other_side_of_an_antinode(place):
+    truth = np.array([0.8, -0.6])  # mass and place, in prior deviations
+    bare, model = campaign(), Cantilever()
+    releases = tuple(trial for trial in bare.trials if trial.kind is TrialKind.RINGDOWN)
+    # With the readings' small noise, which of its narrow valleys a fit descends depends on the last bits.
+    channels = {
+        name: replace(
+            item, noise=replace(item.noise, standard_deviation=30.0 * item.noise.standard_deviation)
+        )
+        for name, item in bare.channels.items()
+    }
+    problem = kit.problem_of(replace(bare, trials=releases, channels=channels), model)
+    (effect,) = kit.chosen("point_mass")
+    candidate = Candidate((Term(effect, effect.places(problem.setting)[0]),))
+    for trial in releases:
+        patch = candidate.patch(problem.setting, truth)
+        trial.values[:] = observe(model, problem.campaign, trial, patch, Conditions(np.ones(1))).values
+    none = kit.fitted(problem)
+
+    def begun_at(begin, iterations):
+        at = replace(none.point, effect=np.array([0.5, begin]))
+        return fit(problem, candidate, at, iterations=iterations)
+
+    right, stuck = begun_at(-0.5, 20), begun_at(place, 2)
+    assert stuck.objective > 1000.0
+    assert abs(stuck.point.effect[1] - truth[1]) > 0.3
+    found = elsewhere(problem, stuck)
+    assert found.objective == pytest.approx(right.objective, abs=0.05)
+    np.testing.assert_allclose(found.point.effect, right.point.effect, atol=0.02)
+    deviation = np.sqrt(np.diag(found.effect_covariance))
+    assert np.all(np.abs(found.point.effect - truth) < 2.0 * deviation)
+    assert elsewhere(problem, right) is right
+
+
+def test_a_record_is_followed_until_its_gap_has_begun():
+    residual = np.random.default_rng(1).standard_normal((500, 2))
+    residual[:40] = 0.0  # blanks
+    assert gap_row(residual) == 500
+    residual[300:, 1] += 6.0
+    assert 300 <= gap_row(residual) <= 305
+
+
+"""Mass and place, in prior deviations."""
+
+
+# ---------------------------------------------------------------- candidates that no fit can follow
+
+
+def softening(coefficient, reference):
+    """A spring of the ninth power that overtakes the rig's own far below its largest motion."""
+
+    def build(setting, values, place):
+        port = setting.scales.ports[place]
+        size = coefficient * values["stiffening"] * port.stiffness * port.displacement
+        return ModelPatch((PowerStiffness(place, size, 9.0, 0, reference * port.displacement),))
+
+    (cubic,) = kit.chosen("cubic_stiffness")
+    sizes = (replace(cubic.parameters[0], prior=Prior("normal", -30.0, 30.0)),)
+    return Term(replace(cubic, identifier="ninth_power", build=build, parameters=sizes, shape=()), "slide")
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return kit.problem_of(*measured("quadratic_damping", 0.02))
+
+
+@given(
+    u=st.floats(-8.0, 8.0), coefficient=st.sampled_from([-1.0, 1.0, 1e100]),
+    reference=st.sampled_from([0.01, 0.3]), iterations=st.sampled_from([0, 4]),
+)  # fmt: skip
+@example(u=-2.66, coefficient=-1.0, reference=0.01, iterations=0)
+@settings(max_examples=12, deadline=None)
+def test_a_fit_ends_with_finite_numbers_or_a_sentence(problem, u, coefficient, reference, iterations):
+    candidate = Candidate((softening(coefficient, reference),))
+    start = replace(problem.start(candidate), effect=np.array([u]))
+    try:
+        found = fit(problem, candidate, start, iterations=iterations)
+    except DiscrepancyError:
+        assert attempt(problem, candidate, start, iterations=iterations) is None
+        assert problem.refusals["ninth_power"].endswith(".")
+        return
+    assert np.isfinite(found.log_evidence)
+    assert np.all(np.isfinite(found.covariance))
+
+
+def test_what_a_model_can_follow_only_while_it_is_small(problem):
+    """It has been outdone by others and is no refusal; the last point that can be followed is compared."""
+    none = kit.fitted(problem)
+    screen = Screen(problem, none)
+    for coefficient, kept in ((-1e-7, 1), (-1e-5, 0)):
+        term = softening(coefficient, 0.3)
+        problem.refusals.clear()
+        assert len(list(Screen(problem, none).changes(term))) == kept
+        assert len(problem.refusals) == 1 - kept
+    problem.refusals.clear()
+    problem.refused(Candidate((term, term)), FitError("Of two, either may be to blame."))
+    assert not problem.refusals
+    term = softening(-4.5e-8, 0.3)
+    last = screen.change(term, np.array([1.0]))
+    with pytest.raises(DiscrepancyError):
+        screen.change(term, np.array([1.1]))
+    assert last.size > 0.0
+    assert _distance(screen, last, [last]) == pytest.approx(0.0, abs=1e-5 * last.size)
+    # nothing is sought beside a base that the beginnings cannot follow
+    base = replace(none, candidate=Candidate((softening(-1.0, 0.01),)))
+    base = replace(base, point=replace(none.point, effect=np.array([4.0])))
+    assert Beginnings(problem).screen(none) is not None
+    assert Beginnings(problem).scan(base, FEW) == []
+
+
+def test_a_search_tells_what_could_not_be_fitted_and_goes_on(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text(Inputs(__file__).text("explosive.toml"), encoding="utf-8")
+    catalogue = load_catalogue([file], installed=False)
+    effects = [effect_by_identifier(key, catalogue) for key in ("quadratic_damping", "explosive")]
+    campaign, model = measured("quadratic_damping", 0.02)
+    verdict = investigate(campaign, model, effects, thorough=False).verdict
+    assert verdict.kind is VerdictKind.NAMED
+    assert [effect.identifier for effect in verdict.effects] == ["quadratic_damping"]
+    (left,) = verdict.not_fitted
+    assert left.identifier == "explosive"
+    assert left.reason.startswith("could not be fitted: ")
+    assert left.reason.endswith("is not a finite number at every time.")
+
+
+# ---------------------------------------------------------------- what is left beside the noise
+
+
+def ringing(seed, samples, extra=None, **given):
+    """Return ring-downs with something added to the first channel, and what their fit leaves."""
+    problem = kit.closed_problem(seed=seed, kinds=("ringdown",), samples=samples, extra=extra, **given)
+    none = kit.fitted(problem)
+    return problem, none, left_by(problem, none)
+
+
+FloatArray = NDArray[np.float64]
+
+
+def covariance(time, size, tau, frequency):
+    lag = np.abs(time[:, np.newaxis] - time)
+    return np.asarray(size**2 * np.exp(-lag / tau) * np.cos(frequency * lag) + 1e-9 * np.eye(len(time)))
+
+
+def coloured(size, tau, frequency, seed=8):
+    """Return what adds an exact draw of a remainder to the first channel of every trial, noise 0.02."""
+    generator = np.random.default_rng(seed)
+
+    def extra(rows):
+        root = np.linalg.cholesky(covariance(0.01 * rows, size, tau, frequency))
+        return np.asarray(0.02 * root @ generator.standard_normal(len(rows)))
+
+    return extra
+
+
+@pytest.mark.parametrize("freedom", [inf, 400.0])
+def test_white_noise_has_no_remainder(freedom):
+    """Forty campaigns of three channels: none has one, and fits stay as they were."""
+    wrong = 0
+    for seed in range(40):
+        problem, found, left = ringing(seed, 150, noise=NoiseRecord(0.02, freedom))
+        wrong += left.acts
+        if seed == 0:
+            assert refitted(problem, widened(problem, left), found) is found
+    assert wrong <= 1
+
+
+def test_white_noise_beyond_its_record_forgets_at_once():
+    """Noise a fifth above its record: of some size, and no time over which it forgets."""
+    generator = np.random.default_rng(4)
+    loud = 0.02 * np.sqrt(0.2)
+    problem, _, left = ringing(3, 600, lambda rows: loud * generator.standard_normal(len(rows)))
+    first = problem.channel_names.index("y1")
+    assert left.size[first] == pytest.approx(np.sqrt(0.2), rel=0.3)
+    assert left.time[first] < 0.05
+    assert np.all(left.factor >= 1.0)
+
+
+@pytest.mark.parametrize(("size", "tau", "frequency"), [(3.0, 0.15, 0.0), (2.0, 1.5, 9.0)])
+def test_size_time_and_frequency_are_found(size, tau, frequency):
+    problem, _, left = ringing(4, 900, coloured(size, tau, frequency))
+    first = problem.channel_names.index("y1")
+    assert left.size[first] == pytest.approx(size, rel=0.4)
+    assert left.time[first] == pytest.approx(tau, rel=0.6)
+    assert 2.0 * np.pi * left.frequency[first] == pytest.approx(frequency, abs=1.0)
+    assert np.all(np.delete(left.size, first) == 0.0)
+    assert not left.is_noise
+
+
+def test_evidence_under_a_wider_noise_is_that_of_a_campaign_with_such_noise():
+    """Optimum, covariance and evidence are those of the same campaign whose records say so."""
+    problem, none, left = ringing(4, 300, coloured(3.0, 0.15, 0.0))
+    found = refitted(problem, widened(problem, left), none)
+    names = problem.campaign.channels
+    said = kit.fitted(kit.with_noise(
+        problem, **{key: NoiseRecord(0.02 * float(f), inf) for key, f in zip(names, left.factor, strict=True)}
+    ))  # fmt: skip
+    np.testing.assert_allclose(found.point.shared, said.point.shared, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(found.covariance, said.covariance, rtol=1e-3, atol=1e-9)
+    assert found.log_evidence == pytest.approx(said.log_evidence, abs=0.05)
+    assert found.chi_square > 3.0 * said.chi_square  # told against the recorded noise
+
+
+def test_evidence_counts_independent_samples():
+    """A drift of the same channel gains much by white noise from a slow remainder, and little beside it."""
+    gains = []
+    for seed in range(6):
+        problem, none, _ = ringing(seed, 400, coloured(4.0, 0.4, 0.0, seed), offset_deviation=0.0)
+        drift = kit.fitted(problem, Term(kit.drift_effect(channel="y1"), "y1"))
+        wide = widened(problem, left_by(problem, drift))
+        pair = [refitted(problem, wide, item).log_evidence for item in (none, drift)]
+        gains.append((drift.log_evidence - none.log_evidence, pair[1] - pair[0]))
+    white, honest = np.array(gains).T
+    assert white.max() > 20.0
+    assert honest.max() < 4.0
+
+
+def test_colour_of_the_noise_is_told_from_a_remainder():
+    """The same process in the trials, in the noise record or not."""
+    generator = np.random.default_rng(5)
+    time = 0.01 * np.arange(200)
+    root = np.linalg.cholesky((covariance(time, 1.5, 0.03, 0.0) + np.eye(200)) / (1.0 + 1.5**2))
+    scale = 0.02 * np.sqrt(1.0 + 1.5**2)
+    for of_noise in (True, False):
+        white = generator.standard_normal(len(time))
+        samples = scale * root @ white if of_noise else 0.02 * white
+        record = NoiseRecord(float(samples.std()), 199.0, samples - samples.mean(), 0.01, "pre-trigger")
+        problem, _, _ = ringing(6, 400, coloured(1.5, 0.03, 0.0))
+        problem = kit.with_noise(problem, y1=record)
+        left = left_by(problem, kit.fitted(problem))
+        size = left.size[problem.channel_names.index("y1")]
+        # what the record's own autoregression took out is no remainder, nor is what it left
+        assert size == (0.0 if of_noise else pytest.approx(1.5, rel=0.5))
+        assert left.is_noise is of_noise

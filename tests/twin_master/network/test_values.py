@@ -1,0 +1,194 @@
+"""Quantities, rewards and plans: sums over states, controls and draws; optimal values."""
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from twin_master.errors import InvalidDistributionError, InvalidModelError, PlanningError
+from twin_master.network.inference import known_control
+from twin_master.network.planner import evaluate_policy, value_iteration
+from twin_master.network.quantity import QuantityModel
+from twin_master.network.rewards import RewardModel, RewardSettings, health_reward
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def random_case(seed, ties=False):
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=(4, 3, 2, 5))
+    if ties:
+        values = np.round(values)
+    weight = rng.dirichlet(np.ones(4))
+    joint = rng.dirichlet(np.ones(6), size=7).reshape(7, 3, 2)
+    joint[0] = 0.0
+    joint[0, 1, 1] = 1.0
+    return values, weight, joint
+
+
+def points(values, weight, joint, sensor):
+    """Every value of one sensor with its probability, under one joint belief."""
+    probability = weight[:, None, None] * joint
+    return values[..., sensor].ravel(), probability.ravel()
+
+
+@settings(deadline=None)
+@given(SEEDS, st.booleans())
+def test_moments_and_quantiles_are_those_of_the_mixture(seed, ties):
+    """The smallest value whose cumulative probability reaches the level; ties and zero weights included."""
+    values, weight, joint = random_case(seed, ties)
+    levels, model = [0.025, 0.3, 0.5, 0.975, 1.0], QuantityModel(values, weight)
+    (mean, deviation), result = model.moments(joint), model.quantiles(joint, levels)
+    assert result.shape == (7, 5, 5)
+    for b in range(7):
+        for g in range(5):
+            x, p = points(values, weight, joint[b], g)
+            assert mean[b, g] == pytest.approx(p @ x, abs=1e-13)
+            assert deviation[b, g] == pytest.approx(np.sqrt(p @ (x - p @ x) ** 2), abs=1e-13)
+            x, p = x[p > 0], p[p > 0]
+            order = np.argsort(x)
+            cumulative = np.cumsum(p[order])
+            for i, level in enumerate(levels):
+                expected = x[order][np.argmax(cumulative >= level - 1e-12)] if level < 1 else x.max()
+                assert result[b, i, g] == expected
+
+
+def test_leading_axes_are_kept():
+    values, weight, joint = random_case(1)
+    model, nested = QuantityModel(values, weight), joint[:6].reshape(2, 3, 3, 2)
+    mean, deviation = model.moments(nested)
+    assert mean.shape == deviation.shape == (2, 3, 5)
+    np.testing.assert_array_equal(mean.reshape(6, 5), model.moments(joint[:6])[0])
+    assert model.quantiles(nested, [0.5]).shape == (2, 3, 1, 5)
+    assert model.quantiles(joint[0], [0.5]).shape == (1, 5)
+
+
+LIMIT, LOAD = 2500e-6, (2.0, 3.0)
+SETTINGS = RewardSettings(
+    limit=LIMIT, control_reward=(-0.1, 0.1), error_scale=125e-6, control_normaliser=LOAD
+)
+
+
+def strains(seed):
+    rng = np.random.default_rng(seed)
+    quantity = QuantityModel(rng.uniform(500e-6, 4000e-6, size=(4, 3, 2, 5)), rng.dirichlet(np.ones(4)))
+    return rng, quantity, rng.dirichlet(np.ones(6)).reshape(3, 2)
+
+
+@given(SEEDS)
+def test_rewards_are_sums_over_states_controls_and_draws(seed):
+    rng, quantity, joint = strains(seed)
+    observation = rng.uniform(500e-6, 4000e-6, 5)
+    observation[rng.integers(5)] = np.nan
+    probability, value = quantity.draw_weight[:, None, None] * joint, quantity.value_per_draw
+    rewards = [
+        1.0 - value.max(axis=3) / LIMIT,
+        np.broadcast_to([-0.1, 0.1], probability.shape),
+        -np.nanmean(np.abs(observation - value), axis=3) / 125e-6 / LOAD,
+    ]
+    found = RewardModel(quantity, SETTINGS).expectation(joint, observation)
+    for i, reward in enumerate(rewards):
+        mean = (probability * reward).sum()
+        spread = np.sqrt((probability * (reward - mean) ** 2).sum())
+        assert found.mean[i] == pytest.approx(mean, abs=1e-12)
+        assert found.standard_deviation[i] == pytest.approx(spread, abs=1e-7)
+
+
+def test_a_known_control_has_no_spread_and_without_an_observation_there_is_no_error():
+    _, quantity, joint = strains(1)
+    model = RewardModel(quantity, SETTINGS)
+    found = model.expectation(known_control(np.full((6, 3), 1 / 3), np.array([0, 1, 0, 1, 0, 1]), 2))
+    assert found.mean.shape == (6, 3)
+    np.testing.assert_allclose(found.mean[:, 1], [-0.1, 0.1] * 3, rtol=1e-14)
+    np.testing.assert_allclose(found.standard_deviation[:, 1], 0.0, atol=1e-15)
+    assert np.all(np.isnan([found.mean[:, 2], found.standard_deviation[:, 2]]))
+    lost = model.expectation(joint, np.full(5, np.nan))
+    assert np.isfinite(lost.mean).tolist() == [True, True, False]
+    health = np.tensordot(quantity.draw_weight, health_reward(quantity.value_per_draw, LIMIT), axes=1)
+    np.testing.assert_allclose(model.planning_reward(1.0, 2.5), health + np.array([-0.25, 0.25]), rtol=1e-13)
+
+
+def random_problem(seed, states=7, controls=3):
+    rng = np.random.default_rng(seed)
+    transition = rng.dirichlet(np.full(states, 0.3), (controls, states))
+    transition /= transition.sum(axis=2, keepdims=True)
+    return transition, rng.normal(size=(states, controls))
+
+
+@settings(max_examples=50, deadline=None)
+@given(seed=SEEDS, discount=st.sampled_from([0.0, 0.6, 0.9, 0.99]))
+def test_the_value_is_optimal_and_that_of_its_policy(seed, discount):
+    transition, reward = random_problem(seed)
+    plan = value_iteration(transition, reward, discount)
+    scale = np.abs(reward).max() / (1.0 - discount)
+    exact = evaluate_policy(transition, reward, discount, plan.policy)
+    np.testing.assert_allclose(plan.value, exact, rtol=0, atol=1e-11 * scale)
+    action_value = reward + discount * np.einsum("ust,t->su", transition, plan.value)
+    np.testing.assert_allclose(plan.action_value, action_value, rtol=0, atol=1e-12 * scale)
+    np.testing.assert_allclose(plan.value, action_value.max(axis=1), rtol=0, atol=1e-11 * scale)
+    np.testing.assert_array_equal(plan.policy.argmax(axis=1), plan.control_index)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_equal_to_pymdptoolbox(seed):
+    transition, reward = random_problem(seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from mdptoolbox.mdp import PolicyIteration, ValueIteration
+
+        iteration = ValueIteration(transition, reward, 0.6, epsilon=1e-12, max_iter=10_000)
+        iteration.run()
+        exact = PolicyIteration(transition, reward, 0.6)
+        exact.run()
+    plan = value_iteration(transition, reward, 0.6)
+    np.testing.assert_array_equal(plan.control_index, iteration.policy)
+    np.testing.assert_array_equal(plan.control_index, exact.policy)
+    np.testing.assert_allclose(plan.value, exact.V, rtol=0, atol=1e-10)
+
+
+def test_closed_form_of_one_state_and_ties_go_to_the_first_control():
+    plan = value_iteration(np.ones((2, 1, 1)), [[1.0, 3.0]], 0.75)
+    assert plan.value == pytest.approx(12.0, rel=1e-12)
+    assert plan.control_index == [1]
+    transition, reward = random_problem(0)
+    doubled = np.concatenate([transition, transition])
+    plan = value_iteration(doubled, np.concatenate([reward, reward + 1e-15], axis=1), 0.9)
+    assert np.all(plan.control_index < 3)
+    assert np.all(value_iteration(transition, np.zeros((7, 3)), 0.9).control_index == 0)
+
+
+MOVES, REWARD = random_problem(0)
+VALUES, WEIGHT, JOINT = random_case(0)
+HOLED = np.where(np.arange(VALUES.size).reshape(VALUES.shape) == 12, np.nan, VALUES)  # at (0, 1, 0, 2)
+QUANTITY = QuantityModel(VALUES, WEIGHT)
+REWARDS = RewardModel(QUANTITY, RewardSettings(1.0, (0.0, 1.0), 1.0))
+REFUSED = [
+    (lambda: QuantityModel(VALUES[0]), r"\(draws, states, controls, sensors\)"),
+    (lambda: QuantityModel(HOLED), r"\(0, 1, 0, 2\) is nan"),
+    (lambda: QuantityModel(VALUES, WEIGHT * 2), "draw weights"),
+    (lambda: QUANTITY.moments(JOINT[:, :, 0]), "known_control"),
+    *((lambda bad=bad: QUANTITY.quantiles(JOINT, bad), "increasing quantile levels")
+      for bad in ([0.9, 0.1], [0.0], [1.1], 0.5, [np.nan])),
+    *((lambda bad=bad: RewardSettings(**({"limit": 1.0, "control_reward": (0.0,), "error_scale": 1.0} | bad)),
+       "must be finite and positive") for bad in ({"limit": 0.0}, {"limit": np.nan}, {"error_scale": -1.0})),
+    (lambda: RewardSettings(1.0, (0.0, 1.0), 1.0, (1.0, 0.0)), "'control_normaliser' must be finite and pos"),
+    (lambda: RewardSettings(1.0, (0.0, np.inf), 1.0), "'control_reward' must be finite"),
+    (lambda: RewardModel(QUANTITY, RewardSettings(1.0, (0.0, 1.0, 2.0), 1.0)), "each of 2 controls, got 3"),
+    (lambda: REWARDS.expectation(JOINT[1, 0]), "joint belief"),
+    (lambda: REWARDS.expectation(JOINT[1], np.zeros(4)), "expected observations of shape"),
+    (lambda: value_iteration(MOVES, REWARD.T, 0.6), "rewards of shape"),
+    *((lambda bad=bad: value_iteration(MOVES, REWARD, bad), r"discount factor in \[0, 1\)")
+      for bad in (1.0, -0.1, np.nan)),
+    (lambda: value_iteration(MOVES, REWARD, 0.9, max_iterations=3), "after 3 sweeps"),
+    (lambda: value_iteration(MOVES * 0.95, REWARD, 0.6), "does not sum to one"),
+    (lambda: evaluate_policy(MOVES, REWARD, 0.6, np.ones((7, 1))), "expected a policy of shape"),
+    (lambda: value_iteration(MOVES, np.full((7, 3), np.nan), 0.6), r"\(0, 0\) is nan"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "sentence"), REFUSED)
+def test_what_does_not_fit_is_refused(make, sentence):
+    with pytest.raises((InvalidModelError, InvalidDistributionError, PlanningError), match=sentence):
+        make()
