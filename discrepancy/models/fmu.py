@@ -271,19 +271,14 @@ class FmuModel(DescribedModel):
         rest = ModelPatch(tuple(item for item in patch if item.kind not in effects))
         load, settings = LoadChange.of(rest), dict[str, float]()
         if load.along_chord and self.description.inputs.torque is None:
-            raise ModelError(
-                f"T{what[1:]} names no torque in [inputs], so a load cannot move along the chord."
-            )
+            raise ModelError(f"T{what[1:]} names no torque in [inputs], so no load moves along the chord.")
         for item in (item for item in patch if item.kind in effects):
             effect = f"effect.{effects[item.kind]}"
             if f"{effect}.active" in settings:
-                raise ModelError(
-                    f"The patch has two primitives {item.kind!r}, but {what} carries one ({effect})."
-                )
-            values = {"active": 1.0} | {
-                key: value for key, value in item.to_mapping().items() if key != "kind"
-            }
-            settings |= {f"{effect}.{key}": float(value) for key, value in values.items()}
+                raise ModelError(f"Of the two primitives {item.kind!r} {what} carries one ({effect}).")
+            values = {"active": 1.0, **item.to_mapping()}
+            given = {key: float(value) for key, value in values.items() if key != "kind"}
+            settings |= {f"{effect}.{key}": value for key, value in given.items()}
         laws = laws_of(rest.of(*INTERNAL_FORCES), self.ports())
         return Asked(trial, conditions, laws, tuple(sorted(settings.items())), load)
 

@@ -299,12 +299,10 @@ class FmuRuns:
                     "[static], or give the FMU's parameters for a state at rest there."
                 )
 
-    def advanced(
-        self, asset: FmiAsset, histories: Mapping[str, FloatArray | float], steps: int
-    ) -> FloatArray:
+    def advanced(self, asset: FmiAsset, courses: Mapping[str, FloatArray | float], steps: int) -> FloatArray:
         """Return the outputs (steps, C) at the ends of steps, inputs held in each; raises `ModelError`."""
         with self._refusals():
-            return asset.simulate(load=histories, steps=steps).values
+            return asset.simulate(load=courses, steps=steps).values
 
     def one_step(self, asset: FmiAsset, inputs: Mapping[str, float]) -> FloatArray:
         """Return the outputs (C,) after one step; `ModelError` if the FMU refuses."""

@@ -276,9 +276,7 @@ class Model(ABC):
         """Refuse a trial that it cannot follow."""
         name = f"The trial {trial.name!r}"
         if trial.kind is TrialKind.FLIGHT and trial.kind not in self.kinds:
-            raise ModelError(
-                f"{name} is a flight, but {self.what} has no input load_factor: give it one, or leave it out."
-            )
+            raise ModelError(f"{name} is a flight, but {self.what} has no input load_factor: give it one.")
         if trial.kind not in self.kinds and trial.kind is TrialKind.RINGDOWN:
             raise ModelError(
                 f"{name} is a ring-down, which {self.what} cannot begin, since it is free, driven or has "
@@ -302,9 +300,8 @@ class Model(ABC):
         for output, quantity in outputs:
             own = self.output_quantity(output)
             if own is None:
-                raise ModelError(
-                    f"{capital(self.what)} has no output {output!r}; it has {', '.join(self.shown_outputs)}."
-                )
+                known = ", ".join(self.shown_outputs)
+                raise ModelError(f"{capital(self.what)} has no output {output!r}; it has {known}.")
             if not quantity.shows(own):
                 raise ModelError(
                     f"The output {output!r} of {self.what} is a {own.value}, but a channel measures "
@@ -395,9 +392,7 @@ class Model(ABC):
         """
         self.check_outputs(outputs)
         if len(self.sensors):
-            raise ModelError(
-                f"{self.name} has sensors built in, through which no missing force is seen; leave them out."
-            )
+            raise ModelError(f"{self.name} has sensors built in, which hide a missing force; leave them out.")
         return self._ported(trial, outputs, parameters)
 
     def remembering(self) -> Self:
@@ -412,14 +407,12 @@ class Model(ABC):
         Its sensors name channels of a campaign, or outputs of the model, and come before those of a question.
         `calibrated` has means and standard deviations of parameters, where they are not those of the model.
         """
-        parameters = tuple(
+        told = tuple(
             replace(item, mean=mean, deviation=deviation)
             for item in self.parameters
             for mean, deviation in [calibrated.get(item.name, (item.mean, item.deviation))]
         )
-        return self._changed(
-            patch=self.patch + patch, parameters=parameters, _declared=self.declared, _kept=None
-        )
+        return self._changed(patch=self.patch + patch, parameters=told, _declared=self.declared, _kept=None)
 
     def apart(self) -> tuple[Self, ModelPatch]:
         """Return the model without laws at its ports, and these at the prior means."""

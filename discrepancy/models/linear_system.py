@@ -179,7 +179,7 @@ class LinearSystem:
             square = np.where(np.abs(square) <= ROUNDING * np.max(np.abs(square), initial=0.0), 0.0, square)
         elif square[0] <= 0.0:
             raise ModelError(
-                f"The stiffness matrix must be positive definite, but an eigenvalue is {square[0]:g} 1/s^2."
+                f"The stiffness must be positive definite, but an eigenvalue is {square[0]:g} 1/s^2."
             )
         moving = len(square)
         found = np.zeros((len(self.mass), moving + self.states))

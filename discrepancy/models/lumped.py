@@ -317,10 +317,8 @@ class LumpedModel(DescribedModel, SystemModel):
         first = self.description.size
         if not np.any(self.port_rows.get(port, np.zeros(0))[first:]):
             return ""
-        shown = {
-            item.quantity for item in self.description.output if item.vector and any(item.vector[first:])
-        }
-        return UNITS[shown.pop()].si if len(shown) == 1 else "of the state's unit"
+        read = {item.quantity for item in self.description.output if item.vector and any(item.vector[first:])}
+        return UNITS[read.pop()].si if len(read) == 1 else "of the state's unit"
 
     def turns(self, port: str) -> bool | None:
         """Return whether a port turns; None where the model does not say it.
@@ -358,7 +356,7 @@ class LumpedModel(DescribedModel, SystemModel):
         )
         if 1.0 - softening < LEAST_STIFFNESS:
             raise ModelError(
-                f"The temperature leaves {1.0 - softening:.2g} of the stiffness, which no structure has."
+                f"The temperature leaves {1.0 - softening:.2g} of the stiffness, which none has."
             )
         key = (parameters.tobytes(), structure.primitives, softening)
         return self._rigs.get(key, lambda: self._made(self._factors(parameters), structure, softening))
@@ -419,12 +417,10 @@ class LumpedModel(DescribedModel, SystemModel):
                 if content is not None:
                     into[rows, columns] = -np.array(content)
             for loop in rig.loops.values() if state.closed else ():
-                for matrix, row, seen in zip(
-                    (stiffness, damping), loop.gives[:2], loop.sees[:2], strict=True
-                ):
-                    matrix -= np.outer(loop.acts, row)
+                for into, row, seen in zip((stiffness, damping), loop.gives[:2], loop.sees[:2], strict=True):
+                    into -= np.outer(loop.acts, row)
                     if loop.state is not None:
-                        matrix[loop.state] += seen
+                        into[loop.state] += seen
             beta = description.damping.beta if description.damping is not None else None
             drives = [description.padded(self._inputs[name].vector) for name in state.drives]
             return rig, SecondOrderSystem(  # the rig lives as long, so that its id stays its own

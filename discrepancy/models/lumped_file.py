@@ -117,9 +117,7 @@ class OutputSection(NamedSection):
         if sum(item is not None for item in (self.vector, self.reaction, self.controller)) != 1:
             raise ValueError(f"the output {self.name!r} needs one of a vector, a reaction and a controller")
         if self.reaction is not None and self.quantity not in (Quantity.FORCE, Quantity.TORQUE):
-            raise ValueError(
-                f'the output {self.name!r} is a reaction: give it quantity = "force" or "torque"'
-            )
+            raise ValueError(f'output {self.name!r} is a reaction: give it quantity = "force" or "torque"')
         return self
 
 
@@ -192,7 +190,7 @@ class ControllerSection(NamedSection):
     def _does_something(self) -> Self:
         if not (self.proportional or self.derivative or self.integral):
             raise ValueError(
-                f"the controller {self.name!r} has no gain: give proportional, derivative or integral"
+                f"controller {self.name!r} has no gain: give proportional, derivative or integral"
             )
         if not any(self.vector) or not any(self.acts):
             raise ValueError(f"vector and acts of the controller {self.name!r} must not be zero")
@@ -265,9 +263,7 @@ class LumpedDescription(ModelDescription):
             file = SHIPPED_MODELS / f"{path}.toml"
             if not file.exists():
                 known = ", ".join(sorted(item.stem for item in SHIPPED_MODELS.glob("*.toml")))
-                raise ModelError(
-                    f"There is no lumped model {str(path)!r}; shipped are {known}, or give a file."
-                )
+                raise ModelError(f"No lumped model is {str(path)!r}; shipped are {known}, or give a file.")
         return super().read(file)
 
     @property

@@ -212,9 +212,7 @@ class SecondOrderSystem(LinearSystem):
         count, moving, first = len(self.angular_frequency), self.moving, acting.time[:1]
         known = acting.begins is not Start.UNKNOWN and acting.clock[1] == 0.0  # dry friction is zero at rest
         drive = np.array([float(item.at(first, 0)[0]) for item in acting.drives.values()])
-        speeds = [
-            item.first_speed if known else float(item.at(first, 1)[0]) for item in acting.drives.values()
-        ]
+        speeds = [one.first_speed if known else float(one.at(first, 1)[0]) for one in acting.drives.values()]
         (q, v), memory = np.zeros((2, count + len(drive))), None
         if acting.begins is Start.SETTLED:
             load = acting.load_at(first, np.eye(len(self.mass)))
@@ -384,20 +382,18 @@ def port_scales(
         usual, most, pace = sizes[:, number].tolist()
         weight = (row @ bare.shapes)[: bare.moving] ** 2
         holds = weight > 1e-6 * float(weight.sum())
-        amount, free = usual or most or 1.0, not np.any(frequency[holds] > 0.0)
+        size, free = usual or most or 1.0, not np.any(frequency[holds] > 0.0)
         force = FORCES * float(np.sqrt(squares[number] / max(count, 1)))
         if np.any(holds) and np.all(frequency[holds] > 0.0):
             stiff = stiff or 1.0 / float(np.sum(weight[holds] / frequency[holds] ** 2))
             w, of_mode = float(frequency[holds][0]), float(weight[holds][0])
             if driven_only and follows[number] and force > 0.0 < pace:
-                found[name] = PortScale(
-                    amount, force / amount, pace / amount, stiff, most or amount, driven=True
-                )
+                found[name] = PortScale(size, force / size, pace / size, stiff, most or size, driven=True)
             else:
-                found[name] = PortScale(amount, w**2 / of_mode, w, stiff, most or 1.0)
+                found[name] = PortScale(size, w**2 / of_mode, w, stiff, most or 1.0)
             continue
         found[name] = PortScale(
-            amount, (force or 1.0) / amount, (pace or 1.0) / amount, None, most or amount, free=free,
+            size, (force or 1.0) / size, (pace or 1.0) / size, None, most or size, free=free,
             turns=bool(turned[number]) or not (free and driven_only and np.any(holds)),
             of_state=not np.any(row[: bare.displacements]),
         )  # fmt: skip

@@ -40,9 +40,8 @@ def observe(
     CatalogueError
         If a sensor primitive names a channel that does not exist or has values that no sensor can have.
     """
-    outputs = tuple(
-        (campaign.channels[name].output, campaign.channels[name].quantity) for name in trial.channels
-    )
+    channels = [campaign.channels[name] for name in trial.channels]
+    outputs = tuple((channel.output, channel.quantity) for channel in channels)
     patch = (_by_channels(model.sensors, campaign) + patch).in_trial(trial.name)
     if not len(patch.of(*SENSORS)):
         return model.respond(trial, outputs, patch, conditions)
@@ -52,15 +51,15 @@ def observe(
         conditions = replace(conditions, clock=clock, components=components)
     bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SENSORS)))
     # inputs at their true times, each channel sampled by its own clock
-    inputs, channels = _logger_rates(campaign, trial, patch)
+    inputs, by_channel = _logger_rates(campaign, trial, patch)
     stamped, clock = trial, conditions.clock
     if inputs:
         stamped = replace(trial, time=(1.0 + inputs) * trial.time)
-    rates, found = np.unique(channels).tolist(), list[Response]()
+    rates, found = np.unique(by_channel).tolist(), list[Response]()
     for rate in rates:
         beside = (rate - inputs) / (1.0 + inputs) * (1.0 + clock[0]) + clock[0]
         found.append(model.respond(stamped, outputs, bare, replace(conditions, clock=(beside, clock[1]))))
-    response, own = found[0], [channels == rate for rate in rates]
+    response, own = found[0], [by_channel == rate for rate in rates]
     if len(found) > 1:
         each = zip(*found, strict=True)
         response = Response._make(None if part[0] is None else np.select(own, part) for part in each)

@@ -355,13 +355,11 @@ class WingModel(SystemModel):
             (stiffness, solve), mass = self._stiffness(state), self.wing.mass(servo, pitot, masses)
             still = solve(np.vstack((self.wing.force_row(place), *held.values())).T)
             basis = motion_basis(solve, mass, self.wing.arrays.start_shapes, still)
-            small_mass, small = basis.T @ mass @ basis, basis.T @ stiffness @ basis
-            small_mass, small = 0.5 * (small_mass + small_mass.T), 0.5 * (small + small.T)
+            inertia, small = basis.T @ mass @ basis, basis.T @ stiffness @ basis
+            inertia, small = 0.5 * (inertia + inertia.T), 0.5 * (small + small.T)
             rows = {port: row @ basis for port, row in held.items()}
-            damping = alpha * small_mass + beta * small
-            return SecondOrderSystem(
-                small_mass, damping, small, rows, MODE_COUNT, beta, ON_MODES, basis=basis
-            )
+            damping = alpha * inertia + beta * small
+            return SecondOrderSystem(inertia, damping, small, rows, MODE_COUNT, beta, ON_MODES, basis=basis)
 
         further = (masses.primitives, state.parameters[1:].tobytes(), place, tuple(held))
         return self._systems.get((_stiffness_key(state), further), make)

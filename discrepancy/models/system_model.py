@@ -209,9 +209,7 @@ class SystemModel(Model):
         """Return what is shown at rest; rows of one structure that follow one another go together."""
         trial, conditions, patch, first = case
         if laws.spans or len(patch.of(PortLoad)):
-            raise ModelError(
-                f"The trial {trial.name!r} has no time, which a law or a force in time asks for."
-            )
+            raise ModelError(f"The trial {trial.name!r} has no time, which a law or force in time asks for.")
         count, losses = len(trial.force), self.losses(trial, conditions.health)
         losses = losses * count if len(losses) == 1 else losses
         warmer = trial.temperature.tolist() if len(patch.of(changes.ModulusTemperature)) else [0.0] * count
