@@ -60,7 +60,7 @@ docs: $(DOCS_VENV)/.docs ## Build the site of the documentation into build/docs;
 
 .PHONY: lock
 lock: $(VENV)/.dev ## Renew the lock files from pyproject.toml and docs/site/requirements.in
-	$(BIN)/pip-compile -q --upgrade --extra build -o requirements.lock pyproject.toml
+	$(BIN)/pip-compile -q --upgrade --extra build --extra fast -o requirements.lock pyproject.toml
 	$(BIN)/pip-compile -q --extra build --extra dev -c requirements.lock -o requirements-dev.lock pyproject.toml
 	$(BIN)/pip-compile -q -c requirements.lock -o requirements-docs.lock docs/site/requirements.in
 

@@ -1,5 +1,9 @@
-"""Loops over numbers compiled by numba, with the machine code kept on disk between processes."""
+"""Loops over numbers compiled by numba, with the machine code kept on disk between processes.
 
+Without numba (extra `uav-twin[fast]`) they run as what they are, plain Python.
+"""
+
+import functools
 import hashlib
 import inspect
 import os
@@ -8,10 +12,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
-import numba
-from numba.extending import overload, register_jitable
+import numpy as np
 
 from fe.reduction.built_once import cache_folder
+from reporting.progress import tell
+
+try:
+    import numba
+    from numba.core import event
+    from numba.extending import overload, register_jitable
+except ModuleNotFoundError:
+    numba = None
 
 __all__ = ["callable_when_compiled", "choose_when_compiled", "compiled"]
 
@@ -19,12 +30,18 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 """A division by zero gives infinity, as in NumPy: a loop that might raise is not computed side by side."""
+WITHOUT = (
+    "numba is not installed, and loops run as plain Python: a mission takes 20 seconds more, `discrepancy` "
+    "several times as long. pip install 'uav-twin[fast]'"
+)
 
 
 def compiled(
     function: Callable[Parameters, Result], calls: Iterable[Callable[..., Any]] = ()
 ) -> Callable[Parameters, Result]:
     """Compile `function` with numba when it is first called; it runs without the interpreter lock.
+
+    That it is compiled, or runs plain, is told once in a process.
 
     The machine code is kept where `NUMBA_CACHE_DIR` says, else beside the function's file, else in the folder
     of what is kept between runs, under a hash of the sources. If none can be written, it is compiled anew in
@@ -38,6 +55,8 @@ def compiled(
         Plain functions of other files that it calls: numba by itself sees changes of its own file only.
         The files of compiled functions that its module names count without being told.
     """
+    if numba is None:
+        return _plain(function)
     named = [item.py_func for item in function.__globals__.values() if hasattr(item, "py_func")]
     with _kept_by_sources([inspect.getfile(item) for item in (function, *calls, *named)]):
         try:
@@ -45,6 +64,33 @@ def compiled(
         except RuntimeError:  # numba's way to say that it found no writable folder
             made = numba.njit(**OPTIONS)(function)
     return cast("Callable[Parameters, Result]", made)
+
+
+def _plain(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    with_silent_divisions = np.errstate(all="ignore")(function)
+
+    @functools.wraps(function)
+    def plain(*given: Parameters.args, **named: Parameters.kwargs) -> Result:
+        _tell_once(WITHOUT)
+        return with_silent_divisions(*given, **named)
+
+    return plain
+
+
+_tell_once = functools.cache(tell)
+
+if numba is not None:
+
+    class _Announcement(event.Listener):  # type: ignore[misc]
+        """Told is the first loop that is not found on disk."""
+
+        def on_start(self, event: Any) -> None:
+            _tell_once("Compiling loops by numba, kept for later runs: up to 20 s ...")
+
+        def on_end(self, event: Any) -> None:
+            """Nothing: the stage of the command that compiles tells its time."""
+
+    event.register("numba:compile", _Announcement())
 
 
 @contextmanager
@@ -81,7 +127,8 @@ def callable_when_compiled(
     inline : bool
         Make it part of its callers.
     """
-    register_jitable(**OPTIONS, _nrt=makes_arrays, forceinline=inline)(function)
+    if numba is not None:
+        register_jitable(**OPTIONS, _nrt=makes_arrays, forceinline=inline)(function)
     return function
 
 
@@ -90,29 +137,19 @@ def choose_when_compiled(chosen: Callable[..., Any], table: tuple[Callable[..., 
 
     The table is one of functions of `callable_when_compiled` that make no arrays.
     """
-    chain = _last(table[-1])
-    for number, function in reversed(list(enumerate(table[:-1]))):
-        if function is not table[-1]:
-            rest = callable_when_compiled(chain, makes_arrays=False, inline=True)
-            chain = _link(number, function, rest)
+    if numba is None:
+        return
+    # Written out as one function: a chain of functions would be compiled link by link.
+    scope: dict[str, Any] = {"Any": Any} | {f"answer_{number}": each for number, each in enumerate(table)}
+    lines = [
+        f"    if number == {number}: return answer_{number}(*given)"
+        for number, function in enumerate(table[:-1])
+        if function is not table[-1]
+    ]
+    head, end = "def choice(number: Any, *given: Any) -> Any:", f"    return answer_{len(table) - 1}(*given)"
+    exec("\n".join([head, *lines, end]), scope)
 
     def compiled_choice(number: Any, *given: Any) -> Any:
-        return chain
+        return scope["choice"]
 
     overload(chosen, jit_options={"nogil": True, "_nrt": False, "forceinline": True})(compiled_choice)
-
-
-def _last(function: Callable[..., Any]) -> Callable[..., Any]:
-    def choice(number: Any, *given: Any) -> Any:
-        return function(*given)
-
-    return choice
-
-
-def _link(number_of_it: int, function: Callable[..., Any], rest: Callable[..., Any]) -> Callable[..., Any]:
-    def choice(number: Any, *given: Any) -> Any:
-        if number == number_of_it:
-            return function(*given)
-        return rest(number, *given)
-
-    return choice

@@ -45,6 +45,15 @@ SilentProgress = Progress
 """By the name that says that nothing is shown."""
 
 
+narrator: Callable[[], Progress] = SilentProgress
+"""Gives what `tell` tells: nothing but while a command runs."""
+
+
+def tell(message: str) -> None:
+    """Tell one line of what a library does unasked, such as to compile, where no `Progress` was handed on."""
+    narrator().note(message)
+
+
 class _BarStage(Stage):
     def __init__(self, bars: "RichBars", task: "TaskID") -> None:
         self._bars = bars

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import reporting.progress
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -141,10 +143,13 @@ def _extend(command: Any, options: Sequence[Any]) -> None:
 def _interruptible(call: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(call)
     def guarded(*arguments: Any, **options: Any) -> Any:
+        before, reporting.progress.narrator = reporting.progress.narrator, progress
         try:
             return call(*arguments, **options)
         except KeyboardInterrupt:
             typer.secho("Interrupted.", fg="red", err=True)
             raise typer.Exit(INTERRUPTED) from None
+        finally:
+            reporting.progress.narrator = before
 
     return guarded

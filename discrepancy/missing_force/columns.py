@@ -72,13 +72,7 @@ def law_course(
         slow = max(WIDER * doubt, SLOW * float(np.sqrt(np.mean(speed**2))))
         moves = erf(np.abs(speed) / (np.sqrt(2.0) * slow))
         found = moves * found + (1.0 - moves) * np.clip(holding, -np.abs(found), np.abs(found))
-    if law.windows:
-        inside = np.zeros(len(found), dtype=bool)
-        for window in law.windows:
-            begin, end = window.span
-            inside |= (time >= begin) & (time < end)
-        found *= inside
-    return found
+    return found * law.acts(time)
 
 
 class Columns:

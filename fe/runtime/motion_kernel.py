@@ -46,7 +46,7 @@ def integrate(
         none[6],
     )  # fmt: skip
     last = go.which[0]
-    ports.feed[:] = go.feed[0]
+    take(ports.feed, go.feed[0])
     find_routes(ports, acting)
     begin_on_modes(go, ports, acting, state, known)
     begin_flexible(ports, acting, state, go.length[last], known)
@@ -59,7 +59,7 @@ def integrate(
                 if acting.route[j] == SPEED:
                     find_answer(go, last, ports, acting, j)
         h = go.length[last]
-        ports.feed[:] = go.feed[k + 1]
+        take(ports.feed, go.feed[k + 1])
         first_half(go, k, ports, acting, state, h)
         if coupled:
             move(go, k, state, acting.room)
@@ -71,6 +71,12 @@ def integrate(
         if k + 1 == go.sample[sample]:
             record(go, ports, acting, state, go.end[k], sample, samples)
             sample += 1
+
+
+def take(into: FloatArray, given: FloatArray) -> None:
+    """Copy numbers; numba takes two seconds to compile `into[:] = given`."""
+    for i in range(len(into)):
+        into[i] = given[i]
 
 
 def find_routes(ports: Ports, acting: Acting) -> None:

@@ -9,6 +9,9 @@ from inspect import get_annotations
 from math import inf, isfinite
 from typing import Any, ClassVar, NamedTuple, dataclass_transform
 
+import numpy as np
+
+from .arrays import BoolArray, FloatArray
 from .errors import InvalidPatchError
 from .expression import Expression
 
@@ -79,6 +82,13 @@ class Primitive:
                 )
         for name in self.courses:
             course_of(getattr(self, name), self.kind)
+
+    def acts(self, time: FloatArray) -> BoolArray:
+        """Return whether it acts at times (N,); its windows are those of their trial."""
+        inside = np.full(len(time), not self.windows)
+        for begin, end in (window.span for window in self.windows):
+            inside |= (begin <= time) & (time < end)
+        return inside
 
     def to_mapping(self) -> dict[str, Any]:
         """Return kind and values as plain data."""

@@ -15,7 +15,7 @@ from math import exp, expm1, factorial
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import BoolArray, FloatArray
+from .arrays import FloatArray
 from .errors import InvalidPatchError
 from .patch import EVERY_CHANNEL, Clock, HighPass, LoggerClock, ModelPatch, Sensor, SensorGain, SensorRotation
 from .patch import SensorRecord as SensorRecord
@@ -140,19 +140,11 @@ def apply_sensors(
             read = filtered(item, record, signal, slope)
         else:
             continue
-        acting = _acts(item, record.time)[:, np.newaxis]
+        acting = item.acts(record.time)[:, np.newaxis]
         shown[:, columns], slopes[:, columns] = (
             np.where(acting, after, before) for after, before in zip(read, (signal, slope), strict=True)
         )
     return shown, None if rates is None else slopes
-
-
-def _acts(item: Primitive, time: FloatArray) -> BoolArray:
-    """Return whether a primitive acts at each sample (N,); its windows are those of the record."""
-    inside = np.full(len(time), not item.windows)
-    for begin, end in (window.span for window in item.windows):
-        inside |= (begin <= time) & (time < end)
-    return inside
 
 
 def columns_of(item: Primitive, channels: Sequence[tuple[str, str]]) -> NDArray[np.intp]:

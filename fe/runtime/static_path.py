@@ -89,8 +89,8 @@ def static_path(
             for _ in range(60):
                 if size <= 1e-12 * scale:
                     break
-                # a singular matrix is moved off its zero
-                move = np.linalg.solve(unit + compliance * slopes + 1e-14 * unit, residual)
+                # A singular matrix is moved off its zero. Compiled, `solve` takes five seconds longer.
+                move = np.linalg.inv(unit + compliance * slopes + 1e-14 * unit) @ residual
                 fraction, before = 1.0, size
                 for _ in range(12):
                     candidate = guess - fraction * move
@@ -107,7 +107,7 @@ def static_path(
             # another branch, beyond a snap.
             stable = np.linalg.det(unit + compliance * slopes) > -1e-9
             if size <= 1e-9 * scale and stable:
-                x[:] = guess
+                x = guess
                 arrive_at_rest(guess, ports, memory, least, own)
                 done = min(done + step, 1.0)
                 step *= 2.0
@@ -115,9 +115,10 @@ def static_path(
                 step *= 0.5
                 if step < 1.0 / 256.0:
                     return level
-        old[:] = linear[level]
-        positions[level] = x
-        forces[level] = own
+        old = linear[level]
+        for j in range(count):  # numba takes two seconds to compile `positions[level] = x`
+            positions[level, j] = x[j]
+            forces[level, j] = own[j]
     return -1
 
 

@@ -88,7 +88,6 @@ def test_a_folder_of_files_becomes_the_campaign_to_the_last_bit(tmp_path, monkey
                 np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
         assert ours.load_place == "mass"
         if theirs.release is not None:
-            assert ours.release is not None
             assert ours.release.displacement == pytest.approx(theirs.release.displacement, rel=1e-15)
     origin = next(remark for remark in read.remarks if "release 1.csv" in remark)
     assert "Imported from release 1.csv (SHA-256 " in origin
@@ -138,7 +137,6 @@ def test_everything_that_is_not_said_is_named_at_once(tmp_path, monkeypatch):
     assert read.trials[0].force.tolist() == [9.80665, 2 * 9.80665]
     assert read.trials[0].values[0].tolist() == [1.234 * 0.0254, 0.0]
     assert read.trials[1].time.tolist()[1] == 0.002
-    assert read.trials[1].release is not None
     assert read.trials[1].release.displacement == -0.0127
 
 
@@ -201,7 +199,6 @@ def test_samples_at_rest_inputs_and_temperatures(tmp_path, monkeypatch):
     )  # fmt: skip
     read = read_campaign("lab")
     noise = read.channels["x"].noise
-    assert noise is not None
     assert noise.samples is not None
     assert noise.interval == pytest.approx(0.01)
     (trial,) = read.trials
@@ -337,7 +334,6 @@ def test_a_terminal_is_asked(tmp_path):
     assert "Write lab?" in screen
     read = read_campaign(tmp_path / "lab")
     assert read.trials[0].values[1, 0] == 2e-3
-    assert read.trials[0].release is not None
     assert read.trials[0].release.displacement == 0.012
 
 

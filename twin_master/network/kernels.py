@@ -5,7 +5,8 @@ own axis. Sums over predecessors are formed of the beliefs as they are wherever 
 what underflowed then weighs less than one part in 1e27 of it, far below rounding. Elsewhere a single block
 sums logarithms. Of a product that would take the product of all predecessors, and where most states are all
 but impossible most of its sums underflow: there numbers are carried as value * 2^(512 power). The powers are
-whole numbers in floating point, so that the loops are vectorised.
+whole numbers in floating point, so that the loops are vectorised. Numbers are copied one by one: numba takes
+two seconds to compile the copy of an array.
 """
 
 from functools import partial
@@ -122,8 +123,7 @@ def _move_scaled(lists: Lists, control: int, before: Float, after: Float, log_af
     to_value, to_power = np.empty(len(before)), np.empty(len(before))
     _split(before, to_value, to_power)
     for block in range(len(levels)):
-        from_value[:] = to_value
-        from_power[:] = to_power
+        from_value, to_value, from_power, to_power = to_value, from_value, to_power, from_power
         count = levels[block]
         rest = len(before) // count
         total, power = np.empty(rest), np.empty(rest)
@@ -219,8 +219,8 @@ def forward_pass(
             now, log_now = forecast[twin, t], log_filtered[twin, t]
             in_force = control[twin, t - 1] if t > 0 else control_before[twin]
             if in_force < 0:
-                now[:] = before
-                log_now[:] = log_before
+                for state in range(size):
+                    now[state], log_now[state] = before[state], log_before[state]
             else:
                 _move_one(lists, in_force, before, log_before, now, log_now)
             best = -np.inf
@@ -287,8 +287,8 @@ def backward_pass(
     levels = forward[0]
     forecast, ratio, work, added = np.empty(size), np.empty(size), np.empty(size), np.zeros(size)
     for twin in range(twins):
-        if steps:
-            smoothed[twin, steps - 1] = filtered[twin, steps - 1]
+        for state in range(size if steps else 0):
+            smoothed[twin, steps - 1, state] = filtered[twin, steps - 1, state]
         for t in range(steps - 2, -1, -1):
             now, later, log_now = smoothed[twin, t], smoothed[twin, t + 1], log_filtered[twin, t]
             before, scaled, largest = filtered[twin, t], False, 1.0
@@ -356,4 +356,5 @@ def move_rows(lists: Lists, control: int, rows: NDArray[np.floating]) -> None:
     for row in range(len(rows)):
         if np.any(rows[row]):
             _apply(lists, control, rows[row], after, work)
-            rows[row] = after
+            for state in range(len(after)):
+                rows[row, state] = after[state]

@@ -127,12 +127,14 @@ def _prepare(
                 matrix[f, h] -= matrix[f, i] * matrix[h, i]
             matrix[f, h] /= matrix[h, h]
             matrix[f, f] -= matrix[f, h] ** 2
-            outward[f] -= matrix[f, h] * outward[h]
+            for g in range(sensors):
+                outward[f, g] -= matrix[f, h] * outward[h, g]
         matrix[f, f] = np.sqrt(matrix[f, f])
         shared -= np.log(matrix[f, f])
-        outward[f] /= matrix[f, f]
         for g in range(sensors):
-            outward_part[f] += outward[f, g] * part[g]
+            outward[f, g] /= matrix[f, f]
+            for r in range(parts):
+                outward_part[f, r] += outward[f, g] * part[g, r]
     for r in range(parts):
         for k in range(r + 1):
             for f in range(factors):
@@ -164,9 +166,10 @@ def _exponents(
         for g in range(len(distance)):
             for b in range(len(square)):
                 along[b] += outward[f, g] * distance[g, b]
-        square -= along * along
-        for r in range(len(slope)):
-            slope[r] -= along * outward_part[f, r]
+        for b in range(len(square)):
+            square[b] -= along[b] * along[b]
+            for r in range(len(slope)):
+                slope[r, b] -= along[b] * outward_part[f, r]
     for b in range(len(square)):
         if not square[b] < np.inf:  # an absurd observation
             square[b], slope[:, b] = np.inf, 0.0
@@ -227,8 +230,8 @@ def log_densities(
                         distance[g, b] = (shown[g, b] - mean[u, s, g]) * inverse_deviation[u, s, g]
                     if not seen[g]:
                         distance[g] = 0.0
-                if result.shape[2] == 1:
-                    offset -= log_weight
+                for e in range(draws if result.shape[2] == 1 else 0):
+                    offset[e] -= log_weight[e]
                 _exponents(
                     distance, part[u, s], function, outward, outward_part, offset, square, slope, exponent
                 )
@@ -238,4 +241,5 @@ def log_densities(
                         result[block[b], s, 0] = shared + square[b]
                 else:
                     for b in range(size):
-                        result[block[b], s] = shared + exponent[:, b]
+                        for e in range(draws):
+                            result[block[b], s, e] = shared + exponent[e, b]

@@ -237,12 +237,11 @@ def test_the_documented_campaign_is_read(tmp_path):
     toml = re.search(r"```toml\n(.*?)```", text, re.DOTALL)
     tables = re.search(r"begin with\n\n```\n(.*?)```", text, re.DOTALL)
     (tmp_path / "campaign.toml").write_text(toml.group(1), encoding="utf-8")
-    columns = zip(*(re.split(r"\s{3,}", line) for line in tables.group(1).splitlines()), strict=True)
-    for name, rows in zip(("noise", "tip_up", "release_1", "turns"), columns, strict=True):
-        more = (
-            [f"{0.002 * k:.3f},{(-1) ** k}" for k in range(3, 50)] if name in ("noise", "release_1") else []
-        )
-        (tmp_path / f"{name}.csv").write_text("\n".join([*rows, *more]) + "\n", encoding="utf-8")
+    record = "\n".join(f"{0.002 * k:.3f},{(-1) ** k}" for k in range(3, 50))
+    for table in tables.group(1).split("\n\n"):
+        name, columns, *_ = table.removeprefix("# ").splitlines()
+        more = f"\n{record}" if columns == "time,g17" else ""
+        (tmp_path / name).write_text(f"{table.rstrip()}{more}\n", encoding="utf-8")
     campaign = read_campaign(tmp_path)
     up, release, turns = campaign.trials
     assert [trial.kind.value for trial in campaign.trials] == ["static", "ringdown", "flight"]

@@ -125,13 +125,10 @@ def test_what_changes_nothing_changes_no_bit(kind: Kind, how: TrialKind) -> None
 @pytest.mark.parametrize("rubs", [False, True])
 def test_a_coarse_force_does_between_its_samples_what_is_said(kind: Kind, hold: Hold, rubs: bool) -> None:
     """At nine samples a period, against the same force recorded a hundred times as fast."""
-    time, fine = (
-        2.0 * np.pi / 9.0 / kind.pace * samples for samples in (np.arange(120), np.arange(11901) / 100)
-    )
-    force, laws = (
-        3.0 * np.sin(kind.pace * time),
-        [PowerDamping(kind.ports[-1], 0.3, 0.0, 0.0, 1.0, 1.0)] * rubs,
-    )
+    pace = 2.0 * np.pi / 9.0 / kind.pace
+    time, fine = pace * np.arange(120), pace * np.arange(11901) / 100
+    force = 3.0 * np.sin(kind.pace * time)
+    laws = [PowerDamping(kind.ports[-1], 0.3, 0.0, 0.0, 1.0, 1.0)] * rubs
     coarse = replace(kind.trial(TrialKind.FORCED, force=force), time=time)
     between = {
         Hold.LINEAR: np.interp(fine, time, force),
@@ -158,9 +155,7 @@ def test_a_coarse_force_does_between_its_samples_what_is_said(kind: Kind, hold: 
         (TrialKind.STATIC, {"parameters": np.ones(9)}, "parameters, but 9 came"),
     ],
 )
-def test_what_cannot_be_answered_is_refused_in_a_sentence(
-    kind: Kind, how: TrialKind, said, sentence: str
-) -> None:
+def test_what_cannot_be_answered_is_refused_in_a_sentence(kind: Kind, how, said, sentence: str) -> None:
     what, given = kind.trial(how, force=np.ones(3)), dict(said)
     what = replace(what, **{name: given.pop(name) for name in ("load_place", "release") if name in given})
     items = given.pop("items", ())

@@ -18,7 +18,6 @@ from discrepancy.models.second_order import Motion, SecondOrderSystem
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
-from fe.runtime.stepwise import ModalMotion
 from tests.fe.runtime.stepping import simulate
 
 FloatArray = NDArray[np.float64]
@@ -50,9 +49,8 @@ def chain(modes: int, beta: float) -> SecondOrderSystem:
 def ringdown(beta: float, *items: Primitive, refinement: int = 1) -> Motion:
     system = chain(3, beta)
     laws = laws_of(ModelPatch(items), list(system.ports))
-    return system.motion(
-        Acting(TIME, np.zeros(len(TIP)), initial=np.zeros((0, 2)), release=(TIP, RELEASE)), laws, refinement
-    )
+    acting = Acting(TIME, np.zeros(len(TIP)), initial=np.zeros((0, 2)), release=(TIP, RELEASE))
+    return system.motion(acting, laws, refinement)
 
 
 def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
@@ -210,9 +208,7 @@ def joint(stiffness: float, flexibility: float, beta: float = 0.0) -> ModalSyste
     return ModalSystem(w, np.zeros((1, 1)), {"mass": np.ones(1)}, np.array([flexibility]), beta)
 
 
-def move(
-    system: ModalSystem, *items: Primitive, q: float = 1.0, v: float = 0.0, **options: object
-) -> ModalMotion:
+def move(system: ModalSystem, *items: Primitive, q: float = 1.0, v: float = 0.0, **options: Any) -> Any:
     laws = laws_of(ModelPatch(items), ["mass"])
     return simulate(
         system, laws, q=np.array([q]), v=np.array([v]), force=np.zeros(801), interval=0.005,
@@ -245,9 +241,8 @@ def test_friction_that_slips_loses_the_area_of_its_loop() -> None:
 
 def test_the_shape_family_is_continuous_at_dry_friction() -> None:
     system = joint(40.0, 1.0 / 60.0, 1e-3)
-    dry, nearly = (
-        move(system, PowerDamping("mass", 1.5, p, a, 6.0, 1.0)) for p, a in ((0.0, 0.0), (1e-5, 1e-5))
-    )
+    laws = (PowerDamping("mass", 1.5, p, p, 6.0, 1.0) for p in (0.0, 1e-5))
+    dry, nearly = (move(system, law) for law in laws)
     assert np.abs(dry.q - nearly.q).max() < 1e-3
     sides = [move(system, PowerDamping("mass", 1.5, p, 0.0, 6.0, 1.0)).q for p in (0.49, 0.5, 0.51)]
     assert np.abs(sides[2] - 2.0 * sides[1] + sides[0]).max() < 1e-3

@@ -131,10 +131,8 @@ def test_a_cubic_spring_over_the_planform_solves_the_equations_of_all_unknowns(w
 
 
 def test_a_law_elsewhere_leaves_no_trace(wing: Wing) -> None:
-    fresh, (span, planform) = (
-        Wing(wing.arrays),
-        (PowerDamping(p, 3.0, 2.0, 0.0, 1.0, 1.0) for p in ("span", "planform")),
-    )
+    fresh = Wing(wing.arrays)
+    span, planform = (PowerDamping(p, 3.0, 2.0, 0.0, 1.0, 1.0) for p in ("span", "planform"))
     wing.seen(RING, planform)
     assert np.array_equal(wing.seen(RING, span), fresh.seen(RING, span))
 
@@ -244,9 +242,9 @@ def test_the_posterior_of_a_calibration_is_the_prior(
     assert model.name == result.asset
     assert [item.mean for item in model.parameters] == pytest.approx(result.samples.mean(axis=0)[:5])
     assert [item.deviation for item in model.parameters] == pytest.approx(result.samples.std(axis=0)[:5])
-    for read, name, sentence in (
-        (WingModel.of_calibration, "absent.nc", "cannot be used"),
-        (WingModel.of_design, "absent.toml", "cannot be read"),
+    for read, name, words in (
+        (WingModel.of_calibration, "absent.nc", "be used"),
+        (WingModel.of_design, "absent.toml", "be read"),
     ):
-        with pytest.raises(ModelError, match=sentence):
+        with pytest.raises(ModelError, match=f"cannot {words}"):
             read(tmp_path / name)

@@ -11,13 +11,7 @@ from skfem.element import ElementHex1, ElementHexS2, ElementTetP1, ElementTetP2,
 from skfem.helpers import ddot, sym_grad
 from skfem.models.elasticity import lame_parameters, linear_stress
 
-from fe.elements.cells import (
-    isotropic_compliance,
-    jacobians,
-    mass_blocks,
-    rotate_elasticity,
-    stiffness_blocks,
-)
+from fe.elements import cells as assembly
 from fe.elements.kinds import KINDS
 from fe.structure.design import Gauge
 from fe.structure.location import attach, face_areas, gauge_rows
@@ -77,8 +71,8 @@ def test_element_arrays_are_those_of_scikit_fems_forms(name: str, box) -> None:
     stiffness = BilinearForm(lambda u, v, w: ddot(stress(sym_grad(u)), sym_grad(v))).assemble(basis)
     mass = BilinearForm(lambda u, v, w: sum(u[i] * v[i] for i in range(3))).assemble(basis)
     nodes = points[cells]
-    K = stiffness_blocks(kind, nodes, np.linalg.inv(isotropic_compliance(2.0, 0.3)))
-    M = mass_blocks(kind, nodes, 1.0, kind.mass_rule)
+    K = assembly.stiffness_blocks(kind, nodes, np.linalg.inv(assembly.isotropic_compliance(2.0, 0.3)))
+    M = assembly.mass_blocks(kind, nodes, 1.0, kind.mass_rule)
     # Unknowns of both are told by the places of their nodes: compare the energies of one smooth field.
     field = np.sin(points @ np.array([[1.0, 2.0, 0.5], [0.3, -1.0, 2.0], [0.7, 0.2, 1.0]]))
     ours, theirs = field[cells].reshape(len(cells), -1), np.zeros(basis.N)
@@ -93,7 +87,7 @@ def test_element_arrays_are_those_of_scikit_fems_forms(name: str, box) -> None:
 def test_patch_test_and_gauges(distorted: StructureMesh) -> None:
     gradient = 1e-3 * np.array([[1.0, 2.0, -0.5], [0.3, -1.5, 0.8], [0.6, -0.2, 0.9]])
     exact = distorted.points @ gradient.T
-    elasticity = np.linalg.inv(isotropic_compliance(7e10, 0.3))
+    elasticity = np.linalg.inv(assembly.isotropic_compliance(7e10, 0.3))
     K = distorted.stiffness(np.arange(len(distorted.cells)), elasticity)
     inner = ((distorted.points > 1e-9) & (distorted.points < np.array([1, 2, 0.5]) - 1e-9)).all(axis=1)
     assert inner.any()
@@ -121,7 +115,7 @@ def test_faces_enclose_the_volume(distorted: StructureMesh) -> None:
     assert np.sum(normal * distorted.points) == pytest.approx(3.0)
     assert face_areas(distorted, distorted.boundary)[1].sum() == pytest.approx(2 * (2.0 + 0.5 + 1.0))
     local, weight = distorted.kind.mass_rule
-    volume = (np.linalg.det(jacobians(distorted.kind, distorted.nodes, local)) * weight).sum()
+    volume = (np.linalg.det(assembly.jacobians(distorted.kind, distorted.nodes, local)) * weight).sum()
     assert volume == pytest.approx(1.0)
 
 
@@ -133,6 +127,8 @@ def test_a_point_inside_is_found(distorted: StructureMesh) -> None:
 
 
 def test_an_isotropic_material_does_not_feel_a_rotation():
-    elasticity = np.linalg.inv(isotropic_compliance(7.0, 0.3))
+    elasticity = np.linalg.inv(assembly.isotropic_compliance(7.0, 0.3))
     rotation, _ = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))
-    assert rotate_elasticity(elasticity[None], rotation[None])[0] == pytest.approx(elasticity, abs=1e-13)
+    assert assembly.rotate_elasticity(elasticity[None], rotation[None])[0] == pytest.approx(
+        elasticity, abs=1e-13
+    )

@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 
 from fe.elements.kinds import KINDS
-from fe.runtime.errors import (
-    CalculixError,
-    FiniteElementError,
-    InvalidDesignError,
-    InvalidStateError,
-    MeshError,
-    SolutionError,
-)
+from fe.runtime import errors
 from fe.structure.affine import natural_frequencies, static_responses
 from fe.structure.mesh_file import check_memory, memory_estimate, read_mesh
 from fe.structure.operators import Structure, load_and_assemble, weighed, write_structure_vtu
@@ -200,7 +193,7 @@ def test_terms_make_what_a_changed_file_makes(beam) -> None:
     np.testing.assert_allclose(structure.load("weight"), split.load("weight"), atol=1e-12)
     np.testing.assert_allclose(structure.load("weight", 1.0), structure.load("weight") / 3.0)
     for ask, wrong in ((structure.stiffness, {"f": 1.0}), (structure.mass, {"z1": 1.0})):
-        with pytest.raises(InvalidStateError, match=r"has no (parameter|free mass) named"):
+        with pytest.raises(errors.InvalidStateError, match=r"has no (parameter|free mass) named"):
             ask(wrong)
 
 
@@ -229,7 +222,7 @@ def test_a_rigid_root_on_springs_shifts_and_turns(beam) -> None:
 
 @pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("cantilever"))
 def test_a_rigid_set_that_cannot_be(old: str, new: str, sentence: str, beam) -> None:
-    with refused(FiniteElementError, sentence):
+    with refused(errors.FiniteElementError, sentence):
         beam((old, new))
 
 
@@ -240,7 +233,7 @@ def test_a_gauge_reads_the_mean_over_its_area(made) -> None:
     field[:, 0] = structure.mesh.points[:, 0] * structure.mesh.points[:, 1] ** 2
     seen = structure.gauge_output @ (structure.expansion.T @ field.ravel())
     assert seen == pytest.approx([0.4**2 + 0.6**2 / 12.0 * (1.0 - 1.0 / 100.0)])
-    with refused(InvalidDesignError, r"0\.2 m long and 1\.2 m wide, the gauge reaches over"):
+    with refused(errors.InvalidDesignError, r"0\.2 m long and 1\.2 m wide, the gauge reaches over"):
         load_and_assemble(made("strip", ("width = 0.6", "width = 1.2")))
 
 
@@ -256,7 +249,9 @@ def test_memory_is_estimated_before_it_is_taken(beam) -> None:
     mesh = beam().mesh
     assert 0.3 * 2**30 < memory_estimate(mesh) < 0.5 * 2**30
     check_memory(mesh)
-    with pytest.raises(MeshError, match=r"744 unknowns would take about 0\.\d GiB, but 0\.1 GiB are allowed"):
+    with pytest.raises(
+        errors.MeshError, match=r"744 unknowns would take about 0\.\d GiB, but 0\.1 GiB are allowed"
+    ):
         check_memory(mesh, 0.1 * 2**30)
 
 
@@ -278,7 +273,7 @@ def test_both_codes_agree(kind: str, changes: tuple[tuple[str, str], ...], body,
 
 
 def test_wedges_cannot_be_compared(body) -> None:
-    with pytest.raises(CalculixError, match=r"integrates 6-node wedges \(C3D6\) in another way"):
+    with pytest.raises(errors.CalculixError, match=r"integrates 6-node wedges \(C3D6\) in another way"):
         structure_deck(body("wedge"))
 
 
@@ -298,12 +293,12 @@ def test_the_file_without_a_fault_is_taken(plate) -> None:
 @pytest.mark.parametrize(("old", "new", "sentence"), [*INPUTS.refused("plate"), *INPUTS.refused("rosette")])
 def test_a_fault_is_one_sentence(old: str, new: str, sentence: str, plate) -> None:
     file = plate((old, new))
-    with refused(FiniteElementError, sentence):
+    with refused(errors.FiniteElementError, sentence):
         load_and_assemble(file)
 
 
 def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
-    with pytest.raises(FiniteElementError, match=r"structure file .*none\.toml"):
+    with pytest.raises(errors.FiniteElementError, match=r"structure file .*none\.toml"):
         load_and_assemble(tmp_path / "none.toml")
 
 
@@ -313,7 +308,7 @@ def test_parts_that_turn_on_a_hinge_cannot_be_solved(box, write) -> None:
     places = np.concatenate((points[cube], points[cube] + (1.0, 1.0, 0.0)))
     corners, numbers = np.unique(places, axis=0, return_inverse=True)
     file = write(corners, "hexahedron", numbers.reshape(2, 8), INPUTS.text("hinge.toml"))
-    with pytest.raises(SolutionError, match=r"some part of the structure is not held|hardly held"):
+    with pytest.raises(errors.SolutionError, match=r"some part of the structure is not held|hardly held"):
         static_responses(load_and_assemble(file))
 
 

@@ -8,44 +8,29 @@ import pytest
 
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
-from fe.verification.calculix_comparison import (
-    agreement,
-    read_frequencies,
-    read_tables,
-    ring_down_agreement,
-    run_calculix,
-)
+from fe.verification import calculix_comparison as comparison
+from fe.verification import known_answers as answers
 from fe.verification.calculix_deck import wing_deck
-from fe.verification.known_answers import (
-    cantilever_check,
-    macneal_harder_beam,
-    mesh_convergence,
-    observed_order,
-    patch_test,
-    rigid_body_residual,
-    rigid_body_values,
-    wing_balance,
-)
 from fe.wing.operators import AffineOperators, assemble
 from tests.calculix_decks import needs_calculix
 from tests.refusals import Inputs
 
 
 def test_a_constant_strain_passes_through_distorted_cells():
-    assert max(patch_test()) < 1e-12
+    assert max(answers.patch_test()) < 1e-12
 
 
 def test_an_unsupported_body_has_six_rigid_motions():
-    values = rigid_body_values()
+    values = answers.rigid_body_values()
     assert (values < 1e-12).sum() == 6
     assert values[6] > 1e-6
 
 
 def test_a_cantilever_bends_as_timoshenko_says():
-    assert abs(cantilever_check()) < 1e-3
+    assert abs(answers.cantilever_check()) < 1e-3
     # It converges to the beam, and a coarse one is already near.
-    coarse, fine = (abs(cantilever_check(cells)) for cells in (5, 10))
-    assert abs(cantilever_check(20)) < fine < coarse < 0.01
+    coarse, fine = (abs(answers.cantilever_check(cells)) for cells in (5, 10))
+    assert abs(answers.cantilever_check(20)) < fine < coarse < 0.01
     assert 2.5 < np.log2(coarse / fine) < 4.5  # the tip of a quadratic element: third to fourth order
 
 
@@ -55,16 +40,16 @@ def test_a_cantilever_bends_as_timoshenko_says():
     [("regular", 0.970, 0.961), ("trapezoid", 0.886, 0.920), ("parallelogram", 0.967, 0.941)],
 )
 def test_the_slender_beam_of_macneal_and_harder_is_reproduced(shape, in_plane, out_of_plane):
-    assert macneal_harder_beam(shape, across_depth=True) == pytest.approx(in_plane, abs=6e-4)
-    assert macneal_harder_beam(shape, across_depth=False) == pytest.approx(out_of_plane, abs=6e-4)
+    assert answers.macneal_harder_beam(shape, across_depth=True) == pytest.approx(in_plane, abs=6e-4)
+    assert answers.macneal_harder_beam(shape, across_depth=False) == pytest.approx(out_of_plane, abs=6e-4)
 
 
 def test_the_wing_resists_no_rigid_motion(coarse_operators):
-    assert rigid_body_residual(coarse_operators) < 1e-12
+    assert answers.rigid_body_residual(coarse_operators) < 1e-12
 
 
 def test_mass_reactions_and_energy_balance(coarse_operators):
-    balance = wing_balance(coarse_operators)
+    balance = answers.wing_balance(coarse_operators)
     assert list(balance) == ["mass", "reaction", "root moment", "energy and work"]
     for name, (found, expected, _) in balance.items():
         assert found == pytest.approx(expected, rel=1e-10 if name == "mass" else 1e-5)
@@ -72,12 +57,12 @@ def test_mass_reactions_and_energy_balance(coarse_operators):
 
 def test_the_structure_weighs_what_it_should(shipped_operators):
     # No weight is published: this is what the parts of the shipped design weigh on the shipped mesh.
-    assert wing_balance(shipped_operators)["mass"][0] == pytest.approx(0.947, rel=0.002)
+    assert answers.wing_balance(shipped_operators)["mass"][0] == pytest.approx(0.947, rel=0.002)
 
 
 @pytest.mark.long
 def test_the_mesh_converges(shipped_design):
-    found = mesh_convergence(shipped_design, (0.25, 0.5, 1.0))
+    found = answers.mesh_convergence(shipped_design, (0.25, 0.5, 1.0))
     assert (np.diff(found["unknowns"]) > 0).all()
     for name in ("tip stiffness", "first bending", "second bending"):
         coarse, half, one = found[name]
@@ -90,12 +75,12 @@ def test_the_mesh_converges(shipped_design):
 @pytest.mark.parametrize("refinements", [(0.5, 1.0, 2.0), (1.0, 1.5, 2.25), (0.25, 0.5, 1.5, 4.5)])
 def test_the_order_of_a_power_law_is_found(refinements, order):
     values = [7.0 - 0.3 * refinement**-order for refinement in refinements]
-    assert observed_order(refinements[-1] / refinements[-2], values) == pytest.approx(order, abs=1e-6)
+    assert answers.observed_order(refinements[-1] / refinements[-2], values) == pytest.approx(order, abs=1e-6)
 
 
 @pytest.mark.parametrize("values", [(1.0, 2.0, 1.5), (1.0, 2.0, 4.0), (1.0, 1.0, 1.0)])
 def test_no_order_where_values_do_not_settle(values):  # to and fro, running away, standing still
-    assert math.isnan(observed_order(2.0, values))
+    assert math.isnan(answers.observed_order(2.0, values))
 
 
 # ---------------------------------------------------------------- the wing against CalculiX
@@ -123,7 +108,7 @@ def test_statics_and_frequencies_agree(
     state, changes, count: int, coarse_design, coarse_operators, tmp_path
 ) -> None:
     wing = assemble(coarse_design.changed(**changes)) if changes else coarse_operators
-    found = agreement(wing_deck(wing, state), tmp_path, count)
+    found = comparison.agreement(wing_deck(wing, state), tmp_path, count)
     assert list(found.loads) == ["tip force", "lift"]
     for differences in found.loads.values():
         assert all(differences[name] < most for name, most in PLACES.items())
@@ -135,7 +120,7 @@ def test_statics_and_frequencies_agree(
 @pytest.mark.long
 @needs_calculix
 def test_a_ring_down_agrees(coarse_operators: AffineOperators, tmp_path: Path) -> None:
-    ours, calculix, same_rule = ring_down_agreement(
+    ours, calculix, same_rule = comparison.ring_down_agreement(
         coarse_operators, tmp_path, DigitalState(), periods=0.125, steps_per_period=80
     )
     assert np.abs(calculix - ours).max() < 0.01
@@ -146,13 +131,13 @@ def test_a_ring_down_agrees(coarse_operators: AffineOperators, tmp_path: Path) -
 @needs_calculix
 def test_an_input_that_calculix_refuses_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(CalculixError, match=r"did not finish .*bad\.inp.*bad\.log"):
-        run_calculix("*NONSENSE\n*STEP\n*STATIC\n*END STEP\n", tmp_path, "bad")
+        comparison.run_calculix("*NONSENSE\n*STEP\n*STATIC\n*END STEP\n", tmp_path, "bad")
 
 
 def test_calculix_that_is_not_there_is_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(CalculixError, match="apt-get install calculix-ccx"):
-        run_calculix("", tmp_path, "job")
+        comparison.run_calculix("", tmp_path, "job")
 
 
 def test_every_cell_has_its_nodes_material_and_axes(coarse_operators: AffineOperators) -> None:
@@ -167,10 +152,10 @@ TABLES, EIGENVALUES = (Inputs(__file__).text(f"{name}.dat") for name in ("tables
 
 
 def test_printed_tables_are_read_or_refused() -> None:
-    tables = {name: [rows.tolist() for rows in own] for name, own in read_tables(TABLES).items()}
+    tables = {name: [rows.tolist() for rows in own] for name, own in comparison.read_tables(TABLES).items()}
     assert tables == {"NALL": [[[1, 0.1, -2, 0], [2, 0.3, 4, 5]]], "E0": [[[1, 1, 2.5]]]}
-    assert read_frequencies(EIGENVALUES).tolist() == [5.632151, 15.09876]
+    assert comparison.read_frequencies(EIGENVALUES).tolist() == [5.632151, 15.09876]
     with pytest.raises(CalculixError, match="not a row of numbers"):
-        read_tables(TABLES.replace("-2.000000E+00", "*************"))
+        comparison.read_tables(TABLES.replace("-2.000000E+00", "*************"))
     with pytest.raises(CalculixError, match="no eigenvalues"):
-        read_frequencies(TABLES)
+        comparison.read_frequencies(TABLES)

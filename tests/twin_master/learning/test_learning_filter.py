@@ -327,7 +327,6 @@ def test_gain_offset_and_noise_are_those_of_the_regression():
 def test_a_turn_says_what_the_store_says(turns, expectation):
     found = expectation.filtered([turn.carried for turn in turns], observations())
     for t, turn in enumerate(turns):
-        assert turn.expected is not None
         mean, noise = turn.expected()
         np.testing.assert_allclose(found.mean[t], mean, atol=1e-12)
         np.testing.assert_allclose(found.noise[t], noise)

@@ -128,7 +128,6 @@ def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch
     seen[2, 1] = np.nan
     known = Noticing(noise_degrees=1e9, onset_turns=3.0)
     found = run(watchful(given=known), seen)[-1].suspicion
-    assert found is not None
     model, sensors = small()
     to_begin = 0.5 / (1.0 + np.arange(turns) / 3.0)
     first = np.concatenate([[0.5], -np.diff(to_begin), [to_begin[-1]]])  # of turns 0..3, and of none of them
@@ -158,7 +157,6 @@ def test_the_first_evidence_is_a_ratio_of_two_sums():
     sensors = small()[1]
     row = sensors.value_per_draw[0, 0, 0] * [1.0, 1.3, 1.0]
     found = run(watchful(), row[None])[0].suspicion
-    assert found is not None
     sums = np.zeros(2)
     for value in sensors.value_per_draw[:, 0, 0]:  # the first state is certain
         spread = np.sqrt(1.0 + (SETTINGS.all_gain * value) ** 2)
@@ -195,7 +193,6 @@ def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_m
     density = np.einsum("es,esn->n", belief, student.pdf(grid, degrees, value[..., None], scale))
     wide = WatchfulEstimator(ExactFilter(model, sensors), sensors, DRAWS, Noticing(absurd_deviations=1e3))
     tomorrow = [wide.turn(today.carried, np.array([x]), 0, turns).suspicion for x in grid]
-    assert today.suspicion is not None
     for name in ("log_evidence_none", "log_evidence_any_gauge"):
         values = np.exp([getattr(suspicion, name) for suspicion in tomorrow])
         mean = np.trapezoid(density * values, grid)
@@ -225,7 +222,6 @@ def test_probabilities_stay_probabilities_whatever_is_lost_or_shown(lost, factor
     estimates = run(watchful(2), np.where(np.array(lost), np.nan, seen))
     for estimate in estimates:
         suspicion = estimate.suspicion
-        assert suspicion is not None
         assert 0.0 <= suspicion.none_of_these + suspicion.gauge_off <= 1.0 + 1e-12
         assert np.all(np.isfinite(suspicion.log_evidence_gauge))
         assert np.isfinite(estimate.filtered).all()
@@ -263,8 +259,6 @@ def test_a_turn_without_readings_changes_no_evidence():
     seen = drawn(np.random.default_rng(4), 6)
     seen[-1] = np.nan
     before, after = (estimate.suspicion for estimate in run(watchful(), seen)[-2:])
-    assert before is not None
-    assert after is not None
     np.testing.assert_allclose(after.log_evidence_gauge, before.log_evidence_gauge, atol=1e-6)
     assert after.log_evidence_none == pytest.approx(before.log_evidence_none, abs=1e-6)
 
@@ -295,7 +289,6 @@ def test_a_model_that_takes_the_place_of_another_begins_without_suspicion():
     assert before[-1].suspicion is not None
     assert before[-1].suspicion.log_evidence_none > np.log(SETTINGS.threshold)
     after = other.turn(before[-1].carried, seen[-1], 0, 12)
-    assert after.suspicion is not None
     assert max(after.suspicion.none_of_these, after.suspicion.gauge_off) < 0.05
     assert not after.notices
 
@@ -351,7 +344,6 @@ def test_a_gauge_that_is_off_is_named(wing, gauge, gain, begin, word):
     assert abs(alarms[0].since - begin) <= 6
     assert not any(estimate.notices for estimate in estimates[:begin])
     last = estimates[-1].suspicion
-    assert last is not None
     assert last.gauge_off > 0.5
 
 
@@ -432,7 +424,6 @@ def test_belief_and_decision_follow_what_holds_now(between):
     assert {*decided[73:79]} == {"none of these"}
     assert {*decided[84:]} == {"model"}
     for found in course[True]:
-        assert found.suspicion is not None
         none = found.suspicion.none_of_these
         assert found.suspicion.hypotheses["none of these"] == pytest.approx(none, abs=1e-12)
         mixed = (1.0 - none) * found.filtered @ known.plan.policy + none * np.array([1.0, 0.0])
@@ -455,6 +446,5 @@ def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_na
     twin = Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful())
     for row in drawn(np.random.default_rng(1), 6) * [0.5, 1.5, 2.0]:
         turn = twin.turn(row)
-    assert turn.suspicion is not None
     assert turn.suspicion.none_of_these > 0.5
     np.testing.assert_allclose(turn.decision_probability, [1.0])  # the policy decides where nothing is safest

@@ -237,7 +237,6 @@ def test_a_policy_file_is_flown_and_kept_with_what_the_twin_knew(tmp_path):
     assert np.array_equal(policy.vectors, plan.policy.vectors)
     keep_knowledge(tmp_path, following(known, policy))
     again = kept_knowledge(tmp_path, known.scenario).plan.on_belief
-    assert again is not None
     assert np.array_equal(again.vectors, policy.vectors)
     (tmp_path / "other.npz").write_bytes(b"no policy")
     with pytest.raises(PlanningError, match="no policy of"):

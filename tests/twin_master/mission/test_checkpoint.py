@@ -55,7 +55,6 @@ def test_round_trip_is_exact(tmp_path):
     assert read(tmp_path) is None
     write(tmp_path, turns)
     found = read(tmp_path)
-    assert found is not None
     assert found.decided == [0, 1, 0]
     for reading, (turn, _) in zip(found.readings, turns, strict=True):
         written = turn.reading
@@ -110,7 +109,6 @@ def test_large_states_are_kept_less_often_and_their_turns_flown_again(tmp_path, 
     turns = [(turn, content) for turn, _ in flown(12)]
     whole = write(tmp_path, turns)
     found = read(tmp_path)
-    assert found is not None
     assert len(found.readings) == 10
     with CheckpointFile(tmp_path, "abc") as file:
         for turn in turns[10:]:

@@ -1,10 +1,26 @@
+"""States, tables of transitions and products of them, equal to one table of all; what fits in memory."""
+
+import tracemalloc
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from twin_master.errors import InvalidDistributionError, InvalidModelError
+from reporting.memory import memory_left
+from tests.twin_master.network.decision_oracles import precise_forward_backward
+from tests.twin_master.runs import loaded_from, table_of, text_of, written
+from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
+from twin_master.errors import (
+    ImpossibleObservation,
+    InvalidDistributionError,
+    InvalidModelError,
+    TwinMasterError,
+)
+from twin_master.mission.preparation import prepare_knowledge
+from twin_master.network import memory
+from twin_master.network import transition as transition_file
 from twin_master.network.distributions import distribution, stochastic_matrix
 from twin_master.network.graphical_model import (
     Factor,
@@ -13,7 +29,12 @@ from twin_master.network.graphical_model import (
     deterministic_policy,
     worsening_table,
 )
+from twin_master.network.inference import filter_sequence, filter_step, predict, smooth
+from twin_master.network.memory import check_scenario_fits
+from twin_master.network.planner import evaluate_policy, given_policy, value_iteration
+from twin_master.network.sensor_model import check_noise
 from twin_master.network.transition import TransitionModel, predecessor_lists
+from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8)
 SPACE = StateSpace((Factor("z1", LEVELS), Factor("z2", (0.0, 0.5, 1.0))))
@@ -187,3 +208,210 @@ REFUSED = [
 def test_what_does_not_fit_is_refused(make, sentence):
     with pytest.raises((InvalidModelError, InvalidDistributionError), match=sentence):
         make()
+
+
+def both(rng, shape=(3, 4, 2), zeros=0.3, least=0.0):
+    """The same model as a product of one block for each factor, and as one table."""
+    blocks = []
+    for count in shape:
+        block = rng.dirichlet(np.ones(count), (2, count))
+        block[rng.random(block.shape) < zeros] = least
+        block[:, np.arange(count), rng.integers(count, size=count)] += 0.1
+        blocks.append(block / block.sum(axis=2, keepdims=True))
+    space = StateSpace(tuple(Factor(f"f{i}", tuple(map(float, range(n)))) for i, n in enumerate(shape)))
+    prior = rng.dirichlet(np.ones(space.size))
+    prior[rng.random(space.size) < zeros] = 0.0
+    prior[0] += 0.1
+    prior /= prior.sum()
+    product = TransitionModel(tuple(blocks))
+    models = [
+        GraphicalModel(space, ("u0", "u1"), prior, moves)
+        for moves in (product, TransitionModel((product.matrix,)))
+    ]
+    assert [model.transition.is_product for model in models] == [True, False]
+    return models
+
+
+def infer(model, control, rows):
+    filtered = filter_sequence(model, control, rows)
+    return filtered, smooth(model, control, filtered.log_filtered)
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 10**6), scale=st.sampled_from([1.0, 30.0, 3000.0]))
+def test_a_product_of_blocks_gives_what_the_table_gives(seed, scale):
+    """Also where all but a few states underflow."""
+    rng = np.random.default_rng(seed)
+    product, table = both(rng, shape=tuple(rng.integers(1, 5, 3)))
+    control = rng.integers(0, 2, 6)
+    rows = -scale * rng.random((6, product.states.size))
+    (found, smoothed), (expected, smoothed_by_table) = (infer(m, control, rows) for m in (product, table))
+    for name in ("forecast", "filtered"):
+        np.testing.assert_allclose(
+            getattr(found, name), getattr(expected, name), rtol=1e-11, atol=1e-300, err_msg=name
+        )
+    np.testing.assert_allclose(smoothed, smoothed_by_table, rtol=1e-10, atol=1e-300)
+    np.testing.assert_allclose(found.log_filtered, expected.log_filtered, rtol=1e-13, atol=1e-11)
+    np.testing.assert_allclose(found.log_evidence, expected.log_evidence, rtol=1e-13, atol=1e-11)
+    last = filter_step(product, found.log_filtered[-2], int(control[-2]), rows[-1])
+    np.testing.assert_array_equal(last.log_filtered, found.log_filtered[-1])
+
+
+def test_probabilities_that_no_double_holds_come_back():
+    """A belief that was 10^-8000, and transitions of 10^-300 in all, against 60 decimals."""
+    rng = np.random.default_rng(5)
+    product, _ = both(rng, shape=(2, 2, 2), zeros=0.5, least=1e-100)
+    rows = np.zeros((4, 8))
+    rows[1, :7] = -5000.0
+    rows[2, 7] = -20000.0
+    rows[3] = rng.normal(size=8)
+    control = np.array([0, 1, 1, 0])
+    filtered, smoothed = infer(product, control, rows)
+    oracle = precise_forward_backward(product, control, rows)
+    np.testing.assert_allclose(filtered.filtered, oracle[0], rtol=1e-10, atol=1e-300)
+    np.testing.assert_allclose(smoothed, oracle[1], rtol=1e-10, atol=1e-300)
+
+
+def test_what_is_impossible_stays_impossible_and_is_named():
+    product, table = both(np.random.default_rng(2), shape=(2, 3, 2), zeros=0.6)
+    rows = np.zeros((3, 12))
+    assert np.array_equal(
+        filter_sequence(product, [0, 1, 0], rows).filtered == 0.0,
+        filter_sequence(table, [0, 1, 0], rows).filtered == 0.0,
+    )
+    rows[1] = -np.inf
+    with pytest.raises(ImpossibleObservation):
+        filter_sequence(product, [0, 1, 0], rows)
+
+
+def test_prediction_and_plan_follow():
+    rng = np.random.default_rng(4)
+    product, table = both(rng)
+    policy = product.policy(rng.dirichlet(np.ones(2), 24))
+    belief = rng.dirichlet(np.ones(24))
+    for name in ("predicted", "joint", "control_probability"):
+        one, other = (getattr(predict(model, belief, 1, policy, 4), name) for model in (product, table))
+        np.testing.assert_allclose(one, other, rtol=1e-12, err_msg=name)
+    reward = rng.normal(size=(24, 2))
+    plan, plan_by_table = (value_iteration(model.transition, reward, 0.9) for model in (product, table))
+    np.testing.assert_allclose(plan.value, plan_by_table.value, rtol=1e-11)
+    np.testing.assert_array_equal(plan.control_index, plan_by_table.control_index)
+    assert plan.iterations == plan_by_table.iterations
+    for discount in (0.0, 0.97):
+        one, other = (evaluate_policy(m.transition, reward, discount, policy) for m in (product, table))
+        np.testing.assert_allclose(one, other, rtol=1e-11)
+    one, other = (given_policy(m.transition, reward, 0.9, policy) for m in (product, table))
+    np.testing.assert_allclose(one.action_value, other.action_value, rtol=1e-11)
+
+
+def test_factors_share_a_table_where_that_is_small_and_blocks_where_it_costs_no_more(monkeypatch):
+    worse = worsening_table(5, 0.1)
+    sizes = {
+        count: [block.shape[1] for block in TransitionModel.from_factors([[worse] * count] * 2).blocks]
+        for count in (1, 2, 4, 6, 7)
+    }
+    assert sizes == {1: [5], 2: [25], 4: [25, 25], 6: [25, 25, 25], 7: [25, 25, 25, 5]}
+    full = np.full((40, 40), 1.0 / 40)
+    assert [b.shape[1] for b in TransitionModel.from_factors([[full, full]]).blocks] == [40, 40]
+    still = np.eye(400)
+    assert [b.shape[1] for b in TransitionModel.from_factors([[still, still]]).blocks] == [400, 400]
+    monkeypatch.setattr(transition_file, "JOINT_NON_ZEROS", 0)
+    tables = [[worsening_table(n, p) for n in (3, 2, 4)] for p in (0.1, 0.2)]
+    np.testing.assert_allclose(
+        TransitionModel.from_factors(tables).matrix[1],
+        np.kron(np.kron(tables[1][0], tables[1][1]), tables[1][2]),
+        rtol=1e-15,
+    )
+
+
+def test_blocks_of_different_controls_are_refused():
+    with pytest.raises(InvalidModelError, match="the same controls"):
+        TransitionModel((np.eye(2)[None], np.stack([np.eye(3)] * 2)))
+
+
+GIGABYTES = 8e9
+
+
+@pytest.fixture
+def small_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine of 8 GB, whatever the tests run on."""
+    monkeypatch.setattr(memory, "memory_left", lambda: GIGABYTES)
+
+
+def six_factors() -> LoadedScenario:
+    """A scenario of 5^6 = 15,625 states."""
+    table = table_of("level_turns")
+    table["state"] = [table["state"][0] | {"name": f"z{number}"} for number in range(1, 7)]
+    table["mission"]["steps"] = 60
+    table["calibration"]["draws"] = 800
+    return loaded_from(table, "level_turns")
+
+
+def test_the_memory_of_this_machine_is_known():
+    assert 5e7 < memory_left() < 1e14
+
+
+@pytest.mark.usefixtures("small_machine")
+def test_too_many_states_are_refused_before_anything_is_built():
+    loaded = six_factors()
+    tracemalloc.start()
+    try:
+        with pytest.raises(InvalidModelError) as caught:
+            asset_source(resolve_scenario(loaded, Overrides()))
+        assert tracemalloc.get_traced_memory()[1] < 5e7
+    finally:
+        tracemalloc.stop()
+    sentence = str(caught.value)
+    for word in ("15625 states", "2 controls", "38.4 GB", "8 GB", "800 draws", "fewer levels"):
+        assert word in sentence, sentence
+    assert "\n" not in sentence
+
+
+@pytest.mark.usefixtures("small_machine")
+def test_too_many_draws_are_refused_with_their_size():
+    table = table_of("level_turns")
+    table["calibration"]["draws"] = 1000000
+    scenario = parse_scenario(table, "x")
+    with pytest.raises(InvalidModelError, match=r"76.8 GB for 1000000 draws of 24 sensors"):
+        check_scenario_fits(scenario)
+    check_scenario_fits(load_scenario("level_turns").scenario)
+
+
+@pytest.mark.usefixtures("small_machine")
+def test_the_table_of_all_states_is_refused_too():
+    table = worsening_table(5, 0.1)
+    product = TransitionModel.from_factors([[table] * 6] * 2)
+    with pytest.raises(InvalidModelError, match="15625 states under 2 controls"):
+        _ = product.matrix
+    assert TransitionModel.from_factors([[table] * 2] * 2).matrix.shape == (2, 25, 25)
+
+
+@pytest.mark.parametrize(
+    ("key", "number"), [("observation.standard_deviation", 125), ("truth.noise.standard_deviation", 150)]
+)
+def test_a_noise_whose_unit_was_forgotten_is_refused(key, number, tmp_path, library_file):
+    old, text = f"standard_deviation_microstrain = {number}", text_of("level_turns")
+    path = written(tmp_path, text, (old, f"standard_deviation = {number}"))
+    with pytest.raises(TwinMasterError, match=f"write `{key}_microstrain = {number}`"):  # no strain at all
+        load_scenario(path)
+    path = written(tmp_path, text, (old, "standard_deviation = 0.05"))
+    scenario = resolve_scenario(load_scenario(path), Overrides(strain_library=library_file))
+    with pytest.raises(TwinMasterError) as caught:
+        prepare_knowledge(scenario, asset_source(scenario), 0)
+    for word in (f"`{key}` is 0.05", f"write `{key}_microstrain = 0.05`", "sensor 1"):
+        assert word in str(caught.value), str(caught.value)
+
+
+def test_only_a_noise_beyond_all_that_its_kind_of_sensor_shows_is_refused():
+    predicted = np.zeros((1, 2, 1, 3))
+    predicted[0, :, 0, 0] = 1e-3, 2e-3
+    predicted[0, :, 0, 2] = 300.0
+    # The second gauge shows nothing at all, as one on the neutral axis; the third is a thermometer.
+    check_noise("noise", [1e-4, 1e-4, 0.5], predicted, ("1", "1", "K"))
+    for noise, named in (
+        ([1e-4, 3e-3, 0.5], "strain"),
+        ([1e-4, 1e-4, 500.0], "in K"),
+        ([1e-4, 125.0, 0.5], "sensor 2"),
+    ):
+        with pytest.raises(InvalidModelError, match=named):
+            check_noise("noise", noise, predicted, ("1", "1", "K"))

@@ -1,6 +1,4 @@
 import pickle
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.twin_master.network.decision_oracles import (
+    eliminate_variables,
+    enumerate_prediction,
+    enumerate_trajectories,
+    precise_forward_backward,
+    random_model,
+)
 from twin_master.errors import ImpossibleObservation, InvalidModelError, InvalidObservationError
 from twin_master.network.estimator import Carried, ExactFilter
 from twin_master.network.graphical_model import (
@@ -26,15 +31,6 @@ from twin_master.network.inference import (
     smooth_many,
 )
 from twin_master.network.transition import TransitionModel
-
-sys.path.insert(0, str(Path(__file__).parent))
-from decision_oracles import (
-    eliminate_variables,
-    enumerate_prediction,
-    enumerate_trajectories,
-    precise_forward_backward,
-    random_model,
-)
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8)
 EXACT = {"rtol": 1e-10, "atol": 1e-12}

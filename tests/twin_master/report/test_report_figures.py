@@ -27,7 +27,6 @@ def test_the_mission_figure_draws_the_stored_arrays(run):
     now, sensors = 18, [16, 3]
     figure = mission_figure(run, now, sensors)
     belief, truth, observed = run.smoothed_until(now), run.truth, run.observed
-    assert truth is not None
     for factor in range(2):
         axes = panel(figure, f"region {factor + 1}")
         assert_allclose(line(axes, "past")[:, 1], 100.0 * (belief @ run.model.states.coordinates)[:, factor])
@@ -215,7 +214,6 @@ def test_calibration_shows_draws_posterior_and_measurements(run):
 
 def test_the_wing_is_coloured_by_belief_and_its_gauges_by_reading_and_residual(run):
     planform = planform_of(load_design(), run.scenario)
-    assert planform is not None
     observed = run.observed.copy()
     observed[-1, 4] = np.nan
     changed = altered(run, observed__strain=observed)

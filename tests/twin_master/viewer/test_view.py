@@ -255,7 +255,6 @@ def test_a_request_of_another_form_is_refused(text):
 def test_the_wing_stands_in_its_place(run):
     flight, design = Flight(run), load_design()
     planform = scene_of(run, flight.knowledge).planform
-    assert planform is not None
     chords = planform.outline[:, 1]
     plan = design.planform
     assert chords[0] - chords[3] == pytest.approx(plan.root_chord)
@@ -271,7 +270,6 @@ def served(folder: Path) -> Iterator[str]:
     process = subprocess.Popen(
         [sys.executable, "-m", "uav_twin", "view", str(folder)], stdout=subprocess.PIPE, text=True
     )
-    assert process.stdout is not None
     try:
         assert select.select([process.stdout], [], [], 120.0)[0]
         found = re.search(r"http://127\.0\.0\.1:\d+/", process.stdout.readline())
@@ -370,7 +368,6 @@ def test_a_mission_with_a_view_is_the_same_to_the_bit(library_file, run, tmp_pat
     line = [sys.executable, "-m", "uav_twin", *map(str, words), "--view"]
     null, pipe = subprocess.DEVNULL, subprocess.PIPE
     process = subprocess.Popen(line, stdout=null, stderr=pipe, text=True, start_new_session=True)
-    assert process.stderr is not None
     said = ""
     while "http://127.0.0.1" not in said or "stays until Ctrl-C" not in said:
         line = process.stderr.readline()
