@@ -1,7 +1,5 @@
 """What the master is measured against: bare ctypes calls, fmpy's simulation, an FMU that computes nothing."""
 
-from __future__ import annotations
-
 import ctypes
 import itertools
 import shutil

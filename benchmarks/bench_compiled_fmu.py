@@ -1,7 +1,5 @@
 """A step of the compiled FMU: in process, through the worker, bare, beside an FMU that computes nothing."""
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 from collections.abc import Callable

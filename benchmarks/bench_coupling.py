@@ -1,7 +1,5 @@
 """A step of three coupled FMUs (damage growth, wing, gauges) beside the same three stepped one by one."""
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 import time

@@ -1,7 +1,5 @@
 """Scans of the catalogue on a whole campaign of the wing, beside one ring-down of it."""
 
-from __future__ import annotations
-
 import resource
 import time
 

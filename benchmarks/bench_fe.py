@@ -1,7 +1,5 @@
 """The wing model: what a build costs, and what the reduced model gives for it."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

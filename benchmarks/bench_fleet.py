@@ -1,7 +1,5 @@
 """Twins side by side beside twins one by one, what storing adds, and what learning costs."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """An FMU step as the master makes it: inputs set with another health each time, step, 24 strains read."""
 
-from __future__ import annotations
-
 import itertools
 import shutil
 import tempfile

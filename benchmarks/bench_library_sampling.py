@@ -1,7 +1,5 @@
 """Sampling an FMU into an observation library with one process and with two, their start included."""
 
-from __future__ import annotations
-
 import resource
 import tempfile
 import time

@@ -1,7 +1,5 @@
 """What the master adds to an FMU: a step in process and through the worker, a simulation beside fmpy's."""
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 from collections.abc import Callable

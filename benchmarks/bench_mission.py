@@ -1,7 +1,5 @@
 """A whole run: from nothing, with the cache warm, and its 50 turns."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

@@ -3,8 +3,6 @@
 Processor seconds, so that another job on the machine does not count; each the least of a few.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import resource

@@ -4,8 +4,6 @@ A beam of 10-node tetrahedra with three damage regions, two loads and a free mas
 once in a process of its own. With UAV_TWIN_BENCH_LARGE=1 also 300 thousand unknowns, without SuperLU.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import resource

@@ -4,8 +4,6 @@ The model is that of the mission: two regions of five levels, two controls, 24 g
 modulus, 50 steps. The strains come from a closed form, so that nothing needs to be read.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 import warnings

@@ -1,7 +1,5 @@
 """A watch that is taken up after few turns and after 20,000, up to its next decision."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -4,8 +4,6 @@ DIR is what `python -m benchmarks.blind generate --out DIR` wrote. Only DIR/camp
 are read; a verdict for each campaign goes to DIR/verdicts.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """A headless Chromium, driven by its DevTools protocol over Tornado's websocket."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import itertools

@@ -4,8 +4,6 @@ Euler-Bernoulli elements on a root that turns in a spring; shear strain of the s
 load behind the elastic line. About the size of the wing that this project flies.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

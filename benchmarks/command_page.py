@@ -3,8 +3,6 @@
 ``python -m benchmarks.command_page`` writes them anew from the commands themselves.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path

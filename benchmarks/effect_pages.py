@@ -3,8 +3,6 @@
 ``python -m benchmarks.effect_pages`` writes them all; ``--no-pictures`` leaves the pictures as they are.
 """
 
-from __future__ import annotations
-
 import argparse
 import tomllib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The picture of each effect: what it does to the trials of the cantilever that show it best."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise

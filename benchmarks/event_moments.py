@@ -7,8 +7,6 @@ Counted are moments within 1 % of the record, 90 % intervals that hold the truth
 without one. The size of the noise comes from a record of 100 samples.
 """
 
-from __future__ import annotations
-
 import argparse
 import time as clock
 from collections import defaultdict

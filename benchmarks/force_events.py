@@ -7,8 +7,6 @@ knows masses, stores and losses to 3 to 10 %. Counted are begins and ends within
 intervals that hold the truth, events that are missed, and those that were not there.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import time as clock

@@ -1,7 +1,5 @@
 """Sound files of every format that users hand to the program, made by the program itself."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

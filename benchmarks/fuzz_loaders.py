@@ -5,8 +5,6 @@ a sentence, or accepted; a traceback (an error that is none of the project's own
 hang (20 s of processor time) are faults. A load has 4 GB of memory. The same seed gives the same mutations.
 """
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 import os

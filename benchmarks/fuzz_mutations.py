@@ -1,7 +1,5 @@
 """Ways in which a file of a user is wrong: by accident, by an editor, by another locale, by intent."""
 
-from __future__ import annotations
-
 import io
 import re
 import zipfile

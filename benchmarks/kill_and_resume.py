@@ -4,8 +4,6 @@
 `python -m twin_master`, for example `-- --strain-library FOLDER`. Exit code 1 if any trial differs.
 """
 
-from __future__ import annotations
-
 import argparse
 import random
 import signal

@@ -1,7 +1,5 @@
 """What a benchmark hands on: a measured figure beside its target and beside a reference of the same run."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Draw gauge strains of box and sandwich plate: `python -m benchmarks.plate_against_box FILE.png`."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -8,8 +8,6 @@ nothing or an effect is hidden in noise of correlation 0.5 whose record has 100 
 campaign, then the counts; verdicts go to DIR/remainder.json.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shutil

@@ -8,8 +8,6 @@ the intervals are right if the calibration is; `--exact-model` leaves these diff
 Exit code 1 if a share of the joint posterior lies outside 85 to 95 %.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

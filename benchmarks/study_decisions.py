@@ -6,8 +6,6 @@ or skin are not as the model says, under many seeds, by the twin of the scenario
 with z1 truly at or above the limit, and turns at 2g below it, which were needless.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from functools import partial

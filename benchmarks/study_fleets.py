@@ -7,8 +7,6 @@
 Everything flies the reduced model in this process; each part prints its table.
 """
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

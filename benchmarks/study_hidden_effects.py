@@ -10,8 +10,6 @@ truth, and the turns at 3g with z1 truly at or above the limit, before and after
 missions that were flown again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import tempfile

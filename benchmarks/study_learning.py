@@ -7,8 +7,6 @@ as many with a gauge whose gain is off by 20 %, and half as many with skin that 
 region, and counts alarms. Exit code 1 if a target is missed.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

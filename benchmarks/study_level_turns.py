@@ -9,8 +9,6 @@ with a model error in the assumed noise, and says what the misfit of the models 
 tables for a page. Exit code 1 if a target is missed.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -9,8 +9,6 @@ error, and in how many of the first `--watched` missions notices raise an alarm 
 Exit code 1 if a share of the former lies outside 85 to 95 %.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -5,8 +5,6 @@ With `--storm` the bounds of Storm's belief exploration (Bork, Katoen and Quatma
 stand beside them: it unfolds the beliefs for a lower bound, and puts them on a grid for an upper one.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import time

@@ -5,8 +5,6 @@ ring-downs, and the loading runs alone, and draws the pictures of docs/real_wing
 calibration folder.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace

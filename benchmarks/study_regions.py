@@ -5,8 +5,6 @@ or the wing with so many regions, packs it as an FMU in this process, and compar
 random states.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

@@ -6,8 +6,6 @@ share of missions that leave the sharp turn before the damage asks for it. Pivot
 in all states is how PySensors places sensors.
 """
 
-from __future__ import annotations
-
 import argparse
 
 import numpy as np

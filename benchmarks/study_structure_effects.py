@@ -7,8 +7,6 @@ FMU of the reduced structure by the file that `uav-twin structure fmu --rig` wri
 Printed: the verdict on each campaign, and its time.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import tempfile

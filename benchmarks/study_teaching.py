@@ -7,8 +7,6 @@ adoption, the rms error of z1 and z2 in points behind the adoption (without one,
 the decisions for 3g with z1 truly at or above the limit; the wing with nothing hidden is the healthy twin's.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import tempfile

@@ -5,8 +5,6 @@ seed. The wing is the full finite element model with a third region and an e of 
 those of the twin of the scenario `watched_wing`, which sees nothing but the gauges.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

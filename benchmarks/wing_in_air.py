@@ -1,7 +1,5 @@
 """A wing in air whose temperature swings: two FMUs that are flown as one asset."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Everything is written under a temporary name in the folder of its destination, f
 moved into place in one step. A kill, a full disk or a refused permission leaves the previous file as it was.
 """
 
-from __future__ import annotations
-
 import errno
 import itertools
 import os

@@ -1,7 +1,5 @@
 """What to run: scenario files, bindings, models of assets and recordings, shipped as package data."""
 
-from __future__ import annotations
-
 from importlib import resources
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Decks of shells and beams as a user of CalculiX writes them, solved by it and stored as matrices."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The command line as a user calls it, without a process for each call."""
 
-from __future__ import annotations
-
 import io
 import subprocess
 import sys

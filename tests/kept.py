@@ -4,8 +4,6 @@ Everything lies under a hash of what it is made from, so that another clone find
 never meets it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Good inputs as files beside the tests, tables of what is refused in them, and refusals in one sentence."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The house: floors, rooms and files import downwards only, and stay small enough to live in."""
 
-from __future__ import annotations
-
 import ast
 import io
 import subprocess

@@ -1,7 +1,5 @@
 """Figures that pages state of the mission and of the wing model are those that come out."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Notebooks are pages like others. Each page has a namespace and a folder of its o
 says that the reader has by then.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import re

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections.abc import Callable
 from multiprocessing import get_context
 from pathlib import Path

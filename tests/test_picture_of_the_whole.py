@@ -1,7 +1,5 @@
 """The picture of the whole is what its script draws."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 from xml.etree import ElementTree

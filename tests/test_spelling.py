@@ -1,7 +1,5 @@
 """Pages use the terms of the glossary, and none of the spellings that it turns down."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

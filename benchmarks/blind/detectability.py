@@ -6,8 +6,6 @@ priors let them: twice the log likelihood ratio that the data could at best show
 new derivatives where the old ones no longer help.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

@@ -6,8 +6,6 @@ displacement [m, rad]. Where an effect acts otherwise than at a port, its truth 
 energy or force in the first mode at each port, "<identifier>.<field>@<port>".
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

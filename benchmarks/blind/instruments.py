@@ -1,7 +1,5 @@
 """What the instruments of a campaign show: hidden faults, then gains, zeros and noise as in any campaign."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol

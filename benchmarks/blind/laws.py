@@ -8,8 +8,6 @@ Dry friction sticks: through the flexibility behind the port where it has one (t
 still follows from the equation above), and by a constraint, entered and left at events, where it has none.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

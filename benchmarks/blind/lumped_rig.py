@@ -1,7 +1,5 @@
 """A rig of three masses on a joint: its nominal model for the file, and the rig with something hidden."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

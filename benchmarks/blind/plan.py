@@ -1,7 +1,5 @@
 """The plan of a campaign: channels and trials, before anything is measured."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """What a verdict is worth, against the sealed truth."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

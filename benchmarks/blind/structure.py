@@ -1,7 +1,5 @@
 """A linear structure with ports, and what it does with hidden forces in it: at rest, and after a release."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The score as a page of markdown tables."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Sequence
 

@@ -1,7 +1,5 @@
 """Traps: campaigns that tempt to name what is not there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

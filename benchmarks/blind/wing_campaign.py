@@ -1,7 +1,5 @@
 """The laboratory and flight campaign of the wing: what is done, with which channels."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from benchmarks.blind.plan import CampaignPlan, ChannelPlan, TrialPlan

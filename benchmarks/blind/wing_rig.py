@@ -1,7 +1,5 @@
 """A wing with something hidden in it: what perfect sensors on it would show."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

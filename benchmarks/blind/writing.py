@@ -1,7 +1,5 @@
 """Campaign folders and sealed files."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Campaigns on these rigs: what drives, what is hidden and how large, what is lost, and the files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What can be wrong with measured data, as a record."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 

@@ -1,7 +1,5 @@
 """Faults of a campaign that a model reveals: units, signs, swapped channels, outputs, short records."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace

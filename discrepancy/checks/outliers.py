@@ -1,7 +1,5 @@
 """Single readings that cannot be right: found by their neighbours or repeats, and left out with a remark."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache

@@ -5,8 +5,6 @@ once; what only a model can tell (units, signs, swapped channels, length) is in
 `discrepancy.checks.model_check`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import combinations
 

@@ -1,7 +1,5 @@
 """Units that records were not stated in: factors of data over model, and the pair of units that they say."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

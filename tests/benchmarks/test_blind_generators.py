@@ -1,7 +1,5 @@
 """Hidden effects against closed forms and other integrators."""
 
-from __future__ import annotations
-
 import ast
 import itertools
 import json

@@ -1,7 +1,5 @@
 """What verdicts are worth."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The hidden wing against the full model and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The generator of the blind test on open rigs: its equations beside the model files, and what it writes."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from pathlib import Path

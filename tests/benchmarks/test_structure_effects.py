@@ -1,7 +1,5 @@
 """Ring-downs of the bracket in the search with the FMU of its reduced model; every module is imported."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from pathlib import Path
 from pkgutil import walk_packages

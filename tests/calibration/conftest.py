@@ -1,7 +1,5 @@
 """The authors' folder of measurements, which is beside the project where it is at hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What tests of models ask: trials, what a model shows of them, and a general integrator of the same."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Simulated campaigns of the single-mass rig, and sensitivities of fits."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from pathlib import Path

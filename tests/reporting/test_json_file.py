@@ -1,7 +1,5 @@
 """Reading JSON: one sentence for whatever is wrong."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Reading NetCDF: all of a file, or one sentence, whatever HDF5 does about it."""
 
-from __future__ import annotations
-
 import gc
 import os
 import time

@@ -1,7 +1,5 @@
 """The one reader of tables guesses nothing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

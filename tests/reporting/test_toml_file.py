@@ -1,7 +1,5 @@
 """Whatever is wrong with a TOML file becomes one sentence of the caller's exception."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

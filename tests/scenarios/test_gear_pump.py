@@ -1,7 +1,5 @@
 """The physics of the shipped gear pump against balances and limits that it does not compute with."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The shipped scenarios and bindings."""
 
-from __future__ import annotations
-
 import tomllib
 
 import pytest

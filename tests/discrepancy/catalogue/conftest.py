@@ -1,7 +1,5 @@
 """A campaign with every kind of trial on a cantilever that can carry every primitive."""
 
-from __future__ import annotations
-
 import pytest
 
 from benchmarks.cantilever import Cantilever, campaign

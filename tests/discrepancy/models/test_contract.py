@@ -1,7 +1,5 @@
 """The contract of a model, lumped, a wing, a structure, an FMU: what it says, reads and refuses."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """A structure as a model of the search, and its FMU by the file that is written beside it."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Effects that act in a window of a record: closed forms, a general integrator, and nothing else changed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from math import atan2, cos, hypot, pi, sin

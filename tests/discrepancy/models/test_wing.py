@@ -1,7 +1,5 @@
 """The wing as a model, against matrices and closed forms of the same reduced wing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

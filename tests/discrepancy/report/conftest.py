@@ -1,7 +1,5 @@
 """A verdict that names an effect, and its folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A virtual wing: a design on a coarse mesh whose outputs stand for the published ones."""
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`python -m evidence.identification` as a developer calls it."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

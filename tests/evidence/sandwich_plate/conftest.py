@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 
 from fe.wing.design import WingDesign, load_design
