@@ -262,10 +262,11 @@ def test_proposals_are_trials_of_the_kinds_that_were_done():
     for item in found:
         assert item.cost > 0.0
         assert len(item.trial.time) == len(item.trial.values)
-    longer = next(item.trial for item in found if item.trial.name == "longer record")
+    longer = next(item for item in found if item.trial.name == "longer record")
     before = max((t for t in problem.campaign.trials if t.release), key=lambda t: t.release.displacement)
-    assert longer.interval == pytest.approx(before.interval)
-    assert len(longer.time) == 3 * len(before.time)
+    assert longer.trial.interval == pytest.approx(before.interval)
+    assert len(longer.trial.time) == 3 * len(before.time)
+    assert f"({3.0 * len(before.time) * before.interval:.3g} s)" in longer.description
     none = kit.fitted(problem)
     assert oscillates(problem, none)
     decay = tuple(
