@@ -31,7 +31,7 @@ Result = TypeVar("Result")
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 """A division by zero gives infinity, as in NumPy: a loop that might raise is not computed side by side."""
 WITHOUT = (
-    "numba is not installed, and loops run as plain Python: a mission takes 20 seconds more, `discrepancy` "
+    "numba is not installed, and loops run as plain Python: a mission takes 25 seconds more, `discrepancy` "
     "several times as long. pip install 'uav-twin[fast]'"
 )
 

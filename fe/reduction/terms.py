@@ -5,7 +5,6 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 from scipy import sparse
-from scipy.stats import qmc
 
 from fe.full.subspace import Norm, conjugate_gradients
 from fe.runtime.arrays import FloatArray
@@ -27,6 +26,13 @@ SAMPLED_INSIDE = 10
 """States inside the box at which the modes are refined."""
 CHOSEN_STATES, CHOSEN_OF_MANY = 128, 1024
 """States inside the box on the training set, beside corners; of more regions than a grid would take."""
+
+
+def halton(dimensions: int, count: int) -> FloatArray:
+    """Return the first points (N, D) of the Halton sequence."""
+    from scipy.stats import qmc  # takes a second to load, and who has the reduced model needs no points
+
+    return np.asarray(qmc.Halton(dimensions, scramble=False).random(count))
 
 
 def loss_corners(regions: int) -> list[tuple[int, ...]]:
@@ -125,7 +131,7 @@ class ReductionTerms:
     def training(self) -> list[State]:
         """States on which the greedy search looks for the largest bound: corners, and points between them."""
         count = CHOSEN_STATES if len(self.losses) <= MOST_GRID_REGIONS else CHOSEN_OF_MANY
-        points = qmc.Halton(len(self.parameters) + len(self.losses), scramble=False).random(count)
+        points = halton(len(self.parameters) + len(self.losses), count)
         return [*self.corners(), *self.inside(points)]
 
     def inside(self, shares: FloatArray) -> list[State]:
@@ -154,7 +160,7 @@ class ReductionTerms:
     def _modal_states(self, corners: Iterable[tuple[State, Sequence[float]]], count: int) -> list[ModalState]:
         """Return states with their masses, and after them `count` of a Halton sequence inside."""
         varied = len(self.parameters) + len(self.losses)
-        points = qmc.Halton(varied + len(self.masses), scramble=False).random(1 + count)[1:]
+        points = halton(varied + len(self.masses), 1 + count)[1:]
         low, high = np.array(self.masses).reshape(-1, 2).T
         inside = zip(self.inside(points[:, :varied]), low + (high - low) * points[:, varied:], strict=True)
         return [(self.theta(state), np.array((1.0, *chosen))) for state, chosen in (*corners, *inside)]

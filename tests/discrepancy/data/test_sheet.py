@@ -283,7 +283,7 @@ ROWS = [
         (ROWS, ["0 1.234", "0.500000 5"]),  # typed numbers are in no doubt
         ([["t", "w [mm]"], [clock(10, 0, 0), 1], [clock(10, 0, 2), 2]], ["0 1", "2 2"]),
         ([["t", "w [mm]"], [timedelta(seconds=1.5), 1], [timedelta(hours=30, seconds=2), 2]],
-         ["0 1", "108000.500000 2"]),
+         ["0.000000 1", "108000.500000 2"]),
         # texts are read like those of a file; true and false are no numbers
         ([["t [s]", "w [mm]"], [0.125, "1,5"], [1.125, "2,5"]], ["0.125 1.5", "1.125 2.5"]),
         ([["t [s]", "w [mm]", "ok"], [0.125, 1.5, True], [1.125, 2.5, False]], ["0.125 1.5", "1.125 2.5"]),
