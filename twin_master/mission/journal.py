@@ -50,7 +50,7 @@ def belief_record(turn: TwinTurn) -> dict[str, Any]:
     if turn.learnt:
         record["learnt"] = {name: vars(learnt) for name, learnt in turn.learnt.items()}
     if turn.notices:
-        record["notices"] = [vars(notice) for notice in turn.notices]
+        record["notices"] = [notice.as_record() for notice in turn.notices]
     if turn.suspicion is not None:
         record["suspicion"] = {
             name: value.tolist() if isinstance(value, np.ndarray) else value

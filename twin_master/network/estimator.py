@@ -92,6 +92,10 @@ class Notice:
     value: float | None = None
     since: int | None = None
 
+    def as_record(self) -> dict[str, Any]:
+        """Return it as it stands in a journal, with lists in the place of tuples."""
+        return vars(self) | {"sensors": list(self.sensors)}
+
 
 @dataclass(frozen=True)
 class Suspicion:

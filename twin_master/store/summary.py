@@ -248,7 +248,7 @@ def noticed(result: MissionResult) -> dict[str, Any]:
     """Return what the operator was told, `notices`, for the summary; nothing where nothing is watched."""
     if result.scenario.notice is None and not result.flight.notices:
         return {}
-    return {"notices": [{"turn": turn} | vars(notice) for turn, notice in result.flight.notices]}
+    return {"notices": [{"turn": turn} | notice.as_record() for turn, notice in result.flight.notices]}
 
 
 def _scored(result: MissionResult) -> list[Figure]:

@@ -142,7 +142,7 @@ class Keeper:
             record |= self._standing.snapshot(self.twin, self._journal.size)
         record |= belief_record(concluded)
         known = {(notice.kind, notice.sensors) for notice in concluded.notices}
-        told = [vars(n) for n in self.intake.notices if (n.kind, n.sensors) not in known]
+        told = [n.as_record() for n in self.intake.notices if (n.kind, n.sensors) not in known]
         told += self._standing.teaching.untold if self.taught else []
         if self.quiet:
             sentence = f"Turn {number}: observations come again, after {self.silence:.0f} s."

@@ -214,7 +214,6 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
         counts = ran(watch, file_feed(source, watch.scenario), *stops)
         assert (counts.late, counts.rejected, counts.missing) == (1, 0, 0)
     assert belief_of(second) == belief_of(first)
-    header, *rows = plain.read_text().split()
     late = [*rows[:20], *rows[21:25], rows[20], rows[25].replace(",", ",,", 1), *rows[26:30], rows[25]]
     (tmp_path / "late.csv").write_text("\n".join([header, *late, ""]))
     watch, told = watchful(base, tmp_path / "watch"), list[dict[str, object]]()
