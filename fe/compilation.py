@@ -85,7 +85,7 @@ if numba is not None:
         """Told is the first loop that is not found on disk."""
 
         def on_start(self, event: Any) -> None:
-            _tell_once("Compiling loops by numba, kept for later runs: up to 20 s ...")
+            _tell_once("Compiling loops by numba, kept for later runs: 10 to 25 s ...")
 
         def on_end(self, event: Any) -> None:
             """Nothing: the stage of the command that compiles tells its time."""

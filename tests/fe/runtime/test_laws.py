@@ -296,7 +296,9 @@ def test_where_all_places_move_alike_the_forces_add_up_to_the_law(kind: str) -> 
 
 def test_rows_of_the_stations_are_displacements_of_the_elastic_line(coarse_patched_wing: PatchedWing) -> None:
     wing = coarse_patched_wing
-    bent = np.linalg.solve(wing.structure(1.0, (0.0, 0.0), 0.17, 0.13).stiffness, wing.arrays.load_tip)
+    bent = np.linalg.solve(
+        wing.at(np.array([1.0, 0.0, 0.0, 0.17, 0.13, 1.0, 0.0])).stiffness, wing.arrays.load_tip
+    )
     along = wing.arrays.line_rows[2] @ bent
     seen = np.array([wing.port_rows[port] @ bent for port in STATION_PORTS])
     between = CubicSpline(wing.arrays.stations, along)(wing.planform[0])

@@ -297,7 +297,8 @@ def test_records_are_those_of_the_naming_side(kind, name, patched, naming_side, 
     patch, chosen, damage, columns = patch_of(name), on(name), np.zeros((1, 2)), slice(26)
     if kind == TrialKind.RINGDOWN:
         damage, chosen = np.array([[0.1, 0.0]]), chosen | {"response": 2.0, "release": 0.03}
-        structure = PatchedWing(arrays).structure(1.0, damage[0], STATE[1], STATE[2], patch.of(*STRUCTURE))
+        state = np.array([1.0, *damage[0], *STATE[1:3], 1.0, 0.0])
+        structure = PatchedWing(arrays).at(state, patch.of(*STRUCTURE))
         shape = structure.static(arrays.load_tip)
         force = 0.03 * float(arrays.load_tip @ shape) / float(arrays.tip_row @ shape)
         given, course = trial(kind, 61, release=Release(force)), {"steps": 60}
@@ -350,7 +351,7 @@ def test_modal_outputs_are_those_of_the_patched_wing(patched, naming_side) -> No
         seen = asset.step({"load_factor": 1.0}, load={"root": 1.0}).extra["frequency[1]"]
         off = asset.step(load={"root": 0.0}).extra["frequency[1]"]
     heavier = patch_of("point_mass", "root")
-    modes = naming_side.wing.structure(1.0, (0.0, 0.0), 0.169, 0.134, heavier).modes
+    modes = naming_side.wing.at(np.array([1.0, 0.0, 0.0, 0.169, 0.134, 1.0, 0.0]), heavier).modes
     assert seen == pytest.approx(modes.frequency[0])
     assert off > seen
 
