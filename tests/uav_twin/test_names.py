@@ -61,13 +61,9 @@ def test_the_import_is_lazy_and_an_unknown_name_is_refused(tmp_path):
         uav_twin.simulate_fmu  # noqa: B018
 
 
-TAKEN = "import uav_twin; uav_twin.load_design()"
-FROM = "from uav_twin import load_design; load_design()"
-
-
+@pytest.mark.parametrize("hidden", ["fe.py", "reporting.py", "scenarios", "scenarios/__init__.py"])
 @pytest.mark.parametrize(
-    ("hidden", "use"),
-    [("fe.py", TAKEN), ("reporting.py", FROM), ("scenarios", FROM), ("scenarios/__init__.py", TAKEN)],
+    "use", ["import uav_twin; uav_twin.load_design()", "from uav_twin import load_design; load_design()"]
 )
 def test_a_file_that_hides_a_package_is_named(hidden, use, tmp_path):
     """A folder without `__init__.py` hides ours in editable installs only; else it is left in peace."""

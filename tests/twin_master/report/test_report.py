@@ -140,7 +140,7 @@ def test_the_last_sentence_judges_the_scatter_and_what_was_learnt_is_said(run):
 # ----------------------------------------------------------------------------------------- the page
 
 
-@pytest.mark.parametrize("now", [0, 18])
+@pytest.mark.parametrize("now", [0, 7, 18, 49])
 def test_smoothing_up_to_a_turn_equals_a_mission_that_ended_there(run, tmp_path, now):
     shorter = flown(tmp_path / "short", steps=now + 1)
     assert_array_equal(shorter["filtered/probability"], run["filtered/probability"][: now + 1])
