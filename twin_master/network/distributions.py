@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reporting.arrays import Float
+from reporting.arrays import Float, Index
 from twin_master.errors import InvalidDistributionError, InvalidModelError, TwinMasterError
 
 ROW_SUM_TOLERANCE = 1e-12
@@ -74,26 +74,23 @@ def expect_shape(
     shape : tuple of int
         That it has.
     *wanted : int or str
-        Lengths of its axes; a word stands for any length, and ``...`` as the first for any axes before.
+        Lengths of its axes; a word stands for any length.
     error : type
         What is raised.
     """
     if shape == wanted:
         return
-    before = wanted[0] == "..."
-    ends = wanted[1:] if before else wanted
-    own = shape[max(len(shape) - len(ends), 0) :] if before else shape
-    pairs = zip(ends, own, strict=False)
-    if len(own) != len(ends) or any(isinstance(length, int) and length != has for length, has in pairs):
+    pairs = zip(wanted, shape, strict=False)
+    if len(shape) != len(wanted) or any(isinstance(length, int) and length != has for length, has in pairs):
         told = ", ".join(map(str, wanted)) + "," * (len(wanted) == 1)
         raise error(f"expected {what} of shape ({told}), got {tuple(shape)}")
 
 
-def expect_controls(index: ArrayLike, count: int) -> None:
+def expect_controls(index: int | Index, count: int) -> None:
     """Refuse indices of controls, an array of any shape, that are none of `count`."""
     if isinstance(index, int):
         low = high = index
     else:
-        low, high = np.min(index, initial=0), np.max(index, initial=0)
+        low, high = index.min(initial=0), index.max(initial=0)
     if low < 0 or high >= count:
         raise InvalidModelError(f"expected control indices between 0 and {count - 1}, got {low} to {high}")

@@ -195,7 +195,7 @@ def filter_sequence(
         As `filter_step`.
     """
     control = _checked_controls(model, control_index)
-    expect_shape("controls", control.shape, "steps")
+    expect_shape("controls", control.shape, control.size)
     rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
     found, failed = filter_many(model, control[None], rows[None], model.log_prior)
     if failed[0] >= 0:
@@ -220,7 +220,7 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
         If shapes do not fit, or a log belief is NaN or plus infinity.
     """
     control = _checked_controls(model, control_index)
-    expect_shape("controls", control.shape, "steps")
+    expect_shape("controls", control.shape, control.size)
     rows = _checked_rows(model, control, log_filtered, what="log belief")
     found = smooth_many(model.transition, control[None], np.exp(rows)[None], rows[None])
     return np.asarray(found[0])

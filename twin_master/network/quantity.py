@@ -106,7 +106,7 @@ class QuantityModel:
         """Return the checked joint (..., S, U)."""
         joint = np.asarray(joint, dtype=np.float64)
         what = "a joint belief, see `known_control`,"
-        expect_shape(what, joint.shape, "...", self.state_count, self.control_count)
+        expect_shape(what, joint.shape, *joint.shape[:-2], self.state_count, self.control_count)
         return joint
 
     def moments(self, joint: ArrayLike) -> tuple[Float, Float]:

@@ -183,9 +183,8 @@ class GaussianSensorModel(QuantityModel):
             The shape is another one, or a value is infinite.
         """
         observation = np.array(observation, dtype=np.float64, order="C")
-        expect_shape(
-            "sensor values", observation.shape, "...", self.sensor_count, error=InvalidObservationError
-        )
+        shape = observation.shape
+        expect_shape("sensor values", shape, *shape[:-1], self.sensor_count, error=InvalidObservationError)
         if np.any(np.isinf(observation)):
             where = tuple(int(i) for i in np.argwhere(np.isinf(observation))[0])
             raise InvalidObservationError(
@@ -258,8 +257,8 @@ class GaussianSensorModel(QuantityModel):
         """Return log densities (T, S, E) of each draw, or of their average where `draws` is one."""
         observations = self.checked(observations)
         control = np.array(control_index, dtype=np.int64)
-        expect_shape("observations", observations.shape, "steps", self.sensor_count)
-        expect_shape("controls", control.shape, len(observations))
+        expect_shape("controls", control.shape, control.size)
+        expect_shape("observations", observations.shape, control.size, self.sensor_count)
         expect_controls(control, self.control_count)
         inside = self.averages_inside and draws == 1
         result = np.zeros((len(observations), self.state_count, draws))

@@ -233,8 +233,8 @@ ZEROS = np.zeros((3, 25))
     [
         (lambda: filter_sequence(MODEL, [1, 1], ZEROS), r"of shape \(2, 25\)"),
         (lambda: filter_sequence(MODEL, [1, 2], ZEROS[:2]), "between 0 and 1"),
-        (lambda: filter_sequence(MODEL, 1, ZEROS[0]), r"controls of shape \(steps,\)"),
-        (lambda: smooth(MODEL, [[1]], ZEROS[None, :1]), r"controls of shape \(steps,\)"),
+        (lambda: filter_sequence(MODEL, 1, ZEROS[0]), r"controls of shape \(1,\), got \(\)"),
+        (lambda: smooth(MODEL, [[1]], ZEROS[None, :1]), r"controls of shape \(1,\), got \(1, 1\)"),
         (lambda: filter_step(MODEL, None, 1, ZEROS[0]), "both or neither"),
         (lambda: predict(MODEL, np.ones(3), 0, POLICY, 1), r"belief of shape \(25,\)"),
         (lambda: predict(MODEL, np.ones(25), 0, POLICY, -1), "horizon of 0 or more"),

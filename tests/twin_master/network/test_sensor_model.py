@@ -196,10 +196,10 @@ REFUSED = [
     *((lambda bad=bad: GaussianSensorModel(VALUES, 1.0, WEIGHT, model_error=bad), "relative model error")
       for bad in (-0.1, np.nan, np.inf, np.ones(SENSORS + 1))),
     (lambda: GaussianSensorModel(VALUES, DEVIATION, WEIGHT, average="both"), "'outside' or 'inside'"),
-    (lambda: HOLDING.log_likelihood(OBSERVATION[:-1], 0), rf"sensor values of .* {SENSORS}\)"),
+    (lambda: HOLDING.log_likelihood(OBSERVATION[:-1], 0), rf"sensor values of shape \({SENSORS},\)"),
     (lambda: HOLDING.log_likelihood(np.r_[OBSERVATION[:3], -np.inf, 0.0, 0.0], 0), r"\(3,\) is infinite"),
     (lambda: HOLDING.log_likelihood(OBSERVATION, 2), "control indices between 0 and 1"),
-    (lambda: HOLDING.log_likelihood_sequence(OBSERVATION[None], [0, 1]), r"controls of shape \(1,\)"),
+    (lambda: HOLDING.log_likelihood_sequence(OBSERVATION[None], [0, 1]), r"observations of shape \(2, 6\)"),
     (lambda: HOLDING.predictive_check(UNIFORM, OBSERVATION[None]), rf"observations of shape \({SENSORS},\)"),
 ]  # fmt: skip
 
