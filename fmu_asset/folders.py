@@ -82,7 +82,7 @@ def end_processes(folder: str | os.PathLike[str]) -> None:
 
     A process has that of its parent, in whatever group or session it hides and whoever has ended before it.
     """
-    mark = f"\0TMPDIR={os.fspath(folder)}".encode()
+    mark, clean = f"\0TMPDIR={os.fspath(folder)}".encode(), 0
     for _ in range(_ROUNDS):
         found = False
         for process in Path("/proc").glob("[0-9]*"):
@@ -90,7 +90,8 @@ def end_processes(folder: str | os.PathLike[str]) -> None:
                 if mark in b"\0" + (process / "environ").read_bytes():
                     os.kill(int(process.name), signal.SIGKILL)
                     found = True
-        if not found:
+        clean = 0 if found else clean + 1
+        if clean == 2:  # one look misses the child of a process that ended meanwhile
             return
         time.sleep(0.01)
 

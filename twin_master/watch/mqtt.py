@@ -6,11 +6,12 @@ more of them than can wait; further ones wait at the broker, or are dropped ther
 
 import json
 import os
+import socket
 import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
 from typing import Any
@@ -242,10 +243,16 @@ class Session:
             self._exchange(0.1)
         if self.behind or self._flying:
             self.note("The broker has not taken all decisions: the rest is published when the watch goes on.")
-        if self._client is not None:
+        if self._client is not None and (connection := self._client.socket()) is not None:
             said = json.dumps(self._pulse() | {"state": "lost" if crashed else "ended"})
             self._client.publish(self._heartbeat, said, retain=True)
-            self._client.disconnect()
+            # The client closes its socket at once. Where something came meanwhile that nobody read, the
+            # system resets the connection, and a broker may hear that before the goodbye.
+            with suppress(OSError), socket.socket(fileno=os.dup(connection.fileno())) as line:
+                line.settimeout(_GOODBYE_SECONDS)
+                self._client.disconnect()
+                while line.recv(65536):
+                    pass
 
 
 class Outbox:
