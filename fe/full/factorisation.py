@@ -220,17 +220,7 @@ class Factorisation:
 
     def riesz(self, right_hand_side: FloatArray) -> FloatArray:
         """X^-1 f (n,) or (n, k) without a check of the residual, for iterations that check their own."""
-        found = self.whitened(right_hand_side)
-        values = found.reshape(len(found), -1)
-        with _threads().limit(limits=1):
-            for front, (lower, below) in zip(self._fronts[::-1], self._factors[::-1], strict=True):
-                own = values[front.start : front.end]
-                if len(front.boundary):
-                    own -= below.T @ values[front.boundary]
-                _substitute(lower, own, transposed=True)
-        solution = np.empty_like(found)
-        solution[self._order] = found
-        return solution
+        return self.unwhitened(self.whitened(right_hand_side))
 
     def whitened(self, right_hand_side: FloatArray) -> FloatArray:
         """L^-1 f (n,) or (n, k), X = L L', in the order of elimination; its length is the dual norm of f."""
@@ -243,9 +233,19 @@ class Factorisation:
                     values[front.boundary] -= below @ own
         return found
 
-    def product(self, vectors: FloatArray) -> FloatArray:
-        """Return X times vectors (n, k)."""
-        return np.asarray(self.stiffness @ vectors)
+    def unwhitened(self, whitened: FloatArray) -> FloatArray:
+        """L'^-1 y (n,) or (n, k) of what is in the order of elimination."""
+        found = np.array(whitened, dtype=np.float64, order="C")
+        values = found.reshape(len(found), -1)
+        with _threads().limit(limits=1):
+            for front, (lower, below) in zip(self._fronts[::-1], self._factors[::-1], strict=True):
+                own = values[front.start : front.end]
+                if len(front.boundary):
+                    own -= below.T @ values[front.boundary]
+                _substitute(lower, own, transposed=True)
+        solution = np.empty_like(found)
+        solution[self._order] = found
+        return solution
 
     def solve(self, right_hand_side: FloatArray) -> FloatArray:
         """Solution (n,) or (n, k), refined once, its backward error and its accuracy checked.

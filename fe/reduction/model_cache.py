@@ -24,7 +24,7 @@ from reporting.provenance import hash_bytes, hash_tree
 
 from .built_once import built_once, cache_folder
 from .fields import WingFields, field_basis
-from .settings import PatchSettings, StructureSettings
+from .settings import StructureSettings
 
 MODELLING_ROOMS = ("runtime", "elements", "full", "structure", "wing", "reduction")
 """The rooms that decide what a reduced model holds; a change in any of their files makes a new entry."""
@@ -106,10 +106,10 @@ def build(
     design: WingDesign, progress: Progress | None = None, settings: StructureSettings | None = None
 ) -> WingFields:
     """Build the reduced model and the bases of a wing, without the cache; see `reduced_model`."""
-    from .reduced_basis import reduce_model
+    from .reduced_basis import reduce_structure
 
     operators = _assembled(design, progress)
-    return field_basis(operators, reduce_model(operators, settings, progress))
+    return field_basis(operators, reduce_structure(operators, settings, progress))
 
 
 def _assembled(design: WingDesign, progress: Progress | None) -> AffineOperators:
@@ -117,29 +117,20 @@ def _assembled(design: WingDesign, progress: Progress | None) -> AffineOperators
         return assemble(design)
 
 
-def patch_arrays(
-    design: WingDesign | None = None,
-    progress: Progress | None = None,
-    settings: PatchSettings | None = None,
-) -> PatchArrays:
+def patch_arrays(design: WingDesign | None = None, progress: Progress | None = None) -> PatchArrays:
     """Return the wing for patches of a design, from the cache if it is there.
 
-    Parameters and errors are those of `reduced_model`; the settings say how far changes may go and how well
-    they are held.
+    Parameters and errors are those of `reduced_model`.
     """
     wing = design or load_design()
-    return _once(
-        PatchArrays, "patches", wing.hash, settings, lambda: build_patch_arrays(wing, progress, settings)
-    )
+    return _once(PatchArrays, "patches", wing.hash, None, lambda: build_patch_arrays(wing, progress))
 
 
-def build_patch_arrays(
-    design: WingDesign, progress: Progress | None = None, settings: PatchSettings | None = None
-) -> PatchArrays:
+def build_patch_arrays(design: WingDesign, progress: Progress | None = None) -> PatchArrays:
     """Build the wing for patches of a design, without the cache; see `patch_arrays`."""
     from .patch_basis import reduce_patches
 
-    return reduce_patches(_assembled(design, progress), settings, progress)
+    return reduce_patches(_assembled(design, progress), progress)
 
 
 def reduced_structure(

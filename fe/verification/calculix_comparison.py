@@ -250,10 +250,10 @@ def ring_down_agreement(
     CalculixError
         If CalculiX is not there or fails.
     """
-    from fe.reduction.reduced_basis import reduce_model
+    from fe.reduction.reduced_basis import reduce_structure
     from fe.runtime.transient import ModalIntegrator
 
-    model = reduce_model(operators).model
+    model = reduce_structure(operators).model
     vector = model.vector(state.values, state.stiffness_loss)
     integrator = ModalIntegrator(model, vector, state.damping_alpha, state.damping_beta)
     frequency, row = integrator.modes.frequency, integrator.modes.output[-1]
