@@ -36,7 +36,6 @@ CORRECTION_LIMIT = 1e-4
 
 Thin cells make the condition number about 1e10, so that about 1e-6 is what double precision reaches.
 """
-_STRIP = 96  # rows that are added at once; only their part right of the diagonal is touched
 
 
 class Front(NamedTuple):
@@ -290,16 +289,12 @@ def _substitute(lower: FloatArray, values: FloatArray, *, transposed: bool) -> F
 def _extend_add(
     top: FloatArray, rest: FloatArray, boundary: IntArray, complement: FloatArray, local: IntArray
 ) -> None:
-    """Add a Schur complement, right of its diagonal, to the pivot rows and to the rest of a front."""
+    """Add a Schur complement to the pivot rows and to the rest of a front."""
     index, pivots = local[boundary], len(top)
     mine = int(np.searchsorted(index, pivots))
-    # One index into the flat array is gathered and scattered twice as fast as a pair of indices.
-    for target, first, start, end in ((top, 0, 0, mine), (rest, pivots, mine, len(index))):
-        flat, width = target.reshape(-1), target.shape[1]
-        for low in range(start, end, _STRIP):
-            high = min(low + _STRIP, end)
-            column = index[low:] - first
-            flat[column[: high - low, None] * width + column] += complement[low:high, low:]
+    later = index[mine:] - pivots
+    top[index[:mine, np.newaxis], index] += complement[:mine]
+    rest[later[:, np.newaxis], later] += complement[mine:, mine:]
 
 
 def most_moved(load: FloatArray, values: FloatArray, shapes: FloatArray) -> IntArray:

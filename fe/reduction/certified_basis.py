@@ -168,12 +168,12 @@ class StaticReduction:
     def _rounding(self, found: FloatArray, solutions: FloatArray) -> float:
         """Return the relative difference of outputs between full solutions and those of their basis."""
         wanted = np.abs(self.outputs.T @ solutions)
-        difference, worst = np.abs(self.outputs.T @ (found - solutions)), 0.0
-        for rows, least in zip(self.terms.groups, self.least, strict=True):
-            size = np.maximum(wanted[rows].max(axis=0), least)
-            share = np.divide(difference[rows].max(axis=0), size, out=np.zeros_like(size), where=size > 0.0)
-            worst = max(worst, float(share.max()))
-        return worst
+        difference = np.abs(self.outputs.T @ (found - solutions))
+        shares = [
+            difference[rows].max(axis=0) / np.maximum(wanted[rows].max(axis=0), least)
+            for rows, least in zip(self.terms.groups, self.least, strict=True)
+        ]
+        return float(np.max(shares))
 
     def model(self, directions: FloatArray | None = None) -> ReducedModel:
         """Return the reduced model of the present basis, or of combinations of it.

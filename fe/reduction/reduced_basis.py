@@ -298,32 +298,23 @@ def measured_errors(
     SolutionError
         If the full model cannot be solved.
     """
-    random = np.random.default_rng(seed)
-    low, high = model.validity_box.T
-    first_control = len(model.chosen) - len(model.controls)
-    broken = set()
-    worst = {"strain": np.nan, "displacement": np.nan, "bound": 0.0, "frequency": 0.0}
-    for number in range(states):
-        vector = low + (high - low) * random.random(len(low))
-        nominal = model.nominal[first_control:]
-        vector[first_control:] = np.where(
-            nominal == 0.0, np.clip(1.0, *model.validity_box[first_control:].T), nominal
-        )
+    (low, high), first = model.validity_box.T, len(model.chosen) - len(model.controls)
+    vectors = low + (high - low) * np.random.default_rng(seed).random((states, len(low)))
+    one = np.clip(1.0, low, high)
+    vectors[:, first:] = np.where(model.nominal == 0.0, one, model.nominal)[first:]
+    errors, frequency = np.full((2, states, 2), np.nan), 0.0  # missed and bound, of strains and displacements
+    for number, vector in enumerate(vectors):
         values = dict(zip(model.chosen, vector.tolist(), strict=True))
         full, found = static_response(structure, values), model.static_response(vector)
-        for what, wanted in (("strain", full.strain), ("displacement", full.output)):
-            came, error = getattr(found, what), getattr(found, f"{what}_error_bound")
-            if wanted.size:
-                size, missed = float(np.abs(wanted).max()), float(np.abs(came - wanted).max())
-                worst[what] = np.fmax(worst[what], missed / size)
-                if missed > error:
-                    broken.add(number)
-                worst["bound"] = max(worst["bound"], error / size)
+        if full.strain.size:
+            missed = np.abs(found.strain - full.strain).max(), found.strain_error_bound
+            errors[:, number, 0] = missed / np.abs(full.strain).max()
+        if full.output.size:
+            missed = np.abs(found.displacement - full.output).max(), found.displacement_error_bound
+            errors[:, number, 1] = missed / np.abs(full.output).max()
         if number in (0, states - 1):
-            ratio = (
-                model.modes(vector).frequency / natural_frequencies(structure, model.mode_count, values)[0]
-            )
-            worst["frequency"] = max(worst["frequency"], float(np.abs(ratio - 1.0).max()))
-    return MeasuredErrors(
-        **{name: float(value) for name, value in worst.items()}, states=states, broken=len(broken)
-    )
+            wanted = natural_frequencies(structure, model.mode_count, values)[0]
+            frequency = max(frequency, float(np.abs(model.modes(vector).frequency / wanted - 1.0).max()))
+    (strain, displacement), bound = np.fmax.reduce(errors[0]), np.nanmax(errors[1])
+    broken = int((errors[0] > errors[1]).any(axis=1).sum())
+    return MeasuredErrors(float(strain), float(displacement), float(bound), frequency, states, broken)

@@ -5,11 +5,10 @@ equations are in `docs/reduced_model.md`. NumPy and relative imports only: this 
 """
 
 from bisect import bisect_right
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, sqrt
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 from numpy import einsum
@@ -17,36 +16,14 @@ from numpy.linalg import solve
 
 from .arrays import FloatArray, IntArray
 from .kept_arrays import KeptArrays
-from .state import MOST_REGIONS, GivenLosses, Losses, losses_of
+from .state import Losses
 
 MOST_ANCHORS = 16
 """Largest number of approximate dual solutions of a reduced model."""
 
 
 @dataclass(frozen=True, repr=False)
-class RegionArrays(KeptArrays):
-    """Arrays of a structure with K damage regions, 1 to 8.
-
-    Attributes
-    ----------
-    regions : tuple of str
-        Names of the damage regions in the order of their stiffness terms.
-    """
-
-    regions: tuple[str, ...]
-
-    def losses(self, stiffness_loss: GivenLosses) -> Losses:
-        """Return one stiffness loss for each region, in their order; see `fe.runtime.state.losses_of`."""
-        return losses_of(stiffness_loss, self.regions)
-
-    def __post_init__(self) -> None:
-        if not 1 <= len(self.regions) <= MOST_REGIONS:
-            self.refuse(f"must have 1 to {MOST_REGIONS} damage regions, but names {len(self.regions)}")
-        super().__post_init__()
-
-
-@dataclass(frozen=True, repr=False)
-class ReducedArrays(RegionArrays):
+class ReducedArrays(KeptArrays):
     """Affine dense matrices, outputs, modal data, error bound and ranges of a reduced structure, with names.
 
     What can be chosen are the parameters, the losses of the damage regions, the free masses [kg] and the
@@ -126,7 +103,7 @@ class ReducedArrays(RegionArrays):
     """
 
     what = "a reduced model"
-    layout: ClassVar[Mapping[str, int]] = {"format": 7}
+    version = 7
 
     name: str
     parameters: tuple[str, ...]
