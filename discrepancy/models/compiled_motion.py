@@ -3,22 +3,13 @@
 from collections.abc import Callable
 from functools import cache
 from inspect import getmembers, isfunction
+from itertools import chain
 from types import ModuleType
 from typing import Any
 
 from fe.compilation import callable_when_compiled, choose_when_compiled, compiled
 from fe.runtime import laws, motion_arrays, motion_kernel, static_path
-from fe.runtime.laws import interface
 from fe.runtime.motion import Kernel
-
-SELDOM = (
-    motion_kernel.find_routes,
-    motion_kernel.begin_on_modes,
-    motion_kernel.find_answer,
-    motion_kernel.begin_flexible,
-    static_path.settle_port,
-)
-"""Functions that are not called at every step; the others become part of their callers."""
 
 
 def _functions(module: ModuleType) -> list[Callable[..., Any]]:
@@ -28,12 +19,14 @@ def _functions(module: ModuleType) -> list[Callable[..., Any]]:
 @cache
 def law_functions() -> tuple[Callable[..., Any], ...]:
     """Return the functions of `fe.runtime.laws`, which compiled functions can call from then on."""
-    functions = [item for module in (*laws.MODULES, interface) for item in _functions(module)]
-    for function in functions:
+    functions = [item for module in laws.MODULES for item in _functions(module)]
+    tables = {choice: laws.answers(choice.__name__) for choice in (laws.advance, laws.pull)}
+    found = tuple(dict.fromkeys((*functions, *chain(*tables.values()))))
+    for function in found:
         callable_when_compiled(function, makes_arrays=False)
-    for name in interface.FUNCTIONS:
-        choose_when_compiled(getattr(laws, name), laws.answers(name))
-    return tuple(functions)
+    for choice, table in tables.items():
+        choose_when_compiled(choice, table)
+    return found
 
 
 @cache
@@ -42,12 +35,10 @@ def compiled_kernel() -> Kernel:
 
     The functions of `fe` stay plain; they can be called from compiled ones from then on.
     """
-    functions = list(law_functions())
-    of_static: tuple[Callable[..., Any], ...] = (static_path.pull_of, static_path.settle_port)
-    for function in (*of_static, *_functions(motion_arrays), *_functions(motion_kernel)):
-        functions.append(function)
-        if function is not motion_kernel.integrate:
-            callable_when_compiled(function, makes_arrays=False, inline=function not in SELDOM)
-    for function in (static_path.static_forces, static_path.arrive_at_rest):
-        callable_when_compiled(function)
+    inner = {*_functions(motion_arrays), *_functions(motion_kernel)} - {motion_kernel.integrate}
+    for function in inner:
+        callable_when_compiled(function, makes_arrays=False, inline=True)
+    callable_when_compiled(static_path.settle_port, makes_arrays=False)
+    callable_when_compiled(static_path.static_forces)
+    functions = (*law_functions(), *inner, static_path.settle_port)
     return Kernel(compiled(motion_kernel.integrate, functions), compiled(static_path.static_path, functions))

@@ -249,9 +249,9 @@ class LinearSystem:
         """Shapes (N, M + P) of what is free, and nothing for the drives."""
         return np.pad(self.shapes, ((0, 0), (0, len(self.drives))))
 
-    def port_rows(self, laws: Laws) -> FloatArray:
-        """Return the rows (J, N) of the laws' ports."""
-        return laws.rows(self.ports, len(self.mass))
+    def port_rows(self, laws: Laws, time: float | None = None) -> FloatArray:
+        """Return the rows (J, N) of the laws' ports, see `Laws.rows`."""
+        return laws.rows(self.ports, len(self.mass), time)
 
     # ------------------------------------------------------------ rest
 
@@ -300,13 +300,18 @@ class LinearSystem:
         return np.asarray(found.T @ self.shapes.T)
 
     def static(
-        self, loads: FloatArray, laws: Laws = NO_LAWS, drive: FloatArray | None = None
+        self,
+        loads: FloatArray,
+        laws: Laws = NO_LAWS,
+        drive: FloatArray | None = None,
+        time: float | None = None,
     ) -> tuple[FloatArray, FloatArray | None]:
         """Return the rest under loads (L, N) that follow one another from zero, see `at_rest`.
 
-        `drive` (P,) is where the drives hold what they move; ports of states are at no position.
+        `drive` (P,) is where the drives hold what they move; ports of states are at no position. Of laws in
+        windows those act that do at a `time` [s].
         """
-        rows, held = self.port_rows(laws), np.zeros(len(self.mass))
+        rows, held = self.port_rows(laws, time), np.zeros(len(self.mass))
         rows[:, self.displacements :] = 0.0
         if drive is not None and len(drive):
             held = self.lift @ drive

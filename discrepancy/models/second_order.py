@@ -19,8 +19,8 @@ from discrepancy.models.interface import Response
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.scales import PortScale
 from fe.runtime.motion import NO_LAWS, Laws, static_solution
-from fe.runtime.motion_arrays import Steps
-from fe.runtime.stepwise import Begin, Boundaries, ModalMotion, advance, steps_under, substeps
+from fe.runtime.motion_arrays import ModalMotion, Steps
+from fe.runtime.stepwise import Begin, Boundaries, advance, steps_under, substeps
 
 
 @dataclass(frozen=True)
@@ -185,12 +185,9 @@ class SecondOrderSystem(LinearSystem):
     def _let_go(self, acting: Acting, laws: Laws, refinement: int) -> Motion:
         """Return the motion of a structure that springs hold after a release."""
         assert acting.release is not None
-        (row, release), times, acts = acting.release, acting.sampled, laws.act_at(0.0)
-        loaded = laws.only(acts) if laws.spans else laws
-        begin, holding = self._released(row, release, acting.initial, loaded)
-        q, v, memory = begin
-        if memory is not None and laws.spans:
-            begin = begin._replace(memory=laws.filled(memory, acts))
+        (row, release), times = acting.release, acting.sampled
+        begin, holding = self._released(row, release, acting.initial, laws)
+        q, v, _ = begin
         held = int(np.searchsorted(times, 0.0)) if release.at_rest else 0
         stamps = times[held:] if held < len(times) else np.zeros(1)  # which nobody looks at
         if stamps[0] < 0.0:
@@ -217,11 +214,9 @@ class SecondOrderSystem(LinearSystem):
         if acting.begins is Start.SETTLED:
             load = acting.load_at(first, np.eye(len(self.mass)))
             if load.any() or drive.any():
-                acts = laws.act_at(float(first[0]))
-                values, felt = self.static(load, laws.only(acts) if laws.spans else laws, drive=drive)
+                values, memory = self.static(load, laws, drive, float(first[0]))
                 amounts = self.shapes.T @ (self.mass @ (values[0] - self.lift @ drive))
                 q[:moving], v[moving:count] = amounts[:moving], amounts[moving:]
-                memory = None if felt is None else laws.filled(felt, acts)
         elif acting.begins is Start.UNKNOWN:
             given = np.zeros(count + moving)  # displacement and speed of each mode, and the states
             given[: len(acting.initial)] = acting.initial[: len(given)]
@@ -250,7 +245,7 @@ class SecondOrderSystem(LinearSystem):
         acts = holding * row
         if len(laws):
             # With the release point held at its displacement: x = x_linear - (C - a a^T / a_0) F.
-            rows = self.port_rows(laws)
+            rows = self.port_rows(laws, 0.0)
             along = rows @ self.flexibility(row)
             held = rows @ self.flexibility(rows.T) - np.outer(along, along) / compliance
             solution = static_solution(laws, (holding * along)[None], held, kernel=compiled_kernel())
