@@ -18,7 +18,7 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
 from fe.structure.affine import natural_frequencies
 
-from .calculix_deck import CalculixDeck, Step
+from .calculix_deck import PRINTED, CalculixDeck, Step
 
 PROGRAM = "ccx"
 _TIME_LIMIT = 3600.0
@@ -123,8 +123,6 @@ def run_calculix(text: str, folder: Path, name: str) -> str:
 
 INTEGRATION_POINTS = gauss_points(3)[0][:, ::-1]
 """Local places (27, 3) in 0..1 of the integration points of a C3D20 element, in the order of its output."""
-# Places of our strains in the order in which CalculiX prints a strain tensor: xx, yy, zz, xy, xz, yz.
-_PRINTED = [0, 1, 2, 5, 4, 3]
 
 
 def _relative(theirs: FloatArray, ours: FloatArray) -> float:
@@ -207,5 +205,5 @@ def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
             strains = deck.mesh.strains(nodes, cells, INTEGRATION_POINTS).reshape(-1, 6)
             strains[:, 3:] *= 0.5  # engineering to tensor shear
             printed_here = tables["EGAUGES"][:, 2:]
-            found["strains at integration points"] = _relative(printed_here, strains[:, _PRINTED])
+            found["strains at integration points"] = _relative(printed_here, strains[:, PRINTED])
     return Agreement(differences, frequencies, theirs[:modes])

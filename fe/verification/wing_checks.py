@@ -13,15 +13,14 @@ from fe.runtime.arrays import FloatArray
 from fe.structure.affine import static_response
 from fe.structure.mesh import rigid_motions
 from fe.wing.design import WingDesign
-from fe.wing.operators import AffineOperators, assemble, cell_density, root_support
+from fe.wing.operators import AffineOperators, assemble
 from fe.wing.responses import eigenmodes
 
 
 def _rigid_motions(operators: AffineOperators) -> FloatArray:
     """Free unknowns (n, 3) of the rigid motions that the root allows: heave, flap and yaw."""
-    mesh = operators.wing_mesh
-    full = rigid_motions(mesh.points, np.zeros(3), 2.0)[:, [2, 3, 5]]
-    return np.vstack((full[root_support(mesh).alone], np.eye(3)))
+    full = rigid_motions(operators.wing_mesh.points, np.zeros(3), 2.0)[:, [2, 3, 5]]
+    return np.vstack((full[operators.body.supports.alone], np.eye(3)))
 
 
 def rigid_body_residual(operators: AffineOperators) -> float:
@@ -30,7 +29,7 @@ def rigid_body_residual(operators: AffineOperators) -> float:
     The motions are those that the root allows, heave, flap and yaw; the forces of the springs are left out.
     """
     free, stiffness = _rigid_motions(operators), operators.stiffness()
-    force = (stiffness - root_support(operators.wing_mesh).stiffness) @ free
+    force = (stiffness - operators.body.supports.stiffness) @ free
     return float(np.abs(force).max() / (abs(stiffness) @ np.abs(free)).max())
 
 
@@ -49,7 +48,11 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[s
     lift = design.lift.force * load_factor / design.lift.load_factor
     energy = 0.5 * u @ (operators.stiffness() @ u)
     return {
-        "mass": (float(heave @ (operators.mass_terms[0] @ heave)), float(volume @ cell_density(mesh)), "kg"),
+        "mass": (
+            float(heave @ (operators.mass_terms[0] @ heave)),
+            float(volume @ operators.body.density),
+            "kg",
+        ),
         "reaction": (float(design.root.transverse_spring * u[-3]), lift, "N"),
         "root moment": (float(design.root.flap_spring * u[-2]), float(flap @ load), "N m"),
         "energy and work": (float(energy), float(0.5 * load @ u), "J"),

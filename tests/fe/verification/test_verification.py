@@ -11,7 +11,7 @@ from fe.runtime.state import DigitalState
 from fe.verification import calculix_comparison as comparison
 from fe.verification import wing_checks as answers
 from fe.verification.calculix_deck import wing_deck
-from fe.wing.operators import AffineOperators, assemble
+from fe.wing.operators import assemble
 from tests.calculix_decks import needs_calculix
 from tests.refusals import Inputs
 
@@ -88,14 +88,6 @@ def test_calculix_that_is_not_there_is_one_sentence(monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(CalculixError, match="apt-get install calculix-ccx"):
         comparison.run_calculix("", tmp_path, "job")
-
-
-def test_every_cell_has_its_nodes_material_and_axes(coarse_operators: AffineOperators) -> None:
-    lines = wing_deck(coarse_operators, DigitalState(stiffness_loss=DAMAGED)).text().splitlines()
-    cells = len(coarse_operators.wing_mesh.cells)
-    assert sum(line.startswith("*SOLID SECTION, ELSET=E") for line in lines) == cells
-    assert sum(line.startswith("*ORIENTATION") for line in lines) == cells
-    assert all(len(number) <= 20 for line in lines if line[0] != "*" for number in line.split(","))
 
 
 TABLES, EIGENVALUES = (Inputs(__file__).text(f"{name}.dat") for name in ("tables", "eigenvalues"))
