@@ -57,15 +57,12 @@ class Step(NamedTuple):
         Whether the load is given as forces of nodes, and not by lines.
     procedure : tuple of str
         Lines that say what is solved.
-    increments : int
-        At most so many.
     """
 
     load: FloatArray = np.empty(0)
     lines: Iterable[str] = ()
     nodal: bool = True
     procedure: tuple[str, ...] = ("*STATIC",)
-    increments: int = 100
 
 
 class Grading(NamedTuple):
@@ -156,37 +153,29 @@ class CalculixDeck:
 
     def text(self, *steps: Step) -> str:
         """Input of a job: the model, then its steps."""
-        held, motions = self.body.supports, self._motions
-        springs = [(*_place(own), held.springs[own]) for own in np.flatnonzero(held.springs).tolist()]
-        fixed = [*map(_place, np.flatnonzero(held.held).tolist())]
-        for places, body in zip(motions, held.rigid, strict=True):
-            springs += [(*places[own], body.springs[own]) for own in np.flatnonzero(body.springs)]
-            fixed += [places[own] for own in np.flatnonzero(body.held)]
-        # Behind the nodes of the mesh: two of each rigid set, eight of each point mass, then the probes.
+        held, points = self.body.supports, self.mesh.points
         masses = ((self.values.get(own.name, own.mass), own.shares) for own in self.body.masses)
         heavy = [(mass, shares) for mass, places in masses for shares in places if mass > 0.0]
-        first = len(self.mesh.points) + 2 * len(motions) + 1
-        corners = np.arange(first, first + 8 * len(heavy)).reshape(-1, 8).tolist()
-        first_probe, block = first + 8 * len(heavy), HEXAHEDRA_20.places[:8] * _BLOCK
-        tied = [(nodes, shares) for (_, shares), nodes in zip(heavy, corners, strict=True)]
+        # Behind the nodes of the mesh: those of rigid motions, eight of each point mass, then the probes.
+        motions = len(held.springs) - len(held.alone)
+        first = len(points) + 1 - (-motions // 3)
+        first_probe = first + 8 * len(heavy)
+        corners = np.arange(first, first_probe).reshape(-1, 8).tolist()
+        blocks = [(nodes, *block) for nodes, block in zip(corners, heavy, strict=True)]
+        side, still = HEXAHEDRA_20.places[:8] * _BLOCK, np.diff(held.expansion.indptr) == 0
         return _template().render(
             deck=self,
             materials=self._materials,
             cells=np.column_stack((np.arange(len(self.mesh.cells)), self.mesh.cells)) + 1,
-            rigid_nodes=[
-                (places[motion][0], body.point)
-                for places, body in zip(motions, held.rigid, strict=True)
-                for motion in (0, 3)
-            ],
-            held=fixed,
-            springs=springs,
+            motion_nodes=range(len(points) + 1, first),
+            held=map(_place, (*np.flatnonzero(still), *range(3 * len(points) + motions, 3 * first - 3))),
+            springs=[*self.terms(held.springs)],
             blocks=[
-                (mass, [*zip(nodes, shares @ self.mesh.points + block, strict=True)])
-                for (mass, shares), nodes in zip(heavy, corners, strict=True)
+                (mass, [*zip(nodes, shares @ points + side, strict=True)]) for nodes, mass, shares in blocks
             ],
             block_side=_BLOCK,
-            probe_nodes=range(first_probe, first_probe + -(-len(self.probes) // 3)),
-            equations=self._equations(tied, first_probe),
+            probe_nodes=range(first_probe, first_probe - (-len(self.probes) // 3)),
+            equations=self._equations([(nodes, shares) for nodes, _, shares in blocks], first_probe),
             steps=steps,
         )
 
@@ -194,10 +183,9 @@ class CalculixDeck:
         self, blocks: Iterable[tuple[list[int], FloatArray]], first_probe: int
     ) -> Iterator[list[Term]]:
         """Yield sums that are zero, of which the first term depends on the others."""
-        for places, body in zip(self._motions, self.body.supports.rigid, strict=True):
-            for row, shares in enumerate(body.motions.tolist()):
-                turned = [(*place, share) for place, share in zip(places, shares, strict=True) if share]
-                yield [(int(body.nodes[row // 3]) + 1, row % 3 + 1, -1.0), *turned]
+        held = self.body.supports
+        for row in np.setdiff1d(np.flatnonzero(np.diff(held.expansion.indptr)), held.alone).tolist():
+            yield [(*_place(row), -1.0), *self.terms(held.expansion[[row]].toarray()[0])]
         for nodes, shares in blocks:
             moved = [(own + 1, float(shares[own])) for own in np.flatnonzero(shares).tolist()]
             for node, component in itertools.product(nodes, (1, 2, 3)):
@@ -206,21 +194,11 @@ class CalculixDeck:
             yield [(first_probe + number // 3, number % 3 + 1, -1.0), *self.terms(row)]
 
     @cached_property
-    def _motions(self) -> list[list[tuple[int, int]]]:
-        """Node and direction of the six motions of each rigid set: shifts of one node, turns as another's."""
-        first = 3 * len(self.mesh.points)
-        return [
-            [_place(first + 6 * number + motion) for motion in range(6)]
-            for number in range(len(self.body.supports.rigid))
-        ]
-
-    @cached_property
     def places(self) -> list[tuple[int, int]]:
         """Node and direction of each free unknown."""
-        found = [*map(_place, self.body.supports.alone.tolist())]
-        for places, body in zip(self._motions, self.body.supports.rigid, strict=True):
-            found += [places[motion] for motion in np.flatnonzero(~body.held)]
-        return found
+        held, behind = self.body.supports, self.mesh.unknowns
+        motions = range(behind, behind + len(held.springs) - len(held.alone))
+        return [_place(unknown) for unknown in (*held.alone.tolist(), *motions)]
 
     def terms(self, values: FloatArray) -> Iterator[Term]:
         """Yield node, direction and value of the values (n,) that are not zero."""

@@ -202,7 +202,8 @@ def test_springs_carry_the_weight(beam) -> None:
     tip = '[[support]]\nset = "tip"\nsprings = [0, 0, 1e4]\n[[load]]\nname = "tip"'
     structure = beam((HELD, 'set = "root"\nsprings = [1e7, 1e7, 1e4]'), ('[[load]]\nname = "tip"', tip))
     down = structure.full_displacement(static_responses(structure)["weight"].displacement)[:, 2]
-    springs = structure.body.supports.springs.reshape(-1, 3)
+    held = structure.body.supports
+    springs = (held.expansion @ held.springs).reshape(-1, 3)
     assert springs.sum(axis=0) == pytest.approx([1e7, 1e7, 2e4])
     assert springs[:, 2] @ down == pytest.approx(-3.0 * 9.81 * weighed(structure)[0], rel=1e-7)
 
