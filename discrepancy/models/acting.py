@@ -174,8 +174,6 @@ class Acting:
     release : tuple of ((n,) ndarray, Release), optional
         How a structure was let go, and the row of the release point: row . u is its displacement, and the
         holding force acts along it.
-    basis : (K, n + m) ndarray, optional
-        Of a system of K unknowns, in whose coordinates all this is; None: it is in those of the system.
     clock : tuple of float
         Rate and zero of the samples beside the inputs.
     """
@@ -188,13 +186,6 @@ class Acting:
     initial: FloatArray = field(default_factory=lambda: np.zeros(0))
     clock: tuple[float, float] = (0.0, 0.0)
     release: tuple[FloatArray, Release] | None = None
-    basis: FloatArray | None = None
-
-    def along(self, basis: FloatArray) -> "Acting":
-        """Return it in the coordinates of a basis (n + m, k)."""
-        release = None if self.release is None else (self.release[0] @ basis, self.release[1])
-        loads = [(row @ basis, course) for row, course in self.loads]
-        return replace(self, constant=self.constant @ basis, loads=loads, release=release, basis=basis)
 
     @property
     def sampled(self) -> FloatArray:

@@ -1,4 +1,4 @@
-"""A linear system with ports: M z'' + C z' + K z = loads, its modes and its rest.
+"""A linear system with ports: M z'' + C z' + K z = loads, its modes and its rest; `motion` moves it.
 
 Displacements u and states x, M u'' + C u' + K u = F x + b(t), T x' + R x = G u' + H u + d(t): a state is the
 speed of a coordinate that has no stiffness, x = s', so that both are one equation in z = (u, s).
@@ -9,7 +9,7 @@ put right at every step. The wing, a structure on springs and a lumped rig are s
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.linalg import cho_factor, eigh, null_space
@@ -19,7 +19,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Shown
 from discrepancy.models.compiled_motion import compiled_kernel
-from discrepancy.models.interface import PortedSystem
+from discrepancy.models.interface import Memory, PortedSystem
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, static_solution
 
@@ -27,22 +27,18 @@ HEAVY = 1e12
 """Mass of a prescribed coordinate over the largest of the system."""
 LEAST_PIVOT = 1e-9
 """A system whose equilibrium is determined worse than this has none of its own."""
+KEPT_ANSWERS = 16
+"""Loads whose answers a structure keeps: outputs and ports are often the same."""
 ROUNDING = 1e-10
 """Share of the largest entry below which what couples modes is rounding."""
 
 
 Resting = Callable[[FloatArray], FloatArray]
 """What returns displacements and states (L, N) at rest under loads (L, N)."""
-
-
-def springs(stiffness: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what gives K^-1 loads for loads (n,) or (n, k); raises `ModelError` if K holds not all."""
-    try:
-        factor, lower = cho_factor(stiffness, check_finite=False)
-    except np.linalg.LinAlgError as cause:
-        raise ModelError(f"The structure has no stiffness left in some direction ({cause}).") from cause
-    # the LAPACK routine itself: checks of its arguments would take ten times as long
-    return lambda loads: np.asarray(dpotrs(factor, loads, lower=lower)[0])
+Flexibility = Callable[[FloatArray], FloatArray]
+"""What gives K^-1 loads, for loads (N,) or (N, k)."""
+Modes = tuple[FloatArray, FloatArray, int]
+"""Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
 
 
 def at_rest(
@@ -120,10 +116,8 @@ class LinearSystem:
         Rows whose motion is prescribed.
     actions : mapping of str to (N,) ndarray
         Rows along which laws at ports act, where that is not how they see.
-    basis : (K, N) ndarray, optional
-        A system of K unknowns is this times the N that are followed here; None: all are.
-    known : tuple of ((M,) ndarray, (N, M) ndarray, int), optional
-        Its modes, as `modes` returns them, where they need not be computed.
+    known : callable, optional
+        What returns its modes by `flexibility`, where they are known or found in another way.
     compliance : (N, N) ndarray, optional
         K^-1, where it is known.
     """
@@ -138,8 +132,7 @@ class LinearSystem:
     states: int = 0
     drives: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     actions: Mapping[str, FloatArray] = field(default_factory=dict)
-    basis: FloatArray | None = None
-    known: tuple[FloatArray, FloatArray, int] | None = None
+    known: Callable[[Flexibility], Modes] | None = None
     compliance: FloatArray | None = None
 
     @property
@@ -158,10 +151,10 @@ class LinearSystem:
         return found
 
     @cached_property
-    def modes(self) -> tuple[FloatArray, FloatArray, int]:
-        """Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
+    def modes(self) -> Modes:
+        """Its modes."""
         if self.known is not None:
-            return self.known
+            return self.known(self.flexibility)
         n, most = self.displacements, self.mode_count
         mass, stiffness = self.mass[:n, :n], 0.5 * (self.stiffness[:n, :n] + self.stiffness[:n, :n].T)
         free = np.eye(n)
@@ -238,7 +231,7 @@ class LinearSystem:
         whole, left_out = stiffness if loose else None, None
         if self.truncated and ports:
             rows = np.array(list(self.ports.values()))
-            left_out = np.einsum("pn,np->p", rows, self.residual @ rows.T)
+            left_out = np.einsum("pn,np->p", rows, self.residual(rows.T))
             all_of_it = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
             flexible = [name not in self.on_modes for name in ports]
             left_out = np.where((left_out > 1e-9 * all_of_it) & flexible, left_out, 0.0)  # less is rounding
@@ -256,18 +249,21 @@ class LinearSystem:
     # ------------------------------------------------------------ rest
 
     @cached_property
-    def flexibility(self) -> Callable[[FloatArray], FloatArray]:
-        """What gives K^-1 loads, for loads (n,) or (n, k), of a structure that springs hold."""
-        compliance = self.compliance
-        if compliance is None:
-            return springs(self.stiffness)
-        return lambda loads: np.asarray(compliance @ loads)
+    def flexibility(self) -> Flexibility:
+        """What gives K^-1 loads of a structure that springs hold; raises `ModelError` if K holds not all."""
+        if self.compliance is not None:
+            return partial(np.matmul, self.compliance)
+        try:
+            factor, lower = cho_factor(self.stiffness, check_finite=False)
+        except np.linalg.LinAlgError as cause:
+            raise ModelError(f"The structure has no stiffness left in some direction ({cause}).") from cause
+        # the LAPACK routine itself: checks of its arguments would take ten times as long
+        known, solve = Memory(KEPT_ANSWERS), partial(dpotrs, factor, lower=lower)
+        return lambda loads: known.get((loads.shape, loads.tobytes()), lambda: np.asarray(solve(loads)[0]))
 
-    @cached_property
-    def residual(self) -> FloatArray:
-        """The part (N, N) of K^-1 that the modes leave out."""
-        held = (self.shapes / self.angular_frequency**2) @ self.shapes.T
-        return self.flexibility(np.eye(len(self.mass))) - held
+    def residual(self, loads: FloatArray) -> FloatArray:
+        """Return what the modes leave out of K^-1 loads, for loads (N,) or (N, k)."""
+        return self.flexibility(loads) - (self.shapes / self.angular_frequency**2) @ (self.shapes.T @ loads)
 
     @cached_property
     def _restoring(self) -> tuple[FloatArray, bool]:
@@ -344,7 +340,7 @@ class LinearSystem:
             if item.reaction is not None:
                 force[:, number] = acts @ self.lift[:, item.reaction]
             elif self.truncated:
-                force[:, number] = -acts @ (self.residual @ item.rows[0])
+                force[:, number] = -acts @ self.residual(item.rows[0])
         mass, *others = (shapes.T @ matrix @ shapes for matrix in (self.mass, self.damping, self.stiffness))
         sees, acts = sees @ shapes, acts @ shapes
         push, by_damping, by_stiffness = (np.linalg.solve(mass, item) for item in (acts.T, *others))

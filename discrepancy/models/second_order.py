@@ -93,7 +93,7 @@ class Motion:
         of their damping.
         """
         system = self.system
-        residual, found = system.residual @ rows.T, np.zeros((len(self.time), len(rows)))
+        residual, found = system.residual(rows.T), np.zeros((len(self.time), len(rows)))
         if self.acting.loads:
             found += self.acting.load_at(self.time, residual)
         if len(self.laws):
@@ -257,7 +257,7 @@ class SecondOrderSystem(LinearSystem):
             holding += float(along @ solution.forces[0]) / compliance
             acts, memory = holding * row - solution.forces[0] @ rows, solution.memory
             if self.truncated:  # of the port's position, fades after the release
-                memory[:, 3] = holding * (rows @ self.residual @ row)
+                memory[:, 3] = holding * (rows @ self.residual(row))
         deviation = given[:, 0] * unit
         deviation[0] = 0.0
         return Begin(acts @ self.shapes / w**2 + deviation, np.zeros(len(w)), memory), holding * row
@@ -292,7 +292,7 @@ class SecondOrderSystem(LinearSystem):
         boundaries = substeps(self.modal, laws, stamps, refinement, SMOOTH_PARTS if smooth else 1, edges)
         feed = np.zeros((len(boundaries.time), len(laws)))
         if self.truncated and len(laws) and acting.loads:
-            feed = acting.load_at(boundaries.time, self.residual @ self.port_rows(laws).T)
+            feed = acting.load_at(boundaries.time, self.residual(self.port_rows(laws).T))
         return advance(self.modal, laws, self._steps(acting, boundaries, feed), begin, compiled_kernel())
 
     def _steps(self, acting: Acting, boundaries: Boundaries, feed: FloatArray) -> Steps:

@@ -12,7 +12,7 @@ from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, 
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, release_of
 from discrepancy.models.interface import NO_PATCH, Conditions, Model, Outputs, Place, PortedSystem, Response
-from discrepancy.models.linear_system import Resting, at_rest
+from discrepancy.models.linear_system import at_rest
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from discrepancy.models.second_order import Motion, Moved, Rested, SecondOrderSystem, port_scales
 from fe.runtime import patch as changes
@@ -35,8 +35,6 @@ class State(NamedTuple):
         What of a patch changes it.
     warmer : float
         Temperature above the reference [K].
-    place, ports : str or (float, float), tuple of str
-        Where it is let go or pushed, and where forces act: what a system of few coordinates must hold.
     drives : tuple of str
         Inputs whose motion is prescribed.
     closed : bool
@@ -47,8 +45,6 @@ class State(NamedTuple):
     losses: Losses = ()
     structure: ModelPatch = NO_PATCH
     warmer: float = 0.0
-    place: Place | None = None
-    ports: tuple[str, ...] = ()
     drives: tuple[str, ...] = ()
     closed: bool = True
 
@@ -69,8 +65,6 @@ class SystemModel(Model):
     ----------
     port_rows : mapping of str to (N,) ndarray
         Rows of all ports where laws act.
-    missing : tuple of str
-        Further ports of `port_rows` where missing forces are looked for.
     reference : str or None
         Place whose stiffness and modal mass are the natural ones; None: that of the first trial.
     displacements : int or None
@@ -80,7 +74,6 @@ class SystemModel(Model):
     """
 
     port_rows: Mapping[str, FloatArray]
-    missing: tuple[str, ...] = ()
     reference: str | None = None
     kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
     displacements: int | None = None
@@ -92,10 +85,6 @@ class SystemModel(Model):
     @abstractmethod
     def system(self, state: State) -> SecondOrderSystem:
         """Return what moves in a state."""
-
-    def rest(self, state: State) -> Resting:
-        """Return what gives the rest in a state."""
-        return self.system(state).resting
 
     @abstractmethod
     def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
@@ -169,22 +158,20 @@ class SystemModel(Model):
         loads, drives = self.pushes(case)
         return replace(acting, loads=loads, drives=drives, initial=conditions.initial.ravel())
 
-    def begun(self, case: Case, ports: tuple[str, ...]) -> tuple[SecondOrderSystem, Acting]:
-        """Return what moves under forces at ports, and what acts on it."""
+    def begun(self, case: Case) -> tuple[SecondOrderSystem, Acting]:
+        """Return what moves in a dynamic trial, and what acts on it."""
         acting = self.acting(case)
-        moving = case.state._replace(place=case.trial.load_place, ports=ports, drives=tuple(acting.drives))
-        system = self.system(moving)
-        return system, acting if system.basis is None else acting.along(system.basis)
+        return self.system(case.state._replace(drives=tuple(acting.drives))), acting
 
-    def moved(self, case: Case, laws: Laws = NO_LAWS, ports: tuple[str, ...] | None = None) -> Motion:
-        """Return the motion in a dynamic trial, `ports` being those of the laws unless it is said.
+    def moved(self, case: Case, laws: Laws = NO_LAWS) -> Motion:
+        """Return the motion in a dynamic trial.
 
         Raises
         ------
         ModelError
             If it cannot begin so, or what acts is not the model's.
         """
-        system, acting = self.begun(case, laws.ports if ports is None else ports)
+        system, acting = self.begun(case)
         try:
             return system.motion(acting, laws, case.conditions.refinement)
         except (ModelError, FiniteElementError) as cause:
@@ -230,7 +217,7 @@ class SystemModel(Model):
             ports = laws.rows(self.port_rows, units.shape[1])
             ports[:, n:] = 0.0  # ports of states are at no position
             seen = np.array([np.concatenate((item.rows[0, :n], item.rows[1, n:])) for item in shown])
-            rest, given = self.rest(case.state), amounts[rows]
+            rest, given = self.system(case.state).resting, amounts[rows]
             try:
                 values[rows], memory = at_rest(rest, units, given, laws, ports, memory, before, seen=seen)
             except (ModelError, FiniteElementError) as cause:
@@ -249,17 +236,13 @@ class SystemModel(Model):
             self.case(trial, Conditions(values, health=trial.health[:1]), patch)
             for values in (self.prior_mean(), parameters)
         )
-        (base, _), (system, acting) = (self.begun(item, self.missing) for item in (at_mean, case))
-        shapes = base.shapes
-        if base.basis is not None and system.basis is not None:
-            # both bases hold nearly the same shapes of the whole structure
-            shapes = np.asarray(np.linalg.lstsq(system.basis, base.basis @ shapes, rcond=None)[0])
-        return system.seen_by(self.shown(case, outputs, acting), shapes)
+        (base, _), (system, acting) = map(self.begun, (at_mean, case))
+        return system.seen_by(self.shown(case, outputs, acting), base.shapes)
 
     def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         case = self.case(trial, conditions, self.patch.in_trial(trial.name))
-        return self.moved(case, ports=self.missing).at_ports
+        return self.moved(case).at_ports
 
     # ------------------------------------------------------------ sizes
 
@@ -298,7 +281,7 @@ class SystemModel(Model):
         """
         trials, parameters = campaign.trials, self.prior_mean(campaign)
         state, names = State(parameters, (0.0,) * len(self.regions)), self.ports()
-        system, rest, laws = self.system(state), self.rest(state), self.laws(parameters)
+        system, laws = self.system(state), self.laws(parameters)
         held = system.mode_count is not None and all(
             trial.kind is not TrialKind.DRIVEN and trial.begins is Start.SETTLED for trial in trials
         )
@@ -334,11 +317,10 @@ class SystemModel(Model):
         if held:
             known = [*(trial.load_place for trial in trials), *(self.load_places or ())]
             row, shape = self.force_row(self.reference or known[0], state), system.shapes[:, 0]
-            shape = shape if system.basis is None else system.basis @ shape
-            stiff = [1.0 / float(own @ rest(own[None])[0]) for own in rows]
+            stiff = [1.0 / float(own @ system.resting(own[None])[0]) for own in rows]
             frequency, participation = float(system.angular_frequency[0]), float(row @ shape) ** 2
             mass = 1.0 / participation if participation else float(np.trace(system.mass))
-            stiffness = 1.0 / float(row @ rest(row[None])[0])
+            stiffness = 1.0 / float(row @ system.resting(row[None])[0])
         else:
             elastic = system.angular_frequency[system.angular_frequency > 0.0]
             usual = speed / peak if peak > 0.0 < speed else 1.0 / sizes["duration"]
@@ -357,7 +339,7 @@ class SystemModel(Model):
 
     def _held(self, case: Case) -> FloatArray:
         """Return the displacements (L, N) in a trial at rest, or from which a ring-down is released."""
-        rest, acting = self.rest(case.state), self.acting(case)
+        rest, acting = self.system(case.state).resting, self.acting(case)
         if acting.release is None:
             units, amounts = acting.levels
             return np.asarray(amounts @ rest(units))
