@@ -113,11 +113,9 @@ class StructureMesh(CellMesh):
         centre, radius = np.empty((len(surface), 3)), np.empty(len(surface))
         for number, nodes in enumerate(self.kind.face_nodes):
             on = np.flatnonzero(surface.face == number)
-            middle = np.full((1, 2), 1.0 / 3.0 if len(self.kind.faces[number]) == 3 else 0.5)
-            values, _ = self.kind.shape_functions(self.kind.face_places(number, middle)[0])
-            points = self.nodes[surface.cell[on]]
-            centre[on] = np.einsum("a,nai->ni", values[0], points)
-            radius[on] = np.linalg.norm(points[:, list(nodes)] - centre[on, None], axis=2).max(axis=1)
+            points = self.nodes[surface.cell[on]][:, list(nodes)]
+            centre[on] = points.mean(axis=1)
+            radius[on] = np.linalg.norm(points - centre[on, None], axis=2).max(axis=1)
         return centre, radius
 
     def place(self, point: FloatArray) -> str:

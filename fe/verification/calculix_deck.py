@@ -10,12 +10,14 @@ strain or displacement, by an equation, because printed displacements hold seven
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
+from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import StrictUndefined, Template
 from numpy.typing import ArrayLike
+from scipy import sparse
 
 from fe.elements.cells import CellMesh
 from fe.elements.kinds import HEXAHEDRA_20, WEDGES_6
@@ -99,16 +101,10 @@ class CalculixDeck:
         Its state by name; what is left out is nominal, and healthy.
     loads : mapping of str to Step
         Static steps of its loads, each alone.
-    probed : tuple of (n,)
-        Rows on the free unknowns that are read behind the gauges and the displacement outputs.
-    gauge_cells : (m,)
-        Cells that are the set EGAUGES.
     grading : Grading, optional
         Where the elasticity changes inside cells.
     damping : (float, float)
         Rayleigh damping [1/s] and [s] of a step in time.
-    each_alone : bool
-        Whether strains and outputs are compared each over its own, and not over the largest of their kind.
     """
 
     title: str
@@ -116,11 +112,8 @@ class CalculixDeck:
     body: Body[CellMesh]
     values: Mapping[str, float]
     loads: Mapping[str, Step]
-    probed: tuple[FloatArray, ...] = ()
-    gauge_cells: IntArray | tuple[()] = ()
     grading: Grading | None = None
     damping: tuple[float, float] = (0.0, 0.0)
-    each_alone: bool = False
 
     @property
     def mesh(self) -> CellMesh:
@@ -148,8 +141,8 @@ class CalculixDeck:
     @cached_property
     def probes(self) -> FloatArray:
         """Rows (m, n) of what is read, on the free unknowns."""
-        own = (self.structure.gauge_output.toarray(), self.structure.displacement_output.toarray())
-        return np.vstack((*own, *self.probed))
+        rows = sparse.vstack((self.structure.gauge_output, self.structure.displacement_output))
+        return np.asarray(rows.toarray())
 
     def text(self, *steps: Step) -> str:
         """Input of a job: the model, then its steps."""
@@ -163,20 +156,28 @@ class CalculixDeck:
         corners = np.arange(first, first_probe).reshape(-1, 8).tolist()
         blocks = [(nodes, *block) for nodes, block in zip(corners, heavy, strict=True)]
         side, still = HEXAHEDRA_20.places[:8] * _BLOCK, np.diff(held.expansion.indptr) == 0
-        return _template().render(
-            deck=self,
-            materials=self._materials,
-            cells=np.column_stack((np.arange(len(self.mesh.cells)), self.mesh.cells)) + 1,
-            motion_nodes=range(len(points) + 1, first),
-            held=map(_place, (*np.flatnonzero(still), *range(3 * len(points) + motions, 3 * first - 3))),
-            springs=[*self.terms(held.springs)],
-            blocks=[
-                (mass, [*zip(nodes, shares @ points + side, strict=True)]) for nodes, mass, shares in blocks
-            ],
-            block_side=_BLOCK,
-            probe_nodes=range(first_probe, first_probe - (-len(self.probes) // 3)),
-            equations=self._equations([(nodes, shares) for nodes, _, shares in blocks], first_probe),
-            steps=steps,
+        file = resources.files("fe.verification").joinpath("templates/calculix.inp.jinja")
+        template = Template(
+            file.read_text(encoding="utf-8"), trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined
+        )
+        return str(
+            template.render(
+                deck=self,
+                numbers=number_line,
+                materials=self._materials,
+                cells=np.column_stack((np.arange(len(self.mesh.cells)), self.mesh.cells)) + 1,
+                motion_nodes=range(len(points) + 1, first),
+                held=map(_place, (*np.flatnonzero(still), *range(3 * len(points) + motions, 3 * first - 3))),
+                springs=[*self.terms(held.springs)],
+                blocks=[
+                    (mass, [*zip(nodes, shares @ points + side, strict=True)])
+                    for nodes, mass, shares in blocks
+                ],
+                block_side=_BLOCK,
+                probe_nodes=range(first_probe, first_probe - (-len(self.probes) // 3)),
+                equations=self._equations([(nodes, shares) for nodes, _, shares in blocks], first_probe),
+                steps=steps,
+            )
         )
 
     def _equations(
@@ -209,19 +210,6 @@ class CalculixDeck:
 def _place(unknown: int) -> tuple[int, int]:
     """Return node and direction, both from 1, of an unknown."""
     return unknown // 3 + 1, unknown % 3 + 1
-
-
-@cache
-def _template() -> Template:
-    environment = Environment(
-        loader=PackageLoader("fe.verification"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters["numbers"] = number_line
-    return environment.get_template("calculix.inp.jinja")
 
 
 def number_line(values: ArrayLike) -> str:
@@ -265,10 +253,7 @@ def _load_step(structure: Structure, load: Load) -> Step:
 
 
 def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
-    """Return the wing in one state; it reads the gauges, the displacement at the tip, then at the test load.
-
-    The root is a rigid set about the straight chord line, which moves in heave, flap and yaw on its springs.
-    """
+    """Return the wing in one state."""
     mesh, design, body = operators.wing_mesh, operators.wing_mesh.design, operators.body
     plan, lift, skin, grading = design.planform, design.lift, design.skin, None
     if skin.stations:  # the station of a node stands as its temperature, on which the skin depends
@@ -277,19 +262,12 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
         body = replace(body, elasticity=body.elasticity / centre[:, None, None])
         course = [(place.station, place.young_modulus) for place in skin.stations]
         grading = Grading(course, mesh.points[:, 1] / plan.semi_span, graded)
-    cells = [  # that hold the middle of a gauge
-        mesh.skin_point(distance, chord * plan.chord(distance / plan.semi_span)).cell
-        for distance, chord in design.gauges.positions
-    ]
     return CalculixDeck(
         "wing, design",
         operators,
         body,
         wing_values(operators, stiffness_loss=state.stiffness_loss, **state.values),
         {"tip force": Step(operators.turn(0.0, TEST_FORCE)), "lift": Step(operators.turn(lift.load_factor))},
-        (operators.load_tip,),
-        np.unique(cells),
         grading,
         (state.damping_alpha, state.damping_beta),
-        each_alone=True,
     )
