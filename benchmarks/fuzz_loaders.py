@@ -49,7 +49,7 @@ from fmu_asset.ssp.reader import read_ssp
 from scenarios import binding_files
 from twin_master.assets.library_source import load_observation_library
 from twin_master.assets.strain_library_source import load_strain_library
-from twin_master.mission.loop import CheckpointFile
+from twin_master.mission.journal import JournalFile, reading_of, records_backwards
 from twin_master.report.reading import read_run as read_record
 from twin_master.run_folder import read_config
 from twin_master.scenario.reading import load_scenario, parse_scenario
@@ -83,8 +83,10 @@ class Loader:
 
 
 def _checkpoint(path: Path) -> None:
-    with CheckpointFile(path.parent, CONFIG_HASH):
-        pass
+    with JournalFile(path.parent, CONFIG_HASH):
+        for record, begin, _ in records_backwards(path):
+            if begin:
+                reading_of(record)
 
 
 def _config(path: Path) -> None:

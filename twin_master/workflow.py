@@ -20,7 +20,7 @@ from twin_master.assets.mismatch import Misfit, find_misfit
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.errors import NotResumableError
 from twin_master.mission import loop
-from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.journal import JOURNAL_NAME, JournalFile
 from twin_master.mission.opening import begin_folder, file_record, restore, resume_folder
 from twin_master.mission.planning import read_policy
 from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
@@ -290,15 +290,11 @@ def _fly(
 ) -> MissionResult:
     scenario = knowledge.scenario
     truth = knowledge.truth(scenario.mission.seed)
-    with closing(source.open()) as asset, loop.CheckpointFile(folder, hash_record(config)) as kept:
-        flight = loop.fly(
-            scenario,
-            knowledge.twin(),
-            knowledge.plant(truth, asset),
-            checkpoint=kept.checkpoint,
-            keep=kept.keep,
-            progress=progress,
-        )
+    with closing(source.open()) as asset, JournalFile(folder, hash_record(config)) as journal:
+        plant = knowledge.plant(truth, asset)
+        flown = loop.taken_up(journal, knowledge, plant)
+        keep = loop.kept_in(journal, plant)
+        flight = loop.fly(scenario, flown.twin, plant, keep, history=flown, progress=progress)
         return MissionResult(scenario, knowledge, flight, truth, asset.units)
 
 

@@ -87,8 +87,6 @@ class AffineStructure:
         What was asked for.
     parameters, masses, controls : dict of str to float
         Nominal values of the parameters [1], free masses [kg] and controls [each in its unit].
-    control_units : dict of str to str
-        Their units.
     ranges : dict of str to (float, float)
         Least and largest value for which a reduced model is to hold, of these and of the losses, by name.
     regions : tuple of str
@@ -109,8 +107,6 @@ class AffineStructure:
         Rows that give a displacement, or with second derivatives an acceleration.
     expansion : csr (full, n)
         Free unknowns to the displacements of all nodes (3 node + component).
-    damping_alpha, damping_beta : float
-        Rayleigh damping [1/s] and [s].
     design_hash : str
         Hash of the design with its mesh.
     """
@@ -119,7 +115,6 @@ class AffineStructure:
     parameters: dict[str, float]
     masses: dict[str, float]
     controls: dict[str, float]
-    control_units: dict[str, str]
     ranges: dict[str, tuple[float, float]]
     regions: tuple[str, ...]
     stiffness_terms: tuple[StiffnessTerm, ...]
@@ -133,8 +128,6 @@ class AffineStructure:
     displacement_output: sparse.csr_array
     acceleration_output: sparse.csr_array
     expansion: sparse.csr_array
-    damping_alpha: float
-    damping_beta: float
     design_hash: str
 
     @property
@@ -251,7 +244,6 @@ def designed(
         "parameters": {part.name: part.nominal for part in design.parameter},
         "masses": {part.name: part.mass for part in design.mass if part.free},
         "controls": {part.name: part.nominal for part in design.control},
-        "control_units": {part.name: part.unit for part in design.control},
         "ranges": design.ranges,
         "regions": tuple(part.name for part in design.damage),
         "mass_terms": tuple((restriction @ (own @ expansion)).tocsr() for own in masses.values()),
@@ -262,8 +254,6 @@ def designed(
         "accelerations": tuple(part.name for part in design.acceleration),
         **{f"{key}_output": (rows @ expansion).tocsr() for key, rows in outputs.items()},
         "expansion": expansion,
-        "damping_alpha": design.damping.alpha,
-        "damping_beta": design.damping.beta,
     }
 
 

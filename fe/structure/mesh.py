@@ -3,10 +3,10 @@
 Last what its supports hold, what springs they set, what is rigid, and whether it is free to move.
 """
 
-from collections.abc import Sized
+from collections.abc import Iterable, Sized
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -113,11 +113,9 @@ class StructureMesh(CellMesh):
         centre, radius = np.empty((len(surface), 3)), np.empty(len(surface))
         for number, nodes in enumerate(self.kind.face_nodes):
             on = np.flatnonzero(surface.face == number)
-            middle = np.full((1, 2), 1.0 / 3.0 if len(self.kind.faces[number]) == 3 else 0.5)
-            values, _ = self.kind.shape_functions(self.kind.face_places(number, middle)[0])
-            points = self.nodes[surface.cell[on]]
-            centre[on] = np.einsum("a,nai->ni", values[0], points)
-            radius[on] = np.linalg.norm(points[:, list(nodes)] - centre[on, None], axis=2).max(axis=1)
+            points = self.nodes[surface.cell[on]][:, list(nodes)]
+            centre[on] = points.mean(axis=1)
+            radius[on] = np.linalg.norm(points - centre[on, None], axis=2).max(axis=1)
         return centre, radius
 
     def place(self, point: FloatArray) -> str:
@@ -206,9 +204,8 @@ _FREE = 1e-8
 """A rigid motion that the supports resist by less than this share of the stiffest one is free."""
 
 
-@dataclass(frozen=True)
-class RigidSet:
-    """Nodes (m,) that move as a rigid body.
+class RigidSet(NamedTuple):
+    """Nodes that move as a rigid body.
 
     Attributes
     ----------
@@ -216,72 +213,68 @@ class RigidSet:
         Numbers of the nodes.
     point : (3,) m
         About which it turns.
-    motions : (3 m, 6)
-        Displacements of the nodes by 1 m along x, y, z and 1 rad about them.
     held : (6,) bool
-        Motions that are held.
+        Motions along x, y, z and about them that are held.
     springs : (6,) N/m, N m/rad
         Springs to the ground.
     """
 
     nodes: IntArray
     point: FloatArray
-    motions: FloatArray
     held: BoolArray
     springs: FloatArray
 
 
-@dataclass(frozen=True)
-class SupportedUnknowns:
-    """Held displacements and springs of all unknowns (3 node + component), and rigid sets.
+class Supports(NamedTuple):
+    """The n free unknowns: displacements, then the motions of rigid sets by 1 m and 1 rad.
 
     Attributes
     ----------
-    held : (full,) bool
-        Whether a displacement is held at zero.
-    springs : (full,) N/m
+    expansion : csr (full, n)
+        Free unknowns to the displacements of all nodes (3 node + component).
+    alone : (f,)
+        Displacements that are free unknowns by themselves, the first of these.
+    springs : (n,) N/m, N m/rad
         Springs to the ground.
-    rigid : tuple of RigidSet
-        Their nodes are not among the held ones.
     """
 
-    held: BoolArray
+    expansion: sparse.csr_array
+    alone: IntArray
     springs: FloatArray
-    rigid: tuple[RigidSet, ...] = ()
-
-    @cached_property
-    def alone(self) -> IntArray:
-        """Unknowns (f,) that are free by themselves."""
-        found = ~self.held
-        for part in self.rigid:
-            found[_unknowns(part.nodes)] = False
-        return np.flatnonzero(found)
-
-    @cached_property
-    def expansion(self) -> sparse.csr_array:
-        """Free unknowns to all unknowns, csr (full, n); the motions of rigid sets come last."""
-        size, count = len(self.held), len(self.alone)
-        parts = [sparse.coo_array((np.ones(count), (self.alone, np.arange(count))), (size, count))]
-        for part in self.rigid:
-            moving = sparse.coo_array(part.motions[:, ~part.held])
-            rows = _unknowns(part.nodes)[moving.row]
-            parts.append(sparse.coo_array((moving.data, (rows, moving.col)), (size, moving.shape[1])))
-        return sparse.hstack(parts).tocsr()
 
     @property
     def stiffness(self) -> sparse.csr_array:
-        """Stiffness (n, n) of the springs on the free unknowns."""
-        ground = self.expansion.T @ sparse.diags_array(self.springs) @ self.expansion
-        turns = [part.springs[~part.held] for part in self.rigid]
-        own = np.concatenate([np.zeros(len(self.alone)), *turns])
-        return sparse.csr_array(ground + sparse.diags_array(own))
+        """Stiffness (n, n) of the springs."""
+        return sparse.diags_array(self.springs).tocsr()
 
 
-def _unknowns(nodes: IntArray) -> IntArray:
-    return np.asarray(3 * nodes[:, None] + np.arange(3)).ravel()
+def supports(
+    points: FloatArray, held: BoolArray, springs: FloatArray, bodies: Iterable[RigidSet]
+) -> Supports:
+    """Return what is free of nodes, of which some are held, sprung or rigid.
+
+    Parameters
+    ----------
+    points : (nodes, 3) m
+        Places of the nodes.
+    held, springs : (nodes, 3) bool, (nodes, 3) N/m
+        Displacements that are held, and springs to the ground, of nodes that belong to no rigid set.
+    bodies : iterable of RigidSet
+        The rigid sets.
+    """
+    free, moved, stiff = ~held, [], []
+    for body in bodies:
+        free[body.nodes] = False
+        moving = sparse.coo_array(rigid_motions(points[body.nodes], body.point, 2.0)[:, ~body.held])
+        places = (3 * body.nodes[moving.row // 3] + moving.row % 3, moving.col)
+        moved.append(sparse.coo_array((moving.data, places), (free.size, moving.shape[1])))
+        stiff.append(body.springs[~body.held])
+    alone = np.flatnonzero(free)
+    expansion = sparse.hstack((sparse.eye_array(free.size, format="csc")[:, alone], *moved))
+    return Supports(expansion.tocsr(), alone, np.concatenate((springs.ravel()[alone], *stiff)))
 
 
-def supported(design: MeshDesign, mesh: StructureMesh) -> SupportedUnknowns:
+def supported(design: MeshDesign, mesh: StructureMesh) -> Supports:
     """Collect the supports of a design.
 
     Raises
@@ -313,7 +306,7 @@ def supported(design: MeshDesign, mesh: StructureMesh) -> SupportedUnknowns:
         taken[body.nodes] = True
     bodies = tuple(rigid.values())
     _check_rigid_motions(mesh, held, springs, bodies)
-    return SupportedUnknowns(held.ravel(), springs.ravel(), bodies)
+    return supports(mesh.points, held, springs, bodies)
 
 
 def _rigid_set(part: Support, mesh: StructureMesh, nodes: IntArray, where: str) -> RigidSet:
@@ -325,7 +318,7 @@ def _rigid_set(part: Support, mesh: StructureMesh, nodes: IntArray, where: str) 
         )
     springs = np.zeros(len(MOTIONS))
     springs[: len(part.springs or ())] = part.springs or ()
-    return RigidSet(nodes, point, motions, np.isin(MOTIONS, part.hold), springs)
+    return RigidSet(nodes, point, np.isin(MOTIONS, part.hold), springs)
 
 
 def rigid_motions(points: FloatArray, centre: FloatArray, size: float) -> FloatArray:

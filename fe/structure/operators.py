@@ -14,11 +14,12 @@ from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError, MeshError
 from reporting.files import atomic_file
 
-from .affine import AffineStructure, StiffnessTerm, designed, static_response
+from .affine import AffineStructure, static_response
+from .body import Body, PointMass
 from .design import Damage, Material, MatrixDesign, MeshDesign, load_structure, structure_hash, unit_vector
 from .location import gauge_rows, nodal_load, point_shares
 from .matrices import assemble_matrices
-from .mesh import StructureMesh, SupportedUnknowns, supported
+from .mesh import StructureMesh, supported
 from .mesh_file import check_memory, read_mesh
 
 
@@ -30,27 +31,26 @@ class Structure(AffineStructure):
     ----------
     design : MeshDesign
         What was asked for.
-    mesh : StructureMesh
-        Its mesh.
+    body : Body
+        Its mesh, and what it is made of.
     material_of : (nc,)
         Number of the material of each cell.
     region_of : (nc,)
         Number of the damage region of each cell, -1 for none.
-    unknowns_held : SupportedUnknowns
-        What the supports hold and spring.
     gauges_moved : (gauges,) m
         How far each gauge lies from where it was asked for.
-    nodal_mass : (nodes,) kg
-        Share of each node in the mass of the structure with its point masses.
     """
 
     design: MeshDesign
-    mesh: StructureMesh
+    body: Body[StructureMesh]
     material_of: IntArray
     region_of: IntArray
-    unknowns_held: SupportedUnknowns
     gauges_moved: FloatArray
-    nodal_mass: FloatArray
+
+    @property
+    def mesh(self) -> StructureMesh:
+        """Its mesh."""
+        return self.body.mesh
 
 
 def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
@@ -161,60 +161,33 @@ def assemble(
             f"{mesh.cell_numbers[bare[0]]} at {mesh.place(mesh.centres[bare[0]])}."
         )
     region_of = _owners(mesh, "damage", design.damage, "damage region")
-    held = supported(design, mesh)
-    shares = [
-        point_shares(mesh, part.point, f"mass[{number}]") for number, part in enumerate(design.mass, start=1)
-    ]
-    density = np.array([part.density for part in design.material])[material_of]
-    rule = mesh.kind.stiffness_rule if mass_as_stiffness else mesh.kind.mass_rule
-    mass, three = mesh.mass(np.arange(len(mesh.cells)), density, rule), sparse.eye_array(3)
-    gauges, moved = gauge_rows(mesh, design.gauge)
-    return Structure(
-        **designed(
-            design,
-            held.expansion,
-            sparse.kron(mass, three).tocsr(),
-            (own @ own.T for own in (sparse.kron(own[:, None], three, format="csr") for own in shares)),
-            (nodal_load(mesh, load, f"load[{n}]").ravel() for n, load in enumerate(design.load, start=1)),
-            {"gauge": gauges}
-            | {key: _point_rows(design, mesh, key) for key in ("displacement", "acceleration")},
+    parameters, regions = ([*(part.name for part in own), None] for own in (design.parameter, design.damage))
+    scaled = np.array([parameters.index(part.scaled_by) for part in design.material])
+    pairs, part = np.unique(
+        scaled[material_of] * len(regions) + region_of % len(regions), return_inverse=True
+    )
+    body = Body(
+        mesh,
+        supported(design, mesh),
+        np.array([own.elasticity for own in design.material])[material_of],
+        np.array([own.density for own in design.material])[material_of],
+        part,
+        tuple((parameters[pair // len(regions)], regions[pair % len(regions)]) for pair in pairs.tolist()),
+        tuple(
+            PointMass(own.name, own.mass, point_shares(mesh, own.point, f"mass[{number}]")[None])
+            for number, own in enumerate(design.mass, start=1)
         ),
-        stiffness_terms=_stiffness_terms(design, mesh, material_of, region_of, held),
+        mass_rule=mesh.kind.stiffness_rule if mass_as_stiffness else None,
+    )
+    gauges, moved = gauge_rows(mesh, design.gauge)
+    loads = (nodal_load(mesh, load, f"load[{n}]").ravel() for n, load in enumerate(design.load, start=1))
+    points = {key: _point_rows(design, mesh, key) for key in ("displacement", "acceleration")}
+    return Structure(
+        **body.assembled(design, loads, {"gauge": gauges} | points),
         design_hash=design_hash,
-        mesh=mesh,
         material_of=material_of,
         region_of=region_of,
-        unknowns_held=held,
         gauges_moved=moved,
-        nodal_mass=mass.sum(axis=1)
-        + sum(part.mass * own for part, own in zip(design.mass, shares, strict=True)),
-    )
-
-
-def _stiffness_terms(
-    design: MeshDesign,
-    mesh: StructureMesh,
-    material_of: IntArray,
-    region_of: IntArray,
-    held: SupportedUnknowns,
-) -> tuple[StiffnessTerm, ...]:
-    """Sum the cells by pairs of a parameter and a region, none last; the pair of none holds the springs."""
-    restriction, springs = held.expansion.T.tocsr(), held.stiffness
-    parameters = [*(part.name for part in design.parameter), None]
-    regions = [*(part.name for part in design.damage), None]
-    elasticity = np.array([part.elasticity for part in design.material])
-    scaled = np.array([parameters.index(part.scaled_by) for part in design.material])
-    pairs = scaled[material_of] * len(regions) + region_of % len(regions)
-    found: dict[int, sparse.csr_array] = {}
-    for pair in np.unique(pairs).tolist():
-        cells = np.flatnonzero(pairs == pair)
-        found[pair] = restriction @ mesh.stiffness(cells, elasticity[material_of[cells]]) @ held.expansion
-    if springs.nnz and springs.max() > 0.0:
-        last = len(parameters) * len(regions) - 1
-        found[last] = found[last] + springs if last in found else springs
-    return tuple(
-        StiffnessTerm(found[pair].tocsr(), parameters[pair // len(regions)], regions[pair % len(regions)])
-        for pair in sorted(found)
     )
 
 
@@ -229,7 +202,7 @@ def _point_rows(design: MeshDesign, mesh: StructureMesh, key: str) -> sparse.csr
 
 def weighed(structure: Structure) -> tuple[float, FloatArray]:
     """Mass [kg] with the nominal point masses, and the centre of gravity (3,) [m]."""
-    shares, points = structure.nodal_mass, structure.mesh.points
+    shares, points = structure.body.nodal_mass, structure.mesh.points
     mass = float(shares.sum())
     return mass, shares @ points / mass if mass > 0.0 else points.mean(axis=0)
 

@@ -258,7 +258,7 @@ class WingMesh(CellMesh):
         return np.array([line.at(chord) for line in self.chord_lines])
 
     def skin_point(self, distance: float, behind_leading_edge: float, *, upper: bool = True) -> SurfacePoint:
-        """Point on the outer surface of the skin.
+        """Point on the outer surface of the skin of the box, where a design has checked that it lies.
 
         Parameters
         ----------
@@ -268,24 +268,12 @@ class WingMesh(CellMesh):
             Distance from the leading edge [m].
         upper : bool
             On the upper skin, otherwise on the lower.
-
-        Raises
-        ------
-        MeshError
-            If the point does not lie on the skin of the box.
         """
-        lines = (self.chord_places(distance), self.span_lines)
         index, local = [], []
-        for places, place in zip(lines, (behind_leading_edge, distance), strict=True):
-            if not places[0] - 1e-9 <= place <= places[-1] + 1e-9:
-                raise MeshError(
-                    f"the point {distance:.4g} m from the root and {behind_leading_edge:.4g} m behind the "
-                    f"leading edge does not lie on the skin, which reaches from {lines[0][0]:.4g} m to "
-                    f"{lines[0][-1]:.4g} m there."
-                )
-            before = int(np.clip(np.searchsorted(places, place, side="right") - 1, 0, len(places) - 2))
+        for lines, place in ((self.chord_places(distance), behind_leading_edge), (self.span_lines, distance)):
+            before = int(np.clip(np.searchsorted(lines, place, side="right") - 1, 0, len(lines) - 2))
             index.append(before)
-            local.append((place - places[before]) / (places[before + 1] - places[before]))
+            local.append((place - lines[before]) / (lines[before + 1] - lines[before]))
         height = self.height_cells + 1 if upper else 0
         return SurfacePoint(int(self._cell_of[*index, height]), np.array([*local, float(upper)]))
 

@@ -23,6 +23,7 @@ from twin_master.mission.journal import (
 )
 from twin_master.mission.loop import Source, operate
 from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
+from twin_master.mission.replay import BelievedModel, journalled_decision, replay
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.run_folder import PATCH, PICTURE, TEACHING, VERDICT, tidy, with_inputs
@@ -32,7 +33,6 @@ from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping
 from twin_master.watch.keeping import Keeper, Standing
-from twin_master.watch.replay import BelievedModel, journalled_decision, replay
 from twin_master.watch.teaching import (
     LEAST_GAIN,
     TRIAL_TURNS,
@@ -181,13 +181,13 @@ class Watch:
             if patched is not None:
                 self._patch(journal, patched)
             found, last = replay(self._path, self.models, self.scenario.watch.lag)
-            intake.restore(None if last is None else last["intake"])
-            if last is not None:
+            intake.restore(last.get("intake"))
+            if last:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
             self.keep = Keeper(journal, intake, found.twin, self.standing)
-            self.keep.quiet = "quiet" in (last or {})
+            self.keep.quiet = "quiet" in last
             yield journal, self.keep
 
     def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:
@@ -253,7 +253,9 @@ class Watch:
         """Believe a patched model; return the twin that goes on."""
         name, first = f"asset/model_patch_{len(self.models)}.json", outcome.model.from_turn
         atomic_write_bytes(self.folder / name, outcome.trial.patch)
-        twin, alarms = outcome.twin()
+        again, _ = replay(self._path, self.models, self.scenario.watch.lag, question=outcome.model)
+        alarms = [n for turn, n in again.notices if turn >= first and n.kind == "alarm"]
+        twin = again.twin
         self.models.append(outcome.model)
         self._patches.append(self.folder / name)
         model: dict[str, Any] = {

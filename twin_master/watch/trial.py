@@ -1,7 +1,7 @@
 """A patch beside what a watch believes: the patched model, its turns filtered again, and what that gains.
 
 All of it follows from a journal up to one of its lines, so that it may be worked out in another process while
-the watch goes on: what came meanwhile is filtered behind it.
+the watch goes on.
 """
 
 import os
@@ -25,14 +25,11 @@ from reporting.progress import Progress, SilentProgress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DesignBelief
 from twin_master.errors import MissionInputError, TwinMasterError
-from twin_master.mission.journal import array_of, records
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.network.estimator import Notice
-from twin_master.network.twin import Twin
+from twin_master.mission.replay import BelievedModel, gap_of, replay
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
 from twin_master.store.summary import policy_switch
-from twin_master.watch.replay import BelievedModel, gap_of, replay
 
 COURTESY = 10
 """Niceness of what is worked out beside a watch: the watch comes first."""
@@ -82,13 +79,9 @@ class Outcome:
     gained : float
         Log evidence of the turns that were compared, with the patch less without [nats].
     before, after : mapping
-        The gap of the turns from `trial.from_turn` on, see `decision.gap_of`.
-    alarms : tuple of Notice
-        What the patched model does not explain of these.
+        The gap of the turns from `trial.from_turn` on, see `gap_of`.
     policy_change : str
         How the policy changes, in a sentence; empty where it stays.
-    state : bytes
-        Of the twin that believes it, after the last turn.
     """
 
     trial: Trial
@@ -96,25 +89,7 @@ class Outcome:
     gained: float
     before: Mapping[str, Any]
     after: Mapping[str, Any]
-    alarms: tuple[Notice, ...]
     policy_change: str
-    state: bytes
-
-    def twin(self) -> tuple[Twin, tuple[Notice, ...]]:
-        """Return the twin that believes the patch, after all turns of the journal, and its alarms."""
-        twin = self.model.knowledge.twin(lag=self.trial.scenario.watch.lag)
-        twin.restore_state(self.state)
-        alarms = [*self.alarms]
-        for record, *_ in records(self.trial.journal, self.trial.end):
-            if "observed" not in record:
-                continue
-            at, observed = int(record["observation_turn"]), array_of(record["observed"])
-            if at < twin.turns:
-                twin.revise(at, observed, int(record["control_index"]))
-            else:
-                found = twin.turn(observed, int(record["control_index"]))
-                alarms += [notice for notice in found.notices if notice.kind == "alarm"]
-        return twin, tuple(alarms)
 
 
 def patched_model(
@@ -170,9 +145,7 @@ def judged(trial: Trial, progress: Progress | None = None) -> Outcome:
         gained=float(compared[1] - compared[0]),
         before=gap_of(before, first - before.first_turn, known.sensor_model),
         after=gap_of(after, first - after.first_turn, model.knowledge.sensor_model),
-        alarms=tuple(n for turn, n in after.notices if turn >= first and n.kind == "alarm"),
         policy_change=policy_change(known, model.knowledge),
-        state=after.twin.save_state(),
     )
 
 

@@ -2,7 +2,7 @@
 
 Every law of a file of this folder is known by its number, its place in `LAWS`. `advance` and `pull` are here
 once, with that number before what they are given: they call those of the law.
-`discrepancy.models.compiled_motion` has the same compiled.
+`fe.compilation` has the same compiled.
 
 NumPy and relative imports only: this folder is copied into the FMU.
 """

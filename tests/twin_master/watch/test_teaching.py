@@ -27,12 +27,12 @@ from tests.twin_master.runs import check_same, journal, text_of, written
 from tests.twin_master.watch.watches import of_gauge, patch_of, ran, viewed, watchful
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
+from twin_master.mission.replay import replay
 from twin_master.network.inference import known_control
 from twin_master.viewer.messages import Request, Teller
 from twin_master.viewer.scene import scene_of
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Patched, Watch
-from twin_master.watch.replay import replay
 from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence
 from twin_master.watch.trial import Judge, Outcome, patched_model, policy_change
 
@@ -239,7 +239,7 @@ def test_a_policy_that_changes_is_told(base):
     ):  # fmt: skip
         plan = replace(known.plan, control_index=np.where(gentle, 1 - sharp, sharp))
         assert policy_change(known, replace(known, plan=plan)) == sentence
-    outcome = Outcome(None, None, 3.5, {}, {}, (), sentence, b"")  # type: ignore[arg-type]
+    outcome = Outcome(None, None, 3.5, {}, {}, sentence)  # type: ignore[arg-type]
     for kind in TRIED:
         assert trial_sentence({"kind": kind, "from_turn": 3}, outcome, "turn").endswith(f". {sentence}")
 

@@ -33,6 +33,7 @@ from tests.twin_master.watch.watches import (
 )  # fmt: skip
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of, whole_record
+from twin_master.mission.replay import BelievedModel, journalled_decision
 from twin_master.mission.turns import History
 from twin_master.network.estimator import ExactFilter
 from twin_master.report.reading import open_run as stored_run
@@ -42,7 +43,6 @@ from twin_master.watch.folder import Patched, Watch
 from twin_master.watch.intake import Feed
 from twin_master.watch.message import Message
 from twin_master.watch.opening import flown, resume_watch
-from twin_master.watch.replay import BelievedModel, journalled_decision
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
 
