@@ -23,11 +23,13 @@ from reporting.json_file import read_json
 from reporting.page import Column, Page, Words, numbers
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND as FLOWN_KIND
+from twin_master.fleet.flight import RESULT_NAME
 from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
 from twin_master.fleet.reading import WITHIN, figure_rows, group_figures, last_turns, leaving, noticed
 from twin_master.fleet.standing import STATE_NAME, FleetRecord
-from twin_master.fleet.store import DONE_NAME, ENDED, FAILED, has_flown, open_group
+from twin_master.fleet.store import ENDED, FAILED, has_flown, open_group
 from twin_master.fleet.watching import KIND as WATCHED_KIND
+from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.report.view import printed_factors
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.schema import Scenario
@@ -166,12 +168,12 @@ def _opening(records: list[dict[str, Any]], groups: "dict[str, xr.Dataset]") -> 
 
 
 def _failures(folder: Path) -> dict[str, str]:
-    """Return the failures of the shards that are done; the last line may still be written."""
+    """Return the failures of the shards that are done."""
     found: dict[str, str] = {}
-    path = folder / DONE_NAME
-    for line in path.read_bytes().splitlines(keepends=True) if path.is_file() else []:
-        if line.endswith(b"\n"):
-            found |= json.loads(line)["failures"]
+    if not (folder / JOURNAL_NAME).is_file() and (folder / RESULT_NAME).is_file():  # of a version before
+        found = read_json(folder / RESULT_NAME, FleetError)["failures"]
+    for record, *_ in records(folder / JOURNAL_NAME):
+        found |= record["failures"]
     return found
 
 
