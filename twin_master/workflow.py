@@ -192,7 +192,7 @@ def _run(
     with clock.stage("store"), progress.stage("Storing"), _kept(folder):
         write_field = _field_writer(source, result)
         misfit = _misfit(knowledge, source)
-        store_flight(
+        stored = store_flight(
             folder, config, result, source.origin, steps=scenario.mission.steps, misfit=misfit,
             write_field=write_field,
         )  # fmt: skip
@@ -200,10 +200,12 @@ def _run(
     del knowledge, result, write_field  # before the report is drawn
     if report:
         with clock.stage("report"), progress.stage("Writing the report"), _kept(folder):
-            _report(folder)
+            from twin_master.report.page import write_report
+
+            write_report(folder, tree=stored())
     timing |= {"stages_seconds": dict(clock.stages), "total_seconds": time.perf_counter() - clock.begin}
     atomic_write_text(folder / TIMING_NAME, to_json(timing))  # the only file with figures of a clock
-    return read_outcome(folder)
+    return read_outcome(folder, stored)
 
 
 def _known(
@@ -332,9 +334,3 @@ def _timing(flight: History) -> dict[str, Any]:
             "last": float(values[-1]),
         }
     return record
-
-
-def _report(folder: Path) -> None:
-    from twin_master.report.page import write_report
-
-    write_report(folder)

@@ -39,7 +39,7 @@ from twin_master.run_folder import (
     tidy,
 )
 from twin_master.scenario.reading import load_scenario
-from twin_master.store.writing import RunOutcome, finished_run, read_run
+from twin_master.store.writing import RunOutcome, finished_run, open_run
 from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
 
@@ -171,7 +171,7 @@ def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
 
 def test_what_a_run_folder_holds(tmp_path, library_file):
     folder = fly(tmp_path / "a" / "run", library_file, "failing_gauges").folder
-    tree = read_run(folder)
+    tree = open_run(folder)
     groups = {"observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth", "notice"}
     assert set(tree.children) == groups
     assert tree["predicted"]["quantity_mean"].shape == (50, 10, 24)

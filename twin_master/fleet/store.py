@@ -198,7 +198,7 @@ def create_store(folder: Path, fleet: Fleet) -> None:
 def _create_group(made: "zarr.Group", group: Group, fleet: Fleet) -> None:
     scenario, count = group.scenarios[0], len(group.members)
     sizes = sizes_of(scenario)
-    true = dict.fromkeys(group.spreads, ["", "SI", "true parameter", "f8"])
+    true = {name: ["", "SI", "true parameter", "f8"] for name in group.spreads}
     for name, (axes, unit, title, kind) in (SCHEMA["fleet"] | true).items():
         shape = (count, *(sizes[axis] for axis in axes.split()))
         made.create_array(

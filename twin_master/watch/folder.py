@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
@@ -29,8 +29,9 @@ from twin_master.network.twin import Twin
 from twin_master.run_folder import PATCH, PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
+from twin_master.store.results import groups_of
 from twin_master.store.summary import Figure
-from twin_master.store.writing import store_flight
+from twin_master.store.writing import store_flight, tree_of
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping
 from twin_master.watch.keeping import Keeper, Standing
 from twin_master.watch.teaching import (
@@ -45,6 +46,9 @@ from twin_master.watch.teaching import (
     verdict_of,
 )
 from twin_master.watch.trial import CANNOT, Judge, Outcome, Trial, judged, patched_model
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 STORED_TURNS = 1_000
 """The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
@@ -290,10 +294,7 @@ class Watch:
         if not turns:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
-        first = max(0, turns - last)
-        found, _ = replay(self._path, self.models, None, first_turn=first)
-        flight = replace(found.behind(first - found.first_turn), notices=self.told(first))
-        result, attributes = MissionResult(self.scenario, self.models[-1].knowledge, flight), {}
+        result, attributes = self.result(turns, last), {}
         if self.standing.adopted:
             adopted = self.standing.adopted[-1]
             attributes = {
@@ -301,7 +302,7 @@ class Watch:
             }  # fmt: skip
         origin = FlownAndBelieved(WATCHED, self._source.origin.model)
         with self._progress.stage("Storing"):
-            store_flight(
+            stored = store_flight(
                 self.folder, self._config, result, origin, steps=turns,
                 figures=self._figures(counts, turns), attributes=attributes,
             )  # fmt: skip
@@ -309,7 +310,19 @@ class Watch:
             from twin_master.report.page import write_report
 
             with self._progress.stage("Writing the report"):
-                write_report(self.folder)
+                write_report(self.folder, tree=stored())
+
+    def result(self, turns: int, last: int) -> MissionResult:
+        """Return the last of so many turns, as a mission."""
+        first = max(0, turns - last)
+        found, _ = replay(self._path, self.models, None, first_turn=first)
+        flight = replace(found.behind(first - found.first_turn), notices=self.told(first))
+        return MissionResult(self.scenario, self.models[-1].knowledge, flight)
+
+    @property
+    def tree(self) -> "xr.DataTree":
+        """The last turns as `open_run` returns them, without a file."""
+        return tree_of(groups_of(self.result(last_turn(self._path)[0] + 1, STORED_TURNS)), {})
 
     def told(self, first: int) -> list[tuple[int, Notice]]:
         """Return what the operator was told in the turns from `first` on, each sentence once.

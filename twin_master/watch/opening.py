@@ -21,11 +21,11 @@ from twin_master.assets.resolution import (
 from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME, last_turn
 from twin_master.mission.opening import begin_folder, file_record, released, resume_folder
-from twin_master.report import reading
 from twin_master.run_folder import CONFIG_NAME, check_versions, read_config
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.writing import SUMMARY_NAME
+from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.broker import broker_of, is_broker
 from twin_master.watch.feeds import JsonLinesFeed, MappingFeed, check_file, file_feed
 from twin_master.watch.folder import STORED_TURNS, Patched, Watch
@@ -160,9 +160,9 @@ def open_run(folder: Path | str) -> "xr.DataTree":
         The journal of a watch was changed or is damaged.
     """
     if _config(Path(folder)) is None or stored(Path(folder)):
-        return reading.open_run(folder)
+        return stored_run(folder)
     with flown(Path(folder), None, None, SilentProgress()) as ended:
-        return reading.open_run(ended)
+        return stored_run(ended)
 
 
 def stored(folder: Path) -> bool:

@@ -22,7 +22,7 @@ from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.mission.journal import JournalFile
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import kept_knowledge
-from twin_master.store.writing import read_run
+from twin_master.store.writing import open_run
 from twin_master.workflow import fly as new_run
 
 
@@ -40,7 +40,7 @@ def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, tmp_path):
     given = Overrides(strain_library=library_file)
     outcome = fly_fleet(ensemble("level_turns", range(2020, 2023), given), tmp_path / "many")
     group = fleet_groups(outcome.folder)["level_turns"]
-    tree = read_run(new_run("level_turns", tmp_path / "one", given, report=False).folder)
+    tree = open_run(new_run("level_turns", tmp_path / "one", given, report=False).folder)
     row = group["seed"].values.tolist().index(int(tree.attrs["seed"]))
     for ours, (part, name) in {
         "observed": ("observed", "strain"),

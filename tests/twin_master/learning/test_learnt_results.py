@@ -18,8 +18,9 @@ from twin_master.mission.replay import gap_of
 from twin_master.mission.turns import History, Reading, Turn
 from twin_master.report.learnt import asset_rows, learnt_figure, sensor_rows
 from twin_master.report.page import render_page
-from twin_master.report.reading import open_run, read_run
+from twin_master.report.reading import read_run
 from twin_master.scenario.reading import load_scenario
+from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Flight
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")

@@ -30,8 +30,8 @@ from twin_master.assets.resolution import Overrides
 from twin_master.errors import RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME
-from twin_master.report.reading import open_run
 from twin_master.scenario.reading import load_scenario
+from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Flight
 from twin_master.viewer.messages import Request, Teller, parse_request
 from twin_master.viewer.scene import LATEST, scene_of

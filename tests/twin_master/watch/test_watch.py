@@ -36,8 +36,8 @@ from twin_master.mission.journal import JOURNAL_NAME, line_of, whole_record
 from twin_master.mission.replay import BelievedModel, journalled_decision
 from twin_master.mission.turns import History
 from twin_master.network.estimator import ExactFilter
-from twin_master.report.reading import open_run as stored_run
 from twin_master.scenario.reading import load_scenario
+from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.feeds import CsvFeed, FolderFeed, JsonLinesFeed, file_feed
 from twin_master.watch.folder import Patched, Watch
 from twin_master.watch.intake import Feed
