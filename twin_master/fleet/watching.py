@@ -1,5 +1,6 @@
 """Real assets, many of them: each is watched as `uav-twin watch` watches one, and leaves the same folder."""
 
+import json
 import os
 import re
 import time
@@ -16,7 +17,7 @@ from reporting.progress import SilentProgress
 from twin_master.errors import FleetError
 from twin_master.fleet.flight import hold_folder, see_folder
 from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
-from twin_master.fleet.standing import STATE_NAME, FleetRecord, WatchedAsset
+from twin_master.fleet.standing import STATE_NAME, WatchedAsset, read_standing
 from twin_master.fleet.store import written
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME
@@ -110,7 +111,7 @@ class FleetWatch:
             else:
                 self._sources.append(_Files(self, group, follow))
         self.closing.callback(os.close, _held(fleet, folder))
-        self._told_before = FleetRecord.read(folder).assets
+        self._told_before = read_standing(folder)["assets"]
         import resource
 
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -172,8 +173,7 @@ class FleetWatch:
                     )
                 closing.callback(os.close, lock)
                 closing.enter_context(watch.begun(source))
-                told = self._told_before.get(key)
-                asset = WatchedAsset(key, watch, told)
+                asset = WatchedAsset(key, watch, self._told_before.get(key))
                 begun(asset)
                 asset.close = closing.pop_all().close
             except Exception as error:  # noqa: BLE001 - whatever one asset comes to, the others go on
@@ -184,8 +184,7 @@ class FleetWatch:
         self._like.setdefault(group.name, watch)
         self.assets[key] = asset
         last = asset.decision
-        before = told.last.turn if told is not None and told.last is not None else -1
-        if last is not None and before < last["turn"]:  # a kill may have left it untold
+        if last is not None and last["turn"] >= asset.first_untold:  # a kill may have left it untold
             self._decided(asset, last)
         return asset
 
@@ -246,8 +245,8 @@ class FleetWatch:
 
     def _write_state(self) -> None:
         assets = {name: asset.record() for name, asset in sorted(self.assets.items())}
-        record = FleetRecord(assets={**self._told_before, **assets}, failures=self.failures)
-        atomic_write_text(self.folder / STATE_NAME, record.model_dump_json() + "\n")
+        record = {"assets": {**self._told_before, **assets}, "failures": self.failures}
+        atomic_write_text(self.folder / STATE_NAME, json.dumps(record) + "\n")
 
 
 def _held(fleet: Fleet, folder: Path) -> int:
