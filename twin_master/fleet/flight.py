@@ -1,10 +1,10 @@
 """A fleet from its plan to its store: checked whole, prepared, flown in shards, resumed where it stopped."""
 
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from twin_master.fleet.plan import Fleet, Group, load_fleet
 from twin_master.fleet.shard import Kit, ShardResult, read_recording, with_parameters
 from twin_master.fleet.store import FAILED, STORE_NAME, check_installed, create_store, sizes_of, written
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
-from twin_master.mission.opening import released
+from twin_master.mission.opening import held
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
@@ -116,12 +116,9 @@ def fly_fleet(
     see_folder(folder, config, fleet.seed, replace_old=replace_old)
     _check(fleet)
     if replace_old and folder.is_dir():
-        lock = _locked(folder)
-        with released(lock):
+        with held(_locked(folder)):
             shutil.rmtree(folder)
-        os.close(lock)
-    lock = hold_folder(folder, config, fleet.seed)
-    try:
+    with hold_folder(folder, config, fleet.seed):
         if not (folder / JOURNAL_NAME).is_file():
             create_store(folder, fleet)
         with JournalFile(folder, hash_record(config)) as journal:
@@ -133,8 +130,6 @@ def fly_fleet(
         )
         told = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "twins": fleet.size}
         atomic_write_text(folder / RESULT_NAME, to_json(told | {"failures": failures, "ended": ended}))
-    finally:
-        os.close(lock)
     seconds = time.perf_counter() - begin
     return FleetOutcome(folder, fleet.size, failures, ended, seconds, shards - len(kept), len(kept))
 
@@ -181,16 +176,16 @@ def fleet_config(folder: Path, kind: str = KIND) -> dict[str, Any]:
     return found
 
 
-def hold_folder(folder: Path, config: Mapping[str, Any], seed: int) -> int:
+@contextmanager
+def hold_folder(folder: Path, config: Mapping[str, Any], seed: int) -> Iterator[None]:
     """Make the folder with its configuration, if it is not there, and hold it for this process."""
     with written(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    lock = _locked(folder)
-    with released(lock):
+    with held(_locked(folder)):
         if not (folder / CONFIG_NAME).is_file():
             provenance = collect_provenance(seed).as_dict()
             atomic_write_text(folder / CONFIG_NAME, to_json({**config, "provenance": provenance}))
-    return lock
+        yield
 
 
 def _locked(folder: Path) -> int:

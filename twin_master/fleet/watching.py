@@ -1,12 +1,11 @@
 """Real assets, many of them: each is watched as `uav-twin watch` watches one, and leaves the same folder."""
 
 import json
-import os
 import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed, LiveFeed
 from twin_master.watch.message import MessageReader
 from twin_master.watch.mqtt import Outbox, Session, placed
-from twin_master.watch.opening import begin_resolved, resume_watch
+from twin_master.watch.opening import begun_watch, resumed_watch
 
 KIND = "uav-twin fleet watch"
 TURNS_AT_ONCE = 64
@@ -110,7 +109,7 @@ class FleetWatch:
                 self._sources.append(_Topics(self, group, authority))
             else:
                 self._sources.append(_Files(self, group, follow))
-        self.closing.callback(os.close, _held(fleet, folder))
+        self.closing.enter_context(_held(fleet, folder))
         self._told_before = read_standing(folder)["assets"]
         import resource
 
@@ -163,15 +162,13 @@ class FleetWatch:
                 if len(self.assets) == LARGEST_FLEET and key not in self.assets:
                     raise FleetError(f"a process watches {LARGEST_FLEET} assets at most.")
                 source, like = feed(group.scenarios[0]), self._like.get(group.name)
-                if (folder / CONFIG_NAME).is_file():
-                    watch, lock = resume_watch(folder, None, SilentProgress(), like)
-                else:
+                opened = resumed_watch(folder, None, SilentProgress(), like)
+                if not (folder / CONFIG_NAME).is_file():
                     with written(folder):
                         folder.parent.mkdir(exist_ok=True)
-                    watch, lock = begin_resolved(
-                        group.scenarios[0], group.file, folder, SilentProgress(), like=like
-                    )
-                closing.callback(os.close, lock)
+                    given = group.scenarios[0], group.file, folder, SilentProgress()
+                    opened = begun_watch(*given, like=like)
+                watch = closing.enter_context(opened)
                 closing.enter_context(watch.begun(source))
                 asset = WatchedAsset(key, watch, self._told_before.get(key))
                 begun(asset)
@@ -249,8 +246,8 @@ class FleetWatch:
         atomic_write_text(self.folder / STATE_NAME, json.dumps(record) + "\n")
 
 
-def _held(fleet: Fleet, folder: Path) -> int:
-    """Make the folder of a fleet, or see that it holds the same; return what holds it for this process."""
+def _held(fleet: Fleet, folder: Path) -> AbstractContextManager[None]:
+    """Make the folder of a fleet, or see that it holds the same; return what holds it."""
     groups = [
         {"name": group.name, "scenarios": [group.scenarios[0].portable().to_dict()]} for group in fleet.groups
     ]

@@ -434,4 +434,3 @@ class Tutor:
     def end(self) -> None:
         """End what is under way."""
         self._search.errand.end()
-        self._judge.end()

@@ -1,26 +1,24 @@
 """A patch beside what a watch believes: the patched model, its turns filtered again, and what that gains.
 
-All of it follows from a journal up to one of its lines, so that it may be worked out in another process while
-the watch goes on.
+All of it follows from a journal up to one of its lines, so that it may be worked out beside the watch,
+which goes on.
 """
 
 import os
-import pickle
-import shutil
 import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory, mkdtemp
+from tempfile import TemporaryDirectory
+from threading import Thread
 from typing import Any
 
 import numpy as np
 
 from fe.runtime.errors import FiniteElementError
 from fmu_asset.errors import FmuError
-from reporting.files import atomic_write_bytes
 from reporting.progress import Progress, SilentProgress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DesignBelief
@@ -35,7 +33,6 @@ COURTESY = 10
 """Niceness of what is worked out beside a watch: the watch comes first."""
 CANNOT = (TwinMasterError, FmuError, FiniteElementError)
 """Why a twin cannot believe a patch."""
-_ASKED, _ANSWER, _LOG = "asked", "answer", "log"
 
 
 @dataclass(frozen=True)
@@ -223,11 +220,6 @@ class Errand:
             raise TwinMasterError(next(said, f"exit code {code}"))
         return False
 
-    @property
-    def over(self) -> bool:
-        """Whether no process is under way."""
-        return self._process is None
-
     def end(self) -> None:
         """End the process, if there is one; a watch that is taken up again begins it anew."""
         if self._process is not None and self._process.poll() is None:
@@ -237,7 +229,7 @@ class Errand:
 
 
 class Judge:
-    """Works out what comes of a patch: at once, or in a process of low priority beside a live watch.
+    """Works out what comes of a patch: at once, or in a thread beside a live watch.
 
     Parameters
     ----------
@@ -246,8 +238,8 @@ class Judge:
     """
 
     def __init__(self, *, wait: bool) -> None:
-        self._wait, self._errand = wait, Errand()
-        self._folder: Path | None = None
+        self._wait = wait
+        self._found: Future[Outcome] | None = None
 
     def outcome(self, asked: Callable[[], Trial]) -> Outcome | None:
         """Return what came of the patch; None while it is worked out, of what was asked first.
@@ -259,41 +251,22 @@ class Judge:
         """
         if self._wait:
             return judged(asked())
-        if self._folder is None:
-            self._folder = Path(mkdtemp(prefix="uav_twin_"))
-            (self._folder / _ASKED).write_bytes(pickle.dumps(asked()))
-        folder = self._folder
-        command = [sys.executable, "-c", f"from {__name__} import work; work()", str(folder)]
-        try:
-            if not self._errand.answered(folder / _ANSWER, folder / _LOG, command):
-                return None
-            found: Outcome | str = pickle.loads((folder / _ANSWER).read_bytes())
-        finally:
-            if self._errand.over:
-                self.end()
-        if isinstance(found, str):
-            raise TwinMasterError(found)
-        return found
+        if self._found is None:
+            self._found = Future()
+            Thread(target=_work, args=(asked(), self._found), daemon=True).start()
+        if not self._found.done():
+            return None
+        found, self._found = self._found, None
+        return found.result()
 
     @property
     def answered(self) -> bool:
-        """Whether the process has left its answer."""
-        return self._folder is not None and (self._folder / _ANSWER).is_file()
-
-    def end(self) -> None:
-        """End what is under way."""
-        self._errand.end()
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
-        self._folder = None
+        """Whether it is worked out."""
+        return self._found is not None and self._found.done()
 
 
-def work() -> None:
-    """Answer what is asked in the folder that the command line names."""
-    folder = Path(sys.argv[-1])
-    found: Outcome | str
+def _work(trial: Trial, found: "Future[Outcome]") -> None:
     try:
-        found = judged(pickle.loads((folder / _ASKED).read_bytes()))
-    except CANNOT as error:
-        found = str(error)
-    atomic_write_bytes(folder / _ANSWER, pickle.dumps(found))
+        found.set_result(judged(trial))
+    except BaseException as error:  # noqa: BLE001 - it is raised where it is asked for
+        found.set_exception(error)

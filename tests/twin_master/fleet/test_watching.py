@@ -1,7 +1,6 @@
 """Many real assets under watch: files that grow, topics of a broker, kills, and what is lost alone."""
 
 import json
-import os
 import re
 import shutil
 import tomllib
@@ -20,7 +19,7 @@ from reporting.progress import SilentProgress
 from tests.command_line import command
 from tests.twin_master.runs import journal, text_of, written
 from tests.twin_master.watch.watches import PASSWORD, Mosquitto, wait_until, write_csv
-from twin_master.assets.resolution import Overrides
+from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.flight import fly_fleet
@@ -34,11 +33,12 @@ from twin_master.fleet.standing import WatchedAsset
 from twin_master.fleet.view import fleet_view, serve_fleet
 from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.opening import file_record
 from twin_master.mission.preparation import kept_knowledge
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.opening import begin_watch
+from twin_master.watch.opening import begun_watch
 
 TURNS = 6
 Decision = Mapping[str, Any]
@@ -80,9 +80,9 @@ def alone(fleet_file: Path, tmp_path: Path) -> list[bytes]:
     loaded, found = load_scenario(tmp_path / "wing.toml"), []
     for number in range(3):
         folder = tmp_path / "alone" / f"wing-{number}"
-        watch, lock = begin_watch(loaded, folder, Overrides(seed=7), SilentProgress(), replace_run=False)
-        watch.run(file_feed(log_of(tmp_path, number), watch.scenario), str)
-        os.close(lock)
+        resolved = resolve_scenario(loaded, Overrides(seed=7))
+        with begun_watch(resolved, file_record(loaded), folder, SilentProgress()) as watch:
+            watch.run(file_feed(log_of(tmp_path, number), watch.scenario), str)
         found.append((folder / JOURNAL_NAME).read_bytes())
     return found
 
