@@ -25,7 +25,7 @@ from scenarios import scenario_files
 from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.mission.opening import file_record
 from twin_master.scenario.reading import load_scenario
-from twin_master.watch import teaching, trial
+from twin_master.watch import teaching
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.opening import begun_watch
 
@@ -133,7 +133,7 @@ def main() -> int:
     parser.add_argument("--only", help="numbers of hidden effects from 0, with commas")
     given = parser.parse_args()
     names = [*HIDDEN] if given.only is None else [[*HIDDEN][int(number)] for number in given.only.split(",")]
-    trial.COURTESY = 0  # nothing else is to be served first
+    teaching.COURTESY = 0  # nothing else is to be served first
     with tempfile.TemporaryDirectory() as work:
         for seed in range(given.first_seed, given.first_seed + given.seeds):
             for name in names:

@@ -1,11 +1,13 @@
 """A watch: its folder, begun or taken up again, its loop, and what it leaves."""
 
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from reporting.files import atomic_write_bytes
@@ -45,7 +47,7 @@ from twin_master.watch.teaching import (
     trial_sentence,
     verdict_of,
 )
-from twin_master.watch.trial import CANNOT, Judge, Outcome, Trial, judged, patched_model
+from twin_master.watch.trial import CANNOT, Outcome, judged, patched_model
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -225,12 +227,11 @@ class Watch:
 
     def trial(
         self, journal: JournalFile, file: Path, from_turn: int, compared: tuple[int, int] = (0, 0)
-    ) -> Trial:
-        """Return the question what comes of a patch from a turn on, after all lines of the journal."""
+    ) -> Callable[..., Outcome]:
+        """Return what tells what comes of a patch from a turn on, after all lines of the journal so far."""
         believed = [m for m in range(len(self.models)) if self.models[m].from_turn <= from_turn]
-        patch = both_patches(self._patches[max(believed)], file)
-        models = tuple(self.models)
-        return Trial(self._path, journal.size, self.scenario, models, patch, from_turn, compared)
+        patch, models = both_patches(self._patches[max(believed)], file), tuple(self.models)
+        return partial(judged, self._path, journal.size, self.scenario, models, patch, from_turn, compared)
 
     def _patch(self, journal: JournalFile, patched: Patched) -> None:
         """Believe a patch that is given from a turn on."""
@@ -239,7 +240,7 @@ class Watch:
             raise MissionInputError(
                 f"--from-turn names one of the {turns} turns watched so far, or the next one."
             )
-        outcome = judged(self.trial(journal, patched.file, patched.from_turn), self._progress)
+        outcome = self.trial(journal, patched.file, patched.from_turn)(progress=self._progress)
         self.adopt(journal, outcome, None, self._kept_verdict(patched.file.parent))
 
     def _kept_verdict(self, found: Path) -> str:
@@ -256,7 +257,7 @@ class Watch:
     ) -> Twin:
         """Believe a patched model; return the twin that goes on."""
         name, first = f"asset/model_patch_{len(self.models)}.json", outcome.model.from_turn
-        atomic_write_bytes(self.folder / name, outcome.trial.patch)
+        atomic_write_bytes(self.folder / name, outcome.patch)
         again, _ = replay(self._path, self.models, self.scenario.watch.lag, question=outcome.model)
         alarms = [n for turn, n in again.notices if turn >= first and n.kind == "alarm"]
         twin = again.twin
@@ -371,7 +372,8 @@ class Tutor:
     source : Stopping
         Says whether the watch was asked to end.
     wait : bool
-        Whether the next turn waits for an answer, as those of a recording do.
+        Whether the next turn waits for an answer, as those of a recording do. Those of a live watch go on
+        beside a process that searches and a thread that tries a patch.
 
     Raises
     ------
@@ -385,7 +387,8 @@ class Tutor:
         check_teachable(watch.scenario)
         watch.keep.taught = True
         self._watch, self._journal, self._search, self._source = watch, journal, search, source
-        self._teaching, self._judge, self._wait = watch.standing.teaching, Judge(wait=wait), wait
+        self._teaching, self._wait = watch.standing.teaching, wait
+        self.outcome: Future[Outcome] | None = None
 
     @property
     def _over(self) -> bool:
@@ -415,16 +418,19 @@ class Tutor:
         if (trial := teaching.trial) is None or not self._over:
             return
         file, compared = watch.folder / trial["folder"] / PATCH, (trial["turn"] + 1, TRIAL_TURNS)
+        if self.outcome is None:
+            ask = watch.trial(self._journal, file, trial["from_turn"], compared)
+            self.outcome = Future()
+            working = Thread(target=_work, args=(ask, self.outcome), daemon=True)
+            (working.run if self._wait else working.start)()
+        if not self.outcome.done():
+            return
+        asked, self.outcome, outcome = self.outcome, None, None
         try:
-            outcome = self._judge.outcome(
-                partial(watch.trial, self._journal, file, trial["from_turn"], compared)
-            )
-        except CANNOT as error:
-            outcome, sentence = None, f"The patch cannot be believed by this twin: {error}"
-        else:
-            if outcome is None:
-                return
+            outcome = asked.result()
             sentence = trial_sentence(trial, outcome, step)
+        except CANNOT as error:
+            sentence = f"The patch cannot be believed by this twin: {error}"
         notice = notice_of("trial", sentence)
         if outcome is not None and outcome.gained >= LEAST_GAIN:
             watch.keep.twin = watch.adopt(self._journal, outcome, notice)
@@ -433,4 +439,11 @@ class Tutor:
 
     def end(self) -> None:
         """End what is under way."""
-        self._search.errand.end()
+        self._search.end()
+
+
+def _work(ask: Callable[[], Outcome], told: "Future[Outcome]") -> None:
+    try:
+        told.set_result(ask())
+    except BaseException as error:  # noqa: BLE001 - it is raised where it is asked for
+        told.set_exception(error)
