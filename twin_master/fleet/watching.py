@@ -211,6 +211,10 @@ class FleetWatch:
             self.lost(asset.name, error)
         return count
 
+    def ask(self) -> None:
+        """Ask for an end between two turns."""
+        self.asked = True
+
     def done(self, asset: WatchedAsset) -> bool:
         """Return whether an asset is left alone: it is lost, or has the turns that were wanted."""
         return self.enough(asset) or asset.name in self.failures

@@ -34,7 +34,7 @@ from twin_master.store.mission_result import MissionResult
 from twin_master.store.results import groups_of
 from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight, tree_of
-from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping
+from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping, listening
 from twin_master.watch.keeping import Keeper, Standing
 from twin_master.watch.teaching import (
     LEAST_GAIN,
@@ -159,7 +159,7 @@ class Watch:
         with self.begun(feed, patched) as (journal, keep):
             source = Stopping(keep.intake, turns, lambda: self.quiet(decide))
             tutor = Tutor(self, journal, search, source, wait=feed.replayable) if search else None
-            with source.listening():
+            with listening(source.ask):
                 try:
                     if untold is not None:
                         decide(untold)
