@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +31,9 @@ from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import another_truth
 from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
+
+if TYPE_CHECKING:
+    from xarray import DataTree
 
 POLICY_NAME = "policy.npy"
 """In the run folder: the policy that was given in the place of a plan, (S, U) or on the belief."""
@@ -184,9 +187,7 @@ def _run(
     del knowledge, result, write_field  # before the report is drawn
     if report:
         with timed("report"), progress.stage("Writing the report"), _kept(folder):
-            from twin_master.report.page import write_report
-
-            write_report(folder, tree=stored())
+            _report(folder, stored())
     timing |= {"stages_seconds": stages, "total_seconds": time.perf_counter() - start}
     atomic_write_text(folder / TIMING_NAME, to_json(timing))  # the only file with figures of a clock
     return read_outcome(folder, stored)
@@ -318,3 +319,9 @@ def _timing(flight: History) -> dict[str, Any]:
             "last": float(values[-1]),
         }
     return record
+
+
+def _report(folder: Path, tree: "DataTree") -> None:
+    from twin_master.report.page import write_report
+
+    write_report(folder, tree=tree)

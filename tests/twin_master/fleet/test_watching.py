@@ -424,7 +424,7 @@ def test_the_store_counts_the_notices_that_watches_gave(fleet_file, tmp_path):
                 assert group["notices"].values[row, place] == len(turns)
                 assert group["first_notice"].values[row, place] == min(turns, default=-1)
         alarms = sum(notice.kind == "alarm" for _, notice in told)
-        assert asset.record().alarms == alarms
+        assert asset.record()["alarms"] == alarms
         alarmed += alarms > 0
     assert group["notices"].values[1, 1] >= 1
     assert alarmed >= 1
@@ -437,7 +437,7 @@ def test_the_store_counts_the_notices_that_watches_gave(fleet_file, tmp_path):
     found = [state[asset.name]["leaving"] for asset in assets]
     np.testing.assert_allclose(found, soon, atol=1e-6)
     again = watched(fleet_file, tmp_path / "out")  # of which nothing is left to read
-    assert [again.assets[asset.name].record().leaving for asset in assets] == pytest.approx(found)
+    assert [again.assets[asset.name].record()["leaving"] for asset in assets] == pytest.approx(found)
 
 
 def test_who_needs_attention_next_comes_first(fleet_file, tmp_path):
