@@ -23,13 +23,8 @@ _ABAQUS_COMMENT = re.compile(r"^\s*\*\*.*")
 _ABAQUS_INCLUDE = re.compile(r"\s*\*\s*INCLUDE\s*,\s*INPUT\s*=(.*)", re.IGNORECASE)
 _VARIANT = re.compile(r"(C3D\d+)(?:[IMR]?H?|T)")
 """Reduced, hybrid and other variants are the same cells; they are integrated here as the plain ones."""
-_ABAQUS_FLAT = {
-    "T3D2": "line", "T3D3": "line3", "CPS3": "triangle", "CPS4": "quad", "CPS6": "triangle6", "CPS8": "quad8",
-}  # fmt: skip
-"""Elements by which Gmsh and others hand on lines and surfaces: they only name nodes and faces here."""
-_TYPES = {kind.calculix: (kind.file_type, kind.node_count) for kind in KINDS.values()} | {
-    name: (kind, FLAT[kind][0]) for name, kind in _ABAQUS_FLAT.items()
-}
+_TYPES = {kind.calculix: (kind.file_type, kind.node_count) for kind in KINDS.values()}
+_TYPES |= {name: (kind, FLAT[kind][0]) for name, kind in words_of("abaqus").flat.items()}
 
 
 class _Block(NamedTuple):
@@ -166,12 +161,7 @@ _ORDER = {
     "wedge15": (*range(9), *range(12, 15), *range(9, 12)),
 }
 """Nastran counts the middles of the upright edges before those of the top."""
-_NASTRAN_FLAT = {
-    "CTRIA3": "triangle", "CTRIAR": "triangle", "CTRIA6": "triangle6",
-    "CQUAD4": "quad", "CQUADR": "quad", "CQUAD8": "quad8",
-    "CBAR": "line", "CBEAM": "line", "CROD": "line", "CTUBE": "line",
-}  # fmt: skip
-"""Shells and bars, by which Gmsh and others hand on surfaces and lines: without a property they only name."""
+_NASTRAN_FLAT = words_of("nastran").flat
 _SECTIONS = re.compile("P(BAR|BEAM|BCOMP|COMP|LPLANE|ROD|SHEAR|SHELL|TUBE)[GL]?")
 _SYSTEM = re.compile(r"CORD([12])([RCS])")
 _NASTRAN_COMMENT = re.compile(r"\$.*")

@@ -140,21 +140,17 @@ def read_by_meshio(path: Path) -> Deck:
         ("ELSET", numbers, found.cell_sets, found.cell_data),
         ("NSET", [np.array(list(deck.nodes))], point_sets, point_data),
     ):
-        named = [
-            (name, number, np.asarray(chosen, dtype=np.int64))
-            for name, parts in sets.items()
-            for number, chosen in enumerate(parts)
-            if chosen is not None and not name.startswith("gmsh:")
-        ]
-        named += [
-            (name, number, chosen)
-            for label, arrays in data.items()
-            for number in range(len(members))
-            for name, chosen in _named(found, label, arrays, number)
-            if name not in sets
-        ]
-        for name, number, chosen in named:
-            deck.members(key, name).extend(members[number][chosen].tolist())
+        for number, own in enumerate(members):
+            named = [
+                (name, np.asarray(parts[number], dtype=np.int64))
+                for name, parts in sets.items()
+                if parts[number] is not None and not name.startswith("gmsh:")
+            ]
+            for label, arrays in data.items():
+                tagged = _named(found, label, arrays, number)
+                named += [(name, places) for name, places in tagged if name not in sets]
+            for name, places in named:
+                deck.members(key, name).extend(own[places].tolist())
     return deck
 
 
