@@ -20,6 +20,7 @@ from fe.elements.cells import axes_of
 from fe.elements.kinds import KINDS, ElementKind
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
+from fe.sentences import said
 from reporting.section import shown
 from reporting.text_file import read_text
 from reporting.toml_file import parse_toml
@@ -195,9 +196,7 @@ class Deck:
         _, first = np.unique(np.sort(cells, axis=1), axis=0, return_index=True)
         twins = np.delete(numbers, first)
         if len(twins):
-            fail(
-                source, f"{len(twins)} elements, such as {twins[0]}, have the nodes of another; delete them."
-            )
+            fail(source, said("deck.twins", count=len(twins), number=twins[0]))
 
         points, own = np.array(list(self.nodes.values())), np.array(list(self.nodes), dtype=np.int64)
         used = np.zeros(len(points), dtype=bool)
@@ -249,11 +248,8 @@ class Deck:
         if len(counts) != 1 or not counts.keys() <= KINDS.keys():
             named = {name: kind.name for name, kind in KINDS.items()}
             came = ", ".join(f"{count} {named.get(name, name)}" for name, count in counts.items())
-            fail(
-                [str(self.path), *self._solids.values()][-1],
-                f"a whole mesh of one kind of elements is expected ({', '.join(named.values())}), but "
-                f"{came or 'none that is solid'} came; mesh it with tetrahedra alone.",
-            )
+            sentence = said("deck.kinds", known=", ".join(named.values()), came=came or "none that is solid")
+            fail([str(self.path), *self._solids.values()][-1], sentence)
         return KINDS[next(iter(counts))]
 
     def _places(self, members: Iterable[int], what: str) -> list[int]:
@@ -274,10 +270,7 @@ class Deck:
             fail(str(self.path), f"the set {name!r} names element {lost}, which is not there.")
         section = self.sections.get(name.casefold())
         if members and section:
-            what = (
-                f"{len(members)} bars, membranes or shells of the set {name!r} have a section and bear loads"
-            )
-            fail(section, f"{what}, but solids alone are read; delete one or the other.")
+            fail(section, said("deck.section", count=len(members), name=name))
         return [(nodes, FLAT[kind][1]) for kind, nodes in map(self.elements.__getitem__, members)]
 
     def _of_surface(

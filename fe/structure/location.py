@@ -13,6 +13,7 @@ from scipy import sparse
 from fe.elements.cells import CellMesh
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError
+from fe.sentences import said
 
 from .design import Gauge, Load, Rosette
 from .mesh import StructureMesh, Surface
@@ -147,11 +148,10 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     best = int(distance.argmin())
     size = float(radius[near[best]])
     if distance[best] > FARTHEST * size:
-        inside = float(residual[best] @ normal[best]) < 0.0
+        inside = ", inside" if float(residual[best] @ normal[best]) < 0.0 else ""
+        far, place = distance[best] / mesh.unit, mesh.place(point - residual[best])
         raise InvalidDesignError(
-            f"{where} lies {distance[best] / mesh.unit:.3g} {mesh.unit_name} off the surface of "
-            f"{mesh.source}{', inside' if inside else ''}; the nearest point of the surface is "
-            f"{mesh.place(point - residual[best])}."
+            said("mesh.off", where=where, distance=far, mesh=mesh, inside=inside, place=place)
         )
     same = (distance <= distance[best] + _SAME_PLACE * size) & (normal @ normal[best] > _SAME_SIDE)
     mean = normal[same].mean(axis=0)
@@ -256,15 +256,11 @@ def gauge_rows(mesh: StructureMesh, gauges: tuple[Gauge, ...]) -> tuple[sparse.c
         if gauge.length or gauge.width:
             inside, corners = _spots(mesh, gauge, direction, np.cross(found.normal, direction))
             wide = f" and {gauge.width:g} {mesh.unit_name} wide" if gauge.width else ""
-            spots = [
-                on_surface(
-                    mesh,
-                    point + off,
-                    f"{where}: {gauge.length:g} {mesh.unit_name} long{wide}, the gauge reaches over the "
-                    f"edge; its point {mesh.place(point + off)}",
-                )
-                for off in (*inside, *corners)
-            ][: len(inside)]
+            over = said("mesh.edge", where=where, gauge=gauge, mesh=mesh, wide=wide)
+            places = [point + off for off in (*inside, *corners)]
+            spots = [on_surface(mesh, place, f"{over} {mesh.place(place)}") for place in places][
+                : len(inside)
+            ]
         for spot in spots:
             along = _in_surface(direction, spot.normal, where)
             share = 1.0 / (len(spots) * len(spot.cell))  # the mean of the cells that meet there
@@ -293,10 +289,9 @@ def _in_surface(direction: FloatArray, normal: FloatArray, where: str) -> FloatA
     direction = direction / np.linalg.norm(direction)
     angle = float(np.degrees(np.arcsin(min(1.0, abs(float(direction @ normal))))))
     if angle > STEEPEST:
+        towards = ", ".join(f"{value + 0.0:.3g}" for value in normal)
         raise InvalidDesignError(
-            f"{where}: its direction points {angle:.0f} degrees out of the surface, whose normal there is "
-            f"({', '.join(f'{value + 0.0:.3g}' for value in normal)}); at most {STEEPEST:g} degrees are "
-            "allowed."
+            said("mesh.direction", where=where, angle=angle, normal=towards, most=STEEPEST)
         )
     inside = direction - (direction @ normal) * normal
     return np.asarray(inside / np.linalg.norm(inside))
