@@ -46,9 +46,10 @@ _PRISMATIC_QUADRATIC = tuple(power for power in _POWERS if power[0] + power[1] +
 def gauss_points(order: int, dimensions: int = 3) -> Rule:
     """Tensor Gauss rule on the unit cube: points (q, dimensions), weights (q,)."""
     line, weight = np.polynomial.legendre.leggauss(order)
-    grids = np.meshgrid(*([0.5 * (line + 1.0)] * dimensions), indexing="ij")
-    weights = np.meshgrid(*([0.5 * weight] * dimensions), indexing="ij")
-    return np.stack([g.ravel() for g in grids], axis=1), np.prod([w.ravel() for w in weights], axis=0)
+    points, weights = (
+        np.array([*itertools.product(0.5 * values, repeat=dimensions)]) for values in (line + 1.0, weight)
+    )
+    return points, weights.prod(axis=1)
 
 
 def _simplex_rule(cell: type[RefTet] | type[RefTri], order: int) -> Rule:
