@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from fe.elements.cells import axes_of, isotropic_compliance, orthotropic_compliance, rotate_elasticity
 from fe.runtime.arrays import FloatArray
@@ -242,7 +242,11 @@ class MeshDesign(tables.StructureDesign, Gauged):
 
 
 FileName = Annotated[str, Field(min_length=1)]
-Files = Annotated[tuple[FileName, ...], Field(min_length=1)]
+Files = Annotated[
+    tuple[FileName, ...],
+    Field(min_length=1),
+    BeforeValidator(lambda files: (files,) if isinstance(files, str) else files),
+]
 Node = Annotated[int, Field(ge=0)]
 
 
@@ -331,11 +335,6 @@ class MatrixDesign(tables.StructureDesign):
 
     what = "matrix"
     scaled_table = "part"
-
-    @field_validator("stiffness_matrix", "mass_matrix", mode="before")
-    @classmethod
-    def _one_or_several(cls, files: Any) -> Any:
-        return (files,) if isinstance(files, str) else files
 
     @model_validator(mode="after")
     def _regions_have_parts(self) -> "MatrixDesign":
