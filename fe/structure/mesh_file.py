@@ -159,7 +159,7 @@ def _found_by_meshio(path: Path) -> Any:
         why = printed.getvalue().removeprefix("Error: ")
     except Exception as error:  # noqa: BLE001 - the readers of formats fail in any way
         why = getattr(error, "strerror", None) or str(error) or "its format is not known"
-    raise MeshError(said("mesh.unread", path=path, why=" ".join(why.split()).rstrip(".")))
+    raise MeshError(said("mesh.unread", path=path, why=" ".join(why[:500].split()).rstrip(".")))
 
 
 def _named(found: Any, label: str, arrays: list[Any], number: int) -> Iterator[tuple[str, IntArray]]:
