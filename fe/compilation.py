@@ -10,11 +10,15 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 
 from fe.reduction.built_once import cache_folder
+from fe.runtime import laws, motion_arrays, motion_kernel, static_path
+from fe.runtime.laws import interface
+from fe.runtime.motion import Kernel
 from reporting.progress import tell
 
 try:
@@ -23,8 +27,6 @@ try:
     from numba.extending import overload, register_jitable
 except ModuleNotFoundError:
     numba = None
-
-__all__ = ["callable_when_compiled", "choose_when_compiled", "compiled"]
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -153,3 +155,46 @@ def choose_when_compiled(chosen: Callable[..., Any], table: tuple[Callable[..., 
         return scope["choice"]
 
     overload(chosen, jit_options={"nogil": True, "_nrt": False, "forceinline": True})(compiled_choice)
+
+
+SELDOM = (
+    motion_kernel.find_routes,
+    motion_kernel.begin_on_modes,
+    motion_kernel.find_answer,
+    motion_kernel.begin_flexible,
+    static_path.settle_port,
+)
+"""Functions of a motion that are not called at every step; the others become part of their callers."""
+
+
+def _functions(module: ModuleType) -> list[Callable[..., Any]]:
+    found = inspect.getmembers(module, inspect.isfunction)
+    return [item for _, item in found if item.__module__ == module.__name__]
+
+
+@functools.cache
+def law_functions() -> tuple[Callable[..., Any], ...]:
+    """Return the functions of `fe.runtime.laws`, which compiled functions can call from then on."""
+    functions = [item for module in (*laws.MODULES, interface) for item in _functions(module)]
+    for function in functions:
+        callable_when_compiled(function, makes_arrays=False)
+    for name in interface.FUNCTIONS:
+        choose_when_compiled(getattr(laws, name), laws.answers(name))
+    return tuple(functions)
+
+
+@functools.cache
+def compiled_kernel() -> Kernel:
+    """Return the compiled loops of `fe.runtime.stepwise.advance` and `static_solution`, for their `kernel`.
+
+    The functions of `fe.runtime` stay plain; they can be called from compiled ones from then on.
+    """
+    functions: list[Callable[..., Any]] = [static_path.pull_of, static_path.settle_port]
+    functions += [*_functions(motion_arrays), *_functions(motion_kernel)]
+    for function in functions:
+        if function is not motion_kernel.integrate:
+            callable_when_compiled(function, makes_arrays=False, inline=function not in SELDOM)
+    for function in (static_path.static_forces, static_path.arrive_at_rest):
+        callable_when_compiled(function)
+    sources = (*law_functions(), *functions)
+    return Kernel(compiled(motion_kernel.integrate, sources), compiled(static_path.static_path, sources))

@@ -15,10 +15,9 @@ from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.trial import SeenTrial
 from discrepancy.missing_force.view import Column, Motion, Part, View, combined
-from discrepancy.models.compiled_motion import law_functions
 from discrepancy.models.interface import Response
 from discrepancy.models.sensing import observe_response
-from fe.compilation import compiled
+from fe.compilation import compiled, law_functions
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS, advance, pull, steady
 from fe.runtime.laws.interface import HEAD, PARAMETERS, PortForce

@@ -15,13 +15,12 @@ from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.compiled_motion import compiled_kernel, law_functions
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion
 from discrepancy.models.fmu_runs import Run, State
 from discrepancy.models.interface import Memory
 from discrepancy.models.port_system import PortSystem
-from fe.compilation import callable_when_compiled, compiled
+from fe.compilation import callable_when_compiled, compiled, compiled_kernel, law_functions
 from fe.runtime import laws
 from fe.runtime.arrays import IntArray
 from fe.runtime.motion import NO_LAWS, Laws, static_solution

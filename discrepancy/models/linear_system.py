@@ -18,8 +18,8 @@ from scipy.linalg.lapack import dpotrs
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Shown
-from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Memory, PortedSystem
+from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, static_solution
 
@@ -33,63 +33,10 @@ ROUNDING = 1e-10
 """Share of the largest entry below which what couples modes is rounding."""
 
 
-Resting = Callable[[FloatArray], FloatArray]
-"""What returns displacements and states (L, N) at rest under loads (L, N)."""
 Flexibility = Callable[[FloatArray], FloatArray]
 """What gives K^-1 loads, for loads (N,) or (N, k)."""
 Modes = tuple[FloatArray, FloatArray, int]
 """Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
-
-
-def at_rest(
-    resting: Resting,
-    units: FloatArray,
-    amounts: FloatArray,
-    laws: Laws,
-    rows: FloatArray,
-    memory: FloatArray | None = None,
-    before: FloatArray | None = None,
-    held: FloatArray | float = 0.0,
-    seen: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray | None]:
-    """Return displacements and states (L, N) under load levels that follow one another from zero.
-
-    The memory of the laws comes with them, None without laws.
-
-    Parameters
-    ----------
-    resting : Resting
-        Of what is loaded.
-    units, amounts : (k, N), (L, k) ndarray
-        Loads, and how much of each acts at each level.
-    laws : Laws
-        Internal forces.
-    rows : (J, N) ndarray
-        By which they see and act.
-    memory, before : ndarray, optional
-        Of the laws, and the amounts (k,) where the first level is reached from; by default never loaded.
-    held : (N,) ndarray, optional
-        Where something holds the system.
-    seen : (C, N) ndarray, optional
-        What these rows show (L, C) is returned instead.
-
-    Raises
-    ------
-    ModelError, SolutionError
-        If nothing holds the system, or a law takes more than it has.
-    """
-    found = resting(np.concatenate((units, rows)))
-    answers, flexible = found[: len(units)] + held, found[len(units) :]
-    at_ports, compliance = answers @ rows.T, rows @ flexible.T
-    if seen is not None:
-        answers, flexible = answers @ seen.T, flexible @ seen.T
-    if not len(laws):
-        return amounts @ answers, None
-    start = None if before is None else before @ at_ports
-    solution = static_solution(
-        laws, amounts @ at_ports, compliance, memory=memory, start=start, kernel=compiled_kernel()
-    )
-    return amounts @ answers - solution.forces @ flexible, solution.memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +163,7 @@ class LinearSystem:
     @cached_property
     def modal(self) -> ModalSystem:
         """What is free and the drives, with ports; what couples modes by rounding only does not."""
-        frequency, free = np.pad(self.angular_frequency, (0, len(self.drives))), self._free_shapes
+        frequency, free = np.pad(self.angular_frequency, (0, len(self.drives))), self.free_shapes
         damping, stiffness = (free.T @ matrix @ free for matrix in (self.damping, self.stiffness))
         diagonal, loose = np.diag(np.diag(damping)), self.mode_count is None
         if loose:
@@ -226,7 +173,7 @@ class LinearSystem:
             damping = diagonal
         ports, actions = (
             {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
-            for rows in (self.ports, {**self.ports, **self.actions} if self.actions else {})
+            for rows in (self.ports, self.acts if self.actions else {})
         )
         whole, left_out = stiffness if loose else None, None
         if self.truncated and ports:
@@ -238,7 +185,7 @@ class LinearSystem:
         return ModalSystem(frequency, damping, ports, left_out, self.relaxation, whole, actions)
 
     @property
-    def _free_shapes(self) -> FloatArray:
+    def free_shapes(self) -> FloatArray:
         """Shapes (N, M + P) of what is free, and nothing for the drives."""
         return np.pad(self.shapes, ((0, 0), (0, len(self.drives))))
 
@@ -296,25 +243,57 @@ class LinearSystem:
         return np.asarray(found.T @ self.shapes.T)
 
     def static(
-        self, loads: FloatArray, laws: Laws = NO_LAWS, drive: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the rest under loads (L, N) that follow one another from zero, see `at_rest`.
+        self, units: FloatArray, laws: Laws = NO_LAWS, amounts: FloatArray | None = None,
+        memory: FloatArray | None = None, before: FloatArray | None = None,
+        held: FloatArray | float = 0.0, seen: FloatArray | None = None,
+    ) -> tuple[FloatArray, FloatArray | None]:  # fmt: skip
+        """Return the rest (L, N) under load levels that follow one another from zero, and the laws' memory.
 
-        `drive` (P,) is where the drives hold what they move; ports of states are at no position.
+        Parameters
+        ----------
+        units : (k, N) ndarray
+            Loads.
+        laws : Laws
+            Internal forces; ports of states are at no position. Without any there is no memory.
+        amounts : (L, k) ndarray, optional
+            How much of each acts at each level; by default they follow one another.
+        memory, before : ndarray, optional
+            Of the laws, and the amounts (k,) where the first level is reached from; by default never loaded.
+        held : (N,) ndarray, optional
+            Where something holds the system.
+        seen : (C, N) ndarray, optional
+            What these rows show (L, C) is returned instead.
+
+        Raises
+        ------
+        ModelError, SolutionError
+            If nothing holds the system, or a law takes more than it has.
         """
-        rows, held = self.port_rows(laws), np.zeros(len(self.mass))
+        rows, levels = self.port_rows(laws), np.eye(len(units)) if amounts is None else amounts
         rows[:, self.displacements :] = 0.0
-        if drive is not None and len(drive):
-            held = self.lift @ drive
-            loads = loads - self.stiffness @ held
-        return at_rest(self.resting, loads, np.eye(len(loads)), laws, rows, held=held)
+        found = self.resting(np.concatenate((units, rows)))
+        answers, flexible = found[: len(units)] + held, found[len(units) :]
+        at_ports, compliance = answers @ rows.T, rows @ flexible.T
+        if seen is not None:
+            answers, flexible = answers @ seen.T, flexible @ seen.T
+        if not len(laws):
+            return levels @ answers, None
+        start = None if before is None else before @ at_ports
+        solution = static_solution(
+            laws, levels @ at_ports, compliance, memory=memory, start=start, kernel=compiled_kernel()
+        )
+        return levels @ answers - solution.forces @ flexible, solution.memory
 
     # ------------------------------------------------------------ what acts, and what is seen
 
-    def driven(self, number: int) -> list[FloatArray]:
-        """Return what resists a drive's motion, its speed and its acceleration, on the modes (M + P,)."""
-        along, free = self.lift[:, number], self._free_shapes
-        return [free.T @ (matrix @ along) for matrix in (self.stiffness, self.damping, self.mass)]
+    @property
+    def acts(self) -> Mapping[str, FloatArray]:
+        """Rows along which laws at all ports act."""
+        return {**self.ports, **self.actions}
+
+    def resisting(self, number: int) -> list[FloatArray]:
+        """Return what resists a drive's motion, its speed and its acceleration, on all unknowns (N,)."""
+        return [matrix @ self.lift[:, number] for matrix in (self.stiffness, self.damping, self.mass)]
 
     def by_order(self, shown: Sequence[Shown], shapes: FloatArray) -> FloatArray:
         """Return what outputs show of modal coordinates and their derivatives (4, C, M), in shapes (N, M)."""
@@ -333,7 +312,7 @@ class LinearSystem:
         ports, size = tuple(self.ports), len(self.mass)
         sees, acts = (
             np.array([rows[port] for port in ports]).reshape(len(ports), size)
-            for rows in (self.ports, {**self.ports, **self.actions})
+            for rows in (self.ports, self.acts)
         )
         force = np.zeros((len(ports), len(shown)))
         for number, item in enumerate(shown):

@@ -16,9 +16,8 @@ from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown, place_among, shown_rows
 from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
-from discrepancy.models.linear_system import Flexibility, Modes
+from discrepancy.models.linear_system import Flexibility, LinearSystem, Modes
 from discrepancy.models.scales import PortScale
-from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime import patch as changes
@@ -173,7 +172,7 @@ class StructureModel(SystemModel):
         """Return the load (n,) that always acts at rest; in motion it is in what is shown."""
         return self._always(case.state.parameters) * (not case.trial.is_dynamic)
 
-    def system(self, state: State) -> SecondOrderSystem:
+    def system(self, state: State) -> LinearSystem:
         """Return the structure at parameters and losses, in the coordinates of `ReducedModel.at`.
 
         Raises
@@ -185,7 +184,7 @@ class StructureModel(SystemModel):
         key = parameters.tobytes(), losses
         return self._systems.get(key, lambda: self._made(self._at(parameters, {}, losses)))
 
-    def _made(self, vector: FloatArray) -> SecondOrderSystem:
+    def _made(self, vector: FloatArray) -> LinearSystem:
         model, state = self.model, ReducedState(self.model, vector)
         size, moving = len(state.shapes), model.modal_stiffness.shape[1]
         theta = model.stiffness_coefficients(vector)
@@ -197,7 +196,7 @@ class StructureModel(SystemModel):
         compliance[moving:, moving:] = inv(dense_sum(theta, model.static_stiffness))
         alpha, beta = model.damping
         modes = 2.0 * np.pi * state.modes.frequency, np.ascontiguousarray(state.shapes), model.mode_count
-        return SecondOrderSystem(
+        return LinearSystem(
             mass, alpha * mass + beta * stiffness, stiffness, self.port_rows, model.mode_count, float(beta),
             known=lambda _: modes, compliance=compliance,
         )  # fmt: skip
@@ -334,14 +333,14 @@ class WingModel(SystemModel):
 
     # ------------------------------------------------------------ structure
 
-    def system(self, state: State) -> SecondOrderSystem:
+    def system(self, state: State) -> LinearSystem:
         """Return the wing in a state."""
         masses, kept = state.structure.of(PointMass), state.structure.of(*STIFFNESSES)
         warmer = state.warmer if len(kept.of(changes.ModulusTemperature)) else 0.0
         key = (state.parameters.tobytes(), state.losses, masses.primitives, kept.primitives, warmer)
         return self._systems.get(key, lambda: self._made(state._replace(warmer=warmer), masses))
 
-    def _made(self, state: State, masses: ModelPatch) -> SecondOrderSystem:
+    def _made(self, state: State, masses: ModelPatch) -> LinearSystem:
         wing, (factor, servo, pitot, alpha, beta) = self.wing, state.parameters.tolist()
         stiffness, mass = wing.stiffness(factor, *state[1:4]), wing.mass(servo, pitot, masses)
 
@@ -350,7 +349,7 @@ class WingModel(SystemModel):
             frequency, own = lowest_modes(basis.T @ stiffness @ basis, basis.T @ mass @ basis, MODE_COUNT)
             return 2.0 * np.pi * frequency, basis @ own, MODE_COUNT
 
-        return SecondOrderSystem(
+        return LinearSystem(
             mass, alpha * mass + beta * stiffness, stiffness, self.port_rows, MODE_COUNT, beta, ON_MODES,
             known=modes,
         )  # fmt: skip

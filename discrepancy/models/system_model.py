@@ -10,11 +10,12 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, release_of
+from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, divided, release_of
 from discrepancy.models.interface import NO_PATCH, Conditions, Model, Outputs, Place, PortedSystem, Response
-from discrepancy.models.linear_system import at_rest
+from discrepancy.models.linear_system import LinearSystem
+from discrepancy.models.motion import Motion, motion_of
+from discrepancy.models.port_scales import Ports
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
-from discrepancy.models.second_order import Motion, Moved, Rested, SecondOrderSystem, port_scales
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
@@ -67,8 +68,6 @@ class SystemModel(Model):
         Rows of all ports where laws act.
     reference : str or None
         Place whose stiffness and modal mass are the natural ones; None: that of the first trial.
-    displacements : int or None
-        How many of the coordinates are displacements, the others being states; None: all.
     components : int
         3 if it tells transverse and shear strain, too; else 1.
     """
@@ -76,14 +75,13 @@ class SystemModel(Model):
     port_rows: Mapping[str, FloatArray]
     reference: str | None = None
     kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
-    displacements: int | None = None
     components: ClassVar[int] = 1
     shows_ports: ClassVar[bool] = True
 
     # ------------------------------------------------------------ what each says
 
     @abstractmethod
-    def system(self, state: State) -> SecondOrderSystem:
+    def system(self, state: State) -> LinearSystem:
         """Return what moves in a state."""
 
     @abstractmethod
@@ -146,7 +144,7 @@ class SystemModel(Model):
     def acting(self, case: Case) -> Acting:
         """Return what acts in a trial."""
         trial, conditions, patch, state = case
-        acting = Acting(trial.time, self.constant(case), begins=trial.begins, clock=conditions.clock)
+        acting = Acting(trial.time, self.constant(case), conditions.stamps(trial.time), begins=trial.begins)
         if trial.kind is TrialKind.RINGDOWN:
             if len(patch.of(PortLoad)):
                 raise ModelError(
@@ -158,7 +156,7 @@ class SystemModel(Model):
         loads, drives = self.pushes(case)
         return replace(acting, loads=loads, drives=drives, initial=conditions.initial.ravel())
 
-    def begun(self, case: Case) -> tuple[SecondOrderSystem, Acting]:
+    def begun(self, case: Case) -> tuple[LinearSystem, Acting]:
         """Return what moves in a dynamic trial, and what acts on it."""
         acting = self.acting(case)
         return self.system(case.state._replace(drives=tuple(acting.drives))), acting
@@ -173,7 +171,7 @@ class SystemModel(Model):
         """
         system, acting = self.begun(case)
         try:
-            return system.motion(acting, laws, case.conditions.refinement)
+            return motion_of(system, acting, laws, case.conditions.refinement)
         except (ModelError, FiniteElementError) as cause:
             raise ModelError(f"The trial {case.trial.name!r} of {self.name!r}: {cause}") from cause
 
@@ -187,9 +185,9 @@ class SystemModel(Model):
         laws, case = self.laws(conditions.parameters, patch), self.case(trial, conditions, patch)
         if not trial.is_dynamic:
             return self._at_rest(case, outputs, laws, components)
-        motion = self.moved(case, laws)
-        shown = (self.shown(case, outputs, motion.acting, number) for number in components)
-        found, *further = map(motion.seen, shown)
+        moved = self.moved(case, laws)
+        shown = (self.shown(case, outputs, moved.acting, number) for number in components)
+        found, *further = map(moved.seen, shown)
         return Response(found.values, found.rates, *(part.values for part in further))
 
     def _at_rest(self, case: Case, outputs: Outputs, laws: Laws, components: range) -> Response:
@@ -207,19 +205,17 @@ class SystemModel(Model):
             case = case._replace(state=first._replace(losses=lost, warmer=warm))
             shown = [item for number in components for item in self.shown(case, outputs, None, number)]
             units, amounts = self.acting(case).levels
-            n = units.shape[1] if self.displacements is None else self.displacements
+            system, given = self.system(case.state), amounts[rows]
+            n = system.displacements
             for (_, quantity), item in zip(outputs, shown, strict=False):
                 if np.any(item.rows[2:, n:]) or (quantity.order > 0 and np.any(item.rows[1:, :n])):
                     raise ModelError(
                         f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
                         "acceleration."
                     )
-            ports = laws.rows(self.port_rows, units.shape[1])
-            ports[:, n:] = 0.0  # ports of states are at no position
             seen = np.array([np.concatenate((item.rows[0, :n], item.rows[1, n:])) for item in shown])
-            rest, given = self.system(case.state).resting, amounts[rows]
             try:
-                values[rows], memory = at_rest(rest, units, given, laws, ports, memory, before, seen=seen)
+                values[rows], memory = system.static(units, laws, given, memory, before, seen=seen)
             except (ModelError, FiniteElementError) as cause:
                 raise ModelError(f"The trial {trial.name!r} is at rest, but {cause}") from cause
             values[rows] += [item.constant for item in shown]
@@ -239,10 +235,13 @@ class SystemModel(Model):
         (base, _), (system, acting) = map(self.begun, (at_mean, case))
         return system.seen_by(self.shown(case, outputs, acting), base.shapes)
 
-    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
+    def port_motion(
+        self, trial: Trial, conditions: Conditions, parts: int = 1
+    ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        case = self.case(trial, conditions, self.patch.in_trial(trial.name))
-        return self.moved(case).at_ports
+        system, acting = self.begun(self.case(trial, conditions, self.patch.in_trial(trial.name)))
+        moved = motion_of(system, replace(acting, sampled=divided(acting.sampled, parts)), NO_LAWS)
+        return moved.at(np.array(list(self.port_rows.values())))
 
     # ------------------------------------------------------------ sizes
 
@@ -258,8 +257,7 @@ class SystemModel(Model):
         channels = [campaign.channels[name] for name in trial.channels]
         outputs = tuple((channel.output, channel.quantity) for channel in channels)
         self.check_outputs(outputs)
-        shown = self.shown(case, outputs, moved.acting)
-        for column, item in enumerate(shown):
+        for column, item in enumerate(self.shown(case, outputs, moved.acting)):
             kept = trial.values[trial.used[:, column], column] - item.constant
             if item.reaction is not None or item.courses is not None or not kept.size:
                 continue
@@ -279,45 +277,32 @@ class SystemModel(Model):
         A structure that springs hold, which only forces move from rest, has scales of its own; for others
         what acts and moves is the measure.
         """
-        trials, parameters = campaign.trials, self.prior_mean(campaign)
-        state, names = State(parameters, (0.0,) * len(self.regions)), self.ports()
-        system, laws = self.system(state), self.laws(parameters)
+        trials, parameters, names = campaign.trials, self.prior_mean(campaign), self.ports()
+        state = State(parameters, (0.0,) * len(self.regions))
+        system, bare = self.system(state), self.system(state._replace(closed=False))
+        rows = np.array([self.port_rows[name] for name in names]).reshape(len(names), len(bare.mass))
         held = system.mode_count is not None and all(
             trial.kind is not TrialKind.DRIVEN and trial.begins is Start.SETTLED for trial in trials
         )
-        rows = np.array([self.port_rows[name] for name in names])
-        bare = self.system(state._replace(closed=False))
-        rests, motions = list[Rested](), list[Moved]()
-        conditions, largest = Conditions(parameters), [0.0, 0.0, 0.0]
+        ports, largest, driven_only = Ports(bare, rows), np.zeros(3), True
         for trial in trials:
-            case, fitted = self.case(trial, conditions), trial.is_dynamic and not trial.held_out
-            if not trial.is_dynamic or trial.kind is TrialKind.RINGDOWN:
-                still = self._held(case) @ rows.T if held and names else np.zeros((0, len(names)))
-                rests.append((still, fitted))
+            fitted = trial.is_dynamic and not trial.held_out
+            if trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN:
+                motion = self._driven(campaign, trial)
+                loads = ports.follow(motion, _measured(campaign, trial), fitted=fitted)
+                shapes = motion.system.all_shapes[: motion.system.displacements].T
+                felt = motion.q @ shapes, motion.velocity @ shapes, loads
+                largest = np.maximum(largest, [np.max(np.abs(item), initial=0.0) for item in felt])
                 continue
-            try:
-                motion = self.moved(case, laws)
-            except ModelError:
-                motion = self.moved(self.case(replace(trial, begins=Start.STILL), conditions), laws)
-            if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
-                initial = self.initial_sizes(campaign, trial)
-                motion = self.moved(self.case(trial, replace(conditions, initial=initial)), laws)
-            pushes = [
-                float(np.max(np.abs(trial.values[trial.used[:, column], column]), initial=0.0))
-                for column, name in enumerate(trial.channels)
-                if campaign.channels[name].quantity in (Quantity.FORCE, Quantity.TORQUE)
-            ]
-            motions.append((motion, max(pushes, default=0.0), fitted))
-            shapes = motion.system.all_shapes[: self.displacements].T
-            loads = motion.acting.load_at(motion.time, np.eye(len(motion.acting.constant)))
-            for number, item in enumerate((motion.q @ shapes, motion.velocity @ shapes, loads)):
-                largest[number] = max(largest[number], float(np.max(np.abs(item), initial=0.0)))
-        (peak, speed, weight), sizes = largest, campaign_sizes(campaign)
-        shape, stiff = np.zeros(0), [0.0] * len(names)
+            driven_only = False
+            if held:
+                ports.rest(self._held(self.case(trial, Conditions(parameters))), fitted=fitted)
+        (peak, speed, weight), sizes = largest.tolist(), campaign_sizes(campaign)
+        shape, stiff = np.zeros(0), np.zeros(len(names))
         if held:
             known = [*(trial.load_place for trial in trials), *(self.load_places or ())]
             row, shape = self.force_row(self.reference or known[0], state), system.shapes[:, 0]
-            stiff = [1.0 / float(own @ system.resting(own[None])[0]) for own in rows]
+            stiff = np.array([1.0 / float(own @ system.resting(own[None])[0]) for own in rows])
             frequency, participation = float(system.angular_frequency[0]), float(row @ shape) ** 2
             mass = 1.0 / participation if participation else float(np.trace(system.mass))
             stiffness = 1.0 / float(row @ system.resting(row[None])[0])
@@ -327,15 +312,26 @@ class SystemModel(Model):
             frequency = float(elastic[0]) if len(elastic) else usual
             mass = float(np.trace(system.mass)) / max(len(system.mass), 1)
             stiffness = weight / peak if peak > 0.0 < weight else mass * frequency**2
-        found = port_scales(bare, dict(zip(names, stiff, strict=True)), rests, motions)
+        found = dict(zip(names, ports.scales(stiff.tolist(), driven_only=driven_only), strict=True))
         return Scales(
             **{**sizes, "force": sizes["force"] or weight},
             length=self.length or max(map(abs, self.stations() or (0.0,))) or 1.0,
-            tip_stiffness=stiffness,
-            modal_mass=mass,
-            angular_frequency=frequency,
+            tip_stiffness=stiffness, modal_mass=mass, angular_frequency=frequency,
             ports=found | self.spread(found, shape),
-        )
+        )  # fmt: skip
+
+    def _driven(self, campaign: Campaign, trial: Trial) -> Motion:
+        """Return the motion of a trial under recorded inputs, as far as these tell it."""
+        conditions = Conditions(self.prior_mean(campaign))
+        laws = self.laws(conditions.parameters)
+        try:
+            motion = self.moved(self.case(trial, conditions), laws)
+        except ModelError:
+            motion = self.moved(self.case(replace(trial, begins=Start.STILL), conditions), laws)
+        if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
+            initial = self.initial_sizes(campaign, trial)
+            motion = self.moved(self.case(trial, replace(conditions, initial=initial)), laws)
+        return motion
 
     def _held(self, case: Case) -> FloatArray:
         """Return the displacements (L, N) in a trial at rest, or from which a ring-down is released."""
@@ -346,3 +342,11 @@ class SystemModel(Model):
         row, release = acting.release
         shape = rest(row[None])
         return np.asarray(release.displacement / float(row @ shape[0]) * shape)
+
+
+def _measured(campaign: Campaign, trial: Trial) -> float:
+    """Return the largest force measured in a trial [N]."""
+    forces = [
+        campaign.channels[name].quantity in (Quantity.FORCE, Quantity.TORQUE) for name in trial.channels
+    ]
+    return float(np.max(np.abs(trial.values), where=trial.used & np.array(forces, bool), initial=0.0))

@@ -74,7 +74,6 @@ def ring_down_agreement(
             0.0 * load,
             ("*NODE PRINT, NSET=NPROBES, FREQUENCY=1", "U"),
             procedure=("*DYNAMIC, DIRECT, ALPHA=0.", number_line([increment, increment * steps])),
-            increments=steps + 10,
         ),
     )
     tables, tip = read_tables(run_calculix(text, folder, "ring_down")), len(operators.gauges)

@@ -1,7 +1,7 @@
 """Internal forces at ports: laws from a patch, and the static solution under them.
 
 `fe.runtime.stepwise` moves a structure under them. NumPy and relative imports only: this file is
-copied into the FMU. The loops run as plain Python here; `discrepancy.models.compiled_motion` has the same
+copied into the FMU. The loops run as plain Python here; `fe.compilation` has the same
 functions compiled, to be given as `kernel`.
 """
 

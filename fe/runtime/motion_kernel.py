@@ -14,7 +14,7 @@ its own position: a monotone equation in one unknown. Dry friction is then an el
 stiffness 1/R.
 
 Written in the subset of Python that numba compiles too. NumPy and relative imports only: this file is copied
-into the FMU. `discrepancy.models.compiled_motion` has the same compiled.
+into the FMU. `fe.compilation` has the same compiled.
 """
 
 import numpy as np

@@ -13,7 +13,7 @@ from fe.elements.kinds import Rule
 from fe.runtime.arrays import FloatArray, IntArray
 
 from .affine import StiffnessTerm, designed
-from .mesh import SupportedUnknowns
+from .mesh import Supports
 from .tables import StructureDesign
 
 Mesh = TypeVar("Mesh", bound=CellMesh, covariant=True)
@@ -35,7 +35,7 @@ class Body(Generic[Mesh]):
     ----------
     mesh : CellMesh
         Nodes and cells.
-    supports : SupportedUnknowns
+    supports : Supports
         What is held, sprung and rigid.
     elasticity, density : (nc, 6, 6) Pa, (nc,) kg/m^3
         Of the cells, in space, nominal and undamaged.
@@ -52,7 +52,7 @@ class Body(Generic[Mesh]):
     """
 
     mesh: Mesh
-    supports: SupportedUnknowns
+    supports: Supports
     elasticity: FloatArray
     density: FloatArray
     part: IntArray
@@ -72,7 +72,7 @@ class Body(Generic[Mesh]):
         """The parts in their order; springs are with the part of nothing, which comes last."""
         terms = {pair: self.stiffness(np.flatnonzero(self.part == n)) for n, pair in enumerate(self.parts)}
         springs, nothing = self.supports.stiffness, (None, None)
-        if springs.count_nonzero():
+        if self.supports.springs.any():
             terms[nothing] = terms[nothing] + springs if nothing in terms else springs
         return tuple(StiffnessTerm(term, *pair) for pair, term in terms.items())
 

@@ -7,15 +7,16 @@ import os
 import re
 import shutil
 import subprocess
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from fe.elements.kinds import gauss_points
+from fe.elements.kinds import HEXAHEDRA_20, gauss_points
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
+from fe.sentences import said
 from fe.structure.affine import natural_frequencies
 
 from .calculix_deck import PRINTED, CalculixDeck, Step
@@ -33,9 +34,7 @@ def required_calculix() -> str:
     """Return the path of CalculiX; raises `CalculixError` where it is not installed."""
     if program := calculix_program():
         return program
-    raise CalculixError(
-        f"CalculiX ('{PROGRAM}') is not installed; on Debian and Ubuntu: apt-get install calculix-ccx."
-    )
+    raise CalculixError(said("calculix.missing", program=PROGRAM))
 
 
 _HEADER = re.compile(r"^ *(\w[\w ]*?) \(.*\) for set (\w+) and time +\S+$", re.MULTILINE)
@@ -55,10 +54,7 @@ def read_tables(text: str) -> dict[str, list[FloatArray]]:
         try:
             rows = np.loadtxt(body.splitlines(), ndmin=2)
         except ValueError as error:
-            raise CalculixError(
-                f"The table of {what} that CalculiX printed holds what is not a row of numbers ({error}); "
-                "its version may print another format (2.20 is known)."
-            ) from None
+            raise CalculixError(said("calculix.table", what=what, error=error)) from None
         tables.setdefault(name, []).append(rows)
     return tables
 
@@ -129,21 +125,15 @@ def _relative(theirs: FloatArray, ours: FloatArray) -> float:
     return float(np.abs(theirs - ours).max() / np.abs(ours).max())
 
 
-def _relative_each(theirs: FloatArray, ours: FloatArray) -> float:
-    return float(np.abs(theirs / ours - 1.0).max())
-
-
-@dataclass(frozen=True)
-class Agreement:
+class Agreement(NamedTuple):
     """A model and CalculiX.
 
     Attributes
     ----------
     loads : dict of str to dict of str to float
-        Of each load the relative differences: of `nodal displacements`, over the largest; of `gauge strains`
-        and `displacement outputs`, where there are some, over the largest of their kind, or of a wing each
-        over its own; of a wing also of `strains at integration points` in the cells with gauges, which
-        CalculiX evaluates itself, over the largest.
+        Of each load the relative differences, over the largest of their kind: of `nodal displacements`; of
+        `gauge strains` and `displacement outputs`, where there are some; of 20-node hexahedra also of
+        `strains at integration points`, which CalculiX evaluates itself.
     ours, calculix : (m,) Hz
         Lowest frequencies of both codes.
     """
@@ -155,7 +145,7 @@ class Agreement:
     @property
     def modal(self) -> float:
         """Largest relative difference of the frequencies."""
-        return _relative_each(self.calculix, self.ours)
+        return float(np.abs(self.calculix / self.ours - 1.0).max())
 
 
 def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
@@ -176,10 +166,10 @@ def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
     CalculixError
         If CalculiX is not there or fails.
     """
-    structure, cells = deck.structure, np.asarray(deck.gauge_cells, dtype=np.int64)
+    structure, strained = deck.structure, deck.mesh.kind is HEXAHEDRA_20
     prints = ["*NODE PRINT, NSET=NALL", "U"]
     prints += ["*NODE PRINT, NSET=NPROBES", "U"] if len(deck.probes) else []
-    prints += ["*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E"] if len(cells) else []
+    prints += ["*EL PRINT, ELSET=EALL, GLOBAL=YES", "E"] if strained else []
     text = deck.text(*(step._replace(lines=[*step.lines, *prints]) for step in deck.loads.values()))
     printed = read_tables(run_calculix(text, folder, "static")) if deck.loads else {}
     if (count := len(printed.get("NALL", ()))) != len(deck.loads):
@@ -199,11 +189,9 @@ def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
         found = differences[name] = {"nodal displacements": _relative(tables["NALL"][:, 1:], nodes)}
         for what, own in parts.items():
             if len(ours[own]):
-                relative = _relative_each if deck.each_alone else _relative
-                found[what] = relative(tables["NPROBES"][:, 1:].ravel()[own], ours[own])
-        if len(cells):
-            strains = deck.mesh.strains(nodes, cells, INTEGRATION_POINTS).reshape(-1, 6)
+                found[what] = _relative(tables["NPROBES"][:, 1:].ravel()[own], ours[own])
+        if strained:
+            strains = deck.mesh.strains(nodes, local=INTEGRATION_POINTS).reshape(-1, 6)
             strains[:, 3:] *= 0.5  # engineering to tensor shear
-            printed_here = tables["EGAUGES"][:, 2:]
-            found["strains at integration points"] = _relative(printed_here, strains[:, PRINTED])
+            found["strains at integration points"] = _relative(tables["EALL"][:, 2:], strains[:, PRINTED])
     return Agreement(differences, frequencies, theirs[:modes])

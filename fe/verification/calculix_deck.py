@@ -10,18 +10,21 @@ strain or displacement, by an equation, because printed displacements hold seven
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
+from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import StrictUndefined, Template
 from numpy.typing import ArrayLike
+from scipy import sparse
 
 from fe.elements.cells import CellMesh
 from fe.elements.kinds import HEXAHEDRA_20, WEDGES_6
 from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
+from fe.sentences import said
 from fe.structure.affine import AffineStructure
 from fe.structure.body import Body
 from fe.structure.design import Load
@@ -57,15 +60,12 @@ class Step(NamedTuple):
         Whether the load is given as forces of nodes, and not by lines.
     procedure : tuple of str
         Lines that say what is solved.
-    increments : int
-        At most so many.
     """
 
     load: FloatArray = np.empty(0)
     lines: Iterable[str] = ()
     nodal: bool = True
     procedure: tuple[str, ...] = ("*STATIC",)
-    increments: int = 100
 
 
 class Grading(NamedTuple):
@@ -102,16 +102,10 @@ class CalculixDeck:
         Its state by name; what is left out is nominal, and healthy.
     loads : mapping of str to Step
         Static steps of its loads, each alone.
-    probed : tuple of (n,)
-        Rows on the free unknowns that are read behind the gauges and the displacement outputs.
-    gauge_cells : (m,)
-        Cells that are the set EGAUGES.
     grading : Grading, optional
         Where the elasticity changes inside cells.
     damping : (float, float)
         Rayleigh damping [1/s] and [s] of a step in time.
-    each_alone : bool
-        Whether strains and outputs are compared each over its own, and not over the largest of their kind.
     """
 
     title: str
@@ -119,11 +113,8 @@ class CalculixDeck:
     body: Body[CellMesh]
     values: Mapping[str, float]
     loads: Mapping[str, Step]
-    probed: tuple[FloatArray, ...] = ()
-    gauge_cells: IntArray | tuple[()] = ()
     grading: Grading | None = None
     damping: tuple[float, float] = (0.0, 0.0)
-    each_alone: bool = False
 
     @property
     def mesh(self) -> CellMesh:
@@ -151,53 +142,52 @@ class CalculixDeck:
     @cached_property
     def probes(self) -> FloatArray:
         """Rows (m, n) of what is read, on the free unknowns."""
-        own = (self.structure.gauge_output.toarray(), self.structure.displacement_output.toarray())
-        return np.vstack((*own, *self.probed))
+        rows = sparse.vstack((self.structure.gauge_output, self.structure.displacement_output))
+        return np.asarray(rows.toarray())
 
     def text(self, *steps: Step) -> str:
         """Input of a job: the model, then its steps."""
-        held, motions = self.body.supports, self._motions
-        springs = [(*_place(own), held.springs[own]) for own in np.flatnonzero(held.springs).tolist()]
-        fixed = [*map(_place, np.flatnonzero(held.held).tolist())]
-        for places, body in zip(motions, held.rigid, strict=True):
-            springs += [(*places[own], body.springs[own]) for own in np.flatnonzero(body.springs)]
-            fixed += [places[own] for own in np.flatnonzero(body.held)]
-        # Behind the nodes of the mesh: two of each rigid set, eight of each point mass, then the probes.
+        held, points = self.body.supports, self.mesh.points
         masses = ((self.values.get(own.name, own.mass), own.shares) for own in self.body.masses)
         heavy = [(mass, shares) for mass, places in masses for shares in places if mass > 0.0]
-        first = len(self.mesh.points) + 2 * len(motions) + 1
-        corners = np.arange(first, first + 8 * len(heavy)).reshape(-1, 8).tolist()
-        first_probe, block = first + 8 * len(heavy), HEXAHEDRA_20.places[:8] * _BLOCK
-        tied = [(nodes, shares) for (_, shares), nodes in zip(heavy, corners, strict=True)]
-        return _template().render(
-            deck=self,
-            materials=self._materials,
-            cells=np.column_stack((np.arange(len(self.mesh.cells)), self.mesh.cells)) + 1,
-            rigid_nodes=[
-                (places[motion][0], body.point)
-                for places, body in zip(motions, held.rigid, strict=True)
-                for motion in (0, 3)
-            ],
-            held=fixed,
-            springs=springs,
-            blocks=[
-                (mass, [*zip(nodes, shares @ self.mesh.points + block, strict=True)])
-                for (mass, shares), nodes in zip(heavy, corners, strict=True)
-            ],
-            block_side=_BLOCK,
-            probe_nodes=range(first_probe, first_probe + -(-len(self.probes) // 3)),
-            equations=self._equations(tied, first_probe),
-            steps=steps,
+        # Behind the nodes of the mesh: those of rigid motions, eight of each point mass, then the probes.
+        motions = len(held.springs) - len(held.alone)
+        first = len(points) + 1 - (-motions // 3)
+        first_probe = first + 8 * len(heavy)
+        corners = np.arange(first, first_probe).reshape(-1, 8).tolist()
+        blocks = [(nodes, *block) for nodes, block in zip(corners, heavy, strict=True)]
+        side, still = HEXAHEDRA_20.places[:8] * _BLOCK, np.diff(held.expansion.indptr) == 0
+        file = resources.files("fe.verification").joinpath("templates/calculix.inp.jinja")
+        template = Template(
+            file.read_text(encoding="utf-8"), trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined
+        )
+        return str(
+            template.render(
+                deck=self,
+                numbers=number_line,
+                materials=self._materials,
+                cells=np.column_stack((np.arange(len(self.mesh.cells)), self.mesh.cells)) + 1,
+                motion_nodes=range(len(points) + 1, first),
+                held=map(_place, (*np.flatnonzero(still), *range(3 * len(points) + motions, 3 * first - 3))),
+                springs=[*self.terms(held.springs)],
+                blocks=[
+                    (mass, [*zip(nodes, shares @ points + side, strict=True)])
+                    for nodes, mass, shares in blocks
+                ],
+                block_side=_BLOCK,
+                probe_nodes=range(first_probe, first_probe - (-len(self.probes) // 3)),
+                equations=self._equations([(nodes, shares) for nodes, _, shares in blocks], first_probe),
+                steps=steps,
+            )
         )
 
     def _equations(
         self, blocks: Iterable[tuple[list[int], FloatArray]], first_probe: int
     ) -> Iterator[list[Term]]:
         """Yield sums that are zero, of which the first term depends on the others."""
-        for places, body in zip(self._motions, self.body.supports.rigid, strict=True):
-            for row, shares in enumerate(body.motions.tolist()):
-                turned = [(*place, share) for place, share in zip(places, shares, strict=True) if share]
-                yield [(int(body.nodes[row // 3]) + 1, row % 3 + 1, -1.0), *turned]
+        held = self.body.supports
+        for row in np.setdiff1d(np.flatnonzero(np.diff(held.expansion.indptr)), held.alone).tolist():
+            yield [(*_place(row), -1.0), *self.terms(held.expansion[[row]].toarray()[0])]
         for nodes, shares in blocks:
             moved = [(own + 1, float(shares[own])) for own in np.flatnonzero(shares).tolist()]
             for node, component in itertools.product(nodes, (1, 2, 3)):
@@ -206,21 +196,11 @@ class CalculixDeck:
             yield [(first_probe + number // 3, number % 3 + 1, -1.0), *self.terms(row)]
 
     @cached_property
-    def _motions(self) -> list[list[tuple[int, int]]]:
-        """Node and direction of the six motions of each rigid set: shifts of one node, turns as another's."""
-        first = 3 * len(self.mesh.points)
-        return [
-            [_place(first + 6 * number + motion) for motion in range(6)]
-            for number in range(len(self.body.supports.rigid))
-        ]
-
-    @cached_property
     def places(self) -> list[tuple[int, int]]:
         """Node and direction of each free unknown."""
-        found = [*map(_place, self.body.supports.alone.tolist())]
-        for places, body in zip(self._motions, self.body.supports.rigid, strict=True):
-            found += [places[motion] for motion in np.flatnonzero(~body.held)]
-        return found
+        held, behind = self.body.supports, self.mesh.unknowns
+        motions = range(behind, behind + len(held.springs) - len(held.alone))
+        return [_place(unknown) for unknown in (*held.alone.tolist(), *motions)]
 
     def terms(self, values: FloatArray) -> Iterator[Term]:
         """Yield node, direction and value of the values (n,) that are not zero."""
@@ -231,19 +211,6 @@ class CalculixDeck:
 def _place(unknown: int) -> tuple[int, int]:
     """Return node and direction, both from 1, of an unknown."""
     return unknown // 3 + 1, unknown % 3 + 1
-
-
-@cache
-def _template() -> Template:
-    environment = Environment(
-        loader=PackageLoader("fe.verification"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters["numbers"] = number_line
-    return environment.get_template("calculix.inp.jinja")
 
 
 def number_line(values: ArrayLike) -> str:
@@ -261,10 +228,7 @@ def structure_deck(structure: Structure) -> CalculixDeck:
     """
     mesh, design = structure.mesh, structure.design
     if mesh.kind in NOT_COMPARABLE:
-        raise CalculixError(
-            f"CalculiX integrates {mesh.kind.name} ({mesh.kind.calculix}) in another way, so that nothing "
-            "can be compared; tetrahedra and hexahedra can."
-        )
+        raise CalculixError(said("calculix.wedges", kind=mesh.kind))
     loads = {load.name: _load_step(structure, load) for load in design.load}
     return CalculixDeck("structure", structure, structure.body, {}, loads)
 
@@ -287,10 +251,7 @@ def _load_step(structure: Structure, load: Load) -> Step:
 
 
 def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
-    """Return the wing in one state; it reads the gauges, the displacement at the tip, then at the test load.
-
-    The root is a rigid set about the straight chord line, which moves in heave, flap and yaw on its springs.
-    """
+    """Return the wing in one state."""
     mesh, design, body = operators.wing_mesh, operators.wing_mesh.design, operators.body
     plan, lift, skin, grading = design.planform, design.lift, design.skin, None
     if skin.stations:  # the station of a node stands as its temperature, on which the skin depends
@@ -299,19 +260,12 @@ def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
         body = replace(body, elasticity=body.elasticity / centre[:, None, None])
         course = [(place.station, place.young_modulus) for place in skin.stations]
         grading = Grading(course, mesh.points[:, 1] / plan.semi_span, graded)
-    cells = [  # that hold the middle of a gauge
-        mesh.skin_point(distance, chord * plan.chord(distance / plan.semi_span)).cell
-        for distance, chord in design.gauges.positions
-    ]
     return CalculixDeck(
         "wing, design",
         operators,
         body,
         wing_values(operators, stiffness_loss=state.stiffness_loss, **state.values),
         {"tip force": Step(operators.turn(0.0, TEST_FORCE)), "lift": Step(operators.turn(lift.load_factor))},
-        (operators.load_tip,),
-        np.unique(cells),
         grading,
         (state.damping_alpha, state.damping_beta),
-        each_alone=True,
     )

@@ -18,7 +18,7 @@ from fe.elements.kinds import gauss_points
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.structure.affine import AffineStructure
 from fe.structure.body import Body, PointMass
-from fe.structure.mesh import RigidSet, SupportedUnknowns, rigid_motions
+from fe.structure.mesh import RigidSet, Supports, supports
 
 from .design import WingDesign, wing_structure
 from .mesh import WingMesh, build_mesh
@@ -157,9 +157,8 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
         compliance = elements.orthotropic_compliance(web.young_modulus, web.poisson_ratio, web.shear_modulus)
         local[mesh.web == index] = np.linalg.inv(compliance)
     for index, rib in enumerate(design.ribs):
-        local[mesh.rib == index] = np.linalg.inv(
-            elements.isotropic_compliance(rib.young_modulus, rib.poisson_ratio)
-        )
+        compliance = elements.isotropic_compliance(rib.young_modulus, rib.poisson_ratio)
+        local[mesh.rib == index] = np.linalg.inv(compliance)
     for rod in design.rods:
         inside = (mesh.web == rod.web) & (station < rod.reach)
         second_moment = design.webs[rod.web].thickness * _web_height(mesh)[inside] ** 3 / 12.0
@@ -215,18 +214,17 @@ def cell_density(mesh: WingMesh) -> FloatArray:
     return density
 
 
-def root_support(mesh: WingMesh) -> SupportedUnknowns:
+def root_support(mesh: WingMesh) -> Supports:
     """Hold the wing: the root section moves as a rigid rib on springs.
 
     The rib may heave along z, flap about x and yaw about z, both about the straight chord line; its three
     unknowns come last. Its other motions are held.
     """
-    root, nothing = mesh.design.root, np.zeros(mesh.unknowns)
+    root, nothing = mesh.design.root, np.zeros(mesh.points.shape)
     on_root = np.flatnonzero(np.abs(mesh.points[:, 1]) < 1e-9 * mesh.design.planform.semi_span)
-    motions = rigid_motions(mesh.points[on_root], np.zeros(3), 2.0)
     springs = np.array([0.0, 0.0, root.transverse_spring, root.flap_spring, 0.0, root.yaw_spring])
-    rib = RigidSet(on_root, np.zeros(3), motions, springs == 0.0, springs)
-    return SupportedUnknowns(nothing.astype(bool), nothing, (rib,))
+    rib = RigidSet(on_root, np.zeros(3), springs == 0.0, springs)
+    return supports(mesh.points, nothing.astype(bool), nothing, [rib])
 
 
 def section_displacement(mesh: WingMesh, distance: float, chord_fraction: float) -> FloatArray:

@@ -2,7 +2,7 @@
 
 Every file of this folder but that one is a law. A law is known by its number, its place in `LAWS`, and each
 function of the interface is here once, with that number before what it is given: it calls that of the law.
-`discrepancy.models.compiled_motion` has the same compiled.
+`fe.compilation` has the same compiled.
 
 NumPy and relative imports only: this folder is copied into the FMU.
 """

@@ -10,7 +10,7 @@ from numpy.polynomial import Polynomial
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
-from discrepancy.models.compiled_motion import compiled_kernel
+from fe.compilation import compiled_kernel
 from fe.runtime import laws as functions
 from fe.runtime import patch
 from fe.runtime.errors import InvalidPatchError, SolutionError

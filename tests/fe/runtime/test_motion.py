@@ -8,7 +8,7 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 from scipy.special import ellipk
 
-from discrepancy.models.compiled_motion import compiled_kernel
+from fe.compilation import compiled_kernel
 from fe.runtime import patch
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
