@@ -17,6 +17,7 @@ from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidStateError, SolutionError
 from fe.runtime.state import losses_of
+from fe.sentences import said
 
 from .tables import StructureDesign
 
@@ -261,9 +262,8 @@ def _updated(nominal: dict[str, float], changed: Values | None, what: str) -> di
     """Return the factors of terms by what they are times: of nothing one, then values by name."""
     unknown = set(changed or {}) - set(nominal)
     if unknown:
-        raise InvalidStateError(
-            f"The structure has no {what} named {min(unknown)!r}; there are {', '.join(nominal) or 'none'}."
-        )
+        known = ", ".join(nominal) or "none"
+        raise InvalidStateError(said("structure.unknown", what=what, name=min(unknown), known=known))
     factors: dict[str | None, float] = {None: 1.0}
     factors.update(nominal | dict(changed or {}))
     return factors
@@ -338,10 +338,8 @@ def natural_frequencies(
         If there is no mass, there are not so many modes, or the iteration did not converge.
     """
     if count >= structure.unknowns:
-        raise SolutionError(
-            f"{count} modes were asked for, but a structure of {structure.unknowns} free unknowns gives at "
-            f"most {structure.unknowns - 1}."
-        )
+        most = structure.unknowns - 1
+        raise SolutionError(said("structure.modes", count=count, unknowns=structure.unknowns, most=most))
     stiffness, mass, _ = structure.at(values or {})
     if not mass.diagonal().any():
         raise SolutionError("The structure has no mass, hence no modes; give its materials a density.")

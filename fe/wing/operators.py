@@ -157,9 +157,8 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
         compliance = elements.orthotropic_compliance(web.young_modulus, web.poisson_ratio, web.shear_modulus)
         local[mesh.web == index] = np.linalg.inv(compliance)
     for index, rib in enumerate(design.ribs):
-        local[mesh.rib == index] = np.linalg.inv(
-            elements.isotropic_compliance(rib.young_modulus, rib.poisson_ratio)
-        )
+        compliance = elements.isotropic_compliance(rib.young_modulus, rib.poisson_ratio)
+        local[mesh.rib == index] = np.linalg.inv(compliance)
     for rod in design.rods:
         inside = (mesh.web == rod.web) & (station < rod.reach)
         second_moment = design.webs[rod.web].thickness * _web_height(mesh)[inside] ** 3 / 12.0
