@@ -94,6 +94,10 @@ class Conditions:
     components: bool = False
     refinement: int = 1
 
+    def stamps(self, time: FloatArray) -> FloatArray:
+        """Return the times at which samples with stamps (N,) show the motion [s]."""
+        return (1.0 + self.clock[0]) * time + self.clock[1]
+
     @property
     def key(self) -> tuple[object, ...]:
         """All of it as a value that can be looked up."""
@@ -252,8 +256,13 @@ class Model(ABC):
         """Return natural sizes (L,) of the state at the begin of a trial; empty: it is never unknown."""
         return np.zeros(0)
 
-    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
-        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
+    def port_motion(
+        self, trial: Trial, conditions: Conditions, parts: int = 1
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws.
+
+        At samples that are so many times as dense as those of the trial.
+        """
         raise NotImplementedError
 
     def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:

@@ -13,9 +13,9 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, LoadChange, Shown, place_among
 from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
+from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.lumped_file import GAINS, ControllerSection, InputSection, LumpedDescription
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.runtime import patch as changes
 from fe.runtime.laws import LAWS
@@ -123,7 +123,7 @@ class LumpedModel(DescribedModel, SystemModel):
         self.kinds = frozenset(TrialKind) - {TrialKind.FLIGHT}
         if not description.is_plain:
             self.kinds -= {TrialKind.RINGDOWN}
-        self.displacements, self.length = description.size, description.characteristic_length
+        self.length = description.characteristic_length
         self.port_rows = {item.name: padded(item.vector) for item in description.port}
         acts = {item.name: padded(item.acts) for item in description.port if item.acts is not None}
         self._acts, self._acting_rows = acts, self.port_rows | acts
@@ -398,11 +398,11 @@ class LumpedModel(DescribedModel, SystemModel):
             state += item.integral != 0.0
         return rig
 
-    def system(self, state: State) -> SecondOrderSystem:
+    def system(self, state: State) -> LinearSystem:
         """Return what moves, with prescribed motions and controllers as the state says."""
         rig = self.rig(state)
 
-        def made() -> tuple[Rig, SecondOrderSystem]:
+        def made() -> tuple[Rig, LinearSystem]:
             description, terms, n = self.description, rig.terms, self.description.size
             own, rest = slice(n, n + description.states), slice(n + description.states, None)
             mass, damping = terms["mass"] + terms["capacity"], terms["damping"] + terms["conductance"]
@@ -423,7 +423,7 @@ class LumpedModel(DescribedModel, SystemModel):
                         into[loop.state] += seen
             beta = description.damping.beta if description.damping is not None else None
             drives = [description.padded(self._inputs[name].vector) for name in state.drives]
-            return rig, SecondOrderSystem(  # the rig lives as long, so that its id stays its own
+            return rig, LinearSystem(  # the rig lives as long, so that its id stays its own
                 mass, damping, stiffness, self.port_rows,
                 mode_count=MOST_MODES if description.is_plain else None,
                 relaxation=rig.factors.get("damping", 1.0) * (beta or 0.0),

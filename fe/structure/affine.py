@@ -17,6 +17,7 @@ from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidStateError, SolutionError
 from fe.runtime.state import losses_of
+from fe.sentences import said
 
 from .tables import StructureDesign
 
@@ -55,8 +56,6 @@ class AffineStructure:
         What was asked for.
     parameters, masses, controls : dict of str to float
         Nominal values of the parameters [1], free masses [kg] and controls [each in its unit].
-    control_units : dict of str to str
-        Their units.
     ranges : dict of str to (float, float)
         Least and largest value for which a reduced model is to hold, of these and of the losses, by name.
     regions : tuple of str
@@ -77,8 +76,6 @@ class AffineStructure:
         Rows that give a displacement, or with second derivatives an acceleration.
     expansion : csr (full, n)
         Free unknowns to the displacements of all nodes (3 node + component).
-    damping_alpha, damping_beta : float
-        Rayleigh damping [1/s] and [s].
     design_hash : str
         Hash of the design with its mesh.
     """
@@ -87,7 +84,6 @@ class AffineStructure:
     parameters: dict[str, float]
     masses: dict[str, float]
     controls: dict[str, float]
-    control_units: dict[str, str]
     ranges: dict[str, tuple[float, float]]
     regions: tuple[str, ...]
     stiffness_terms: tuple[StiffnessTerm, ...]
@@ -101,8 +97,6 @@ class AffineStructure:
     displacement_output: sparse.csr_array
     acceleration_output: sparse.csr_array
     expansion: sparse.csr_array
-    damping_alpha: float
-    damping_beta: float
     design_hash: str
 
     followed_load: ClassVar[int | None] = None
@@ -222,7 +216,6 @@ def designed(
         "parameters": {part.name: part.nominal for part in design.parameter},
         "masses": {part.name: part.mass for part in design.mass if part.free},
         "controls": {part.name: part.nominal for part in design.control},
-        "control_units": {part.name: part.unit for part in design.control},
         "ranges": design.ranges,
         "regions": tuple(part.name for part in design.damage),
         "mass_terms": tuple((restriction @ (own @ expansion)).tocsr() for own in masses.values()),
@@ -233,8 +226,6 @@ def designed(
         "accelerations": tuple(part.name for part in design.acceleration),
         **{f"{key}_output": (rows @ expansion).tocsr() for key, rows in outputs.items()},
         "expansion": expansion,
-        "damping_alpha": design.damping.alpha,
-        "damping_beta": design.damping.beta,
     }
 
 
@@ -242,9 +233,8 @@ def _updated(nominal: dict[str, float], changed: Values | None, what: str) -> di
     """Return the factors of terms by what they are times: of nothing one, then values by name."""
     unknown = set(changed or {}) - set(nominal)
     if unknown:
-        raise InvalidStateError(
-            f"The structure has no {what} named {min(unknown)!r}; there are {', '.join(nominal) or 'none'}."
-        )
+        known = ", ".join(nominal) or "none"
+        raise InvalidStateError(said("structure.unknown", what=what, name=min(unknown), known=known))
     factors: dict[str | None, float] = {None: 1.0}
     factors.update(nominal | dict(changed or {}))
     return factors
@@ -319,10 +309,8 @@ def natural_frequencies(
         If there is no mass, there are not so many modes, or the iteration did not converge.
     """
     if count >= structure.unknowns:
-        raise SolutionError(
-            f"{count} modes were asked for, but a structure of {structure.unknowns} free unknowns gives at "
-            f"most {structure.unknowns - 1}."
-        )
+        most = structure.unknowns - 1
+        raise SolutionError(said("structure.modes", count=count, unknowns=structure.unknowns, most=most))
     stiffness, mass, _ = structure.at(values or {})
     if not mass.diagonal().any():
         raise SolutionError("The structure has no mass, hence no modes; give its materials a density.")

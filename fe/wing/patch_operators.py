@@ -17,6 +17,7 @@ from fe.runtime.arrays import FloatArray
 
 from . import operators as full
 from .design import WingDesign
+from .turn_load import STANDARD_GRAVITY
 
 LEAST_LINE_DISTANCE = 0.1
 """Least distance between lines of a section, as a fraction of the chord."""
@@ -83,8 +84,8 @@ def assemble_patch_operators(operators: full.AffineOperators) -> PatchOperators:
         nodal = np.array([full.section_displacement(mesh, place, chord) for place in stations])
         return sparse.csr_array(sparse.csr_array(nodal) @ expansion[component::3])
 
-    weight = -full.upward(full.nodal_weight(mesh))
-    lift = full.turn_load(mesh)
+    weight = -STANDARD_GRAVITY * full.upward(operators.body.nodal_mass)
+    lift = full.turn_load(operators.body)
     if design.lift.inertia_relief:  # the load holds the weight
         lift = lift - weight
     node_station = np.abs(mesh.points[:, 1:2] - stations).argmin(axis=1)
@@ -99,7 +100,6 @@ def assemble_patch_operators(operators: full.AffineOperators) -> PatchOperators:
     found, part_of = np.unique(
         np.stack((strips, mesh.stiffness_term), axis=1)[skin], axis=0, return_inverse=True
     )
-    parts = full.stiffness_parts(mesh, (skin[part_of == number] for number in range(len(found))))
     flap = np.zeros(operators.unknowns)
     flap[-2] = 1.0
     return PatchOperators(
@@ -130,5 +130,5 @@ def assemble_patch_operators(operators: full.AffineOperators) -> PatchOperators:
             "gauge_stations": np.array([place for place, _ in design.gauges.positions]),
             "gauge_length": design.gauges.averaging_spanwise,
         },
-        strips=tuple(sparse.csr_array(restriction @ (part @ expansion)) for part in parts),
+        strips=tuple(operators.body.stiffness(skin[part_of == number]) for number in range(len(found))),
     )

@@ -9,7 +9,9 @@ from scipy import sparse
 from fe.reduction.reduced_basis import Reduction, reduce_structure
 from fe.reduction.settings import StructureSettings
 from fe.runtime.state import region_names
-from fe.wing.operators import AffineWing
+from fe.structure.affine import StiffnessTerm, designed
+from fe.wing.design import wing_structure
+from fe.wing.operators import AffineWing, outputs, stiffness_parts
 
 SETTINGS = StructureSettings(mode_count=4)
 ROUGH = 0.1
@@ -36,14 +38,16 @@ def springs(regions: int = 2, root: float = 1.0) -> AffineWing:
     tip = np.eye(count)[-1]
     # each gauge is a mean over a piece of the chain, so that no spring decides alone
     places = np.linspace(0, count - 9, 24).astype(int)
-    return AffineWing.of(
-        region_names(regions),
-        ((stretch.T @ sparse.diags_array(1e3 * row) @ stretch).tocsr() for row in kind),
-        (sparse.diags_array(row).tocsr() for row in masses),
-        (random.uniform(0.5, 1.5, count), tip),
-        sparse.csr_array((np.eye(count)[places + 8] - np.eye(count)[places]) / 8),
-        tip,
-        sparse.eye_array(count).tocsr(),
+    gauges = sparse.csr_array((np.eye(count)[places + 8] - np.eye(count)[places]) / 8)
+    names = region_names(regions)
+    terms = ((stretch.T @ sparse.diags_array(1e3 * row) @ stretch).tocsr() for row in kind)
+    structure, *points = (sparse.diags_array(row).tocsr() for row in masses)
+    loads = random.uniform(0.5, 1.5, count), tip
+    expansion = sparse.eye_array(count).tocsr()
+    design = wing_structure(names, len(places))
+    return AffineWing(
+        **designed(design, expansion, structure, points, loads, outputs(gauges, tip)),
+        stiffness_terms=tuple(map(StiffnessTerm, terms, *zip(*stiffness_parts(names), strict=True))),
         design_hash="a chain",
     )
 

@@ -14,9 +14,10 @@ from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Shown
 from discrepancy.models.interface import Conditions
+from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
-from discrepancy.models.second_order import SecondOrderSystem
+from discrepancy.models.motion import motion_of
 from fe.runtime import patch as patches
 from fe.runtime.motion import NO_LAWS
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
@@ -220,13 +221,13 @@ def test_a_point_mass_sits_between_places(chain: LumpedModel) -> None:
 
 def test_omitted_modes_follow_slow_forces() -> None:
     # base excitation far below the second mode: with one mode and the residual the answer is nearly whole
-    whole, one = (SecondOrderSystem(MASS, VISCOUS, STIFFNESS, {"joint": JOINT}, count) for count in (None, 1))
+    whole, one = (LinearSystem(MASS, VISCOUS, STIFFNESS, {"joint": JOINT}, count) for count in (None, 1))
     time = np.arange(500) * 0.01
     course = Course.of(time, 1.0 - np.cos(4.0 * time))
-    acting = Acting(time, np.zeros(3), [(np.array([0.0, 1.0, 0.0]), course)])
+    acting = Acting(time, np.zeros(3), time, [(np.array([0.0, 1.0, 0.0]), course)])
     rows = [Shown.of(row) for row in np.eye(3)]
-    exact, found = (system.motion(acting, NO_LAWS).seen(rows).values for system in (whole, one))
-    bare = one.motion(acting, NO_LAWS).q @ one.shapes.T
+    exact, found = (motion_of(system, acting, NO_LAWS).seen(rows).values for system in (whole, one))
+    bare = motion_of(one, acting, NO_LAWS).q @ one.shapes.T
     scale = np.max(np.abs(exact))
     assert np.max(np.abs(exact - found)) < 2e-3 * scale
     assert np.max(np.abs(exact - bare)) > 2e-2 * scale

@@ -15,7 +15,7 @@ from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.second_order import FORCES
+from discrepancy.models.port_scales import FORCES
 from fe.runtime.patch import ModulusTemperature, Overflow, PowerDamping, PowerStiffness
 from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
 from tests.discrepancy.asking import trial as asked

@@ -16,9 +16,7 @@ from fe.runtime.patched_wing import PatchedWing
 from fe.wing.operators import (
     AffineOperators,
     assemble,
-    cell_elasticity,
     gauge_output,
-    modulus_variation,
     point_masses,
     section_displacement,
 )  # fmt: skip
@@ -84,12 +82,10 @@ class Compared:
         sound = operators is not self.operators
         factors = np.ones(3) if sound else operators.theta(FACTOR, STATE[1])[:3]
         whole = operators.stiffness() if sound else operators.stiffness(FACTOR, STATE[1])
-        elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
         for region, factor in enumerate(factors):
             cells = np.flatnonzero((mesh.stiffness_term == region) & inside)
             if cells.size:
-                part = mesh.stiffness(cells, elasticity[cells], variation[cells])
-                whole = whole - loss * factor * (operators.expansion.T @ (part @ operators.expansion))
+                whole = whole - loss * factor * operators.body.stiffness(cells)
         return whole.tocsr()
 
     @property
