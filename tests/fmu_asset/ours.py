@@ -75,7 +75,6 @@ def chain_model(stiffness: float = 9.0e4, regions: tuple[str, ...] = ("z1", "z2"
         bound_reference=np.ones(count + 1),
         residual_load=np.zeros((16, 2)),
         residual_stiffness=np.zeros((16, count + 1, NODES)),
-        dual_counts=np.full(count, 2),
         dual_split=np.full(count, 0.4),
         dual_correction=np.zeros((2**count, 1, outputs, 16)),
         dual_residual=np.zeros((2**count, outputs, count + 3, count + 3)),

@@ -100,7 +100,7 @@ def test_same_system_gives_the_same_bytes(reduction: Reduction) -> None:
 @pytest.mark.parametrize("regions", [1, 4])
 def test_few_regions_have_a_bound_of_each_and_many_one_together(regions: int) -> None:
     found = reduced_springs(regions)
-    assert found.model.dual_output.shape[::2] == ((2, 1) if regions == 1 else (1, 11))
+    assert found.model.dual_output.shape[::2] == ((2, 1) if regions == 1 else (1, 12))
     assert found.bound_history[-1] <= 5e-3
 
 
