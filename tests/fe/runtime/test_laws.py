@@ -13,9 +13,10 @@ from scipy.interpolate import CubicSpline
 from fe.compilation import compiled_kernel
 from fe.runtime import laws as functions
 from fe.runtime import patch
+from fe.runtime.arrays import FORCE
 from fe.runtime.errors import InvalidPatchError, SolutionError
 from fe.runtime.laws import speed
-from fe.runtime.laws.interface import FORCE, PARAMETERS, PortForce
+from fe.runtime.laws.interface import PARAMETERS, PortForce
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import (
     NO_LAWS,
