@@ -212,14 +212,6 @@ class LinearSystem:
         """Return what the modes leave out of K^-1 loads, for loads (N,) or (N, k)."""
         return self.flexibility(loads) - (self.shapes / self.angular_frequency**2) @ (self.shapes.T @ loads)
 
-    @cached_property
-    def _restoring(self) -> tuple[FloatArray, bool]:
-        """Matrix (M, M) of modal forces at rest by displacements and states; whether it tells the rest."""
-        free, moving = len(self.angular_frequency), self.moving
-        matrix = np.hstack((self.modal.whole[:free, :moving], self.modal.damping[:free, moving:free]))
-        values = np.linalg.svd(matrix, compute_uv=False) if matrix.size else np.ones(1)
-        return matrix, bool(values[-1] > LEAST_PIVOT * max(values[0], 1e-300))
-
     def resting(self, loads: FloatArray) -> FloatArray:
         """Return displacements and states (L, N) at rest under loads (L, N).
 
@@ -230,9 +222,8 @@ class LinearSystem:
         """
         if self.mode_count is not None:
             return self.flexibility(loads.T).T
-        (restoring, tells), force = self._restoring, loads @ self.shapes
-        if tells:
-            return np.asarray(np.linalg.solve(restoring, force.T).T @ self.shapes.T)
+        free, moving, force = len(self.angular_frequency), self.moving, loads @ self.shapes
+        restoring = np.hstack((self.modal.whole[:free, :moving], self.modal.damping[:free, moving:free]))
         found = np.linalg.lstsq(restoring, force.T, rcond=LEAST_PIVOT)[0]
         if np.max(np.abs(restoring @ found - force.T)) > 1e-6 * max(float(np.max(np.abs(force))), 1e-300):
             size = float(np.max(np.abs(restoring), initial=0.0))

@@ -333,8 +333,7 @@ def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campa
         return unit_text(units.pop()) if len(units) == 1 and unit == CHANNEL_UNIT else ""
     if " or " in unit:
         port = str(getattr(primitive, "port", ""))
-        if state := model.unit_of_state(port):
-            return state if unit.startswith("m/s") else f"{state}/s times capacity"
-        moving, turning = unit.split(" or ")
-        return {True: turning, False: moving, None: unit}[model.turns(port)]
+        (moving, turning), own = unit.split(" or "), model.motion_unit(port)
+        of_state = own if unit.startswith("m/s") else model.port_unit(port)
+        return {"m": moving, "rad": turning, "": unit}.get(own, of_state)
     return unit_text(unit)

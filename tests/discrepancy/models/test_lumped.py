@@ -224,7 +224,7 @@ def test_omitted_modes_follow_slow_forces() -> None:
     whole, one = (LinearSystem(MASS, VISCOUS, STIFFNESS, {"joint": JOINT}, count) for count in (None, 1))
     time = np.arange(500) * 0.01
     course = Course.of(time, 1.0 - np.cos(4.0 * time))
-    acting = Acting(time, np.zeros(3), time, [(np.array([0.0, 1.0, 0.0]), course)])
+    acting = Acting(time, time, [(np.array([0.0, 1.0, 0.0]), course)])
     rows = [Shown.of(row) for row in np.eye(3)]
     exact, found = (motion_of(system, acting, NO_LAWS).seen(rows).values for system in (whole, one))
     bare = motion_of(one, acting, NO_LAWS).q @ one.shapes.T

@@ -360,7 +360,7 @@ def test_states_may_be_given_by_parts_alone() -> None:
     other = model_of(INPUTS.text("tanks.toml", (whole, "")) + parts)
     one, other = (item.description.terms()["conductance"] for item in (rig("tanks"), other))
     np.testing.assert_array_equal(one, other)
-    with pytest.raises(ModelError, match="conductance must be a 2 x 2 matrix"):
+    with pytest.raises(ModelError, match="conductance is missing: give it, or"):
         rig("tanks", (whole, ""))
 
 
