@@ -19,6 +19,8 @@ from fe.runtime.state import Losses
 from reporting.words import brief, capital, counted
 
 Place = str | tuple[float, float]
+MOVES, TURNS, EITHER = ("N", "m"), ("N m", "rad"), ("N or N m", "m or rad")
+"""Units of a force and of a motion at a port."""
 KEPT = 400
 """Responses that a model keeps; the oldest goes first."""
 _Value = TypeVar("_Value")
@@ -273,9 +275,12 @@ class Model(ABC):
         """Return forces as they act at the ports of `ported`."""
         return forces
 
-    def motion_unit(self, port: str) -> str:
-        """Return the unit of what a law at a port acts on, "m", "rad" or that of a state; empty: unknown."""
-        return ""
+    def port_units(self, port: str) -> tuple[str, str]:
+        """Return the units of a force at a port and of what it acts on: `MOVES`, `TURNS`, or of a state.
+
+        Both where the model does not say it.
+        """
+        return EITHER
 
     def check(self, trial: Trial) -> None:
         """Refuse a trial that it cannot follow."""
@@ -424,12 +429,6 @@ class Model(ABC):
         laws = self.patch.of(PortForce)
         rest = ModelPatch(tuple(item for item in self.patch if not isinstance(item, PortForce)))
         return self._changed(patch=rest, _kept=None), laws
-
-    def port_unit(self, port: str) -> str:
-        """Return the unit of a force: "N", "N m", both where the model does not say it, or that of a flow."""
-        unit = self.motion_unit(port)
-        known = {"m": "N", "rad": "N m", "": "N or N m"}
-        return known.get(unit, f"{unit}/s times capacity")
 
     def _changed(self, **attributes: object) -> Self:
         """Return the model with other attributes."""

@@ -11,7 +11,7 @@ from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInp
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, LoadChange, Shown, place_among
-from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
+from discrepancy.models.interface import EITHER, MOVES, NO_PATCH, TURNS, Memory, Outputs, Place
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.lumped_file import (
     GAINS,
@@ -292,24 +292,26 @@ class LumpedModel(DescribedModel, SystemModel):
         description = self.description.model_copy(update={"law": []})
         return linear._changed(description=description), self.own_laws(self.prior_mean()) + laws
 
-    def motion_unit(self, port: str) -> str:
-        """Return the unit of what a law at a port acts on, "m", "rad" or that of a state; empty: unknown.
+    def port_units(self, port: str) -> tuple[str, str]:
+        """Return the units of a force at a port and of what it acts on.
 
         It moves or turns as the unknowns do of which it is a sum or difference, and these as what is measured
         or prescribed of them.
         """
         row, n, description = self.port_rows.get(port), self.description.size, self.description
-        if row is None or not np.any(row[:n]):
+        if row is not None and not np.any(row[:n]):
             states = {item.quantity for item in description.output if item.vector and any(item.vector[n:])}
             unit = UNITS[states.pop()].si if len(states) == 1 else "of the state's unit"
-            return "" if row is None else unit
-        told: dict[int, set[str]] = {}
+            return f"{unit}/s times capacity", unit
+        if row is None or not np.all(np.isin(row, (-1.0, 0.0, 1.0))):
+            return EITHER
+        told: dict[int, set[tuple[str, str]]] = {}
         read = [(item.vector or (), item.quantity.moving) for item in description.output]
         for vector, moving in (*read, *((item.vector, item.quantity.moving) for item in description.input)):
             if moving and np.count_nonzero(vector) == 1 and max(vector) == 1.0:
-                told.setdefault(vector.index(1.0), set()).add("rad" if Quantity.ANGLE in moving else "m")
-        units = set().union(*(told.get(at, {"m", "rad"}) for at in np.flatnonzero(row).tolist()))
-        return units.pop() if len(units) == 1 and np.all(np.isin(row, (-1.0, 0.0, 1.0))) else ""
+                told.setdefault(vector.index(1.0), set()).add(TURNS if Quantity.ANGLE in moving else MOVES)
+        units = set().union(*(told.get(at, {MOVES, TURNS}) for at in np.flatnonzero(row).tolist()))
+        return units.pop() if len(units) == 1 else EITHER
 
     # ------------------------------------------------------------ matrices
 

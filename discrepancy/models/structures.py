@@ -15,7 +15,7 @@ from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Load, Shown, place_among
-from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
+from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Memory, Outputs, Place
 from discrepancy.models.linear_system import Flexibility, LinearSystem, Modes
 from discrepancy.models.scales import PortScale
 from discrepancy.models.system_model import Case, State, SystemModel
@@ -306,9 +306,9 @@ class WingModel(SystemModel):
         """Whether the wing can carry a primitive; it can carry all but forces by a formula in time."""
         return primitive in PRIMITIVES.values() and primitive is not changes.PortLoad
 
-    def motion_unit(self, port: str) -> str:
-        """Return the unit of a port's motion: the root turns, the others move up and down."""
-        return "rad" if port == ROTATING_PORT else "m"
+    def port_units(self, port: str) -> tuple[str, str]:
+        """Return the units of force and motion at a port: the root turns, the others move up and down."""
+        return TURNS if port == ROTATING_PORT else MOVES
 
     def at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return forces as they act at ports of `port_rows`."""
