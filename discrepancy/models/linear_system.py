@@ -189,9 +189,9 @@ class LinearSystem:
         """Shapes (N, M + P) of what is free, and nothing for the drives."""
         return np.pad(self.shapes, ((0, 0), (0, len(self.drives))))
 
-    def port_rows(self, laws: Laws) -> FloatArray:
-        """Return the rows (J, N) of the laws' ports."""
-        return laws.rows(self.ports, len(self.mass))
+    def port_rows(self, laws: Laws, time: float | None = None) -> FloatArray:
+        """Return the rows (J, N) of the laws' ports, see `Laws.rows`."""
+        return laws.rows(self.ports, len(self.mass), time)
 
     # ------------------------------------------------------------ rest
 
@@ -236,7 +236,7 @@ class LinearSystem:
     def static(
         self, units: FloatArray, laws: Laws = NO_LAWS, amounts: FloatArray | None = None,
         memory: FloatArray | None = None, before: FloatArray | None = None,
-        held: FloatArray | float = 0.0, seen: FloatArray | None = None,
+        held: FloatArray | float = 0.0, seen: FloatArray | None = None, time: float | None = None,
     ) -> tuple[FloatArray, FloatArray | None]:  # fmt: skip
         """Return the rest (L, N) under load levels that follow one another from zero, and the laws' memory.
 
@@ -254,13 +254,15 @@ class LinearSystem:
             Where something holds the system.
         seen : (C, N) ndarray, optional
             What these rows show (L, C) is returned instead.
+        time : float, optional
+            Of laws in windows those act that do then [s].
 
         Raises
         ------
         ModelError, SolutionError
             If nothing holds the system, or a law takes more than it has.
         """
-        rows, levels = self.port_rows(laws), np.eye(len(units)) if amounts is None else amounts
+        rows, levels = self.port_rows(laws, time), np.eye(len(units)) if amounts is None else amounts
         rows[:, self.displacements :] = 0.0
         found = self.resting(np.concatenate((units, rows)))
         answers, flexible = found[: len(units)] + held, found[len(units) :]

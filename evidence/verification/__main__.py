@@ -1,7 +1,8 @@
 """What `uav-twin wing verify` need not repeat for each wing: `python -m evidence.verification`.
 
-Called in a checkout of the project: the elements against known answers, and a ring-down of the wing against
-CalculiX where that is installed. `docs/verification.md` says what came out. Ends with 1 if a limit is broken.
+Called in a checkout of the project: the elements against known answers, test decks of CalculiX against its
+published results, and a ring-down of the wing against CalculiX, where these are installed.
+`docs/verification.md` says what came out. Ends with 1 if a limit is broken.
 """
 
 import tempfile
@@ -12,6 +13,7 @@ from typing import Annotated
 import typer
 
 from evidence.verification import known_answers as answers
+from evidence.verification.calculix_examples import DECKS, NAMES, published_difference
 from evidence.verification.ring_down import ring_down_agreement
 from fe.runtime.state import DigitalState
 from fe.verification.calculix_comparison import calculix_program
@@ -31,7 +33,7 @@ def check(
     quick: Annotated[bool, typer.Option("--quick", help="A quarter of a period of ring-down.")] = False,
 ) -> None:
     """Check the elements against known answers, and a ring-down against CalculiX."""
-    checks = list(element_checks())
+    checks = [*element_checks(), *example_checks()]
     if calculix_program() is not None:
         coarse = assemble(load_design(design).changed(mesh={"refinement": 0.25}))
         with tempfile.TemporaryDirectory(prefix="uav-twin-") as folder:
@@ -54,6 +56,14 @@ def element_checks() -> Iterator[Check]:
             found = answers.macneal_harder_beam(shape, across_depth=across)
             name = f"{shape}, {'in' if across else 'out of'} plane, against HEX20"
             yield Check("MacNeal-Harder", name, abs(found - value), 6e-4, f"({found:.4f}, {value:.3f})")
+
+
+def example_checks() -> Iterator[Check]:
+    """Yield the differences to published results of CalculiX, where its test decks are installed."""
+    for name in NAMES if DECKS.is_dir() else ():
+        with tempfile.TemporaryDirectory(prefix="uav-twin-") as folder:
+            found = published_difference(name, Path(folder))
+        yield Check("CalculiX, published", name, found, 1e-6)
 
 
 def ring_down_checks(operators: AffineOperators, jobs: Path, periods: float) -> Iterator[Check]:

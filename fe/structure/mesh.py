@@ -14,6 +14,7 @@ from scipy import sparse
 from fe.elements.cells import CellMesh
 from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import MeshError
+from fe.sentences import said
 
 from .design import MeshDesign, Support
 from .tables import MOTIONS
@@ -123,6 +124,10 @@ class StructureMesh(CellMesh):
         text = ", ".join(f"{value / self.unit + 0.0:.6g}" for value in point)
         return f"({text}) {self.unit_name}"
 
+    def cell(self, number: int) -> str:
+        """Return a cell as it stands in a sentence: its number in the file, and where it is."""
+        return f"{self.cell_numbers[number]} at {self.place(self.centres[number])}"
+
     def cells_of(self, name: str, where: str) -> IntArray:
         """Cells (m,) of a set; `where` is the place in the design, for the sentence.
 
@@ -147,21 +152,15 @@ class StructureMesh(CellMesh):
         found = self._content(self.node_sets, name, "nodes or faces", "node", where)
         left_out = int((found < 0).sum())
         if left_out:
-            raise MeshError(
-                f"{where}: {left_out} of the nodes of the set {name!r} of {self.source} touch no cell; take "
-                "them out of the set."
-            )
+            raise MeshError(said("mesh.loose", where=where, count=left_out, name=name, mesh=self))
         return found
 
     def _content(self, sets: dict[str, _Content], name: str, kind: str, member: str, where: str) -> _Content:
         found = _named(sets, name)
         if found is None:
-            names = [*sets]
-            more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-            raise MeshError(
-                f"{where}: {self.source} holds no set of {kind} named {name!r}; there are "
-                f"{', '.join(names[:_LISTED]) or 'none'}{more}."
-            )
+            more = f" and {len(sets) - _LISTED} more" if len(sets) > _LISTED else ""
+            known = (", ".join([*sets][:_LISTED]) or "none") + more
+            raise MeshError(said("mesh.unknown", where=where, mesh=self, kind=kind, name=name, known=known))
         if not len(found):
             raise MeshError(f"{where}: the set {name!r} of {self.source} holds no {member}.")
         return found
@@ -176,10 +175,7 @@ class StructureMesh(CellMesh):
         """
         surface = self.faces_between(name, self.nodes_of(name, where))
         if not len(surface):
-            raise MeshError(
-                f"{where}: no face of the surface lies in the set {name!r} of {self.source}; a set of faces, "
-                "or all nodes of the faces, is expected."
-            )
+            raise MeshError(said("mesh.faces", where=where, name=name, mesh=self))
         return surface
 
     def faces_between(self, name: str, nodes: IntArray) -> Surface:
@@ -286,7 +282,7 @@ def supported(design: MeshDesign, mesh: StructureMesh) -> Supports:
     rigid: dict[str, RigidSet] = {}
     held = np.zeros((len(mesh.points), 3), dtype=bool)
     springs = np.zeros((len(mesh.points), 3))
-    for where, part in ((f"support[{number}]", part) for number, part in enumerate(design.support, start=1)):
+    for where, part in design.numbered("support"):
         nodes = mesh.nodes_of(part.set, where)
         if part.rigid_about is not None:
             rigid[where] = _rigid_set(part, mesh, nodes, where)
@@ -299,10 +295,8 @@ def supported(design: MeshDesign, mesh: StructureMesh) -> Supports:
     for where, body in rigid.items():
         shared = body.nodes[taken[body.nodes]]
         if len(shared):
-            raise MeshError(
-                f"{where}: {len(shared)} nodes of the rigid set belong to another support, too, such as that "
-                f"at {mesh.place(mesh.points[shared[0]])}; say what holds it in its own table."
-            )
+            place = mesh.place(mesh.points[shared[0]])
+            raise MeshError(said("mesh.rigid_shared", where=where, count=len(shared), place=place))
         taken[body.nodes] = True
     bodies = tuple(rigid.values())
     _check_rigid_motions(mesh, held, springs, bodies)
@@ -313,9 +307,7 @@ def _rigid_set(part: Support, mesh: StructureMesh, nodes: IntArray, where: str) 
     point = mesh.unit * np.asarray(part.rigid_about)
     motions = rigid_motions(mesh.points[nodes], point, 2.0)
     if np.linalg.matrix_rank(motions, _FREE * np.linalg.norm(motions)) < len(MOTIONS):
-        raise MeshError(
-            f"{where}: the nodes of the rigid set {part.set!r} lie on a line, about which it could turn."
-        )
+        raise MeshError(said("mesh.rigid", where=where, name=part.set))
     springs = np.zeros(len(MOTIONS))
     springs[: len(part.springs or ())] = part.springs or ()
     return RigidSet(nodes, point, np.isin(MOTIONS, part.hold), springs)
@@ -345,10 +337,8 @@ def _check_rigid_motions(
     _, values, directions = np.linalg.svd(np.vstack((resisted, np.zeros((6, 6)))), full_matrices=False)
     free = directions[values <= _FREE * max(float(values[0]), 1e-300)]
     if len(free):
-        raise MeshError(
-            f"{mesh.source}: the supports leave {len(free)} of the six rigid motions free, among them "
-            f"{_described(free[0], mesh, centre)}; hold further directions."
-        )
+        motion = _described(free[0], mesh, centre)
+        raise MeshError(said("mesh.free", mesh=mesh, count=len(free), motion=motion))
 
 
 def _described(motion: FloatArray, mesh: StructureMesh, centre: FloatArray) -> str:

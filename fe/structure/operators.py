@@ -1,6 +1,6 @@
 """From a structure file and its mesh to affine operators, and their fields as VTU files for ParaView."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,12 @@ from scipy import sparse
 from fe.elements.kinds import meshio_with_wedges
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError, MeshError
+from fe.sentences import said
 from reporting.files import atomic_file
 
 from .affine import AffineStructure, static_response
 from .body import Body, PointMass
-from .design import Damage, Material, MatrixDesign, MeshDesign, load_structure, structure_hash, unit_vector
+from .design import MatrixDesign, MeshDesign, load_structure, structure_hash, unit_vector
 from .location import gauge_rows, nodal_load, point_shares
 from .matrices import assemble_matrices
 from .mesh import StructureMesh, supported
@@ -72,17 +73,15 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
     return replace(mesh, node_sets=mesh.node_sets | sets["nodes"], cell_sets=mesh.cell_sets | sets["cells"])
 
 
-def _owners(mesh: StructureMesh, key: str, parts: Sequence[Material | Damage], what: str) -> IntArray:
+def _owners(mesh: StructureMesh, design: MeshDesign, key: str, what: str) -> IntArray:
     """Find the number (nc,) of the part whose set holds each cell, -1 for none.
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh.
+    mesh, design : StructureMesh, MeshDesign
+        The mesh and its design.
     key : str
         The table of the parts in the design.
-    parts : sequence of Material or Damage
-        The parts.
     what : str
         What they are, for the sentence.
 
@@ -92,16 +91,13 @@ def _owners(mesh: StructureMesh, key: str, parts: Sequence[Material | Damage], w
         If a set is missing or empty, or two overlap.
     """
     owner = np.full(len(mesh.cells), -1, dtype=np.int64)
-    for number, part in enumerate(parts):
-        where = f"{key}[{number + 1}]"
+    for number, (where, part) in enumerate(design.numbered(key)):
         cells = mesh.cells_of(part.set, where)
         taken = cells[owner[cells] >= 0]
         if len(taken):
-            raise MeshError(
-                f"{where}: the {what}s {part.name!r} and {parts[owner[taken[0]]].name!r} share {len(taken)} "
-                f"elements, such as {mesh.cell_numbers[taken[0]]} at {mesh.place(mesh.centres[taken[0]])}; "
-                "their sets must not overlap."
-            )
+            other, count = getattr(design, key)[owner[taken[0]]], len(taken)
+            both = {"what": what, "name": part.name, "other": other.name, "cell": mesh.cell(taken[0])}
+            raise MeshError(said("mesh.shared", where=where, count=count, **both))
         owner[cells] = number
     return owner
 
@@ -131,10 +127,7 @@ def load_and_assemble(
     file = Path(file)
     design = load_structure(file)
     if isinstance(design, MatrixDesign):
-        raise InvalidDesignError(
-            f"{file} is a structure from matrices: without a mesh there is no field to draw, and nothing "
-            "that CalculiX could solve."
-        )
+        raise InvalidDesignError(said("design.without_mesh", file=file))
     mesh = structure_mesh(design, file)
     check_memory(mesh, memory_limit)
     digest = structure_hash(design, file.parent)
@@ -153,18 +146,16 @@ def assemble(
     design: MeshDesign, mesh: StructureMesh, design_hash: str, *, mass_as_stiffness: bool = False
 ) -> Structure:
     """Assemble the affine operators of a design on its mesh, see `load_and_assemble`."""
-    material_of = _owners(mesh, "material", design.material, "material")
+    material_of = _owners(mesh, design, "material", "material")
     bare = np.flatnonzero(material_of < 0)
     if len(bare):
-        raise MeshError(
-            f"{mesh.source}: {len(bare)} of {len(mesh.cells)} elements have no material, among them "
-            f"{mesh.cell_numbers[bare[0]]} at {mesh.place(mesh.centres[bare[0]])}."
-        )
-    region_of = _owners(mesh, "damage", design.damage, "damage region")
+        counts = {"count": len(bare), "all": len(mesh.cells)}
+        raise MeshError(said("mesh.bare", mesh=mesh, cell=mesh.cell(bare[0]), **counts))
+    region_of = _owners(mesh, design, "damage", "damage region")
     parameters, regions = ([*(part.name for part in own), None] for own in (design.parameter, design.damage))
     scaled = np.array([parameters.index(part.scaled_by) for part in design.material])
     pairs, part = np.unique(
-        scaled[material_of] * len(regions) + region_of % len(regions), return_inverse=True
+        np.column_stack((scaled[material_of], region_of % len(regions))), axis=0, return_inverse=True
     )
     body = Body(
         mesh,
@@ -172,15 +163,15 @@ def assemble(
         np.array([own.elasticity for own in design.material])[material_of],
         np.array([own.density for own in design.material])[material_of],
         part,
-        tuple((parameters[pair // len(regions)], regions[pair % len(regions)]) for pair in pairs.tolist()),
+        tuple((parameters[first], regions[second]) for first, second in pairs.tolist()),
         tuple(
-            PointMass(own.name, own.mass, point_shares(mesh, own.point, f"mass[{number}]")[None])
-            for number, own in enumerate(design.mass, start=1)
+            PointMass(own.name, own.mass, point_shares(mesh, own.point, where)[None])
+            for where, own in design.numbered("mass")
         ),
         mass_rule=mesh.kind.stiffness_rule if mass_as_stiffness else None,
     )
     gauges, moved = gauge_rows(mesh, design.gauge)
-    loads = (nodal_load(mesh, load, f"load[{n}]").ravel() for n, load in enumerate(design.load, start=1))
+    loads = (nodal_load(mesh, load, where).ravel() for where, load in design.numbered("load"))
     points = {key: _point_rows(design, mesh, key) for key in ("displacement", "acceleration")}
     return Structure(
         **body.assembled(design, loads, {"gauge": gauges} | points),
@@ -193,11 +184,11 @@ def assemble(
 
 def _point_rows(design: MeshDesign, mesh: StructureMesh, key: str) -> sparse.csr_array:
     """Rows (m, full) of the displacements of points along directions."""
-    rows = [sparse.csr_array((0, mesh.unknowns))]
-    for number, part in enumerate(getattr(design, key), start=1):
-        shares = point_shares(mesh, part.point, f"{key}[{number}]")
-        rows.append(sparse.csr_array(np.outer(shares, unit_vector(part.direction)).reshape(1, -1)))
-    return sparse.vstack(rows).tocsr()
+    rows = [
+        np.outer(point_shares(mesh, part.point, where), unit_vector(part.direction)).ravel()
+        for where, part in design.numbered(key)
+    ]
+    return sparse.csr_array(np.reshape(rows, (-1, mesh.unknowns)))
 
 
 def weighed(structure: Structure) -> tuple[float, FloatArray]:

@@ -16,6 +16,7 @@ from fe.elements.kinds import HEXAHEDRA_20, gauss_points
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
+from fe.sentences import said
 from fe.structure.affine import natural_frequencies
 
 from .calculix_deck import PRINTED, CalculixDeck, Step
@@ -33,9 +34,7 @@ def required_calculix() -> str:
     """Return the path of CalculiX; raises `CalculixError` where it is not installed."""
     if program := calculix_program():
         return program
-    raise CalculixError(
-        f"CalculiX ('{PROGRAM}') is not installed; on Debian and Ubuntu: apt-get install calculix-ccx."
-    )
+    raise CalculixError(said("calculix.missing", program=PROGRAM))
 
 
 _HEADER = re.compile(r"^ *(\w[\w ]*?) \(.*\) for set (\w+) and time +\S+$", re.MULTILINE)
@@ -55,10 +54,7 @@ def read_tables(text: str) -> dict[str, list[FloatArray]]:
         try:
             rows = np.loadtxt(body.splitlines(), ndmin=2)
         except ValueError as error:
-            raise CalculixError(
-                f"The table of {what} that CalculiX printed holds what is not a row of numbers ({error}); "
-                "its version may print another format (2.20 is known)."
-            ) from None
+            raise CalculixError(said("calculix.table", what=what, error=error)) from None
         tables.setdefault(name, []).append(rows)
     return tables
 

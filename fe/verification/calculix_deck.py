@@ -24,6 +24,7 @@ from fe.elements.kinds import HEXAHEDRA_20, WEDGES_6
 from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
+from fe.sentences import said
 from fe.structure.affine import AffineStructure
 from fe.structure.body import Body
 from fe.structure.design import Load
@@ -227,10 +228,7 @@ def structure_deck(structure: Structure) -> CalculixDeck:
     """
     mesh, design = structure.mesh, structure.design
     if mesh.kind in NOT_COMPARABLE:
-        raise CalculixError(
-            f"CalculiX integrates {mesh.kind.name} ({mesh.kind.calculix}) in another way, so that nothing "
-            "can be compared; tetrahedra and hexahedra can."
-        )
+        raise CalculixError(said("calculix.wedges", kind=mesh.kind))
     loads = {load.name: _load_step(structure, load) for load in design.load}
     return CalculixDeck("structure", structure, structure.body, {}, loads)
 

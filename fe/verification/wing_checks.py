@@ -73,22 +73,17 @@ def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> dict[s
     InvalidDesignError
         If a refinement lies outside the range of the design.
     """
-    found: dict[str, list[Any]] = {}
+    names = ("unknowns", "tip stiffness", "first bending", "second bending", "strain")
+    found: list[tuple[Any, ...]] = []
     for refinement in refinements:
         operators = assemble(design.changed(mesh={"refinement": refinement}))
         loads = np.column_stack((operators.turn(design.lift.load_factor), operators.load_tip))
         turn, bent = Factorisation(operators.stiffness()).solve(loads).T
         modes = eigenmodes(operators, 1.0, (), design.masses.servo, design.masses.pitot, 4)
         first, second = modes.frequency[modes.flapwise_bending].tolist()
-        for name, value in (
-            ("unknowns", operators.unknowns),
-            ("tip stiffness", 1.0 / float(operators.load_tip @ bent)),
-            ("first bending", first),
-            ("second bending", second),
-            ("strain", operators.gauge_output @ turn),
-        ):
-            found.setdefault(name, []).append(value)
-    return {name: np.array(values) for name, values in found.items()}
+        stiffness = 1.0 / float(operators.load_tip @ bent)
+        found.append((operators.unknowns, stiffness, first, second, operators.gauge_output @ turn))
+    return dict(zip(names, map(np.array, zip(*found, strict=True)), strict=True))
 
 
 def observed_order(ratio: float, values: Sequence[float]) -> float:

@@ -18,6 +18,7 @@ from fe.elements.cells import CellMesh, hexahedra_20
 from fe.elements.kinds import HEXAHEDRA_20
 from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import MeshError
+from fe.sentences import said
 
 from .design import WingDesign, rib_interval
 from .parts import four_digit_half_thickness, four_digit_slope
@@ -70,11 +71,8 @@ def _filled(
             if np.abs(gaps).max() <= _SAME:
                 continue
             if gaps.min() < SMALLEST_GAP:
-                raise MeshError(
-                    f"{line.label} and {lines[-1].label} come closer than {SMALLEST_GAP * 1e3:g} mm or cross "
-                    f"between root and tip, at {line.at(lengths)[0]:.5f} m; move one of them or put them on "
-                    "the same line."
-                )
+                place, gap = line.at(lengths)[0], SMALLEST_GAP * 1e3
+                raise MeshError(said("wing.lines", line=line, other=lines[-1], gap=gap, place=place))
         lines.append(line)
     for line, room in wished:
         gaps = line.at(lengths) - np.array([other.at(lengths) for other in lines])

@@ -16,6 +16,7 @@ from scipy import sparse
 from fe.elements import cells as elements
 from fe.elements.kinds import gauss_points
 from fe.runtime.arrays import FloatArray, IntArray
+from fe.runtime.state import TIP_FORCE
 from fe.structure.affine import AffineStructure
 from fe.structure.body import Body, PointMass
 from fe.structure.mesh import RigidSet, Supports, supports
@@ -85,6 +86,8 @@ ROOT_UNKNOWNS = 3
 @dataclass(frozen=True)
 class AffineWing(AffineStructure):
     """A wing as a structure: a factor on its skin, two point masses, a turn and a force near its tip."""
+
+    followed_load = TIP_FORCE
 
     @property
     def load_lift(self) -> FloatArray:
@@ -157,9 +160,8 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
         compliance = elements.orthotropic_compliance(web.young_modulus, web.poisson_ratio, web.shear_modulus)
         local[mesh.web == index] = np.linalg.inv(compliance)
     for index, rib in enumerate(design.ribs):
-        local[mesh.rib == index] = np.linalg.inv(
-            elements.isotropic_compliance(rib.young_modulus, rib.poisson_ratio)
-        )
+        compliance = elements.isotropic_compliance(rib.young_modulus, rib.poisson_ratio)
+        local[mesh.rib == index] = np.linalg.inv(compliance)
     for rod in design.rods:
         inside = (mesh.web == rod.web) & (station < rod.reach)
         second_moment = design.webs[rod.web].thickness * _web_height(mesh)[inside] ** 3 / 12.0

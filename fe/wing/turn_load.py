@@ -80,10 +80,7 @@ def lifting_line(planform: Planform, terms: int = 40, section_slope: float = 2.0
     return per_length
 
 
-DISTRIBUTIONS: dict[str, Callable[[Planform], Distribution]] = {
-    "schrenk": schrenk,
-    "lifting_line": lifting_line,
-}
+DISTRIBUTIONS = {"schrenk": schrenk, "lifting_line": lifting_line}
 """Lift distributions by their name in a design."""
 
 

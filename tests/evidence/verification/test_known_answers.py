@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from evidence.verification import calculix_examples as examples
 from evidence.verification import known_answers as answers
 from evidence.verification.__main__ import element_checks, ring_down_checks
 from fe.wing.design import load_design
@@ -21,6 +22,12 @@ def test_a_cantilever_converges_to_timoshenkos_beam():
     coarse, middle, fine = (abs(answers.cantilever_check(cells)) for cells in (5, 10, 20))
     assert fine < middle < coarse < 0.01
     assert 2.5 < np.log2(coarse / middle) < 4.5  # the tip of a quadratic element: third to fourth order
+
+
+@pytest.mark.skipif(not examples.DECKS.is_dir(), reason="Debian's calculix-ccx-test is not installed")
+@pytest.mark.parametrize("name", examples.NAMES)
+def test_decks_of_calculix_give_its_published_results(name, tmp_path):
+    assert examples.published_difference(name, tmp_path) < 1e-6
 
 
 @pytest.mark.long
