@@ -65,11 +65,13 @@ def test_formats_agree(kind: str, file_format: str, box, tmp_path: Path) -> None
     tags, half = [np.zeros(len(cells), dtype=np.int32)], points[cells].mean(axis=1)[:, 0] < 0.5
     data = {"gmsh:physical": tags, "gmsh:geometrical": tags} if ending == "msh" else {}
     data |= {"cell_tags": [np.where(half, -1, -2)]} if ending == "med" else {}
-    mesh = meshio.Mesh(points * (-1 if ending == "med" else 1, 1, 1), [(kind, cells)], cell_data=data)
+    mesh = meshio_with_wedges().Mesh(
+        points * (-1 if ending == "med" else 1, 1, 1), [(kind, cells)], cell_data=data
+    )
     if ending == "med":
         mesh.point_data["point_tags"] = np.where(points[:, 0] == 0.0, 1, 0)
         mesh.point_tags, mesh.cell_tags = {1: ["root"]}, {-1: ["left", "body"], -2: ["body"]}
-    meshio_with_wedges().write(tmp_path / f"m.{ending}", mesh, file_format=file_format)
+    meshio.write(tmp_path / f"m.{ending}", mesh, file_format=file_format)
     found = read_mesh(tmp_path / f"m.{ending}", 1e-3, "mm")
     assert found.kind is KINDS[kind]
     assert volume(found) == pytest.approx(1e-9)
@@ -155,7 +157,7 @@ def test_other_files_that_cannot_be_read_are_refused(box, tmp_path: Path, capsys
 
 
 def test_a_deck_is_read_with_its_sets(tmp_path: Path) -> None:
-    mesh = written(tmp_path / "m.inp", CUBES)
+    mesh = written(tmp_path / "m.inp", CUBES, "*SURFACE, NAME=sides", "10, S1", "10, S2")
     assert mesh.cell_numbers.tolist() == [10, 20]
     assert mesh.cells_of("BODY", "here").tolist() == [0, 1]
     assert mesh.cells_of("left", "here").tolist() == [0]
@@ -164,6 +166,7 @@ def test_a_deck_is_read_with_its_sets(tmp_path: Path) -> None:
     top = mesh.faces_of("top", "here")
     assert (top.cell.tolist(), top.face.tolist()) == ([0, 1], [1, 1])
     assert (len(mesh.nodes_of("TOP", "here")), len(mesh.faces_of("END", "here"))) == (6, 1)
+    assert len(mesh.faces_of("sides", "here")) == 2  # whose nodes are those of all faces of the cube
     assert mesh.loose.tolist() == [99]
     with pytest.raises(MeshError, match=r"1 of the nodes of the set 'Nall' .* touch no cell"):
         mesh.nodes_of("Nall", "support[1]")
