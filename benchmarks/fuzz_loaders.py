@@ -54,7 +54,7 @@ from twin_master.report.reading import read_run as read_record
 from twin_master.run_folder import read_config
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario_check import check_scenario
-from twin_master.store.writing import finished_run, read_run
+from twin_master.store.writing import finished_run, open_run
 
 CPU_SECONDS = 20
 MEMORY = 4 * 1024**3
@@ -107,7 +107,7 @@ LOADERS: dict[str, Loader] = {
     "patch, packing": Loader("verdict/patch.json", load_patch, TEXT),
     "verdict": Loader("verdict/verdict.json", read_verdict_file, TEXT),
     "residuals": Loader("verdict/residuals.nc", read_residuals, BINARY),
-    "run, store": Loader("run/run.nc", lambda path: read_run(path.parent), BINARY),
+    "run, store": Loader("run/run.nc", lambda path: open_run(path.parent), BINARY),
     "run, report": Loader("run/run.nc", lambda path: read_record(path.parent), BINARY),
     "checkpoint": Loader("checkpoint/journal.jsonl", _checkpoint, TEXT),
     "configuration": Loader("run/config.json", _config, TEXT),

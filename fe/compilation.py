@@ -6,6 +6,7 @@ Without numba (extra `uav-twin[fast]`) they run as what they are, plain Python.
 import functools
 import hashlib
 import inspect
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,7 +18,6 @@ import numpy as np
 
 from fe.reduction.built_once import cache_folder
 from fe.runtime import laws, motion_arrays, motion_kernel, static_path
-from fe.runtime.laws import interface
 from fe.runtime.motion import Kernel
 from reporting.progress import tell
 
@@ -157,16 +157,6 @@ def choose_when_compiled(chosen: Callable[..., Any], table: tuple[Callable[..., 
     overload(chosen, jit_options={"nogil": True, "_nrt": False, "forceinline": True})(compiled_choice)
 
 
-SELDOM = (
-    motion_kernel.find_routes,
-    motion_kernel.begin_on_modes,
-    motion_kernel.find_answer,
-    motion_kernel.begin_flexible,
-    static_path.settle_port,
-)
-"""Functions of a motion that are not called at every step; the others become part of their callers."""
-
-
 def _functions(module: ModuleType) -> list[Callable[..., Any]]:
     found = inspect.getmembers(module, inspect.isfunction)
     return [item for _, item in found if item.__module__ == module.__name__]
@@ -175,12 +165,14 @@ def _functions(module: ModuleType) -> list[Callable[..., Any]]:
 @functools.cache
 def law_functions() -> tuple[Callable[..., Any], ...]:
     """Return the functions of `fe.runtime.laws`, which compiled functions can call from then on."""
-    functions = [item for module in (*laws.MODULES, interface) for item in _functions(module)]
-    for function in functions:
+    functions = [item for module in laws.MODULES for item in _functions(module)]
+    tables = {choice: laws.answers(choice.__name__) for choice in (laws.advance, laws.pull)}
+    found = tuple(dict.fromkeys((*functions, *itertools.chain(*tables.values()))))
+    for function in found:
         callable_when_compiled(function, makes_arrays=False)
-    for name in interface.FUNCTIONS:
-        choose_when_compiled(getattr(laws, name), laws.answers(name))
-    return tuple(functions)
+    for choice, table in tables.items():
+        choose_when_compiled(choice, table)
+    return found
 
 
 @functools.cache
@@ -189,12 +181,10 @@ def compiled_kernel() -> Kernel:
 
     The functions of `fe.runtime` stay plain; they can be called from compiled ones from then on.
     """
-    functions: list[Callable[..., Any]] = [static_path.pull_of, static_path.settle_port]
-    functions += [*_functions(motion_arrays), *_functions(motion_kernel)]
-    for function in functions:
-        if function is not motion_kernel.integrate:
-            callable_when_compiled(function, makes_arrays=False, inline=function not in SELDOM)
-    for function in (static_path.static_forces, static_path.arrive_at_rest):
-        callable_when_compiled(function)
-    sources = (*law_functions(), *functions)
+    inner = {*_functions(motion_arrays), *_functions(motion_kernel)} - {motion_kernel.integrate}
+    for function in inner:
+        callable_when_compiled(function, makes_arrays=False, inline=True)
+    callable_when_compiled(static_path.settle_port, makes_arrays=False)
+    callable_when_compiled(static_path.static_forces)
+    sources = (*law_functions(), *inner, static_path.settle_port)
     return Kernel(compiled(motion_kernel.integrate, sources), compiled(static_path.static_path, sources))

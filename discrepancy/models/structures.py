@@ -14,8 +14,8 @@ from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Shown, place_among, shown_rows
-from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
+from discrepancy.models.acting import Acting, Course, Load, Shown, place_among
+from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Memory, Outputs, Place
 from discrepancy.models.linear_system import Flexibility, LinearSystem, Modes
 from discrepancy.models.scales import PortScale
 from discrepancy.models.system_model import Case, State, SystemModel
@@ -136,7 +136,7 @@ class StructureModel(SystemModel):
 
         Loads that always act shift what a motion shows.
         """
-        found = shown_rows((self._rows[output] for output, _ in outputs), outputs)
+        found = [Shown.of(self._rows[output], quantity.order) for output, quantity in outputs]
         always = self._always(case.state.parameters)
         if acting is None or not always.any():
             return found
@@ -168,9 +168,12 @@ class StructureModel(SystemModel):
         recorded = {name: 0.0 for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls}
         return self._pull(parameters, recorded)
 
-    def constant(self, case: Case) -> FloatArray:
-        """Return the load (n,) that always acts at rest; in motion it is in what is shown."""
-        return self._always(case.state.parameters) * (not case.trial.is_dynamic)
+    def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
+        """Return loads in a trial; in motion what always acts is in what is shown."""
+        (loads, drives), trial = super().pushes(case), case.trial
+        if not trial.is_dynamic:
+            loads.append((self._always(case.state.parameters), Course.always(trial.time)))
+        return loads, drives
 
     def system(self, state: State) -> LinearSystem:
         """Return the structure at parameters and losses, in the coordinates of `ReducedModel.at`.
@@ -290,7 +293,7 @@ class WingModel(SystemModel):
         if factors is not None:
             gauges = np.array([strain_gauge(output) for output, _ in outputs])
             rows = rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
-        return shown_rows(rows, outputs)
+        return [Shown.of(row, quantity.order) for row, (_, quantity) in zip(rows, outputs, strict=True)]
 
     @property
     def shown_outputs(self) -> tuple[str, ...]:
@@ -303,9 +306,9 @@ class WingModel(SystemModel):
         """Whether the wing can carry a primitive; it can carry all but forces by a formula in time."""
         return primitive in PRIMITIVES.values() and primitive is not changes.PortLoad
 
-    def turns(self, port: str) -> bool | None:
-        """Return whether a port turns; the others move up and down."""
-        return port == ROTATING_PORT
+    def port_units(self, port: str) -> tuple[str, str]:
+        """Return the units of force and motion at a port: the root turns, the others move up and down."""
+        return TURNS if port == ROTATING_PORT else MOVES
 
     def at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return forces as they act at ports of `port_rows`."""
@@ -318,10 +321,6 @@ class WingModel(SystemModel):
     def lift(self, state: State, change: ModelPatch) -> FloatArray:
         """Return the parts (2, n) of the lift."""
         return self.wing.load_parts(change)
-
-    def constant(self, case: Case) -> FloatArray:
-        """Return nothing (n,): what always acts is in the zeros of readings."""
-        return np.zeros(self.wing.size)
 
     def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
         """Return the scales of a force over the planform, from those of its mean and the first mode."""

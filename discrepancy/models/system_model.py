@@ -88,10 +88,6 @@ class SystemModel(Model):
     def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
         """Return the load (N,) of 1 N at a place, as load primitives have it."""
 
-    @abstractmethod
-    def constant(self, case: Case) -> FloatArray:
-        """Return the load (N,) that always acts."""
-
     def lift(self, state: State, change: ModelPatch) -> FloatArray:
         """Return the loads (2, N) of a load factor and of its square, as load primitives have them."""
         raise NotImplementedError
@@ -144,7 +140,7 @@ class SystemModel(Model):
     def acting(self, case: Case) -> Acting:
         """Return what acts in a trial."""
         trial, conditions, patch, state = case
-        acting = Acting(trial.time, self.constant(case), conditions.stamps(trial.time), begins=trial.begins)
+        acting = Acting(trial.time, conditions.stamps(trial.time), begins=trial.begins)
         if trial.kind is TrialKind.RINGDOWN:
             if len(patch.of(PortLoad)):
                 raise ModelError(

@@ -18,6 +18,7 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import known_control
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import printed_state
 
 Float = NDArray[np.float64]
 
@@ -58,6 +59,17 @@ def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: Grap
     if "learnt" in line:
         record["learnt"] = line["learnt"]
     return record
+
+
+def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
+    """Return mean and standard deviation of each factor of the state, as a decision tells them."""
+    said = {}
+    for name, known in decision["health"].items():
+        scale, unit = printed_state(known["unit"])
+        digits = ".0f" if unit == "%" else ".3g"
+        mean, deviation = (f"{scale * known[moment]:{digits}}" for moment in ("mean", "standard_deviation"))
+        said[name] = f"{mean} ± {deviation} {unit}"
+    return said
 
 
 def gap_of(history: History, skipped: int, sensors: GaussianSensorModel) -> dict[str, Any]:

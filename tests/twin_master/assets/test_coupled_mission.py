@@ -20,7 +20,7 @@ from twin_master.fleet.plan import ensemble
 from twin_master.mission.truth import Plant, Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
-from twin_master.store.writing import read_run
+from twin_master.store.writing import open_run
 from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
 
@@ -94,7 +94,7 @@ def rows(run: Path) -> dict[str, bytes]:
 
 def test_a_heat_exchanger_is_watched_and_steered(direct):
     run = direct["fouling"]
-    tree = read_run(run)
+    tree = open_run(run)
     observed, truth = tree["observed"], tree["truth"]
     assert observed["temperature"].shape == (30, 2)
     found = [observed["temperature"], observed["mass_flow"], truth["heat"], truth["state"]]
