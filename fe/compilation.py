@@ -154,15 +154,15 @@ def law_functions() -> tuple[Callable[..., Any], ...]:
 
 def _choose_when_compiled(choice: Callable[..., Any], table: tuple[Callable[..., Any], ...]) -> None:
     """Let compiled functions call `choice(number, ...)`, which is `table[number](...)`."""
-    # Written out as one function: a chain of functions would be compiled link by link.
-    answers = {f"answer_{number}": answer for number, answer in enumerate(table)}
+    # Written out as one function: a chain of functions would be compiled link by link. Its signature is that
+    # of `compiled_choice`, as numba asks.
+    scope: dict[str, Any] = {"Any": Any} | {f"answer_{number}": each for number, each in enumerate(table)}
     lines = [f"    if number == {number}: return answer_{number}(*given)" for number in range(len(table) - 1)]
-    exec(
-        "\n".join(("def chosen(number, *given):", *lines, f"    return {list(answers)[-1]}(*given)")), answers
-    )
+    head, end = "def choice(number: Any, *given: Any) -> Any:", f"    return answer_{len(table) - 1}(*given)"
+    exec("\n".join([head, *lines, end]), scope)
 
     def compiled_choice(number: Any, *given: Any) -> Any:
-        return answers["chosen"]
+        return scope["choice"]
 
     overload(choice, jit_options={"nogil": True, "_nrt": False, "forceinline": True})(compiled_choice)
 
