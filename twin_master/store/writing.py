@@ -88,12 +88,6 @@ def tree_of(groups: Mapping[str, Group], attributes: Mapping[str, Any]) -> "Data
     return xr.DataTree.from_dict(sets)
 
 
-def write_summary(folder: Path, figures: Sequence[Figure], heading: Mapping[str, Any]) -> Path:
-    """Write `summary.json`: the heading, and each figure beside its reference."""
-    record = {**heading, "figures": [asdict(figure) for figure in figures]}
-    return atomic_write_text(folder / SUMMARY_NAME, to_json(record))
-
-
 def store_flight(
     folder: Path,
     config: Mapping[str, Any],
@@ -164,7 +158,8 @@ def store_flight(
         **noticed(result),
     }
     rewards = groups["filtered"]["reward_mean"].values
-    write_summary(folder, [*figures, *summarise(result, rewards, misfit)], heading)
+    shown = [asdict(figure) for figure in (*figures, *summarise(result, rewards, misfit))]
+    atomic_write_text(folder / SUMMARY_NAME, to_json({**heading, "figures": shown}))
     return partial(tree_of, groups, told)
 
 
