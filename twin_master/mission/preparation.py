@@ -280,11 +280,15 @@ def prepare_twin(
     """
     loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
     resolved = resolve_scenario(loaded, given_overrides(overrides))
-    source = asset_source(resolved)
+    return prepared_alone(resolved, asset_source(resolved), progress)
+
+
+def prepared_alone(scenario: Scenario, source: AssetSource, progress: Progress | None = None) -> Knowledge:
+    """Return what a twin knows that flies in no folder."""
     source.check()
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         source.prepare(Path(folder), progress or SilentProgress())
-        return prepare_knowledge(resolved, source, resolved.mission.seed)
+        return prepare_knowledge(scenario, source, scenario.mission.seed)
 
 
 def reward_settings(scenario: Scenario) -> RewardSettings:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -189,6 +189,8 @@ class RunOutcome:
         When which control was left for which, in words.
     notices : tuple of str
         What the operator should know, a sentence each.
+    stored : callable or None
+        Gives `tree` where this process flew the run.
     """
 
     folder: Path
@@ -199,7 +201,7 @@ class RunOutcome:
     step_name: str
     control: str
     notices: tuple[str, ...] = ()
-    stored: Callable[[], "DataTree"] | None = None
+    stored: Callable[[], "DataTree"] | None = field(default=None, repr=False, compare=False)
 
     @cached_property
     def tree(self) -> "DataTree":
