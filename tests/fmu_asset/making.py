@@ -1,6 +1,5 @@
 """What these tests make things with: archives, changed FMUs, bindings, systems, other processes."""
 
-import re
 import subprocess
 import sys
 import zipfile
@@ -54,19 +53,6 @@ def parameters_of(fmu: Path) -> dict[str, float]:
     return {v.name: float(v.start or 0.0) for v in read_fmu(fmu).variables if v.causality == "parameter"}
 
 
-def with_dependencies(fmu: Path, target: Path, dependencies: Mapping[str, Sequence[str]]) -> Path:
-    """Copy an FMU and write which inputs each of its outputs depends on."""
-    text = members(fmu)[DESCRIPTION].decode()
-    names = re.findall(r'<ScalarVariable[^>]*?\bname="([^"]+)"', text)
-    outputs = text[text.index("<Outputs>") : text.index("</Outputs>")]
-    told = outputs
-    for output, inputs in dependencies.items():
-        index, value = names.index(output) + 1, " ".join(str(names.index(name) + 1) for name in inputs)
-        assert f'<Unknown index="{index}"' in told
-        told = told.replace(f'<Unknown index="{index}"', f'<Unknown index="{index}" dependencies="{value}"')
-    return edited(fmu, target, (outputs, told))
-
-
 def run_python(program: str, *arguments: object, **options: Any) -> str:
     """Return what a program, run in a process of its own, writes; it must end well."""
     words = [sys.executable, "-c", program, *map(str, arguments)]
@@ -101,7 +87,7 @@ def changed(binding: Binding, *, header: Mapping[str, object] | None = None, **t
 
 
 def linear(name: str, fmu: Path, substeps: int = 1, **values: Any) -> Component:
-    """Return a component of `linear_system.py`; matrices as nested lists, `initial` as a pair."""
+    """Return a component of `linear2.c`; matrices as nested lists, `initial` as a pair."""
     settings = {}
     for key, value in values.items():
         for place, x in np.ndenumerate(np.array(value, dtype=float)):

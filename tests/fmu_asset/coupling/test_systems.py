@@ -18,7 +18,7 @@ from fmu_asset.coupling.structure import Component, Connection, Connector, Setti
 from fmu_asset.coupling.structure import expand_connection as expand
 from fmu_asset.coupling.wiring import Wiring
 from tests.fmu_asset.door import kinds
-from tests.fmu_asset.door.kinds import OSCILLATOR, SYSTEM_OF_THREE, held, oscillator, three
+from tests.fmu_asset.door.kinds import BINDINGS, OSCILLATOR, held, oscillator, three
 from tests.fmu_asset.making import bound, changed, linear, system, watch
 from tests.fmu_asset.ours import OurFmus
 
@@ -163,7 +163,7 @@ def test_parameters_and_refusals_are_those_of_the_components(ours) -> None:
     structure, seen = three(ours), []
     for seed in (5.0, 6.0):
         options = {"isolated": False, "parameters": {"seed": seed}}
-        with CoupledAsset(structure, SYSTEM_OF_THREE, **options) as asset:
+        with CoupledAsset(structure, BINDINGS["three"], **options) as asset:
             assert asset.schedule.order == ("damage", "wing", "gauges")
             seen.append(asset.simulate({"load_factor": 2.0}, steps=3).values)
             state = asset.save_state()
@@ -175,7 +175,7 @@ def test_parameters_and_refusals_are_those_of_the_components(ours) -> None:
             asset.step({"load_factor": 2.0})
     assert not np.array_equal(*seen)
     delayed = tuple(replace(c, delayed=bool(c.source.component)) for c in structure.connections)
-    other = CoupledAsset(replace(structure, connections=delayed), SYSTEM_OF_THREE, isolated=False)
+    other = CoupledAsset(replace(structure, connections=delayed), BINDINGS["three"], isolated=False)
     with other, pytest.raises(errors.FmuStateError, match="another FMU than the system test"):
         other.restore_state(state)
 
@@ -284,7 +284,7 @@ def test_an_input_that_is_only_set_keeps_its_value(base) -> None:
         with CoupledAsset(structure, binding, isolated=False) as asset:
             shown.append((asset.observe().values[0], asset.step().values[0]))
     assert shown[0][0] == shown[0][1]
-    assert shown[0][1] > 1.05 * shown[1][1]
+    assert shown[0][1] > 1.03 * shown[1][1]
 
 
 def test_bindings_that_do_not_fit(base) -> None:

@@ -11,10 +11,11 @@ from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component, Connection, Endpoint, Setting, SystemStructure
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuInputError
-from tests.fmu_asset.door.kinds import KINDS, LINE
+from tests.fmu_asset.door.kinds import KINDS
 from tests.fmu_asset.making import bound, changed, linear, system, watch
 
 LINES = KINDS["lines"].binding
+LINE = [0.5, 2.0, -1.0, -1.0, 3.0, 3.5, 0.0]
 
 
 @pytest.mark.parametrize(("state", "isolated"), [("serialised", True), ("replay", False)])
