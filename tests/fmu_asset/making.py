@@ -7,14 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.coupling.structure import (
     Component,
     Connection,
     Connector,
-    Setting,
     SystemStructure,
     expand_connection,
 )
@@ -84,15 +81,6 @@ def changed(binding: Binding, *, header: Mapping[str, object] | None = None, **t
     """Return a binding with further keys of its header, and some tables replaced."""
     record = binding.model_dump(exclude_none=True, mode="json")
     return parse_binding(record | {"binding": record["binding"] | dict(header or {})} | tables)
-
-
-def linear(name: str, fmu: Path, substeps: int = 1, **values: Any) -> Component:
-    """Return a component of `linear2.c`; matrices as nested lists, `initial` as a pair."""
-    settings = {}
-    for key, value in values.items():
-        for place, x in np.ndenumerate(np.array(value, dtype=float)):
-            settings[key + "".join(str(index + 1) for index in place)] = Setting(float(x))
-    return Component(name, fmu, settings, substeps)
 
 
 def system(

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import expm
 
 from fe.runtime.state import TIP_FORCE
 from fe.runtime.transient import ModalIntegrator
@@ -21,7 +20,8 @@ from fmu_asset.door.binding import Binding, load_binding, parse_binding
 from fmu_asset.structures.binding import structure_binding
 from scenarios import binding_files
 from tests.conftest import BEAM
-from tests.fmu_asset.making import linear, parameters_of, system
+from tests.fmu_asset.coupling.reference import recursion
+from tests.fmu_asset.making import parameters_of, system
 from tests.fmu_asset.ours import OurFmus
 
 Floats = npt.NDArray[np.float64]
@@ -261,45 +261,12 @@ def damage(kind: Kind, ours: OurFmus) -> Shown:
 
 # ---------------------------------------------------------------------- systems
 
-M1, M2, K1, K2, KC, C1, CC = 1.0, 1.5, 4.0, 3.0, 2.0, 0.1, 0.2
-OSCILLATOR = np.array([1.0, 0.0, -0.5, 0.3])  # x1, v1, x2, v2 at the start
-# The first mass is pushed by a force, the second one feels where the first one is and answers with the force.
-A1, B1 = np.array([[0.0, 1.0], [-K1 / M1, -C1 / M1]]), np.array([[0.0, 0.0], [1.0 / M1, 1.0 / M1]])
-A2 = np.array([[0.0, 1.0], [-(K2 + KC) / M2, -CC / M2]])
-B2 = np.array([[0.0, 0.0], [KC / M2, CC / M2]])
-C2, D2 = np.array([[KC, CC], [0.0, 0.0]]), np.array([[-KC, -CC], [0.0, 0.0]])
 
-
-def held(matrix: Floats, inputs: Floats, step: float) -> tuple[Floats, Floats]:
-    """Return what moves states and held inputs over a step."""
-    block = np.zeros((4, 4))
-    block[:2, :2], block[:2, 2:] = matrix, inputs
-    whole = expm(block * step)
-    return whole[:2, :2], whole[:2, 2:]
-
-
-def recursion(kind: Kind, _: OurFmus) -> Shown:
-    """Positions and force of two masses, the coupling written out by hand."""
-    (p1, q1), (p2, q2) = (held(a, b, kind.binding.interval) for a, b in ((A1, B1), (A2, B2)))
-    x, z = OSCILLATOR[:2], OSCILLATOR[2:]
-    force, shown = (C2 @ z + D2 @ x)[0], []
-    for push in kind.course["control"]["push"]:
-        old, x = x, p1 @ x + q1 @ [force, push]
-        seen = old if kind.file.endswith("jacobi") else x
-        z = p2 @ z + q2 @ seen
-        force = (C2 @ z + D2 @ seen)[0]
-        shown.append([*x, force])
-    return shown, {}
-
-
-def oscillator(
-    state_fmu: Path, linear_fmu: Path, substeps: int = 1, *, pushed: bool = False
-) -> SystemStructure:
-    """Return two masses, the components in the wrong order: the right one follows from the dependencies."""
-    first = linear("first", state_fmu, substeps, a=A1, b=B1, c=np.eye(2), initial=OSCILLATOR[:2])
-    second = linear("second", linear_fmu, substeps, a=A2, b=B2, c=C2, d=D2, initial=OSCILLATOR[2:])
-    ends = [("first.y1", "second.u1"), ("first.y2", "second.u2"), ("second.y1", "first.u1")]
-    return system([second, first], [*ends, *([("push", "first.u2")] if pushed else [])])
+def masses(kind: Kind, _: OurFmus) -> Shown:
+    """Positions and force of the two masses of the system `oscillator`."""
+    pushes, jacobi = kind.course["control"]["push"], kind.file.endswith("jacobi")
+    found = recursion("oscillator", ("first", "second"), kind.binding.interval, pushes, jacobi=jacobi)
+    return np.column_stack((found["first"], found["second"][:, 0]))[1:], {}
 
 
 def three(ours: OurFmus) -> SystemStructure:

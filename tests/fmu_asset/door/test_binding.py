@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.binding import Binding, expand, load_binding, parse_binding
+from fmu_asset.door.binding import Binding, load_binding, parse_binding
 from fmu_asset.door.draft import draft_binding
 from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.placement import limits_of
@@ -73,12 +73,6 @@ def test_missing_or_unreadable_file(tmp_path) -> None:
         load_binding(path)
 
 
-@given(st.integers(0, 500), st.integers(0, 50))
-def test_patterns_count(first, more) -> None:
-    names = expand(f"x[{{{first}..{first + more}}}].y")
-    assert names == tuple(f"x[{i}].y" for i in range(first, first + more + 1))
-
-
 def test_ranges_of_the_binding_narrow_those_of_the_fmu(fmu, binding) -> None:
     def limited(**limits: float) -> Binding:
         return changed(binding, control={"load_factor": {"variable": "load_factor", "unit": "1", **limits}})
@@ -127,24 +121,6 @@ def test_other_texts_mean_nothing() -> None:
     texts = ("mmin", "bushel", "degC/s", "N..m", "W/(m2", "m)", "", "2", "pm40", "m/(pm40)", "Gm40")
     for text in (*texts, "(" * 3000 + "m" + ")" * 3000):
         assert meaning_of(text) is None, text
-
-
-USUAL = st.sampled_from(["m", "kg", "s", "kN", "mm", "Pa", "K", "rad", "W", "1", "min", "%"])
-
-
-@given(USUAL, USUAL, st.integers(1, 4))
-def test_products_multiply_and_quotients_divide(one, two, power) -> None:
-    first, second = meaning_of(one), meaning_of(two)
-    for sign, factor, together in (
-        (1, first.factor * second.factor, meaning_of(f"{one}.{two}")),
-        (-1, first.factor / second.factor, meaning_of(f"{one}/{two}")),
-    ):
-        exponents = tuple(a + sign * b for a, b in zip(first.exponents, second.exponents, strict=True))
-        assert together == Meaning(exponents, pytest.approx(factor, rel=1e-12))
-    if one != "1":
-        exponents = tuple(power * e for e in first.exponents)
-        factor = pytest.approx(first.factor**power, rel=1e-12)
-        assert meaning_of(f"{one}{power}") == Meaning(exponents, factor)
 
 
 @given(st.text(max_size=12))

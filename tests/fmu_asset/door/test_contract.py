@@ -13,7 +13,8 @@ from fmu_asset.door.layout import Observation
 from fmu_asset.door.saved_state import SavedState
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError, FmuStateError
-from tests.fmu_asset.door.kinds import INPUTS, KINDS, STEPS, Kind, oscillator, three
+from tests.fmu_asset.coupling.reference import coupled
+from tests.fmu_asset.door.kinds import INPUTS, KINDS, STEPS, Kind, three
 from tests.fmu_asset.ours import NAMES, OurFmus
 
 Open = Callable[..., FmiAsset]
@@ -31,9 +32,10 @@ def open_asset(
         if kind.file == "three":
             return CoupledAsset(three(ours), kind.binding, **given)
         if kind.file.startswith("oscillator"):
-            fmus = (request.getfixturevalue(name) for name in ("state_fmu", "linear_fmu"))
             algorithm = {"algorithm": "jacobi"} if kind.file.endswith("jacobi") else {}
-            return CoupledAsset(oscillator(*fmus, pushed=True), kind.binding, **algorithm, **given)
+            return CoupledAsset(
+                coupled("oscillator", request.getfixturevalue), kind.binding, **algorithm, **given
+            )
         file = ours(kind.file) if kind.file in NAMES else foreign_fmu(kind.file)
         return FmiAsset(file, kind.binding, **given)
 

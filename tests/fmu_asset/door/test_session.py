@@ -1,28 +1,23 @@
-"""What is particular in a session: refusals, units, what happens in the midst of a run, starts and copies.
+"""What is particular in a session: refusals, units, the midst of a run, inputs in lines, starts and copies.
 
 A start is a start: a reset that does nothing is not believed.
 """
 
 import logging
-import re
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from fmu_asset import errors
 from fmu_asset.archive.declared import FmuDescription
-from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.check import check_fmu
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component
 from fmu_asset.door import placement, session
-from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.session import FmiAsset
-from tests.fmu_asset.door.kinds import BINDINGS, BINDINGS_FOLDER, HOSTILE, INPUTS
+from tests.fmu_asset.door.kinds import BINDINGS, BINDINGS_FOLDER, HOSTILE, INPUTS, KINDS
 from tests.fmu_asset.making import bound, changed, system
 from twin_master.library.grid import GridSampler, SamplingGrid
 
@@ -86,46 +81,38 @@ def test_the_fmu_itself_refuses_and_says_why(fmu, binding, monkeypatch) -> None:
 # ---------------------------------------------------------------------- in the midst of a run
 
 NOT_A_NUMBER, SLEEP, DIE, RAISE, DISCARD = 1, 2, 3, 4, 5
-GOES_WRONG: dict[int, tuple[type[Exception], str]] = {
-    NOT_A_NUMBER: (errors.FmuOutputError, r"not finite at t = .* s: position"),
-    RAISE: (errors.FmuCallError, r"(?s)returned Fatal.*the spring broke"),
-    DISCARD: (errors.FmuCallError, r"step \d+ from t = .* returned Discard"),
-}
+GOES_WRONG = [
+    (NOT_A_NUMBER, errors.FmuOutputError, r"not finite at t = .* s: position"),
+    (RAISE, errors.FmuCallError, r"(?s)returned Fatal.*the spring broke"),
+    (DISCARD, errors.FmuCallError, r"step \d+ from t = .* returned Discard"),
+]
 
 
 @pytest.mark.parametrize("bad", [0, 1, 9])
-@pytest.mark.parametrize("behaviour", GOES_WRONG)
+@pytest.mark.parametrize(("behaviour", "kind", "sentence"), GOES_WRONG)
 def test_a_step_that_goes_wrong_ends_a_run_there(
-    spring_mass, spring_binding, isolated, behaviour, bad, monkeypatch
+    spring_mass, spring_binding, isolated, behaviour, kind, sentence, bad, monkeypatch
 ) -> None:
     """Whatever blocks it is made in; as single steps end there."""
     monkeypatch.setattr(session, "_BLOCK_BYTES", 3 * 6 * 8)
-    kind, sentence = GOES_WRONG[behaviour]
     push, load = np.linspace(0.0, 1.0, 10), {"misbehaviour": np.where(np.arange(10) == bad, behaviour, 0)}
     with (
         FmiAsset(spring_mass, spring_binding, isolated=isolated) as asset,
         FmiAsset(spring_mass, spring_binding, isolated=False) as other,
     ):
         for one in (asset, other):
-            one.step({"push": 0.3})
+            one.step({"push": 0.3}, load={"misbehaviour": 0})
         with pytest.raises(kind, match=sentence):
             asset.simulate({"push": push}, load=load)
         for value in push[:bad]:
-            other.step({"push": value}, load={"misbehaviour": 0})
+            other.step({"push": value})
         assert asset.step_index == bad + 1 + (behaviour == NOT_A_NUMBER)  # after which the step was made
         if behaviour == DISCARD:  # it is where it was before
             assert asset.save_state() == other.save_state()
-            with pytest.raises(kind, match=sentence):
-                asset.step({"push": 7.0}, load={"misbehaviour": DISCARD})
             assert asset.step().values.tobytes() == other.step().values.tobytes()
         elif behaviour == RAISE:
-            for going_on in (asset.step, lambda: asset.simulate(steps=2)):
-                with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
-                    going_on()
-        for one in (asset, other):
-            one.reset()
-        history = asset.simulate({"push": push}, load={"misbehaviour": 0})
-        assert history.values.tobytes() == np.array([other.step({"push": p}).values for p in push]).tobytes()
+            with pytest.raises(errors.FmuWorkerError, match="reset the asset"):
+                asset.simulate(steps=2)
 
 
 def test_a_step_that_hangs_or_dies_ends_the_worker(spring_mass, spring_binding) -> None:
@@ -162,25 +149,63 @@ def test_histories_that_are_refused(foreign_fmu, spring_mass, spring_binding) ->
         np.testing.assert_allclose(held.values, [[6e-3, 12e-3], [12e-3, 24e-3]], rtol=1e-12)
 
 
-@given(
-    power=st.lists(st.floats(-1e3, 1e3) | st.sampled_from([-0.0, 0, 1e-320, True]), min_size=1, max_size=6),
-    outside=st.floats(-40.0, 50.0) | st.sampled_from([-40.0, 50.0]),
+# ---------------------------------------------------------------------- inputs in straight lines
+
+LINES = KINDS["lines"].binding
+LINE = [0.5, 2.0, -1.0, -1.0, 3.0, 3.5, 0.0]
+
+
+@pytest.mark.parametrize(("state", "isolated"), [("serialised", True), ("replay", False)])
+def test_an_input_may_jump_before_the_state_is_kept(foreign_fmu, state, isolated) -> None:
+    """A worker is told the lines with each request."""
+    with FmiAsset(
+        foreign_fmu("follow2"), changed(LINES, header={"state": state}), isolated=isolated
+    ) as asset:
+        asset.simulate({"u": LINE[:3]})
+        asset.hold({"u": 3.0})
+        with pytest.raises(errors.FmuInputError, match="outside the range"):
+            asset.hold({"u": 1000.0})
+        kept = asset.save_state()
+        there = asset.simulate({"u": LINE[3:]})
+        assert there.extra["seen"][0] == 3.0
+        with asset.sibling() as other:
+            other.restore_state(kept)
+            assert other.simulate({"u": LINE[3:]}).values.tobytes() == there.values.tobytes()
+
+
+@pytest.mark.parametrize("interface", ["co-simulation", "model-exchange"])
+def test_an_input_that_stays_is_held_to_the_bit(foreign_fmu, interface) -> None:
+    binding, seen = changed(LINES, header={"interface": interface, "step_size": 0.1, "decimation": 3}), []
+    for kind in ("zero-order", "linear"):
+        held = binding.with_header(interpolation=kind)
+        with FmiAsset(foreign_fmu("follow2"), held, isolated=False) as asset:
+            asset.reset(control={"u": 0.7})
+            seen.append(asset.simulate(steps=5).values.tobytes())
+    assert seen[0] == seen[1]
+
+
+def test_a_line_that_goes_on_is_no_event(foreign_fmu) -> None:
+    mode, record = {"mode": {"variable": "mode", "unit": "1"}}, {"variables": ["events"]}
+    binding = changed(LINES, header={"interface": "model-exchange"}, load=mode, record=record)
+    with FmiAsset(foreign_fmu("follow2"), binding, isolated=False) as asset:
+        asset.reset({}, control={"u": 0.0}, load={"mode": 0})
+        smooth = asset.simulate({"u": [0.3, 0.1, 0.4]}).extra["events"]
+        assert len(set(smooth.tolist())) == 1
+        assert asset.step({"u": 0.5}, load={"mode": 1}).extra["events"] == smooth[-1] + 1
+
+
+@pytest.mark.parametrize(
+    ("model", "taken", "given", "sentence"),
+    [
+        ("spring2", ("force", "N"), ("position", "m"), "of inputs: it does not declare `canInterpolate"),
+        ("array3", ("u", "1"), ("y", "mm"), "takes no derivatives of inputs: FMI 3.0 has no"),
+        ("follow2", ("mode", "1"), ("x", "1"), "none of them is a continuous real number"),
+    ],
 )
-def test_what_is_sent_is_what_a_step_sends(foreign_fmu, power, outside) -> None:
-    exchange = Exchange(read_fmu(foreign_fmu("room2")), BINDINGS["room2"])
-    target, sent, refused = exchange.start_values({}), [], ""
-    held, roles = np.array(target), {"control": {"power": power}, "load": {"outside": outside}}
-    try:
-        for value in power:
-            exchange.place(target, {"control": {"power": value}, "load": {"outside": outside}})
-            sent.append(list(target))
-    except errors.FmuInputError as error:
-        refused = error.sentence
-    if refused:
-        with pytest.raises(errors.FmuInputError, match=re.escape(refused)):
-            exchange.rows(held, roles, None)
-    else:
-        assert exchange.rows(held, roles, None).tobytes() == np.array(sent).tobytes()
+def test_what_cannot_follow_is_refused(foreign_fmu, model, taken, given, sentence) -> None:
+    binding = bound(1.0, {"y": given}, load={"u": taken}, header={"interpolation": "linear"})
+    with pytest.raises(errors.BindingError, match=sentence):
+        FmiAsset(foreign_fmu(model), binding)
 
 
 # ---------------------------------------------------------------------- starts

@@ -51,11 +51,11 @@ def installed(program: str, package: str = "") -> str:
     return path or pytest.skip(f"{package or program} is not installed")
 
 
-def opinion(fmu: Path, home: Path) -> tuple[int, str]:
+def opinion(fmu: Path, home: Path) -> str:
     """Return what another tool says; it keeps its log and settings in the home of the user."""
     words = [installed("fmutool", "fmu-manipulation-toolbox"), "-input", str(fmu), "-check"]
-    done = run(words, check=False, env={"HOME": str(home), "PATH": "/usr/bin:/bin"})
-    return done.returncode, done.stdout + done.stderr
+    done = run(words, env={"HOME": str(home), "PATH": "/usr/bin:/bin"})
+    return f"{done.stdout}{done.stderr}\nexit code {done.returncode}"
 
 
 # ---------------------------------------------------------------------- what holds of all
@@ -83,18 +83,15 @@ def test_more_instances_in_one_process_than_python_had_room_for(fmu) -> None:
 
 @pytest.mark.parametrize("name", TOLD)
 def test_another_tool_has_no_complaint(ours, name, tmp_path) -> None:
-    code, said = opinion(ours(name), tmp_path)
-    assert code == 0, said
-    assert f"seems to be compliant with FMI-{3 if '3' in name else 2}.0" in said
-    assert "No semantic error" in said
+    said = opinion(ours(name), tmp_path)
+    words = f"seems to be compliant with FMI-{3 if '3' in name else 2}.0", "No semantic error", "exit code 0"
+    assert all(text in said for text in words), said
     assert not re.search("ERROR|WARNING", said)
 
 
 def test_another_tool_does_complain_where_there_is_reason(fmu, tmp_path) -> None:
-    bad = edited(fmu, tmp_path / "bad.fmu", ('causality="input"', 'causality="inward"'))
-    code, said = opinion(bad, tmp_path)
-    assert code != 0
-    assert "seems to be compliant" not in said
+    said = opinion(edited(fmu, tmp_path / "bad.fmu", ('causality="input"', 'causality="inward"')), tmp_path)
+    assert not re.search("seems to be compliant|exit code 0", said)
 
 
 @pytest.mark.parametrize("name", EQUAL)
@@ -103,12 +100,12 @@ def test_equal_input_gives_equal_bytes(ours, name, tmp_path, monkeypatch) -> Non
     elsewhere = tmp_path / "else where"
     elsewhere.mkdir()
     monkeypatch.setenv("TMPDIR", str(elsewhere))
-    again = tmp_path / "again.fmu"
     if name in STRUCTURES:
-        which, options = ours.model(name), ours.options(name)
-        build_fmu(ReducedModel.from_bytes(which.to_bytes()), again, **options)
+        again = build_fmu(
+            ReducedModel.from_bytes(ours.model(name).to_bytes()), tmp_path / "again.fmu", **ours.options(name)
+        ).path
     else:
-        ours.write(name, again)
+        again = ours.write(name, tmp_path / "again.fmu")
     assert again.read_bytes() == ours(name).read_bytes()
 
 
@@ -231,13 +228,9 @@ def test_a_structure_of_the_wings_name_is_no_wing(ours) -> None:
 
 def test_a_note_and_a_further_file(model, fmu, tmp_path) -> None:
     note, content = 'Calibrated for "Wing <7> & é".', b'{"asset": "Wing <7>"}\n'
-    one, two = (
-        build_fmu(model, tmp_path / name, note=note, resources={"calibration.json": content}).path
-        for name in ("one.fmu", "two.fmu")
-    )
-    assert one.read_bytes() == two.read_bytes()
-    assert check_fmu(one).passed
-    described, inside = read_model_description(str(one)), members(one)
+    path = build_fmu(model, tmp_path / "a.fmu", note=note, resources={"calibration.json": content}).path
+    assert check_fmu(path).passed
+    described, inside = read_model_description(str(path)), members(path)
     assert described.description.endswith(note)
     assert described.guid != read_model_description(str(fmu)).guid
     assert inside["resources/calibration.json"] == content
@@ -247,33 +240,28 @@ def test_a_note_and_a_further_file(model, fmu, tmp_path) -> None:
 # ---------------------------------------------------------------------- the kind in Python
 
 
+ALONE = """
+name = open("resources/slavemodule.txt").read()
+Wing = getattr(__import__(name), "Structure_" + name.rpartition("_")[2])
+wing = Wing(instance_name="a", resources="resources")
+wing.enter_initialization_mode(); wing.exit_initialization_mode()
+assert wing.do_step(0.0, 1.0) is True, wing.log_queue
+assert wing.get_real([12])[0] != 0.0
+"""
+
+
 def test_it_needs_numpy_alone(ours, tmp_path) -> None:
-    """The runtime loads with everything of the project and all other packages hidden."""
+    """The runtime loads where there is nothing of the project and no other package."""
     project = re.compile(rb"^\s*(?:from|import) (?:fe|fmu_asset|reporting)\b", re.MULTILINE)
     for name in ("python", "sensing", "patched"):
         texts = {entry: text for entry, text in members(ours(name)).items() if entry.endswith(".py")}
         assert not [entry for entry, text in texts.items() if project.search(text)]
     shutil.unpack_archive(ours("python"), tmp_path, "zip")
-    program = (
-        "import os, sys\n"
-        "os.chdir(sys.argv[1])\n"
-        "class Refuse:\n"
-        "    def find_spec(self, name, path=None, target=None):\n"
-        "        top = name.partition('.')[0]\n"
-        "        ours = top == 'numpy' or top.startswith('uav_wing_')\n"
-        "        if top not in sys.stdlib_module_names and not ours:\n"
-        "            raise ImportError(name)\n"
-        "sys.meta_path.insert(0, Refuse())\n"
-        "sys.path.insert(0, 'resources')\n"
-        "name = open('resources/slavemodule.txt').read()\n"
-        "module = __import__(name)\n"
-        "wing = getattr(module, 'Structure_' + name.rpartition('_')[2])\n"
-        "wing = wing(instance_name='a', resources='resources')\n"
-        "wing.enter_initialization_mode(); wing.exit_initialization_mode()\n"
-        "assert wing.do_step(0.0, 1.0) is True, wing.log_queue\n"
-        "assert wing.get_real([12])[0] != 0.0\n"
-    )
-    run_python(program, tmp_path)
+    for folder in Path(np.__file__).parents[1].glob("numpy*"):
+        (tmp_path / "resources" / folder.name).symlink_to(folder)
+    environment = {"PYTHONPATH": str(tmp_path / "resources")}
+    done = run([sys.executable, "-S", "-c", ALONE], cwd=tmp_path, env=environment)
+    assert done.returncode == 0, done.stderr
 
 
 def test_units_of_a_list_are_converted_each_on_its_own(ours) -> None:

@@ -383,19 +383,6 @@ def test_a_restored_state_has_the_same_future(pair, steps, later, elsewhere, res
     assert other.saved() == slave.saved()
 
 
-@settings(deadline=None, max_examples=20)
-@given(past=st.lists(STEPS, max_size=12), course=st.lists(STEPS, min_size=1, max_size=6))
-def test_the_past_of_an_instance_does_not_show(pair, past, course) -> None:
-    """What an instance has kept of other states of health never changes a bit of its outputs."""
-    pair[0].start(response=2, young_modulus_factor=1.05, mass__pitot=0.11)
-    fly(pair[0], 0.0, past)
-    pair[0].everything()
-    for one in pair:
-        one.start(response=2, initial_tip_displacement=0.02, mass__pitot=0.13)
-        fly(one, 0.0, course)
-    assert pair[0].everything() == pair[1].everything()
-
-
 def test_states_of_something_else_are_refused(slave, ours) -> None:
     compiled = is_compiled(slave)
     foreign = []

@@ -8,7 +8,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +29,6 @@ from twin_master.library.grid import SamplingGrid
 from twin_master.library.sampling import sample_library
 
 pytestmark = pytest.mark.skipif(landlock_version() < 6, reason="the kernel is older than Linux 6.12")
-
-Attempted = Callable[[], bool] | None
-"""Whether what was attempted has happened; None where only the FMU can tell."""
 
 
 @pytest.fixture
@@ -58,23 +55,12 @@ def attempting(foreign_fmu: Any, monkeypatch: pytest.MonkeyPatch) -> Attempting:
     return make
 
 
-def listening(
-    cleaner: ExitStack, family: int, kind: int, address: Any = ("127.0.0.1", 0)
-) -> tuple[object, Attempted]:
+def listening(cleaner: ExitStack, family: int, kind: int, address: Any = ("127.0.0.1", 0)) -> object:
     line = cleaner.enter_context(socket.socket(family, kind))
     line.bind(address)
     if kind == socket.SOCK_STREAM:
         line.listen()
-    line.setblocking(False)
-
-    def reached() -> bool:
-        try:
-            line.accept()[0].close() if kind == socket.SOCK_STREAM else line.recv(8)
-        except BlockingIOError:
-            return False
-        return True
-
-    return line.getsockname()[1] if family == socket.AF_INET else address, reached
+    return line.getsockname()[1] if family == socket.AF_INET else address
 
 
 def shared(cleaner: ExitStack, kind: str, *size: int) -> int:
@@ -85,52 +71,38 @@ def shared(cleaner: ExitStack, kind: str, *size: int) -> int:
     return int(number)
 
 
-Targets = Callable[[str], tuple[str, Attempted]]
+def process(cleaner: ExitStack) -> int:
+    running = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    cleaner.callback(running.communicate)
+    return running.pid
+
+
+Target = Callable[[str], str]
 
 
 @pytest.fixture
-def targets(tmp_path: Path, key: Path) -> Iterator[Targets]:
-    """Return what is attempted, by name: the target that the FMU is told, and whether it was reached."""
+def target(tmp_path: Path, key: Path) -> Iterator[Target]:
+    """Return what is attempted upon, by name, as the FMU is told it; it says whether it reached it."""
     inet, unix, stream, datagram = socket.AF_INET, socket.AF_UNIX, socket.SOCK_STREAM, socket.SOCK_DGRAM
-    made, queue = tmp_path / "made", f"uav-twin-{os.getpid()}"
-
-    def process() -> tuple[object, Attempted]:
-        running = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-        cleaner.callback(running.communicate)
-
-        def killed() -> bool:
-            with suppress(subprocess.TimeoutExpired):
-                return running.wait(0.1) != 0
-            return False
-
-        return running.pid, killed
-
-    ways: dict[str, Callable[[], tuple[object, Attempted]]] = {
-        "delete": lambda: (key, lambda: not key.exists()),
-        "overwrite": lambda: (key, lambda: key.read_text() == ""),
-        "read": lambda: (key, None),
-        "project": lambda: (ROOT / "pyproject.toml", None),  # beside the packages of a checkout
-        "spy": lambda: (f"/proc/{os.getpid()}/environ", None),
-        "make": lambda: (made, made.exists),
+    queue = f"uav-twin-{os.getpid()}"
+    ways: dict[str, Callable[[], object]] = {
+        "file": lambda: key,
+        "project": lambda: ROOT / "pyproject.toml",  # beside the packages of a checkout
+        "spy": lambda: f"/proc/{os.getpid()}/environ",
+        "make": lambda: tmp_path / "made",
         "call": lambda: listening(cleaner, inet, stream),
         "datagram": lambda: listening(cleaner, inet, datagram),
         "service": lambda: listening(cleaner, unix, stream, str(tmp_path / "service")),
         "mailbox": lambda: listening(cleaner, unix, datagram, str(tmp_path / "mailbox")),
-        "watch": lambda: (tmp_path, None),
-        "share": lambda: (shared(cleaner, "shm", 4096), None),
-        "semaphore": lambda: (shared(cleaner, "sem", 1), None),
-        "message": lambda: (shared(cleaner, "msg"), None),
-        "queue": lambda: (queue, lambda: ctypes.CDLL(None).mq_unlink(f"/{queue}".encode()) == 0),
-        "hamper": lambda: (process()[0], None),
-        "kill": process,
+        "watch": lambda: tmp_path,
+        "share": lambda: shared(cleaner, "shm", 4096),
+        "semaphore": lambda: shared(cleaner, "sem", 1),
+        "message": lambda: shared(cleaner, "msg"),
+        "queue": lambda: cleaner.callback(ctypes.CDLL(None).mq_unlink, f"/{queue}".encode()) and queue,
+        "process": lambda: process(cleaner),
     }
-
-    def target(what: str) -> tuple[str, Attempted]:
-        told, happened = ways[what]()
-        return str(told), happened
-
     with ExitStack() as cleaner:
-        yield target
+        yield lambda what: str(ways[what]())
 
 
 def granted(asset: FmiAsset) -> None:
@@ -149,15 +121,14 @@ def refused(asset: FmiAsset, sentence: str, kind: type[Exception] = errors.FmuCa
 
 
 @pytest.mark.parametrize("row", MISBEHAVIOURS["attempt"], ids=lambda row: row["call"])
-def test_what_is_not_its_own_is_out_of_reach(attempting, targets, row) -> None:
+def test_what_is_not_its_own_is_out_of_reach(attempting, target, key, row) -> None:
     """And the same FMU reaches it where the sandbox is off: it is the sandbox that holds."""
-    reason = row.get("reason", "Permission denied")
-    target, happened = targets(row["what"])
-    error = refused(attempting(row["call"], target), rf"(?s)step 2 .*it cannot have {target}: {reason}")
+    reason, told = row.get("reason", "Permission denied"), target(row["what"])
+    error = refused(attempting(row["call"], told), rf"(?s)step 2 .*it cannot have {told}: {reason}")
     assert ("granted by `read`, `write`, `ports`" in str(error)) == (reason == "Permission denied")
-    assert not (happened and happened())
-    granted(attempting(row["call"], target, sandbox=False))
-    assert happened is None or happened()
+    assert key.read_text() == "the private key"
+    assert not (key.parent / "made").exists()
+    granted(attempting(row["call"], told, sandbox=False))
 
 
 def test_what_was_refused_is_named_also_where_the_fmu_does_not_say_it(
@@ -182,19 +153,17 @@ def test_rights_of_files_stay_as_they_are(attempting, key) -> None:
 
 
 @pytest.mark.parametrize(("what", "attempt", "limit"), MISBEHAVIOURS["granted"])
-def test_what_is_granted_can_be_had(attempting, targets, what, attempt, limit) -> None:
-    target, happened = targets(what)
-    granted(attempting(attempt, target, **{limit: [int(target) if limit == "ports" else target]}))
-    assert happened is None or happened()
+def test_what_is_granted_can_be_had(attempting, target, what, attempt, limit) -> None:
+    told = target(what)
+    granted(attempting(attempt, told, **{limit: [int(told) if limit == "ports" else told]}))
 
 
 @pytest.mark.parametrize(("what", "attempt", "port"), MISBEHAVIOURS["closed"])
 def test_a_port_beside_the_granted_one_and_another_protocol_stay_closed(
-    attempting, targets, what, attempt, port
+    attempting, target, what, attempt, port
 ) -> None:
-    target, happened = targets(what)
-    refused(attempting(attempt, target, ports=[port or int(target)]), "Permission denied")
-    assert not happened()
+    told = target(what)
+    refused(attempting(attempt, told, ports=[port or int(told)]), "Permission denied")
 
 
 def test_a_program_that_is_granted_is_as_confined_as_the_fmu(attempting, tmp_path) -> None:
