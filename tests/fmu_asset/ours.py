@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -40,26 +41,7 @@ DESIGNS = {
     "regions": THREE.changed(mesh=COARSE, defects=[*THREE.defects[:2], LAST]),
 }
 REGIONS = DESIGNS["regions"].regions
-LOST = DigitalState(stiffness_loss=(0.1, 1.0 / 3.0, 0.3))
-EXCHANGE = {"interface": "model-exchange"}
-STRUCTURES: dict[str, tuple[str, dict[str, Any]]] = {
-    "python": ("wing", {}),
-    "compiled": ("wing", {"kind": "compiled"}),
-    "source": ("wing", {"kind": "source"}),
-    "fmi3": ("wing", {"kind": "compiled", "fmi": 3}),
-    "exchange": ("wing", {"kind": "compiled", **EXCHANGE}),
-    "exchange3": ("wing", {"kind": "compiled", "fmi": 3, **EXCHANGE}),
-    "sensing": ("wing", {"patch": "sensors.json"}),
-    "patched": ("wing", {"patch": "wing.json"}),
-    "regions": ("regions", {"state": LOST}),
-    "compiled_regions": ("regions", {"kind": "compiled", "state": LOST}),
-    "beam": ("beam", {}),
-    "compiled_beam": ("beam", {"kind": "compiled"}),
-    "plate": ("plate", {}),
-    "compiled_plate": ("plate", {"kind": "compiled"}),
-    "source3_beam": ("beam", {"kind": "source", "fmi": 3}),
-}
-"""Of each FMU of a structure its model and the options of `build_fmu`, a patch by its file."""
+STRUCTURES = tomllib.loads((HERE / "ours.toml").read_text("utf-8"))
 NAMES = (*STRUCTURES, "spring_mass", *COMPANION_NAMES, *asset_scripts())
 
 
@@ -110,17 +92,19 @@ class OurFmus:
 
     def model(self, name: str) -> ReducedModel:
         """Return the reduced model of a structure's FMU."""
-        which = STRUCTURES[name][0]
+        which = STRUCTURES[name]["model"]
         model: ReducedModel = wing_model(which) if which in DESIGNS else self._fixture(f"{which}_model")
         return model
 
     def options(self, name: str) -> dict[str, Any]:
         """Return the options of `build_fmu` for a structure's FMU."""
-        options = dict(STRUCTURES[name][1])
+        options = {key: value for key, value in STRUCTURES[name].items() if key != "model"}
         if name == "patched":
             options["arrays"] = wing_arrays()
         if "patch" in options:
             options["patch"] = load_patch(HERE / "packing" / options["patch"])
+        if "state" in options:
+            options["state"] = DigitalState(**options["state"])
         return options
 
 

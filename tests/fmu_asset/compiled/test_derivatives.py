@@ -1,8 +1,10 @@
 """The compiled wing as a system of equations: exact derivatives, and states that others' solvers move."""
 
 import ctypes
+import tomllib
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +13,10 @@ from scipy.linalg import eigh, expm
 
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.package import STATES as STATE_NAMES
-from fmu_asset.door.session import FmiAsset
-from tests.fmu_asset.door.kinds import KINDS, WING
-from tests.fmu_asset.making import changed
 from tests.fmu_asset.ours import OurFmus
 from tests.fmu_asset.slaves.slave import DISCARD, ERROR, OK, Slave
 
+REFUSED = tomllib.loads(Path(__file__).with_name("refused.toml").read_text("utf-8"))
 STRAINS = [f"strain[{gauge}]" for gauge in range(1, 25)]
 FREQUENCIES, RATIOS = ([f"{name}[{mode}]" for mode in range(1, 7)] for name in ("frequency", "damping_ratio"))
 TIP, LOAD_POINT = "tip_displacement", "load_point_displacement"
@@ -145,14 +145,7 @@ def test_derivatives_that_there_are_not_are_refused_in_a_sentence(ours) -> None:
         assert status("strain[1]", "load_factor", 24) == ERROR
         assert "not initialised" in wing.log[-1][1]
         flown(wing)
-        for unknown, known, size, sentence in (
-            ("strain_error_bound", "load_factor", 1, "strain_error_bound with respect to load_factor is not"),
-            (TIP, "initial_tip_displacement", 1, "initial_tip_displacement is not offered"),
-            (TIP, "health.z1", 1, "one number for each value"),
-            (TIP, "load_factor", 2, "one number for each value"),
-            ("status", "load_factor", 1, "one number for each value"),
-            (TIP, "health.z2", 1, "one number for each value"),
-        ):
+        for unknown, known, size, sentence in REFUSED["derivatives"]:
             assert status(unknown, known, size) == DISCARD
             assert sentence in wing.log[-1][1]
 
@@ -251,14 +244,6 @@ def test_loads_in_straight_lines_are_those_of_the_linear_system(moving, ours) ->
                 slave.get(*SEEN), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
             )
             np.testing.assert_allclose(slave.get(*LOADS), load, rtol=1e-14)
-    lines = changed(WING, header={"step_size": 0.02, "interpolation": "linear"})
-    with FmiAsset(
-        ours("compiled"), lines, parameters=KINDS["wing in motion"].parameters, isolated=False
-    ) as asset:
-        asset.reset(health={"z1": 0.3})
-        low, high = asset.input_range("control", "load_factor")
-        assert asset.step({"load_factor": high}).time == 0.02  # to the edge of the range
-        assert asset.step({"load_factor": low}, {"z1": 0.4}).time == 0.04
 
 
 def test_health_is_discrete_and_wrong_calls_are_refused(moving) -> None:

@@ -1,4 +1,4 @@
-"""Systems of linear FMUs by name, and their recursion written out in matrices: what couples them must do."""
+"""Systems of FMUs by name, and the recursion of linear ones, in matrices: what coupling must do."""
 
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
@@ -11,9 +11,14 @@ from scipy.linalg import expm
 
 from fmu_asset.coupling.structure import Component, Setting, SystemStructure
 from tests.fmu_asset.making import system
+from tests.fmu_asset.ours import OurFmus
 
 Floats = npt.NDArray[np.float64]
 SYSTEMS = tomllib.loads(Path(__file__).with_name("systems.toml").read_text("utf-8"))
+
+
+PARTS = {"damage": "damage_growth", "wing": "python", "gauges": "strain_gauges", "spring": "spring_mass"}
+"""Components of systems of ours."""
 
 
 def linear(name: str, fmu: Path, substeps: int = 1, **values: Any) -> Component:
@@ -32,6 +37,15 @@ def coupled(name: str, fmu: Callable[[str], Path], substeps: int = 1) -> SystemS
         values = {"fmu": "linear_fmu", **told}
         components.append(linear(part, fmu(values.pop("fmu")), substeps, **values))
     return system(components, SYSTEMS[name]["links"])
+
+
+def of_ours(ours: OurFmus, told: Mapping[str, Any] = SYSTEMS["three"], name: str = "test") -> SystemStructure:
+    """Return a system of our FMUs: what is set in them, and how they are joined."""
+    components = [
+        Component(part, ours(PARTS[part]), {key: Setting(*value) for key, value in given.items()})
+        for part, given in told["given"].items()
+    ]
+    return system(components, told["links"], name)
 
 
 def recursion(

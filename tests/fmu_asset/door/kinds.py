@@ -15,13 +15,12 @@ from fe.runtime.state import TIP_FORCE
 from fe.runtime.transient import ModalIntegrator
 from fe.structure.design import parse_structure
 from fmu_asset.companions.damage_growth import DamageGrowth
-from fmu_asset.coupling.structure import Component, Setting, SystemStructure
 from fmu_asset.door.binding import Binding, load_binding, parse_binding
 from fmu_asset.structures.binding import structure_binding
 from scenarios import binding_files
 from tests.conftest import BEAM
 from tests.fmu_asset.coupling.reference import recursion
-from tests.fmu_asset.making import parameters_of, system
+from tests.fmu_asset.making import parameters_of
 from tests.fmu_asset.ours import OurFmus
 
 Floats = npt.NDArray[np.float64]
@@ -267,27 +266,6 @@ def masses(kind: Kind, _: OurFmus) -> Shown:
     pushes, jacobi = kind.course["control"]["push"], kind.file.endswith("jacobi")
     found = recursion("oscillator", ("first", "second"), kind.binding.interval, pushes, jacobi=jacobi)
     return np.column_stack((found["first"], found["second"][:, 0]))[1:], {}
-
-
-def three(ours: OurFmus) -> SystemStructure:
-    """Return damage growth, a wing in motion and its gauges."""
-    damage = {"probability.z1": Setting(0.5), "probability.z2": Setting(0.4), "seed": Setting(7)}
-    moving = {"response": Setting("transient"), "damping.alpha": Setting(1.0)}
-    gauges = {"noise": Setting(150.0, "microstrain"), "dropout_probability": Setting(10.0, "%")}
-    return system(
-        [
-            Component("damage", ours("damage_growth"), damage),
-            Component("gauges", ours("strain_gauges"), gauges),
-            Component("wing", ours("python"), moving),
-        ],
-        [
-            ("load_factor", "wing.load_factor"),
-            ("load_factor", "damage.load_factor"),
-            ("damage.z1", "wing.health.z1"),
-            ("damage.z2", "wing.health.z2"),
-            ("wing.strain[{1..24}]", "gauges.strain[{1..24}]"),
-        ],
-    )
 
 
 # ---------------------------------------------------------------------- the table

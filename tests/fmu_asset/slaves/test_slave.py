@@ -14,7 +14,7 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -236,31 +236,28 @@ def test_refused_steps_change_nothing(pair, wrong, response) -> None:
 
 def test_calls_in_the_wrong_phase(slave) -> None:
     fmu, compiled = slave.fmu, is_compiled(slave)
-    set_real, set_whole = getattr(fmu, f"set{slave.real}"), getattr(fmu, f"set{slave.whole}")
     fmu.reset()
     assert slave.status_of(fmu.doStep, 0.0, 1.0) != OK
     assert "before initialisation" in slave.log[-1][1]
     assert slave.start() == OK
     slave.status_of(fmu.enterInitializationMode)
     assert slave.status == variables.STATUS_BAD_CALL
-    for call, name, value in (
-        (set_real, "mass.servo", 0.2),
-        (set_whole, "response", 2),
-        (set_real, "strain[1]", 1.0),
-        (set_real, "response", 1.0),
-        (set_real, "", 1.0),
-        (fmu.setBoolean, "load_factor", True),
-        (fmu.setString, "load_factor", "x"),
+    for kind, name, value in (
+        (slave.real, "mass.servo", 0.2),
+        (slave.whole, "response", 2),
+        (slave.real, "strain[1]", 1.0),
+        (slave.real, "response", 1.0),
+        (slave.real, "", 1.0),
+        ("Boolean", "load_factor", True),
+        ("String", "load_factor", "x"),
     ):
-        before = slave.everything()
+        before, call = slave.everything(), getattr(fmu, f"set{kind}")
         assert (slave.status_of(call, [slave.reference.get(name, 999)], [value]) != OK) == compiled
         assert slave.status == variables.STATUS_BAD_CALL
         assert slave.everything() == before
     if not compiled:
-        for unknown in ([999], [49, 50, 51], [0, 999]):
-            assert math.isnan(fmu.getReal(unknown)[-1])
-        assert fmu.getString([0]) == [b""]
-        assert list(fmu.getReal([])) == []
+        assert all(math.isnan(fmu.getReal(unknown)[-1]) for unknown in ([999], [49, 50, 51], [0, 999]))
+        assert (fmu.getString([0]), list(fmu.getReal([]))) == ([b""], [])
         assert any("fixed parameter" in text for _, text in slave.log)
     assert slave.step(STILL, 0.0, 1.0) == OK
     fmu.terminate()
@@ -275,30 +272,30 @@ def test_calls_in_the_wrong_phase(slave) -> None:
 
 def test_wrong_calls_of_fmi_3_are_refused_and_change_nothing(ours) -> None:
     with closing(Slave(ours("fmi3"))) as wing:
-
-        def call(name: str, *arguments: Any) -> int:
-            return int(getattr(wing.fmu.dll, f"fmi3{name}")(wing.fmu.component, *arguments))
-
         assert wing.start(anew=False) == OK
         assert wing.step(GOOD, 0.0, 1.0) == OK
         before = wing.everything()
         health, second, tip = ((ctypes.c_uint * 1)(wing.reference["health.z1"] + n) for n in (0, 1, 34))
-        values = (ctypes.c_double * 3)(0.1, 0.2, 0.3)
-        assert call("SetFloat64", health, 1, values, 1) == DISCARD
-        assert call("GetFloat64", health, 1, values, 3) == DISCARD
-        assert "not the number that the variables have" in wing.log[-1][1]
-        assert call("GetFloat64", second, 1, values, 1) == ERROR
-        assert "value reference 2" in wing.log[-1][1]
-        assert call("SetFloat64", tip, 1, values, 1) == DISCARD
-        assert call("GetInt32", health, 1, (ctypes.c_int32 * 1)(), 1) == DISCARD
-        assert call("EnterEventMode") == DISCARD
-        wing.set({"health.z1": 0.95})
-        reached = ctypes.c_double()
+        values, reached = (ctypes.c_double * 3)(0.1, 0.2, 0.3), ctypes.c_double()
         flags = [ctypes.byref(item) for item in (*(ctypes.c_bool() for _ in range(3)), reached)]
-        assert (
-            call("DoStep", ctypes.c_double(1.0), ctypes.c_double(1.0), ctypes.c_bool(True), *flags) == DISCARD
-        )
-        assert "health[1] = 0.94999999999999996 lies outside its range 0 to 0.8" in wing.log[-1][1]
+        times = ctypes.c_double(1.0), ctypes.c_double(1.0), ctypes.c_bool(True)
+        wing.set({"health.z1": 0.95})
+        for name, arguments, status, said in (
+            ("SetFloat64", (health, 1, values, 1), DISCARD, "not the number that the variables have"),
+            ("GetFloat64", (health, 1, values, 3), DISCARD, "not the number that the variables have"),
+            ("GetFloat64", (second, 1, values, 1), ERROR, "value reference 2"),
+            ("SetFloat64", (tip, 1, values, 1), DISCARD, ""),
+            ("GetInt32", (health, 1, (ctypes.c_int32 * 1)(), 1), DISCARD, ""),
+            ("EnterEventMode", (), DISCARD, ""),
+            (
+                "DoStep",
+                (*times, *flags),
+                DISCARD,
+                "health[1] = 0.94999999999999996 lies outside its range 0 to 0.8",
+            ),
+        ):
+            assert int(getattr(wing.fmu.dll, f"fmi3{name}")(wing.fmu.component, *arguments)) == status
+            assert said in wing.log[-1][1]
         assert reached.value == 1.0
         assert wing.everything()[RESULTS] == before[RESULTS]
         assert wing.read([51]) == [1.0]

@@ -33,8 +33,9 @@ from fmu_asset.errors import CouplingError, SspError
 from fmu_asset.ssp.check import check_ssp, join_ssp, left_out_sentence
 from fmu_asset.ssp.reader import read_ssp
 from fmu_asset.ssp.writer import write_ssp
+from tests.fmu_asset.coupling.reference import PARTS, of_ours
 from tests.fmu_asset.door.kinds import BINDINGS
-from tests.fmu_asset.making import archive_of, bound, system, watch
+from tests.fmu_asset.making import archive_of, bound, watch
 from tests.fmu_asset.ours import OurFmus
 
 HERE = Path(__file__).parent
@@ -46,16 +47,12 @@ BINDING = BINDINGS["three_sent"]
 
 @pytest.fixture(scope="module")
 def fmus(ours: OurFmus) -> dict[str, Path]:
-    return {"damage": ours("damage_growth"), "wing": ours("python"), "gauges": ours("strain_gauges")}
+    return {name: ours(PARTS[name]) for name in NAMES}
 
 
 @pytest.fixture(scope="module")
-def structure(fmus: dict[str, Path]) -> SystemStructure:
-    given = {
-        name: {key: Setting(*told) for key, told in settings.items()}
-        for name, settings in CASES["given"].items()
-    }
-    return system([Component(name, fmus[name], given[name]) for name in NAMES], CASES["joined"], "three")
+def structure(ours: OurFmus) -> SystemStructure:
+    return of_ours(ours, CASES["ours"], "three")
 
 
 @pytest.fixture(scope="module")
