@@ -2,23 +2,23 @@
 
 import subprocess
 import sys
+import tomllib
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.coupling.structure import (
-    Component,
-    Connection,
-    Connector,
-    SystemStructure,
-    expand_connection,
-)
+from fmu_asset.coupling.structure import Component, Connection, Connector, SystemStructure, expand_connection
 from fmu_asset.door.binding import Binding, parse_binding
 
 ROOT = Path(__file__).parents[2]
 DESCRIPTION = "modelDescription.xml"
+
+
+def tables(test: str, name: str = "refused") -> dict[str, Any]:
+    """Return the tables of a TOML file beside a test, by the test's `__file__`."""
+    return tomllib.loads(Path(test).with_name(f"{name}.toml").read_text("utf-8"))
 
 
 def members(path: Path) -> dict[str, bytes]:

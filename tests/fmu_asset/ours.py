@@ -3,7 +3,6 @@
 import shutil
 import subprocess
 import sys
-import tomllib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -29,6 +28,7 @@ from fmu_asset.packing.script import build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import asset_scripts
+from tests.fmu_asset.making import tables
 from tests.kept import FE, ROOT, compiled_wing, kept, packed
 
 HERE = Path(__file__).parent
@@ -41,7 +41,7 @@ DESIGNS = {
     "regions": THREE.changed(mesh=COARSE, defects=[*THREE.defects[:2], LAST]),
 }
 REGIONS = DESIGNS["regions"].regions
-STRUCTURES = tomllib.loads((HERE / "ours.toml").read_text("utf-8"))
+STRUCTURES = tables(__file__, "ours")
 NAMES = (*STRUCTURES, "spring_mass", *COMPANION_NAMES, *asset_scripts())
 
 

@@ -1,10 +1,8 @@
 """The compiled wing as a system of equations: exact derivatives, and states that others' solvers move."""
 
 import ctypes
-import tomllib
 from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,10 +11,11 @@ from scipy.linalg import eigh, expm
 
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.package import STATES as STATE_NAMES
+from tests.fmu_asset.making import tables
 from tests.fmu_asset.ours import OurFmus
 from tests.fmu_asset.slaves.slave import DISCARD, ERROR, OK, Slave
 
-REFUSED = tomllib.loads(Path(__file__).with_name("refused.toml").read_text("utf-8"))
+REFUSED = tables(__file__)
 STRAINS = [f"strain[{gauge}]" for gauge in range(1, 25)]
 FREQUENCIES, RATIOS = ([f"{name}[{mode}]" for mode in range(1, 7)] for name in ("frequency", "damping_ratio"))
 TIP, LOAD_POINT = "tip_displacement", "load_point_displacement"

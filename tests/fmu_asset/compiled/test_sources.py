@@ -7,7 +7,6 @@ import os
 import shutil
 import struct
 import subprocess
-import tomllib
 import zlib
 from pathlib import Path
 from typing import Any
@@ -20,10 +19,10 @@ from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.compiled.compiler import CROSS_COMPILER
 from fmu_asset.compiled.package import MAGIC, NAME_BYTES, data_file_bytes, pack_arrays
 from fmu_asset.packing.structure_fmu import build_fmu
-from tests.fmu_asset.making import DESCRIPTION, members, run_python
+from tests.fmu_asset.making import DESCRIPTION, members, run_python, tables
 
 DRIVER, HOST = (Path(__file__).with_name(name) for name in ("driver.c", "host.c"))
-REFUSED = tomllib.loads(Path(__file__).with_name("refused.toml").read_text("utf-8"))
+REFUSED = tables(__file__)
 WARNINGS = (
     *("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wcast-qual", "-Wstrict-prototypes"),
     "-Werror",

@@ -1,6 +1,5 @@
 """Systems of FMUs by name, and the recursion of linear ones, in matrices: what coupling must do."""
 
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,11 +9,11 @@ import numpy.typing as npt
 from scipy.linalg import expm
 
 from fmu_asset.coupling.structure import Component, Setting, SystemStructure
-from tests.fmu_asset.making import system
+from tests.fmu_asset.making import system, tables
 from tests.fmu_asset.ours import OurFmus
 
 Floats = npt.NDArray[np.float64]
-SYSTEMS = tomllib.loads(Path(__file__).with_name("systems.toml").read_text("utf-8"))
+SYSTEMS = tables(__file__, "systems")
 
 
 PARTS = {"damage": "damage_growth", "wing": "python", "gauges": "strain_gauges", "spring": "spring_mass"}

@@ -1,9 +1,7 @@
 """Coupled systems against their recursion, and what cannot be joined in one sentence each."""
 
-import tomllib
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,7 @@ from fmu_asset.coupling.structure import expand_connection as expand
 from fmu_asset.coupling.wiring import Wiring
 from tests.fmu_asset.coupling.reference import PARTS, SYSTEMS, coupled, linear, of_ours, recursion
 from tests.fmu_asset.door.kinds import BINDINGS
-from tests.fmu_asset.making import bound, changed, system, watch
+from tests.fmu_asset.making import bound, changed, system, tables, watch
 from tests.fmu_asset.ours import OurFmus
 
 NAN, DIE = 1.0, 3.0
@@ -222,7 +220,7 @@ def link(source: str, target: str, **options: Any) -> Connection:
     return replace(expand(source, target, tuple(PARTS))[0], **options)
 
 
-REFUSED = tomllib.loads(Path(__file__).with_name("refused.toml").read_text("utf-8"))
+REFUSED = tables(__file__)
 
 
 def test_what_does_not_fit_is_one_sentence(base, tmp_path) -> None:

@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from collections import ChainMap
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
@@ -20,7 +21,7 @@ from fmu_asset.structures.binding import structure_binding
 from scenarios import binding_files
 from tests.conftest import BEAM
 from tests.fmu_asset.coupling.reference import recursion
-from tests.fmu_asset.making import parameters_of
+from tests.fmu_asset.making import parameters_of, tables
 from tests.fmu_asset.ours import OurFmus
 
 Floats = npt.NDArray[np.float64]
@@ -75,14 +76,11 @@ class Kind:
     @property
     def rows(self) -> list[dict[str, Any]]:
         """Return the inputs of each step, whatever their role."""
-        return [
-            {name: value for named in self.at(index).values() for name, value in named.items()}
-            for index in range(STEPS)
-        ]
+        return [dict(ChainMap(*self.at(index).values())) for index in range(STEPS)]
 
 
 HERE = Path(__file__).parent
-INPUTS, FILE = (tomllib.loads((HERE / name).read_text("utf-8")) for name in ("inputs.toml", "kinds.toml"))
+INPUTS, FILE = tables(__file__, "inputs"), tables(__file__, "kinds")
 """Tables of what is refused, and of kinds."""
 BINDINGS_FOLDER = HERE / "bindings"
 _FILES = *BINDINGS_FOLDER.glob("*.toml"), *binding_files().values()

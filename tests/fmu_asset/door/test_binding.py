@@ -23,12 +23,12 @@ from fmu_asset.door.units import Conversion, Meaning, contradictions, conversion
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.worker.client import WorkerLimits
 from tests.fmu_asset.foreign.workshop import MODELS
-from tests.fmu_asset.making import changed
+from tests.fmu_asset.making import changed, tables
 
 HERE = Path(__file__).parent
 GOOD = (HERE / "good.toml").read_text("utf-8")
-REFUSED = tomllib.loads((HERE / "refused.toml").read_text("utf-8"))["refused"]
-UNITS = tomllib.loads((HERE / "unit_texts.toml").read_text("utf-8"))
+REFUSED = tables(__file__)["refused"]
+UNITS = tables(__file__, "unit_texts")
 
 
 def drafted(fmu: Any, **options: Any) -> Binding:

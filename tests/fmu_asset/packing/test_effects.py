@@ -5,7 +5,6 @@ Both sides hold the wing in the same few vectors; what can differ is the physics
 
 import json
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -35,10 +34,11 @@ from fmu_asset.slaves.effects import active_primitives, effect_rows, numbers_of,
 from reporting.provenance import collect_provenance
 from tests.command_line import command, refused, said
 from tests.fmu_asset.door.kinds import BINDINGS, KINDS
+from tests.fmu_asset.making import tables
 from tests.fmu_asset.ours import OurFmus, wing_arrays
 from tests.fmu_asset.slaves.slave import OK, Slave
 
-HERE = Path(__file__).parent
+HERE, REFUSED = Path(__file__).parent, tables(__file__)
 SENSORS, WING = (
     {effect["id"]: effect["primitives"] for effect in json.loads((HERE / name).read_text("utf-8"))["effects"]}
     for name in ("sensors.json", "wing.json")
@@ -202,17 +202,11 @@ def test_what_is_read_while_initialising_leaves_no_trace(sensing, response) -> N
     assert seen[0] == seen[1]
 
 
-IMPOSSIBLE = {
-    "sensing": (SENSING, {}, on("coupling"), {"time_constant": -1.0}, {"time_constant": 0.7},
-                "(?s)positive time constant.*the state is as it was"),
-    "patched": (PATCHED, {"play": 1.0}, {"release": 0.01}, {"half_width": -1.0}, {"half_width": 0.004},
-                "half_width of 'free_play' must not be negative"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("which", IMPOSSIBLE)
-def test_values_that_cannot_be_are_refused_and_change_nothing(ours, which) -> None:
-    binding, first, parameters, wrong, right, sentence = IMPOSSIBLE[which]
+@pytest.mark.parametrize(("which", "parameters", "first", "wrong", "right", "sentence"), REFUSED["values"])
+def test_values_that_cannot_be_are_refused_and_change_nothing(
+    ours, which, parameters, first, wrong, right, sentence
+) -> None:
+    binding = {"sensing": SENSING, "patched": PATCHED}[which]
     with FmiAsset(ours(which), binding, isolated=False, parameters=parameters | {"response": 2.0}) as asset:
         asset.step({"load_factor": 1.0}, load=first)
         before = asset.save_state()
@@ -343,9 +337,7 @@ def test_whole_numbers_are_whole_and_what_has_no_bounds_is_refused(patched) -> N
 # ---------------------------------------------------------------------- refusals
 
 
-@pytest.mark.parametrize(
-    "row", tomllib.loads((HERE / "refused.toml").read_text("utf-8"))["refused"], ids=lambda row: row["case"]
-)
+@pytest.mark.parametrize("row", REFUSED["refused"], ids=lambda row: row["case"])
 def test_patches_that_mean_nothing_are_refused_in_one_sentence(row, model, tmp_path) -> None:
     given = row["text"].encode() if "text" in row else content(json.loads(row["effects"]))
     options = {"arrays": wing_arrays()} if "wing" in row else {}

@@ -2,7 +2,6 @@
 
 import itertools
 import re
-import tomllib
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,11 +34,11 @@ from fmu_asset.ssp.reader import read_ssp
 from fmu_asset.ssp.writer import write_ssp
 from tests.fmu_asset.coupling.reference import PARTS, of_ours
 from tests.fmu_asset.door.kinds import BINDINGS
-from tests.fmu_asset.making import archive_of, bound, watch
+from tests.fmu_asset.making import archive_of, bound, tables, watch
 from tests.fmu_asset.ours import OurFmus
 
 HERE = Path(__file__).parent
-CASES = tomllib.loads((HERE / "cases.toml").read_text("utf-8"))
+CASES = tables(__file__, "cases")
 NAMES = ("damage", "wing", "gauges")
 NOISE = {Endpoint("gauges", "noise"): "noise"}
 BINDING = BINDINGS["three_sent"]
@@ -189,12 +188,6 @@ def joined(theirs: Pack, tmp_path: Path) -> Callable[..., Wiring]:
     )
 
 
-DELAYED = (
-    '<ssd:Annotations><ssc:Annotation type="uav-twin"><own:Coupling xmlns:own="urn:uav-twin:coupling" '
-    'delayed="true"/></ssc:Annotation></ssd:Annotations>'
-)
-
-
 def conversions(wiring: Wiring, end: str) -> dict[str, tuple[float, float]]:
     return {str(port.end): port.conversion for port in wiring.ends[end]}
 
@@ -209,7 +202,7 @@ def test_nested_systems_parameters_and_mappings(theirs, joined) -> None:
     assert (str(feed.end), str(target)) == ("damage.z1", "structure.wing.health.z1")
     assert (feed.conversion, feed.delayed) == ((0.5, 0.0), False)
     inner = 'startConnector="z" endElement="wing" endConnector="health.z1"'
-    late = joined((f"{inner}/>", f"{inner}>{DELAYED}</ssd:Connection>"))
+    late = joined((f"{inner}/>", f"{inner}>{CASES['delayed']}</ssd:Connection>"))
     assert [feed.delayed for feed in late.feeds.values()] == [True]
     assert conversions(wiring, "loss") == {"damage.z1": pytest.approx((100.0, 0.0))}
     n = {"structure.wing.load_factor": (1.0, 0.0), "damage.load_factor": (0.5, 0.25)}
@@ -248,16 +241,10 @@ def test_what_means_the_same_is_read_alike(joined, case) -> None:
     assert read.settings == plain.settings
 
 
-MORE = """<ssd:ParameterBinding><ssd:ParameterValues><ssv:ParameterSet version="1.0" name="more">
-<ssv:Parameters>%s</ssv:Parameters>
-<ssv:Units><ssc:Unit name="%%"><ssc:BaseUnit factor="0.1"/></ssc:Unit></ssv:Units>
-</ssv:ParameterSet></ssd:ParameterValues></ssd:ParameterBinding></ssd:ParameterBindings><ssd:Elements>"""
-
-
 def further(*parameters: tuple[str, str]) -> tuple[str, str]:
     """Return the change that gives the system a second parameter binding, with another `%` than its first."""
     more = "".join(f'<ssv:Parameter name="{name}">{value}</ssv:Parameter>' for name, value in parameters)
-    return "</ssd:ParameterBindings>\n  <ssd:Elements>", MORE % more
+    return "</ssd:ParameterBindings>\n  <ssd:Elements>", CASES["more"] % more
 
 
 def test_values_go_where_the_standard_says(joined) -> None:

@@ -9,7 +9,6 @@ import sys
 import tempfile
 import threading
 import time
-import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -26,9 +25,9 @@ from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.worker.client import WorkerInstance
 from fmu_asset.worker.protocol import CALL, HEADER
 from tests.fmu_asset.door.kinds import HOSTILE
-from tests.fmu_asset.making import ROOT, archive_of, changed, members, run_python
+from tests.fmu_asset.making import ROOT, archive_of, changed, members, run_python, tables
 
-MISBEHAVIOURS = tomllib.loads(Path(__file__).with_name("misbehaviours.toml").read_text("utf-8"))
+MISBEHAVIOURS = tables(__file__, "misbehaviours")
 REPLAYED = changed(HOSTILE, header={"state": "replay"})
 FREE = changed(HOSTILE, limits={"sandbox": False})
 LIMITS = {"step_timeout": 30.0, "load_timeout": 30.0, "memory_limit": 400.0}
