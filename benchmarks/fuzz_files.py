@@ -115,14 +115,14 @@ def _run(folder: Path) -> None:
 
 
 def _checkpoint(folder: Path) -> None:
-    from tests.twin_master.mission.test_checkpoint import flown
-    from twin_master.mission.loop import CheckpointFile
+    from tests.twin_master.mission.test_checkpoint import made
+    from twin_master.mission.journal import JournalFile, turn_record
 
     place = folder / "checkpoint"
     place.mkdir()
-    with CheckpointFile(place, CONFIG_HASH) as file:
-        for turn, state in flown(4):
-            file.keep(turn, state)
+    with JournalFile(place, CONFIG_HASH) as file:
+        for number in range(4):
+            file.append(turn_record(made(number)) | {"asset_state": "c3RhdGU="})
 
 
 def _static(folder: Path) -> None:

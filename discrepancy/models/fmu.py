@@ -11,7 +11,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Course, LoadChange, place_among, release_of
+from discrepancy.models.acting import Course, LoadChange, divided, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_laws import FmuLaws
 from discrepancy.models.fmu_motion import Sampled, sampled
@@ -182,21 +182,24 @@ class FmuModel(DescribedModel):
         orders = [quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs]
         return [self.fmu.columns[output] for output, _ in outputs], orders
 
-    def _moving(self, asked: Asked, columns: Sequence[int], orders: Sequence[int]) -> Sampled:
-        """Return columns of the FMU's outputs in a dynamic trial, derived so many times, and their rates."""
+    def _moving(self, asked: Asked, columns: Sequence[int], orders: Sequence[int], parts: int = 1) -> Sampled:
+        """Return columns of the FMU's outputs in a dynamic trial, derived so many times, and their rates.
+
+        At samples that are so many times as dense as those of the trial.
+        """
         (trial, conditions, laws, *_), fmu = asked, self.fmu
-        (rate, zero), excite = conditions.clock, partial(self._run, asked)
+        stamps, excite = divided(conditions.stamps(trial.time), parts), partial(self._run, asked)
         finer = FINER if len(laws) and trial.kind is TrialKind.FORCED else 1
         run = excite(conditions.refinement * finer)
 
         def shown(values: FloatArray, step: float) -> Sampled:
-            return sampled(values, step, (1.0 + rate) * trial.time + zero, orders)
+            return sampled(values, step, stamps, orders)
 
         free = fmu.free(run)
         added = fmu.added(laws, run, free, trial, columns) if len(laws) else None
         if len(laws) and added is None:
             return shown(*fmu.stepped(laws, excite, trial, conditions.refinement, columns))
-        key = (*columns, *orders, rate, zero, trial.time.tobytes(), run.key)
+        key = (*columns, *orders, stamps.tobytes(), run.key)
         found = self._shown.get(key, lambda: shown(free[:, columns], run.step))
         if added is None:
             return found
@@ -258,10 +261,12 @@ class FmuModel(DescribedModel):
         rows, at_once = found.rows(list(zip(*self._read(outputs), strict=True)))
         return PortedSystem(found.generator, self.ports(), found.push.T, position, speed, rows, at_once.T)
 
-    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
+    def port_motion(
+        self, trial: Trial, conditions: Conditions, parts: int = 1
+    ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         asked = self._asked(trial, conditions, self.patch)._replace(laws=NO_LAWS)
-        return self._moving(asked, self.fmu.x, [0] * len(self.ports()))
+        return self._moving(asked, self.fmu.x, [0] * len(self.ports()), parts)
 
     # ------------------------------------------------------------ trials in its names and units
 

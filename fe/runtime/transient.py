@@ -23,7 +23,7 @@ from .modal_system import ModalSystem, rayleigh_damping_ratio
 
 if TYPE_CHECKING:
     from .motion import Laws
-    from .stepwise import ModalMotion
+    from .motion_arrays import ModalMotion
 
 
 INSTANT = 1e-6

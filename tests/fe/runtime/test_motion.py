@@ -8,12 +8,12 @@ from scipy.integrate import quad, solve_ivp
 from scipy.optimize import brentq
 from scipy.special import ellipk
 
-from discrepancy.models.compiled_motion import compiled_kernel
+from fe.compilation import compiled_kernel
 from fe.runtime import patch
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
+from fe.runtime.motion_arrays import ModalMotion
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
-from fe.runtime.stepwise import ModalMotion
 from tests.fe.runtime.stepping import exact, second_order, simulate
 
 W = 2.0 * np.pi  # one second for a period

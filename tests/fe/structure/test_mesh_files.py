@@ -1,6 +1,5 @@
 """Mesh files of all programs: the same cells and sets, coordinates of any kind, faults in a sentence."""
 
-import gzip
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,9 @@ from scipy.spatial.transform import Rotation
 from fe.elements.cells import jacobians
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.runtime.errors import MeshError
-from fe.structure.affine import static_responses
 from fe.structure.deck import words_of
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_by_meshio, read_mesh
-from fe.structure.operators import load_and_assemble
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
@@ -33,7 +30,6 @@ SOLID = [
 DIALECTS = {"abaqus": ("m.inp", SOLID), "nastran": ("m.bdf", TETRAHEDRON)}
 ORIGIN = np.array([0.3, -1.2, 0.7])
 TURN = Rotation.from_rotvec([0.4, -0.9, 1.3])
-DECKS = Path("/usr/share/doc/calculix-ccx-test/examples/test")
 
 
 def coordinates(points: Any, kind: str) -> Any:
@@ -294,35 +290,3 @@ def test_nodes_of_abaqus_in_a_system_of_their_own(kind: str, box, tmp_path: Path
     # A point on x alone turns x about z, after its height is left out.
     turned = written(tmp_path / "m.inp", "*SYSTEM", ",, 0, , 3, 4,", *SOLID)
     np.testing.assert_allclose(turned.nodes[0], [[0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-15)
-
-
-# ---------------------------------------------------------------- CalculiX
-
-
-@pytest.mark.skipif(not DECKS.is_dir(), reason="Debian's calculix-ccx-test is not installed")
-@pytest.mark.parametrize("name", ["beam10p", "beam20p", "beam8p"])
-def test_decks_of_calculix_give_its_published_results(name: str, tmp_path: Path) -> None:
-    """The same load along y at each node of a set; results are printed with seven digits."""
-    deck, results = (
-        gzip.decompress((DECKS / f"{name}{end}").read_bytes()).decode() for end in (".inp.gz", ".dat.ref.gz")
-    )
-    extra = "".join(f"*NSET, NSET=NODE{n}\n{n}\n" for n in (1, 3))
-    mesh = written(tmp_path / "m.inp", deck.rstrip(), extra)
-    part, direction, force = deck.split("*CLOAD")[1].splitlines()[1].split(",")
-    assert direction == "2"
-    text = INPUTS.text("deck.toml")
-    for block in deck.split("*BOUNDARY")[1:]:
-        for line in block.split("*")[0].splitlines()[1:]:
-            place, first, *last = (part.strip() for part in line.split(",") if part.strip())
-            axes = [*"xyz"[int(first) - 1 : int((last or [first])[0])]]
-            text += f'[[support]]\nset = "{"NODE" * place.isdigit()}{place}"\nhold = {axes}\n'
-    for number, point in enumerate(mesh.points[mesh.nodes_of(part, "here")].tolist()):
-        text += f'[[load]]\nname = "n{number}"\npoint = {point}\nforce = [0, {float(force)}, 0]\n'
-    (tmp_path / "s.toml").write_text(text)
-    structure = load_and_assemble(tmp_path / "s.toml")
-    total = sum(found.displacement for found in static_responses(structure).values())
-    field = 1e3 * structure.full_displacement(np.asarray(total))
-    printed = [line.split() for line in results.split("displacements")[1].splitlines()[2:]]
-    rows = np.array([line for line in printed if len(line) == 4][: len(mesh.points)], dtype=float)
-    assert rows[:, 0].tolist() == mesh.node_numbers.tolist()
-    assert np.abs(rows[:, 1:] - field).max() < 1e-6 * np.abs(field).max()

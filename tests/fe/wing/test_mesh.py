@@ -1,5 +1,7 @@
 """The wing's mesh and operators: geometry, rigid motions, sums, gauges."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -96,8 +98,6 @@ def test_a_point_of_the_skin_is_found_where_it_is(coarse_mesh, upper):
     place = coarse_mesh.positions(np.array([point.cell]), point.local[None])[0, 0]
     assert place[:2] == pytest.approx([(0.2 - 0.3) * chord, 0.8])
     assert (place[2] > 0.0) == upper
-    with pytest.raises(MeshError, match="does not lie on the skin"):
-        coarse_mesh.skin_point(0.8, 0.99 * chord)
 
 
 @pytest.mark.parametrize(("refinement", "limit"), [(0.25, 1e-3), (1.0, 1e-4)])
@@ -151,12 +151,9 @@ def rigid(operators, lever=None):
 def test_the_affine_sum_equals_direct_assembly(coarse_operators):
     factor, loss, mesh = 1.07, (0.35, 0.6), coarse_operators.wing_mesh
     kept = [mesh.region == SKIN, mesh.region == 1, mesh.region == 2]
-    variation = (
-        modelled.modulus_variation(mesh)
-        * np.select(kept, [factor, 1.0 - loss[0], 1.0 - loss[1]], 1.0)[:, None]
-    )
-    direct = mesh.stiffness(np.arange(len(mesh.cells)), modelled.cell_elasticity(mesh), variation)
-    direct = (coarse_operators.expansion.T @ direct @ coarse_operators.expansion).tocsr()
+    factors = np.select(kept, [factor, 1.0 - loss[0], 1.0 - loss[1]], 1.0)[:, None]
+    body = coarse_operators.body
+    direct = replace(body, variation=body.variation * factors).stiffness(np.arange(len(mesh.cells)))
     springs = mesh.design.root
     affine = coarse_operators.stiffness({"young_modulus_factor": factor}, loss)
     difference = (affine - direct).tolil()
