@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from threadpoolctl import threadpool_limits
 
+from fe.reduction import patch_basis
 from fe.reduction.model_cache import build_patch_arrays
-from fe.reduction.reduced_basis import reduce_model
-from fe.reduction.settings import PatchSettings
+from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
@@ -50,15 +50,20 @@ def wing_model(name: str = "wing") -> ReducedModel:
     """Return the reduced model of a design."""
     design = DESIGNS[name]
     with threadpool_limits(1):
-        return kept("coarse-reduction", lambda: reduce_model(assemble(design)), FE, design.hash).model
+        return kept("coarse-reduction", lambda: reduce_structure(assemble(design)), FE, design.hash).model
 
 
 @cache
 def wing_arrays() -> PatchArrays:
     """Return the wing for patches, in few vectors: what they hold is the same on both sides of a test."""
-    few = PatchSettings(strip_count=8, vectors=60, states=40)
-    with threadpool_limits(1):
-        return kept("few-patches", lambda: build_patch_arrays(DESIGNS["wing"], None, few), FE, few)
+
+    def few() -> PatchArrays:
+        with pytest.MonkeyPatch.context() as patch, threadpool_limits(1):
+            patch.setattr(patch_basis, "VECTORS", 60)
+            patch.setattr(patch_basis, "STATES", 40)
+            return build_patch_arrays(DESIGNS["wing"])
+
+    return kept("few-patches", few, FE)
 
 
 class OurFmus:
