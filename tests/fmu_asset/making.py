@@ -61,20 +61,18 @@ def run_python(program: str, *arguments: object, **options: Any) -> str:
 Ends = Mapping[str, tuple[Any, Any]]
 
 
-def bound(step_size: float, observation: Ends, *, record: object = None, **roles: Any) -> Binding:
+def bound(step_size: float, observation: Ends, **roles: Any) -> Binding:
     """Return a binding: of each name in each role its variable and unit, and its range where there are more.
 
-    `header` has further keys; `limits` and `port` are tables as in the file.
+    `header` has further keys; `port` is a table as in the file.
     """
     header = {"name": "bound", "step_size": step_size, **roles.pop("header", {})}
-    tables: dict[str, Any] = {name: roles.pop(name) for name in ("limits", "port") if name in roles}
+    parts: dict[str, Any] = {"port": roles.pop("port")} if "port" in roles else {}
     keys = "variable", "unit", "minimum", "maximum"
     for role, ends in roles.items():
-        tables[role] = {name: dict(zip(keys, end, strict=False)) for name, end in ends.items()}
-    if record is not None:
-        tables["record"] = {"variables": record}
+        parts[role] = {name: dict(zip(keys, end, strict=False)) for name, end in ends.items()}
     observed = {name: {"variables": names, "unit": unit} for name, (names, unit) in observation.items()}
-    return parse_binding({"binding": header, "observation": observed, **tables})
+    return parse_binding({"binding": header, "observation": observed, **parts})
 
 
 def changed(binding: Binding, *, header: Mapping[str, object] | None = None, **tables: Any) -> Binding:

@@ -315,7 +315,6 @@ def test_an_fmu_in_python_that_loops(spring_mass, spring_binding, scratch, misbe
 
 # ---------------------------------------------------------------------- a process of its own
 
-FINE, WANDER, TALK = 0.0, 6.0, 7.0
 PUSHED = {"push": 1.0}
 
 
@@ -341,7 +340,7 @@ def test_what_an_fmu_does_to_its_process_stays_there(
     """Neither its chatter nor its working directory nor its modules are the twin's, or another FMU's."""
     here, path, modules = Path.cwd(), list(sys.path), set(sys.modules)
     with FmiAsset(spring_mass, spring_binding) as asset:
-        for behaviour in (TALK, WANDER, FINE):
+        for behaviour in (7.0, 6.0, 0.0):  # it talks, goes elsewhere, is fine
             asset.step(load={"misbehaviour": behaviour})
         assert asset.log[0] == ("OK", "the spring creaks")
     assert capfd.readouterr().out == ""
