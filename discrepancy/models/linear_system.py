@@ -39,6 +39,12 @@ Modes = tuple[FloatArray, FloatArray, int]
 """Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
 
 
+def _differs(matrix: FloatArray, other: FloatArray) -> bool:
+    """Whether two matrices differ by more than rounding."""
+    size = np.abs(matrix).max(initial=1e-300)
+    return bool(np.abs(matrix - other).max(initial=0.0) > ROUNDING * size)
+
+
 @dataclass(frozen=True, eq=False)
 class LinearSystem:
     """A linear system of N unknowns, n of them displacements.
@@ -165,12 +171,9 @@ class LinearSystem:
         """What is free and the drives, with ports; what couples modes by rounding only does not."""
         frequency, free = np.pad(self.angular_frequency, (0, len(self.drives))), self.free_shapes
         damping, stiffness = (free.T @ matrix @ free for matrix in (self.damping, self.stiffness))
-        diagonal, loose = np.diag(np.diag(damping)), self.mode_count is None
-        if loose:
-            apart = np.abs(stiffness - np.diag(frequency**2)).max(initial=0.0)
-            loose = bool(apart > ROUNDING * np.abs(stiffness).max(initial=1e-300))
-        if np.abs(damping - diagonal).max(initial=0.0) <= ROUNDING * np.abs(diagonal).max(initial=1e-300):
-            damping = diagonal
+        diagonal = np.diag(np.diag(damping))
+        damping = damping if _differs(damping, diagonal) else diagonal
+        loose = self.mode_count is None and _differs(stiffness, np.diag(frequency**2))
         ports, actions = (
             {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
             for rows in (self.ports, self.acts if self.actions else {})

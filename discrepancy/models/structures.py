@@ -99,21 +99,19 @@ class StructureModel(SystemModel):
         self.reference, self.load_places = (*self.forces, LOAD_FACTOR)[0], self.forces
         self.largest_force = 0.5 * min((model.validity[name][1] for name in self.forces), default=np.inf)
         _, outputs, accelerations = model.rows
-        strains, displacements = np.split(outputs, [len(model.gauges)])
-        named = (
-            (model.gauges, Quantity.STRAIN, strains),
-            (model.displacements, Quantity.DISPLACEMENT, displacements),
-            (model.accelerations, Quantity.ACCELERATION, accelerations),
-        )
-        self.quantities = {name: quantity for names, quantity, _ in named for name in names}
-        self._rows = {name: row for names, _, rows in named for name, row in zip(names, rows, strict=True)}
+        self.quantities = {
+            **dict.fromkeys(model.gauges, Quantity.STRAIN),
+            **dict.fromkeys(model.displacements, Quantity.DISPLACEMENT),
+            **dict.fromkeys(model.accelerations, Quantity.ACCELERATION),
+        }
+        self._rows = dict(zip(self.quantities, (*outputs, *accelerations), strict=True))
         self._systems = Memory()
         along = [self._load(self.prior_mean(), force) for force in self.forces]
         self.port_rows = {
-            name: row
+            name: self._rows[name]
             for push in along
-            for name, row in zip(model.displacements, displacements, strict=True)
-            if np.abs(row - push).max() <= SAME * np.abs(push).max()
+            for name in model.displacements
+            if np.abs(self._rows[name] - push).max() <= SAME * np.abs(push).max()
         }
         self.port_names = tuple(self.port_rows)
 
@@ -159,9 +157,8 @@ class StructureModel(SystemModel):
         return self._load(state.parameters, place_among(self.forces or (LOAD_FACTOR,), place, self.what))
 
     def lift(self, state: State, change: ModelPatch) -> FloatArray:
-        """Return the loads (2, n) of the load factor and of its square, which is zero."""
-        row = self._load(state.parameters, LOAD_FACTOR)
-        return np.stack((row, np.zeros_like(row)))
+        """Return the load (1, n) of the load factor."""
+        return self._load(state.parameters, LOAD_FACTOR)[None]
 
     def _always(self, parameters: FloatArray) -> FloatArray:
         """Return the load (n,) of constant loads and of controls that no trial records."""

@@ -89,7 +89,7 @@ class SystemModel(Model):
         """Return the load (N,) of 1 N at a place, as load primitives have it."""
 
     def lift(self, state: State, change: ModelPatch) -> FloatArray:
-        """Return the loads (2, N) of a load factor and of its square, as load primitives have them."""
+        """Return the loads (k, N) of a load factor and of its powers, as load primitives have them."""
         raise NotImplementedError
 
     def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
@@ -102,7 +102,7 @@ class SystemModel(Model):
         if trial.kind is TrialKind.FLIGHT:
             # where a mass has weight; other zeros are read with it in place
             rows = self.lift(state, patch.of(*LOADS, changes.PointMass))
-            amounts = [trial.load_factor, trial.load_factor**2]
+            amounts = [trial.load_factor**power for power in range(1, len(rows) + 1)]
         else:
             rows = self.force_row(trial.load_place, state, loads)[None]
             amounts = [LoadChange.of(loads).changed(trial.force, trial.force)]
