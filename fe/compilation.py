@@ -6,6 +6,7 @@ Without numba (extra `uav-twin[fast]`) they run as what they are, plain Python.
 import functools
 import hashlib
 import inspect
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,7 +18,6 @@ import numpy as np
 
 from fe.reduction.built_once import cache_folder
 from fe.runtime import laws, motion_arrays, motion_kernel, static_path
-from fe.runtime.laws import interface
 from fe.runtime.motion import Kernel
 from reporting.progress import tell
 
@@ -134,39 +134,6 @@ def callable_when_compiled(
     return function
 
 
-def choose_when_compiled(chosen: Callable[..., Any], table: tuple[Callable[..., Any], ...]) -> None:
-    """Let compiled functions call `chosen(number, ...)`, which is `table[number](...)`.
-
-    The table is one of functions of `callable_when_compiled` that make no arrays.
-    """
-    if numba is None:
-        return
-    # Written out as one function: a chain of functions would be compiled link by link.
-    scope: dict[str, Any] = {"Any": Any} | {f"answer_{number}": each for number, each in enumerate(table)}
-    lines = [
-        f"    if number == {number}: return answer_{number}(*given)"
-        for number, function in enumerate(table[:-1])
-        if function is not table[-1]
-    ]
-    head, end = "def choice(number: Any, *given: Any) -> Any:", f"    return answer_{len(table) - 1}(*given)"
-    exec("\n".join([head, *lines, end]), scope)
-
-    def compiled_choice(number: Any, *given: Any) -> Any:
-        return scope["choice"]
-
-    overload(chosen, jit_options={"nogil": True, "_nrt": False, "forceinline": True})(compiled_choice)
-
-
-SELDOM = (
-    motion_kernel.find_routes,
-    motion_kernel.begin_on_modes,
-    motion_kernel.find_answer,
-    motion_kernel.begin_flexible,
-    static_path.settle_port,
-)
-"""Functions of a motion that are not called at every step; the others become part of their callers."""
-
-
 def _functions(module: ModuleType) -> list[Callable[..., Any]]:
     found = inspect.getmembers(module, inspect.isfunction)
     return [item for _, item in found if item.__module__ == module.__name__]
@@ -175,12 +142,29 @@ def _functions(module: ModuleType) -> list[Callable[..., Any]]:
 @functools.cache
 def law_functions() -> tuple[Callable[..., Any], ...]:
     """Return the functions of `fe.runtime.laws`, which compiled functions can call from then on."""
-    functions = [item for module in (*laws.MODULES, interface) for item in _functions(module)]
-    for function in functions:
+    tables = {choice: laws.answers(choice.__name__) for choice in (laws.advance, laws.pull)}
+    functions = [item for module in laws.MODULES for item in _functions(module)]
+    found = tuple(dict.fromkeys((*functions, *itertools.chain(*tables.values()))))
+    for function in found:
         callable_when_compiled(function, makes_arrays=False)
-    for name in interface.FUNCTIONS:
-        choose_when_compiled(getattr(laws, name), laws.answers(name))
-    return tuple(functions)
+    for choice, table in tables.items() if numba is not None else ():
+        _choose_when_compiled(choice, table)
+    return found
+
+
+def _choose_when_compiled(choice: Callable[..., Any], table: tuple[Callable[..., Any], ...]) -> None:
+    """Let compiled functions call `choice(number, ...)`, which is `table[number](...)`."""
+    # Written out as one function: a chain of functions would be compiled link by link.
+    answers = {f"answer_{number}": answer for number, answer in enumerate(table)}
+    lines = [f"    if number == {number}: return answer_{number}(*given)" for number in range(len(table) - 1)]
+    exec(
+        "\n".join(("def chosen(number, *given):", *lines, f"    return {list(answers)[-1]}(*given)")), answers
+    )
+
+    def compiled_choice(number: Any, *given: Any) -> Any:
+        return answers["chosen"]
+
+    overload(choice, jit_options={"nogil": True, "_nrt": False, "forceinline": True})(compiled_choice)
 
 
 @functools.cache
@@ -189,12 +173,10 @@ def compiled_kernel() -> Kernel:
 
     The functions of `fe.runtime` stay plain; they can be called from compiled ones from then on.
     """
-    functions: list[Callable[..., Any]] = [static_path.pull_of, static_path.settle_port]
-    functions += [*_functions(motion_arrays), *_functions(motion_kernel)]
-    for function in functions:
-        if function is not motion_kernel.integrate:
-            callable_when_compiled(function, makes_arrays=False, inline=function not in SELDOM)
-    for function in (static_path.static_forces, static_path.arrive_at_rest):
-        callable_when_compiled(function)
-    sources = (*law_functions(), *functions)
+    inner = {*_functions(motion_arrays), *_functions(motion_kernel)} - {motion_kernel.integrate}
+    for function in inner:
+        callable_when_compiled(function, makes_arrays=False, inline=True)
+    callable_when_compiled(static_path.settle_port, makes_arrays=False)
+    callable_when_compiled(static_path.static_forces)
+    sources = (*law_functions(), *inner, static_path.settle_port)
     return Kernel(compiled(motion_kernel.integrate, sources), compiled(static_path.static_path, sources))

@@ -22,9 +22,10 @@ from discrepancy.models.interface import Memory
 from discrepancy.models.port_system import PortSystem
 from fe.compilation import callable_when_compiled, compiled, compiled_kernel, law_functions
 from fe.runtime import laws
-from fe.runtime.arrays import IntArray
+from fe.runtime.arrays import PLACE, IntArray
+from fe.runtime.laws import speed
 from fe.runtime.motion import NO_LAWS, Laws, static_solution
-from fe.runtime.motion_arrays import FIRST_PARTS, Ports
+from fe.runtime.motion_arrays import Ports
 
 CONVERGED = 1e-4
 """Largest rms change of a motion with laws when steps are halved, as a share of the largest motion."""
@@ -62,8 +63,9 @@ def held_forces(
     for j in range(count):
         if ports.of_speed[j] == 0:
             middle = x[j] + 0.5 * h * v[j] + h * h / 6.0 * (push[j] - taken[j] / h)
-            laws.advance(ports.numbers[j], ports.values[j], memory[j], middle, 1)
-            forces[j] = laws.pull(ports.numbers[j], ports.values[j], memory[j], middle, 1.0, 1)[0]
+            laws.advance(ports.numbers[j], ports.values[j], memory[j], middle)
+            memory[j, PLACE] = middle
+            forces[j] = laws.pull(ports.numbers[j], ports.values[j], memory[j], middle, 1.0)[0]
     for j in range(count):
         if ports.of_speed[j] == 1:
             left = push[j]
@@ -71,9 +73,8 @@ def held_forces(
                 if i < j or ports.of_speed[i] == 0:
                     left -= gain[j, i] * forces[i] / h
             middle = x[j] + 0.5 * h * v[j] + 0.125 * h * h * (push[j] - taken[j] / h)
-            strength = laws.strength(ports.numbers[j], ports.values[j], gain[j, j] / h)
-            strength *= laws.share(ports.numbers[j], ports.values[j], middle)
-            forces[j] = laws.held(ports.numbers[j], ports.values[j], v[j], left, gain[j, j], strength, h)
+            strength = speed.strength(ports.values[j], middle, gain[j, j] / h)
+            forces[j] = speed.held(ports.values[j], v[j], left, gain[j, j], strength, h)
 
 
 def couple(
@@ -115,7 +116,8 @@ def couple(
 def begin(positions: FloatArray, ports: Ports, memory: FloatArray) -> None:
     """Load the laws from zero to positions (J,) without turning."""
     for j in range(len(positions)):
-        laws.advance(ports.numbers[j], ports.values[j], memory[j], positions[j], FIRST_PARTS)
+        laws.advance(ports.numbers[j], ports.values[j], memory[j], positions[j])
+        memory[j, PLACE] = positions[j]
 
 
 @cache
@@ -149,7 +151,7 @@ class Coupling:
         index = np.array(port_of, dtype=np.int64)
         self._index, self._speeds, self._step = index, len(gain) + index, step
         self._gain = np.ascontiguousarray(gain[np.ix_(index, index)])
-        self._ports = internal.at(np.zeros((len(index), 0)))  # which the loops know by their own rows
+        self._ports = internal.at_rest()  # which the loops know by their own rows
         self._memory, self._last = internal.memory(), 2.0 * free[0, self._speeds] - free[1, self._speeds]
         self._forces, self._room = np.zeros(len(index)), np.zeros((2, len(index)))
         _loops()[0](free[0, index], self._ports, self._memory)

@@ -17,8 +17,8 @@ from discrepancy.models.interface import Response
 from discrepancy.models.linear_system import LinearSystem
 from fe.compilation import compiled_kernel
 from fe.runtime.motion import Laws, static_solution
-from fe.runtime.motion_arrays import Steps
-from fe.runtime.stepwise import Begin, Boundaries, ModalMotion, advance, steps_under, substeps
+from fe.runtime.motion_arrays import ModalMotion, Steps
+from fe.runtime.stepwise import Begin, Boundaries, advance, steps_under, substeps
 
 LEAST_PARTICIPATION = 0.03
 """A mode that moves the release point less than this share of the most moving one is scaled by the share."""
@@ -169,11 +169,8 @@ def motion_of(system: LinearSystem, acting: Acting, laws: Laws, refinement: int 
             driven = ~np.any(rows[:, : len(system.angular_frequency)], axis=1)
             found.port_forces[0, driven & (rows @ begin.v == 0.0) & (laws.of_speed == 1)] = 0.0
         return Motion(system, acting, laws, times, *found[:4])
-    acts = laws.act_at(0.0)
-    begin, holding = _released(system, acting, laws.only(acts) if laws.spans else laws)
-    q, v, memory = begin
-    if memory is not None and laws.spans:
-        begin = begin._replace(memory=laws.filled(memory, acts))
+    begin, holding = _released(system, acting, laws)
+    q, v, _ = begin
     held = int(np.searchsorted(times, 0.0)) if acting.release[1].at_rest else 0
     stamps = times[held:] if held < len(times) - 1 else np.append(times[held:], abs(times[-1]) + 1.0)
     if stamps[0] < 0.0:
@@ -207,12 +204,10 @@ def _first(system: LinearSystem, acting: Acting, laws: Laws) -> Begin:
     if acting.begins is Start.SETTLED:
         load, held = acting.load_at(first, np.eye(len(system.mass))), system.lift @ drive
         if load.any() or drive.any():
-            acts = laws.act_at(float(first[0]))
-            acting_laws = laws.only(acts) if laws.spans else laws
-            values, felt = system.static(load - system.stiffness @ held, acting_laws, held=held)
+            moved = load - system.stiffness @ held
+            values, memory = system.static(moved, laws, held=held, time=float(first[0]))
             amounts = system.shapes.T @ (system.mass @ (values[0] - held))
             q[:moving], v[moving:count] = amounts[:moving], amounts[moving:]
-            memory = None if felt is None else laws.filled(felt, acts)
     if drives:
         q[count:], v[count:] = system.heaviness * drive, system.heaviness * speeds
     return Begin(q, v, memory)
@@ -238,7 +233,7 @@ def _released(system: LinearSystem, acting: Acting, laws: Laws) -> tuple[Begin, 
     acts = holding * row
     if len(laws):
         # With the release point held at its displacement: x = x_linear - (C - a a^T / a_0) F.
-        rows = system.port_rows(laws)
+        rows = system.port_rows(laws, 0.0)
         along = rows @ system.flexibility(row)
         held = rows @ system.flexibility(rows.T) - np.outer(along, along) / compliance
         solution = static_solution(laws, (holding * along)[None], held, kernel=compiled_kernel())
@@ -261,7 +256,7 @@ def _followed(
     """Return the motion at stamps from a state at a time that may lie before them [s]."""
     late = stamps[0] - first > LEAST_LEAD * (stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
     times, modal, smooth = np.append(first, stamps) if late else stamps, system.modal, bool(acting.drives)
-    pushed = acting.loads or acting.drives or acting.constant.any() or not laws.linear
+    pushed = acting.loads or acting.drives or not laws.linear
     free = None if pushed else modal.free(begin.q, begin.v, stamps - (first if late else stamps[0]))
     if free is not None:
         none = np.zeros((len(stamps), 0))

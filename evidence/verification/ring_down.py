@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fe.reduction.reduced_basis import reduce_model
+from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import TIP_FORCE, DigitalState
 from fe.runtime.transient import ModalIntegrator
@@ -53,7 +53,7 @@ def ring_down_agreement(
     CalculixError
         If CalculiX is not there or fails.
     """
-    model = reduce_model(operators).model
+    model = reduce_structure(operators).model
     vector = model.vector(state.values, state.stiffness_loss)
     integrator = ModalIntegrator(model, vector, state.damping_alpha, state.damping_beta)
     frequency, row = integrator.modes.frequency, integrator.modes.output[-1]

@@ -16,6 +16,7 @@ from scipy import sparse
 from fe.elements import cells as elements
 from fe.elements.kinds import gauss_points
 from fe.runtime.arrays import FloatArray, IntArray
+from fe.runtime.state import TIP_FORCE
 from fe.structure.affine import AffineStructure
 from fe.structure.body import Body, PointMass
 from fe.structure.mesh import RigidSet, Supports, supports
@@ -85,6 +86,8 @@ ROOT_UNKNOWNS = 3
 @dataclass(frozen=True)
 class AffineWing(AffineStructure):
     """A wing as a structure: a factor on its skin, two point masses, a turn and a force near its tip."""
+
+    followed_load = TIP_FORCE
 
     @property
     def load_lift(self) -> FloatArray:

@@ -66,24 +66,13 @@ def section_lines(design: WingDesign) -> tuple[float, ...]:
     return elastic, *sorted(lines[1:])
 
 
-def strip_edges(lines: FloatArray, count: int) -> FloatArray:
-    """Return at most `count` + 1 of the mesh lines, ends included, that part the span most evenly."""
-    if count >= len(lines) - 1:
-        return np.array(lines)
-    wanted = np.linspace(lines[0], lines[-1], count + 1)
-    nearest = np.abs(lines[:, np.newaxis] - wanted).argmin(axis=0)
-    return np.asarray(lines[np.unique(nearest)])
-
-
-def assemble_patch_operators(operators: full.AffineOperators, strip_count: int = 64) -> PatchOperators:
+def assemble_patch_operators(operators: full.AffineOperators) -> PatchOperators:
     """Assemble the operators of the primitives for a wing.
 
     Parameters
     ----------
     operators : AffineOperators
         The wing.
-    strip_count : int
-        Largest number of strips of the skin.
     """
     mesh, design, expansion = operators.wing_mesh, operators.wing_mesh.design, operators.expansion
     restriction = expansion.T.tocsr()
@@ -106,8 +95,7 @@ def assemble_patch_operators(operators: full.AffineOperators, strip_count: int =
 
     along = operators.gauge_output
     across, diagonal = (full.gauge_output(mesh, angle) @ expansion for angle in (0.5 * np.pi, 0.25 * np.pi))
-    edges = strip_edges(lines, strip_count)
-    strips = np.searchsorted(edges, mesh.centres[:, 1]) - 1
+    strips = np.searchsorted(lines, mesh.centres[:, 1]) - 1
     skin = np.flatnonzero(mesh.stiffness_term <= len(design.regions))
     found, part_of = np.unique(
         np.stack((strips, mesh.stiffness_term), axis=1)[skin], axis=0, return_inverse=True
@@ -130,7 +118,7 @@ def assemble_patch_operators(operators: full.AffineOperators, strip_count: int =
             "tip_row": operators.tip_row,
         },
         plain={
-            "strip_lines": edges,
+            "strip_lines": np.array(lines),
             "strip_of": found[:, 0],
             "term_of": found[:, 1],
             "flap_spring": design.root.flap_spring,

@@ -20,7 +20,7 @@ from fe.wing.operators import (
     point_masses,
     section_displacement,
 )  # fmt: skip
-from fe.wing.patch_operators import area_shares, strip_edges
+from fe.wing.patch_operators import area_shares
 from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY, lift_load
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
@@ -377,10 +377,7 @@ def test_what_cannot_be_is_refused(both: Compared, ask: Any, message: str) -> No
         _ = ask(both) if callable(ask) else both.structure(ask, temperature=10.0).mass
 
 
-def test_strips_end_at_mesh_lines_and_shares_of_the_area_integrate_a_parabola_on_each_cell() -> None:
-    lines = np.array([0.0, 0.003, 0.1, 0.25, 0.5, 0.52, 0.8, 1.0])
-    assert strip_edges(lines, 4).tolist() == [0.0, 0.25, 0.5, 0.8, 1.0]
-    assert strip_edges(lines, 100).tolist() == lines.tolist()
+def test_shares_of_the_area_integrate_a_parabola_on_each_cell() -> None:
     stations = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
     # mean of y^2 with chord 2 - y: (2/3 - 1/4) / 1.5
     mean = area_shares(stations, 2.0, 1.0) @ stations**2
