@@ -229,7 +229,7 @@ def _motion(
     laws = laws_of(patch.of(*INTERNAL_FORCES), PORTS)
     if trial.is_dynamic:
         system = _system(float(modulus[0]), structural)
-        acting = Acting(trial.time, np.zeros(len(TIP)), conditions.stamps(trial.time))
+        acting = Acting(trial.time, conditions.stamps(trial.time))
         if trial.kind is TrialKind.RINGDOWN:
             acting = replace(acting, release=(TIP, release_of(trial)), initial=conditions.initial)
         else:

@@ -6,11 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import meshio
+
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from fe.wing.design import SHIPPED_DESIGN, load_design
-from scenarios import binding_files, scenario_files
+from scenarios import binding_files, scenario_files, structure_files
 
 DOCS = Path(__file__).parents[1] / "docs"
+INPUTS = Path(__file__).parents[1] / "tests" / "fe" / "structure" / "inputs"
 REFERENCE = Path(__file__).parents[1].parent / "shared" / "reference"
 CONFIG_HASH = "0" * 64
 """Of the configuration that the kept checkpoint belongs to."""
@@ -49,6 +52,7 @@ def make_files(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     _texts(folder)
     for name, make in (
+        ("structure", _structure),
         ("campaign", _campaign),
         ("verdict", _verdict),
         ("laboratory", _laboratory),
@@ -88,6 +92,16 @@ def _texts(folder: Path) -> None:
     library = REFERENCE / "uav_digital_twin" / "UAVconfig.json"
     if library.is_file():
         shutil.copy(library, folder / "strains.json")
+
+
+def _structure(folder: Path) -> None:
+    place = folder / "structure"
+    place.mkdir()
+    for file in structure_files().values():
+        for part in file.parent.glob(f"{file.stem}.*"):
+            shutil.copy(part, place)
+    shutil.copy(INPUTS / "pieces.bdf", place)
+    meshio.read(place / "bracket.inp").write(folder / "bracket.vtu", binary=False)
 
 
 def _campaign(folder: Path) -> None:

@@ -40,6 +40,8 @@ from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.lumped import LumpedModel
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
+from fe.structure.design import load_structure
+from fe.structure.mesh_file import read_mesh
 from fe.wing.design import load_design
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import load_binding
@@ -94,7 +96,16 @@ def _config(path: Path) -> None:
     parse_scenario(read_config(path.parent)["scenario"], str(path))
 
 
+def _mesh(path: Path) -> None:
+    read_mesh(path, 1e-3, "mm")
+
+
 LOADERS: dict[str, Loader] = {
+    "structure": Loader("structure/bracket.toml", load_structure, TEXT),
+    "deck": Loader("structure/bracket.inp", _mesh, TEXT),
+    "bulk data": Loader("structure/pieces.bdf", _mesh, TEXT),
+    "Gmsh": Loader("structure/stiffened_panel.msh", _mesh, TEXT),
+    "VTU": Loader("bracket.vtu", _mesh, TEXT),
     "scenario": Loader("scenario.toml", lambda path: check_scenario(load_scenario(path)), TEXT),
     "binding": Loader("binding.toml", load_binding, TEXT),
     "wing design": Loader("design.toml", load_design, TEXT),

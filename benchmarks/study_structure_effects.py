@@ -147,7 +147,7 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
             release = Release(sign * DEFLECTION * (1.0, 0.7, 0.5, 0.3)[number], 0.02, mode_count=1)
             initial = np.zeros((1, 2))
             initial[0, 0] = release.deviation * random.standard_normal()
-            acting = Acting(time, np.zeros(len(end)), time, initial=initial, release=(end, release))
+            acting = Acting(time, time, initial=initial, release=(end, release))
             moved = motion_of(system, acting, laws)
             values = moved.seen([Shown.of(row) for row in rows]).values
         else:

@@ -134,29 +134,6 @@ def callable_when_compiled(
     return function
 
 
-def choose_when_compiled(chosen: Callable[..., Any], table: tuple[Callable[..., Any], ...]) -> None:
-    """Let compiled functions call `chosen(number, ...)`, which is `table[number](...)`.
-
-    The table is one of functions of `callable_when_compiled` that make no arrays.
-    """
-    if numba is None:
-        return
-    # Written out as one function: a chain of functions would be compiled link by link.
-    scope: dict[str, Any] = {"Any": Any} | {f"answer_{number}": each for number, each in enumerate(table)}
-    lines = [
-        f"    if number == {number}: return answer_{number}(*given)"
-        for number, function in enumerate(table[:-1])
-        if function is not table[-1]
-    ]
-    head, end = "def choice(number: Any, *given: Any) -> Any:", f"    return answer_{len(table) - 1}(*given)"
-    exec("\n".join([head, *lines, end]), scope)
-
-    def compiled_choice(number: Any, *given: Any) -> Any:
-        return scope["choice"]
-
-    overload(chosen, jit_options={"nogil": True, "_nrt": False, "forceinline": True})(compiled_choice)
-
-
 def _functions(module: ModuleType) -> list[Callable[..., Any]]:
     found = inspect.getmembers(module, inspect.isfunction)
     return [item for _, item in found if item.__module__ == module.__name__]
@@ -165,14 +142,29 @@ def _functions(module: ModuleType) -> list[Callable[..., Any]]:
 @functools.cache
 def law_functions() -> tuple[Callable[..., Any], ...]:
     """Return the functions of `fe.runtime.laws`, which compiled functions can call from then on."""
-    functions = [item for module in laws.MODULES for item in _functions(module)]
     tables = {choice: laws.answers(choice.__name__) for choice in (laws.advance, laws.pull)}
+    functions = [item for module in laws.MODULES for item in _functions(module)]
     found = tuple(dict.fromkeys((*functions, *itertools.chain(*tables.values()))))
     for function in found:
         callable_when_compiled(function, makes_arrays=False)
-    for choice, table in tables.items():
-        choose_when_compiled(choice, table)
+    for choice, table in tables.items() if numba is not None else ():
+        _choose_when_compiled(choice, table)
     return found
+
+
+def _choose_when_compiled(choice: Callable[..., Any], table: tuple[Callable[..., Any], ...]) -> None:
+    """Let compiled functions call `choice(number, ...)`, which is `table[number](...)`."""
+    # Written out as one function: a chain of functions would be compiled link by link. Its signature is that
+    # of `compiled_choice`, as numba asks.
+    scope: dict[str, Any] = {"Any": Any} | {f"answer_{number}": each for number, each in enumerate(table)}
+    lines = [f"    if number == {number}: return answer_{number}(*given)" for number in range(len(table) - 1)]
+    head, end = "def choice(number: Any, *given: Any) -> Any:", f"    return answer_{len(table) - 1}(*given)"
+    exec("\n".join([head, *lines, end]), scope)
+
+    def compiled_choice(number: Any, *given: Any) -> Any:
+        return scope["choice"]
+
+    overload(choice, jit_options={"nogil": True, "_nrt": False, "forceinline": True})(compiled_choice)
 
 
 @functools.cache

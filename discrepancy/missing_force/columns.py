@@ -18,9 +18,10 @@ from discrepancy.missing_force.view import Column, Motion, Part, View, combined
 from discrepancy.models.interface import Response
 from discrepancy.models.sensing import observe_response
 from fe.compilation import compiled, law_functions
+from fe.runtime.arrays import HEAD, PLACE
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS, advance, pull
-from fe.runtime.laws.interface import HEAD, PARAMETERS, PLACE, PortForce
+from fe.runtime.laws.interface import PARAMETERS, PortForce
 from fe.runtime.laws.speed import steady
 from fe.runtime.patch import SENSORS, LoggerClock, ModelPatch
 from fe.runtime.sensors import clock_of

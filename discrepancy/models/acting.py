@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline, PPoly
 
-from discrepancy.campaign.records import FloatArray, Hold, Quantity, Release, Start, Trial
+from discrepancy.campaign.records import FloatArray, Hold, Release, Start, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Memory, Place
 from fe.runtime.expression import Expression
@@ -56,6 +56,11 @@ class Course:
         key = (known, motion, time.tobytes(), values.tobytes())
         return _courses.get(key, lambda: Course(time, values, known, motion))
 
+    @staticmethod
+    def always(time: FloatArray) -> "Course":
+        """Return the course of what acts by one all the time."""
+        return Course.of(time, np.ones(len(time)))
+
     edges: ClassVar[tuple[float, ...]] = ()
     """Moments at which it jumps between the stamps: none."""
 
@@ -65,6 +70,14 @@ class Course:
         base: PPoly = CubicSpline(self.time, self.values)
         lower = [base.antiderivative(number) for number in range(self.motion or 0, 0, -1)]
         return [*lower, base, *(base.derivative(number) for number in range(1, 4 - len(lower)))]
+
+    @property
+    def slope(self) -> "Course":
+        """Its derivative, of a linear one in steps."""
+        if self.hold is Hold.SMOOTH:
+            return Course(self.time, self.at(self.time, 1), Hold.SMOOTH)
+        slopes = np.diff(self.values) / np.diff(self.time)
+        return Course(self.time, np.append(slopes, slopes[-1]), Hold.ZERO_ORDER)
 
     def at(self, time: FloatArray, order: int = 0) -> FloatArray:
         """Return the values (N,) at times, of a held one that of just before, or a derivative of a spline."""
@@ -146,12 +159,10 @@ class Acting:
     ----------
     time : (N,) ndarray
         Stamps of the inputs [s].
-    constant : (n + m,) ndarray
-        Constant load.
     sampled : (N,) ndarray
         Times at which the samples show the motion [s].
     loads : sequence of Load
-        What else pushes.
+        What pushes.
     drives : mapping of str to Course
         Prescribed motions by their inputs, in the order of `LinearSystem.drives`.
     begins : Start
@@ -165,7 +176,6 @@ class Acting:
     """
 
     time: FloatArray
-    constant: FloatArray
     sampled: FloatArray
     loads: Sequence[Load] = ()
     drives: Mapping[str, Course] = field(default_factory=dict)
@@ -177,28 +187,23 @@ class Acting:
     def levels(self) -> tuple[FloatArray, FloatArray]:
         """Loads (k, n + m), and how much of each (L, k) acts in the rows of a trial at rest."""
         pushes = [(row, course.values) for row, course in self.loads if isinstance(course, Course)]
-        if self.constant.any():
-            pushes.append((self.constant, np.ones(len(self.time))))
         units, amounts = zip(*pushes, strict=True)
         return np.array(units), np.column_stack(amounts)
 
     def load_at(self, time: FloatArray, base: FloatArray) -> FloatArray:
         """Return the loads (T, B) in a base (n + m, B) at times, held ones as they were just before."""
-        return self.total([course.at(time) for _, course in self.loads], base, len(time))
+        return self._total([course.at(time) for _, course in self.loads], base, len(time))
 
     def ends(self, time: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the loads (K, B) at the begin and the end of the steps between times (K + 1,)."""
         found = [course.ends(time) for _, course in self.loads]
         begin, end = ([pair[side] for pair in found] for side in (0, 1))
-        return self.total(begin, base, len(time) - 1), self.total(end, base, len(time) - 1)
+        return self._total(begin, base, len(time) - 1), self._total(end, base, len(time) - 1)
 
-    def total(self, amounts: Sequence[FloatArray], base: FloatArray, count: int) -> FloatArray:
-        """Return the loads (T, B) of amounts (T,) of each beside the constant one."""
-        constant, *rows = np.array([self.constant, *(row for row, _ in self.loads)]) @ base
-        if not rows:
-            return np.tile(constant, (count, 1))
-        found: FloatArray = np.array(amounts).T @ np.array(rows)
-        return found + constant if constant.any() else found
+    def _total(self, amounts: Sequence[FloatArray], base: FloatArray, count: int) -> FloatArray:
+        """Return the loads (T, B) of amounts (T,) of each."""
+        rows = np.array([row for row, _ in self.loads]).reshape(len(self.loads), len(base))
+        return np.array(amounts).reshape(len(rows), count).T @ (rows @ base)
 
 
 class Shown(NamedTuple):
@@ -227,11 +232,6 @@ class Shown(NamedTuple):
         rows, n = np.zeros((4, len(row))), len(row) - states
         rows[order, :n], rows[further + 1, n:] = row[:n], row[n:]
         return cls(rows)
-
-
-def shown_rows(rows: Iterable[FloatArray], outputs: Sequence[tuple[str, Quantity]]) -> list[Shown]:
-    """Return what sensors of displacements and their derivatives show at rows (n,)."""
-    return [Shown.of(row, quantity.order) for row, (_, quantity) in zip(rows, outputs, strict=True)]
 
 
 def place_among(places: Sequence[str], place: Place, what: str, where: str = "a trial") -> str:

@@ -22,9 +22,8 @@ from discrepancy.models.interface import Memory
 from discrepancy.models.port_system import PortSystem
 from fe.compilation import callable_when_compiled, compiled, compiled_kernel, law_functions
 from fe.runtime import laws
-from fe.runtime.arrays import IntArray
+from fe.runtime.arrays import PLACE, IntArray
 from fe.runtime.laws import speed
-from fe.runtime.laws.interface import PLACE
 from fe.runtime.motion import NO_LAWS, Laws, static_solution
 from fe.runtime.motion_arrays import Ports
 

@@ -39,6 +39,12 @@ Modes = tuple[FloatArray, FloatArray, int]
 """Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
 
 
+def _differs(matrix: FloatArray, other: FloatArray) -> bool:
+    """Whether two matrices differ by more than rounding."""
+    size = np.abs(matrix).max(initial=1e-300)
+    return bool(np.abs(matrix - other).max(initial=0.0) > ROUNDING * size)
+
+
 @dataclass(frozen=True, eq=False)
 class LinearSystem:
     """A linear system of N unknowns, n of them displacements.
@@ -165,12 +171,9 @@ class LinearSystem:
         """What is free and the drives, with ports; what couples modes by rounding only does not."""
         frequency, free = np.pad(self.angular_frequency, (0, len(self.drives))), self.free_shapes
         damping, stiffness = (free.T @ matrix @ free for matrix in (self.damping, self.stiffness))
-        diagonal, loose = np.diag(np.diag(damping)), self.mode_count is None
-        if loose:
-            apart = np.abs(stiffness - np.diag(frequency**2)).max(initial=0.0)
-            loose = bool(apart > ROUNDING * np.abs(stiffness).max(initial=1e-300))
-        if np.abs(damping - diagonal).max(initial=0.0) <= ROUNDING * np.abs(diagonal).max(initial=1e-300):
-            damping = diagonal
+        diagonal = np.diag(np.diag(damping))
+        damping = damping if _differs(damping, diagonal) else diagonal
+        loose = self.mode_count is None and _differs(stiffness, np.diag(frequency**2))
         ports, actions = (
             {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
             for rows in (self.ports, self.acts if self.actions else {})
@@ -212,14 +215,6 @@ class LinearSystem:
         """Return what the modes leave out of K^-1 loads, for loads (N,) or (N, k)."""
         return self.flexibility(loads) - (self.shapes / self.angular_frequency**2) @ (self.shapes.T @ loads)
 
-    @cached_property
-    def _restoring(self) -> tuple[FloatArray, bool]:
-        """Matrix (M, M) of modal forces at rest by displacements and states; whether it tells the rest."""
-        free, moving = len(self.angular_frequency), self.moving
-        matrix = np.hstack((self.modal.whole[:free, :moving], self.modal.damping[:free, moving:free]))
-        values = np.linalg.svd(matrix, compute_uv=False) if matrix.size else np.ones(1)
-        return matrix, bool(values[-1] > LEAST_PIVOT * max(values[0], 1e-300))
-
     def resting(self, loads: FloatArray) -> FloatArray:
         """Return displacements and states (L, N) at rest under loads (L, N).
 
@@ -230,9 +225,8 @@ class LinearSystem:
         """
         if self.mode_count is not None:
             return self.flexibility(loads.T).T
-        (restoring, tells), force = self._restoring, loads @ self.shapes
-        if tells:
-            return np.asarray(np.linalg.solve(restoring, force.T).T @ self.shapes.T)
+        free, moving, force = len(self.angular_frequency), self.moving, loads @ self.shapes
+        restoring = np.hstack((self.modal.whole[:free, :moving], self.modal.damping[:free, moving:free]))
         found = np.linalg.lstsq(restoring, force.T, rcond=LEAST_PIVOT)[0]
         if np.max(np.abs(restoring @ found - force.T)) > 1e-6 * max(float(np.max(np.abs(force))), 1e-300):
             size = float(np.max(np.abs(restoring), initial=0.0))

@@ -256,7 +256,7 @@ def _followed(
     """Return the motion at stamps from a state at a time that may lie before them [s]."""
     late = stamps[0] - first > LEAST_LEAD * (stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
     times, modal, smooth = np.append(first, stamps) if late else stamps, system.modal, bool(acting.drives)
-    pushed = acting.loads or acting.drives or acting.constant.any() or not laws.linear
+    pushed = acting.loads or acting.drives or not laws.linear
     free = None if pushed else modal.free(begin.q, begin.v, stamps - (first if late else stamps[0]))
     if free is not None:
         none = np.zeros((len(stamps), 0))

@@ -14,8 +14,8 @@ from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Shown, place_among, shown_rows
-from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
+from discrepancy.models.acting import Acting, Course, Load, Shown, place_among
+from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Memory, Outputs, Place
 from discrepancy.models.linear_system import Flexibility, LinearSystem, Modes
 from discrepancy.models.scales import PortScale
 from discrepancy.models.system_model import Case, State, SystemModel
@@ -99,21 +99,19 @@ class StructureModel(SystemModel):
         self.reference, self.load_places = (*self.forces, LOAD_FACTOR)[0], self.forces
         self.largest_force = 0.5 * min((model.validity[name][1] for name in self.forces), default=np.inf)
         _, outputs, accelerations = model.rows
-        strains, displacements = np.split(outputs, [len(model.gauges)])
-        named = (
-            (model.gauges, Quantity.STRAIN, strains),
-            (model.displacements, Quantity.DISPLACEMENT, displacements),
-            (model.accelerations, Quantity.ACCELERATION, accelerations),
-        )
-        self.quantities = {name: quantity for names, quantity, _ in named for name in names}
-        self._rows = {name: row for names, _, rows in named for name, row in zip(names, rows, strict=True)}
+        self.quantities = {
+            **dict.fromkeys(model.gauges, Quantity.STRAIN),
+            **dict.fromkeys(model.displacements, Quantity.DISPLACEMENT),
+            **dict.fromkeys(model.accelerations, Quantity.ACCELERATION),
+        }
+        self._rows = dict(zip(self.quantities, (*outputs, *accelerations), strict=True))
         self._systems = Memory()
         along = [self._load(self.prior_mean(), force) for force in self.forces]
         self.port_rows = {
-            name: row
+            name: self._rows[name]
             for push in along
-            for name, row in zip(model.displacements, displacements, strict=True)
-            if np.abs(row - push).max() <= SAME * np.abs(push).max()
+            for name in model.displacements
+            if np.abs(self._rows[name] - push).max() <= SAME * np.abs(push).max()
         }
         self.port_names = tuple(self.port_rows)
 
@@ -136,7 +134,7 @@ class StructureModel(SystemModel):
 
         Loads that always act shift what a motion shows.
         """
-        found = shown_rows((self._rows[output] for output, _ in outputs), outputs)
+        found = [Shown.of(self._rows[output], quantity.order) for output, quantity in outputs]
         always = self._always(case.state.parameters)
         if acting is None or not always.any():
             return found
@@ -159,18 +157,20 @@ class StructureModel(SystemModel):
         return self._load(state.parameters, place_among(self.forces or (LOAD_FACTOR,), place, self.what))
 
     def lift(self, state: State, change: ModelPatch) -> FloatArray:
-        """Return the loads (2, n) of the load factor and of its square, which is zero."""
-        row = self._load(state.parameters, LOAD_FACTOR)
-        return np.stack((row, np.zeros_like(row)))
+        """Return the load (1, n) of the load factor."""
+        return self._load(state.parameters, LOAD_FACTOR)[None]
 
     def _always(self, parameters: FloatArray) -> FloatArray:
         """Return the load (n,) of constant loads and of controls that no trial records."""
         recorded = {name: 0.0 for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls}
         return self._pull(parameters, recorded)
 
-    def constant(self, case: Case) -> FloatArray:
-        """Return the load (n,) that always acts at rest; in motion it is in what is shown."""
-        return self._always(case.state.parameters) * (not case.trial.is_dynamic)
+    def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
+        """Return loads in a trial; in motion what always acts is in what is shown."""
+        (loads, drives), trial = super().pushes(case), case.trial
+        if not trial.is_dynamic:
+            loads.append((self._always(case.state.parameters), Course.always(trial.time)))
+        return loads, drives
 
     def system(self, state: State) -> LinearSystem:
         """Return the structure at parameters and losses, in the coordinates of `ReducedModel.at`.
@@ -290,7 +290,7 @@ class WingModel(SystemModel):
         if factors is not None:
             gauges = np.array([strain_gauge(output) for output, _ in outputs])
             rows = rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
-        return shown_rows(rows, outputs)
+        return [Shown.of(row, quantity.order) for row, (_, quantity) in zip(rows, outputs, strict=True)]
 
     @property
     def shown_outputs(self) -> tuple[str, ...]:
@@ -303,9 +303,9 @@ class WingModel(SystemModel):
         """Whether the wing can carry a primitive; it can carry all but forces by a formula in time."""
         return primitive in PRIMITIVES.values() and primitive is not changes.PortLoad
 
-    def turns(self, port: str) -> bool | None:
-        """Return whether a port turns; the others move up and down."""
-        return port == ROTATING_PORT
+    def port_units(self, port: str) -> tuple[str, str]:
+        """Return the units of force and motion at a port: the root turns, the others move up and down."""
+        return TURNS if port == ROTATING_PORT else MOVES
 
     def at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return forces as they act at ports of `port_rows`."""
@@ -318,10 +318,6 @@ class WingModel(SystemModel):
     def lift(self, state: State, change: ModelPatch) -> FloatArray:
         """Return the parts (2, n) of the lift."""
         return self.wing.load_parts(change)
-
-    def constant(self, case: Case) -> FloatArray:
-        """Return nothing (n,): what always acts is in the zeros of readings."""
-        return np.zeros(self.wing.size)
 
     def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
         """Return the scales of a force over the planform, from those of its mean and the first mode."""

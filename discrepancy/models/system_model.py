@@ -88,12 +88,8 @@ class SystemModel(Model):
     def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
         """Return the load (N,) of 1 N at a place, as load primitives have it."""
 
-    @abstractmethod
-    def constant(self, case: Case) -> FloatArray:
-        """Return the load (N,) that always acts."""
-
     def lift(self, state: State, change: ModelPatch) -> FloatArray:
-        """Return the loads (2, N) of a load factor and of its square, as load primitives have them."""
+        """Return the loads (k, N) of a load factor and of its powers, as load primitives have them."""
         raise NotImplementedError
 
     def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
@@ -106,7 +102,7 @@ class SystemModel(Model):
         if trial.kind is TrialKind.FLIGHT:
             # where a mass has weight; other zeros are read with it in place
             rows = self.lift(state, patch.of(*LOADS, changes.PointMass))
-            amounts = [trial.load_factor, trial.load_factor**2]
+            amounts = [trial.load_factor**power for power in range(1, len(rows) + 1)]
         else:
             rows = self.force_row(trial.load_place, state, loads)[None]
             amounts = [LoadChange.of(loads).changed(trial.force, trial.force)]
@@ -144,7 +140,7 @@ class SystemModel(Model):
     def acting(self, case: Case) -> Acting:
         """Return what acts in a trial."""
         trial, conditions, patch, state = case
-        acting = Acting(trial.time, self.constant(case), conditions.stamps(trial.time), begins=trial.begins)
+        acting = Acting(trial.time, conditions.stamps(trial.time), begins=trial.begins)
         if trial.kind is TrialKind.RINGDOWN:
             if len(patch.of(PortLoad)):
                 raise ModelError(

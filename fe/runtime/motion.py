@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .arrays import BoolArray, FloatArray, IntArray
+from .arrays import HEAD, BoolArray, FloatArray, IntArray
 from .errors import InvalidPatchError, SolutionError
 from .laws import LAWS
-from .laws.interface import HEAD, PARAMETERS, PortForce
+from .laws.interface import PARAMETERS, PortForce
 from .modal_system import ModalSystem
 from .motion_arrays import SPEED, STILL, Ports
 from .motion_kernel import integrate

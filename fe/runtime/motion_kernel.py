@@ -20,9 +20,8 @@ into the FMU. `fe.compilation` has the same compiled.
 import numpy as np
 
 from . import laws
-from .arrays import FloatArray
+from .arrays import FADING, FORCE, HELD, LAGGED, PLACE, FloatArray
 from .laws import speed
-from .laws.interface import FADING, FORCE, HELD, LAGGED, PLACE
 from .motion_arrays import SPEED, STILL, Kept, ModalMotion, Ports, State, Steps, Unnamed, add, at_port
 from .static_path import settle_port
 

@@ -7,7 +7,7 @@ into the FMU.
 import numpy as np
 
 from . import laws
-from .laws.interface import FADING, FORCE, LAGGED, PLACE
+from .arrays import FADING, FORCE, LAGGED, PLACE
 from .motion_arrays import FloatArray, Ports, Unnamed
 
 

@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .arrays import FloatArray, IntArray
-from .laws.interface import PLACE
+from .arrays import PLACE, FloatArray, IntArray
 from .modal_system import ModalSystem
 from .motion import PLAIN, Kernel, Laws, port_flexibility
 from .motion_arrays import ModalMotion, State, Steps

@@ -160,12 +160,14 @@ class AffineStructure:
         values : mapping of str to float
             Parameters, losses, free masses and controls; what is left out is nominal, and healthy.
         """
-        parameters, losses, masses = (
-            {name: values[name] for name in names if name in values}
-            for names in (self.parameters, self.regions, self.masses)
-        )
+        parameters, losses, masses = self.parted(values)
         loads = (self.load(name, values.get(control or ""), masses) for name, control in self.loads.items())
         return self.stiffness(parameters, losses), self.mass(masses), sum(loads, np.zeros(self.unknowns))
+
+    def parted(self, values: Values) -> tuple[dict[str, float], ...]:
+        """Return the parameters, the losses and the free masses among values by name."""
+        kinds = (self.parameters, self.regions, self.masses)
+        return tuple({name: values[name] for name in names if name in values} for names in kinds)
 
     def full_displacement(self, free: FloatArray) -> FloatArray:
         """Displacements (nodes, 3) [m] of all nodes from free unknowns (n,)."""

@@ -130,22 +130,6 @@ def load_and_assemble(
         raise InvalidDesignError(said("design.without_mesh", file=file))
     mesh = structure_mesh(design, file)
     check_memory(mesh, memory_limit)
-    digest = structure_hash(design, file.parent)
-    return assemble(design, mesh, digest, mass_as_stiffness=mass_as_stiffness)
-
-
-def assemble_structure(file: Path | str, memory_limit: float | None = None) -> AffineStructure:
-    """Read a structure file with its mesh or matrices; parameters and errors as of `load_and_assemble`."""
-    design, folder = load_structure(file), Path(file).parent
-    if isinstance(design, MatrixDesign):
-        return assemble_matrices(design, folder, structure_hash(design, folder))
-    return load_and_assemble(file, memory_limit)
-
-
-def assemble(
-    design: MeshDesign, mesh: StructureMesh, design_hash: str, *, mass_as_stiffness: bool = False
-) -> Structure:
-    """Assemble the affine operators of a design on its mesh, see `load_and_assemble`."""
     material_of = _owners(mesh, design, "material", "material")
     bare = np.flatnonzero(material_of < 0)
     if len(bare):
@@ -175,11 +159,19 @@ def assemble(
     points = {key: _point_rows(design, mesh, key) for key in ("displacement", "acceleration")}
     return Structure(
         **body.assembled(design, loads, {"gauge": gauges} | points),
-        design_hash=design_hash,
+        design_hash=structure_hash(design, file.parent),
         material_of=material_of,
         region_of=region_of,
         gauges_moved=moved,
     )
+
+
+def assemble_structure(file: Path | str, memory_limit: float | None = None) -> AffineStructure:
+    """Read a structure file with its mesh or matrices; parameters and errors as of `load_and_assemble`."""
+    design, folder = load_structure(file), Path(file).parent
+    if isinstance(design, MatrixDesign):
+        return assemble_matrices(design, folder, structure_hash(design, folder))
+    return load_and_assemble(file, memory_limit)
 
 
 def _point_rows(design: MeshDesign, mesh: StructureMesh, key: str) -> sparse.csr_array:

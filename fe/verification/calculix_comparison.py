@@ -166,7 +166,7 @@ def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
     CalculixError
         If CalculiX is not there or fails.
     """
-    structure, strained = deck.structure, deck.mesh.kind is HEXAHEDRA_20
+    structure, strained = deck.structure, deck.body.mesh.kind is HEXAHEDRA_20
     prints = ["*NODE PRINT, NSET=NALL", "U"]
     prints += ["*NODE PRINT, NSET=NPROBES", "U"] if len(deck.probes) else []
     prints += ["*EL PRINT, ELSET=EALL, GLOBAL=YES", "E"] if strained else []
@@ -191,7 +191,7 @@ def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
             if len(ours[own]):
                 found[what] = _relative(tables["NPROBES"][:, 1:].ravel()[own], ours[own])
         if strained:
-            strains = deck.mesh.strains(nodes, local=INTEGRATION_POINTS).reshape(-1, 6)
+            strains = deck.body.mesh.strains(nodes, local=INTEGRATION_POINTS).reshape(-1, 6)
             strains[:, 3:] *= 0.5  # engineering to tensor shear
             found["strains at integration points"] = _relative(tables["EALL"][:, 2:], strains[:, PRINTED])
     return Agreement(differences, frequencies, theirs[:modes])

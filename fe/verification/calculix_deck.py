@@ -32,8 +32,6 @@ from fe.structure.operators import Structure
 from fe.wing.operators import AffineOperators
 from fe.wing.responses import wing_values
 
-NOT_COMPARABLE = (WEDGES_6,)
-"""Kinds that CalculiX integrates otherwise (C3D6 at two points)."""
 PRINTED = [0, 1, 2, 5, 4, 3]
 """Places of our strains in the order of CalculiX: xx, yy, zz, xy, xz, yz."""
 ANISOTROPIC = tuple(
@@ -117,19 +115,10 @@ class CalculixDeck:
     damping: tuple[float, float] = (0.0, 0.0)
 
     @property
-    def mesh(self) -> CellMesh:
-        """Its mesh."""
-        return self.body.mesh
-
-    @property
     def _materials(self) -> Iterator[tuple[list[tuple[float, FloatArray]], float, IntArray]]:
         """Constants of CalculiX at temperatures, density and cells of each material in this state."""
-        body, structure = self.body, self.structure
-        parameters, losses = (
-            {name: self.values[name] for name in names if name in self.values}
-            for names in (structure.parameters, structure.regions)
-        )
-        factor = structure.theta(parameters, losses)[body.part]
+        parameters, losses, _ = self.structure.parted(self.values)
+        body, factor = self.body, self.structure.theta(parameters, losses)[self.body.part]
         graded = np.zeros(len(factor)) if self.grading is None else self.grading.cells
         constants = factor[:, None] * body.elasticity[:, *ANISOTROPIC]
         whole = np.column_stack((constants, body.density, graded))
@@ -147,7 +136,7 @@ class CalculixDeck:
 
     def text(self, *steps: Step) -> str:
         """Input of a job: the model, then its steps."""
-        held, points = self.body.supports, self.mesh.points
+        held, points = self.body.supports, self.body.mesh.points
         masses = ((self.values.get(own.name, own.mass), own.shares) for own in self.body.masses)
         heavy = [(mass, shares) for mass, places in masses for shares in places if mass > 0.0]
         # Behind the nodes of the mesh: those of rigid motions, eight of each point mass, then the probes.
@@ -166,7 +155,7 @@ class CalculixDeck:
                 deck=self,
                 numbers=number_line,
                 materials=self._materials,
-                cells=np.column_stack((np.arange(len(self.mesh.cells)), self.mesh.cells)) + 1,
+                cells=np.column_stack((np.arange(len(self.body.mesh.cells)), self.body.mesh.cells)) + 1,
                 motion_nodes=range(len(points) + 1, first),
                 held=map(_place, (*np.flatnonzero(still), *range(3 * len(points) + motions, 3 * first - 3))),
                 springs=[*self.terms(held.springs)],
@@ -198,7 +187,7 @@ class CalculixDeck:
     @cached_property
     def places(self) -> list[tuple[int, int]]:
         """Node and direction of each free unknown."""
-        held, behind = self.body.supports, self.mesh.unknowns
+        held, behind = self.body.supports, self.body.mesh.unknowns
         motions = range(behind, behind + len(held.springs) - len(held.alone))
         return [_place(unknown) for unknown in (*held.alone.tolist(), *motions)]
 
@@ -227,7 +216,7 @@ def structure_deck(structure: Structure) -> CalculixDeck:
         If CalculiX has no element that is integrated in the same way.
     """
     mesh, design = structure.mesh, structure.design
-    if mesh.kind in NOT_COMPARABLE:
+    if mesh.kind is WEDGES_6:  # C3D6 at two points
         raise CalculixError(said("calculix.wedges", kind=mesh.kind))
     loads = {load.name: _load_step(structure, load) for load in design.load}
     return CalculixDeck("structure", structure, structure.body, {}, loads)

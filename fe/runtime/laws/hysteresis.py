@@ -4,17 +4,9 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
+from ..arrays import HEAD, PLACE
 from ..errors import InvalidPatchError
-from .interface import (
-    HEAD,
-    NOT_NEGATIVE,
-    PARAMETERS,
-    PLACE,
-    POSITIVE,
-    FloatArray,
-    PortForce,
-    power,
-)
+from .interface import NOT_NEGATIVE, PARAMETERS, POSITIVE, FloatArray, PortForce, power
 
 STEP = 0.3
 """Longest way in one step of a Bouc-Wen path, in yield displacements over an order above one."""

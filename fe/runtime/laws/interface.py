@@ -31,8 +31,6 @@ from ..primitive import Primitive
 
 PARAMETERS = 5
 """Most parameters of a law."""
-HELD, PLACE, LAGGED, FADING, FORCE, HEAD = range(6)
-"""Columns of a memory; from `HEAD` on its hysteretic elements."""
 POSITIVE, NOT_NEGATIVE = "be positive", "not be negative"
 """What a number must, said after its unit."""
 

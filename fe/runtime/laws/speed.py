@@ -9,7 +9,8 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 
-from .interface import NOT_NEGATIVE, PLACE, POSITIVE, FloatArray, PortForce, power
+from ..arrays import PLACE
+from .interface import NOT_NEGATIVE, POSITIVE, FloatArray, PortForce, power
 
 
 def way_pull(law: FloatArray, memory: FloatArray, x: float, h: float) -> tuple[float, float]:

@@ -50,7 +50,7 @@ def chain(modes: int, beta: float) -> LinearSystem:
 def ringdown(beta: float, *items: Primitive, refinement: int = 1) -> Motion:
     system = chain(3, beta)
     laws = laws_of(ModelPatch(items), list(system.ports))
-    acting = Acting(TIME, np.zeros(len(TIP)), TIME, initial=np.zeros((0, 2)), release=(TIP, RELEASE))
+    acting = Acting(TIME, TIME, initial=np.zeros((0, 2)), release=(TIP, RELEASE))
     return motion_of(system, acting, laws, refinement)
 
 
@@ -282,7 +282,7 @@ def test_a_slow_force_leads_through_the_static_states(name: str) -> None:
     laws = laws_of(ModelPatch(LAWS[name]), list(system.ports))
     time = np.linspace(0.0, 90.0, 3001)
     force = np.asarray(15.0 * np.sin(2.0 * np.pi * time / 90.0))
-    acting = Acting(time, np.zeros(len(TIP)), time, [(TIP, Course.of(time, force))])
+    acting = Acting(time, time, [(TIP, Course.of(time, force))])
     moved = values(motion_of(system, acting, laws), ROWS)
     still = system.static(np.outer(force, TIP), laws)[0] @ ROWS.T
     assert np.abs(moved - still).max(axis=0) == pytest.approx(np.zeros(2), abs=7e-3 * np.abs(still).max())

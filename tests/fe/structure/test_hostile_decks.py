@@ -1,4 +1,7 @@
-"""Decks, meshes, TOML, JSON and tables with faults, or of one long word: read or refused, never for long."""
+"""Decks, TOML, JSON and tables of one long word, or that ask for much: read or refused, never for long.
+
+`benchmarks.fuzz_loaders` damages structures and meshes of all formats, as other files of a user.
+"""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -6,18 +9,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import meshio
-import numpy as np
 import pytest
 
-from benchmarks.fuzz_mutations import TEXT
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
-from fe.structure.design import parse_structure
 from fe.structure.mesh_file import read_mesh
 from reporting.json_file import parse_json
 from reporting.table_file import TableErrors, parse_table
 from reporting.toml_file import parse_toml
-from scenarios import structure_files
 from tests.refusals import Inputs
 
 pytestmark = pytest.mark.usefixtures("alarm")
@@ -49,37 +47,6 @@ def check(read: Callable[[], Any], *expected: type[Exception]) -> bool:
         assert len(sentence) < 2000
         return False
     return True
-
-
-def read_file(path: Path) -> None:
-    if path.suffix == ".toml":
-        parse_structure(parse_toml(path.read_bytes(), "s.toml", DesignFileError))
-    else:
-        read_mesh(path, 1.0, "m")
-
-
-@pytest.mark.parametrize("count", [60, pytest.param(400, marks=pytest.mark.long)])
-@pytest.mark.parametrize("name", ["m.inp", "m.bdf", "m.msh", "m.vtu", "s.toml"])
-def test_a_file_with_faults_is_read_or_refused(name: str, count: int, box, tmp_path: Path) -> None:
-    """One to three faults in each, as of the other files of a user."""
-    path, (points, cells) = tmp_path / name, box("tetra", (1, 1, 1))
-    if name in ("m.msh", "m.vtu"):
-        halves = {"gmsh:physical": [[1, 1, 1, 2, 2, 2]], "gmsh:geometrical": [[1] * 6]}
-        form, tags = {"m.msh": ("gmsh22", halves), "m.vtu": ("vtu", {"part": [[1] * 6]})}[name]
-        meshio.write(path, meshio.Mesh(points, [("tetra", cells)], cell_data=tags), form, binary=False)
-    else:
-        bracket = structure_files()["bracket"].read_text(encoding="utf-8")
-        decks = {"m.inp": INPUTS.text("brick.inp"), "m.bdf": INPUTS.text("pieces.bdf"), "s.toml": bracket}
-        path.write_text(decks[name], encoding="utf-8")
-    good, draw, done = path.read_bytes(), np.random.default_rng(2028), []
-    assert check(partial(read_file, path)), "it is read before it is changed"
-    for _ in range(count):
-        damaged = good
-        for kind in draw.choice([*TEXT], draw.integers(1, 4)):
-            damaged = TEXT[kind](damaged, draw) or b" "
-        path.write_bytes(damaged)
-        done.append(check(partial(read_file, path), MeshError, DesignFileError, InvalidDesignError))
-    assert 1 < sum(done) < count - 1, "the faults are too small, or too large, to find anything"
 
 
 LONG = 300_000
