@@ -381,4 +381,4 @@ def carry_flexible(ports: Ports, acting: Acting, state: State, h: float) -> None
                 arrive(ports, state, j, x, 1)
             state.memory[j, 2] = keep * state.memory[j, 2] + ease * state.current[j]
             state.memory[j, 3] *= keep
-            add(state.v, ports.rows[j], -state.current[j], 0.5 * h)
+            add(state.v, ports.acts[j], -state.current[j], 0.5 * h)

@@ -50,5 +50,5 @@ def _chosen(name: str) -> Callable[..., Any]:
 
 (
     advance, parts, pull,
-    dry, holds, strength, share, steady, kick, holding_limit, crossing, held,
+    dry, holds, strength, share, steady, kick, holding_limit, crossing,
 ) = map(_chosen, FUNCTIONS)  # fmt: skip

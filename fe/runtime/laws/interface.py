@@ -193,17 +193,8 @@ def crossing(
     return 0.0, 0.0, 0.0
 
 
-def held(law: FloatArray, speed: float, push: float, gain: float, strength: float, h: float) -> float:
-    """Return the force that is given when it is held over a whole step.
-
-    `speed` of the port at the begin, its acceleration `push` without this force, `gain` of its speed by a
-    unit of force over the step.
-    """
-    return 0.0
-
-
 FUNCTIONS = (
     "advance", "parts", "pull",
-    "dry", "holds", "strength", "share", "steady", "kick", "holding_limit", "crossing", "held",
+    "dry", "holds", "strength", "share", "steady", "kick", "holding_limit", "crossing",
 )  # fmt: skip
 """Functions of a law."""

@@ -153,28 +153,3 @@ def crossing(
         # the force ends, but here the next force begins, of the other sign.
         moment -= sign * strength * h * h / 6.0
     return impulse + lost, moment + lost * h, 0.0
-
-
-def held(law: FloatArray, speed: float, push: float, gain: float, strength: float, h: float) -> float:
-    """Return the force that is given when it is held over a whole step."""
-    if strength == 0.0 or gain <= 0.0:
-        return 0.0
-    if law[1] == 0.0:
-        sign = 0.0
-        if speed != 0.0:
-            sign = 1.0 if speed > 0.0 else -1.0
-            last = speed + (push - sign * strength) * h
-            if last * sign > 0.0:
-                return sign * strength * h / gain
-        if abs(push) <= strength:  # it stops, and stays
-            return (speed + push * h) / gain
-        first = 0.0 if speed == 0.0 else speed / (sign * strength - push)  # time until it turns
-        first = min(max(first, 0.0), h)
-        back = 1.0 if push > 0.0 else -1.0
-        return (sign * first + back * (h - first)) * strength / gain
-    middle = speed + 0.5 * h * push
-    after = kick(law, middle, strength, h, False)
-    if law[1] < 1.0 and (after == 0.0 or after * speed < 0.0):
-        middle = speed + h * push
-        after = kick(law, middle, strength, h, False)
-    return float((middle - after) / gain)

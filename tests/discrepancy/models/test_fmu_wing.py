@@ -85,12 +85,6 @@ def test_it_is_the_wing(pair: Pair, case: Trial, tolerance: float, state: dict[s
     assert pair.share(case, **state) < tolerance
 
 
-def test_another_use_of_the_instance_at_rest_leaves_no_trace(pair: Pair) -> None:
-    for health in (0.1, 0.4):  # inputs of one step after another; parameters would ask for a reset
-        assert pair.share(LOADS, health=np.full((1, 2), health)) < 1e-9
-        pair.fmu.fmu.started(1.0, {}, {}, settle=False)
-
-
 @pytest.mark.parametrize("item", [PointMass(0.3, 0.9), RootCompliance(3e-4)])
 def test_effects_that_the_fmu_carries_are_used(pair: Pair, item: Any) -> None:
     assert all(model.supports(type(item)) for model in pair)
