@@ -12,12 +12,12 @@ import numpy as np
 
 from benchmarks.measurement import Measurement
 from reporting.progress import SilentProgress
-from twin_master.assets.resolution import Overrides
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.opening import file_record
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.opening import begin_watch, resume_watch
+from twin_master.watch.opening import begun_watch, resumed_watch
 
 TURNS = 20_000
 REPETITIONS = 7
@@ -48,14 +48,13 @@ def taken_up(folder: Path, log: Path) -> tuple[float, float]:
 
     journal = folder / JOURNAL_NAME
     size, begin = journal.stat().st_size, time.process_time()
-    watch, lock = resume_watch(folder, None, SilentProgress())
-    prepared = time.process_time()
-    try:
-        watch.last_decision()
-        watch.run(file_feed(log, watch.scenario, follow=True), told)
-    except _Told:
-        end = time.process_time()
-    os.close(lock)
+    with resumed_watch(folder, None, SilentProgress()) as watch:
+        prepared = time.process_time()
+        try:
+            watch.last_decision()
+            watch.run(file_feed(log, watch.scenario, follow=True), told)
+        except _Told:
+            end = time.process_time()
     os.truncate(journal, size)
     return end - begin, end - prepared
 
@@ -75,11 +74,10 @@ def run() -> list[Measurement]:
         for turns in (1, 99, TURNS + 19):  # 32 turns between two lines with all that is needed
             folder = place / str(turns)
             loaded = load_scenario(SCENARIO)
-            watch, lock = begin_watch(loaded, folder, Overrides(), SilentProgress(), replace_run=False)
-            if not log.exists():
-                record(watch, log, TURNS + 20)
-            watch.run(file_feed(log, watch.scenario), lambda _decision: None, turns=turns)
-            os.close(lock)
+            with begun_watch(loaded.scenario, file_record(loaded), folder, SilentProgress()) as watch:
+                if not log.exists():
+                    record(watch, log, TURNS + 20)
+                watch.run(file_feed(log, watch.scenario), lambda _decision: None, turns=turns)
             seconds[turns] = np.median([in_a_process(folder, log) for _ in range(REPETITIONS)], axis=0)
     return [
         Measurement(

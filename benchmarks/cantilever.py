@@ -22,8 +22,9 @@ from discrepancy.campaign.records import (
 )
 from discrepancy.models.acting import Acting, Course, Shown, release_of
 from discrepancy.models.interface import Conditions, Model, Outputs, Response
+from discrepancy.models.linear_system import LinearSystem
+from discrepancy.models.motion import motion_of
 from discrepancy.models.scales import PortScale, Scales
-from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.sensing import observe
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import (
@@ -96,7 +97,7 @@ PORTS = {"root": ROOT, "tip": TIP, "span": SPAN}
 
 
 @cache
-def _system(modulus: float, structural: ModelPatch) -> SecondOrderSystem:
+def _system(modulus: float, structural: ModelPatch) -> LinearSystem:
     """Return the structure with its modulus scaled and masses, root and losses of a patch."""
     loss = np.zeros(ELEMENTS)
     mass, extra, compliance = np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE)), 1.0 / ROOT_STIFFNESS
@@ -133,7 +134,7 @@ def _system(modulus: float, structural: ModelPatch) -> SecondOrderSystem:
     damping = (
         2.0 * DAMPING_RATIO / 30.0 * stiffness
     )  # ratio as stated at 30 rad/s, in proportion to frequency
-    return SecondOrderSystem(mass, damping, stiffness, PORTS, 5)
+    return LinearSystem(mass, damping, stiffness, PORTS, 5)
 
 
 class Cantilever(Model):
@@ -228,13 +229,13 @@ def _motion(
     laws = laws_of(patch.of(*INTERNAL_FORCES), PORTS)
     if trial.is_dynamic:
         system = _system(float(modulus[0]), structural)
-        acting = Acting(trial.time, np.zeros(len(TIP)), clock=conditions.clock)
+        acting = Acting(trial.time, conditions.stamps(trial.time))
         if trial.kind is TrialKind.RINGDOWN:
             acting = replace(acting, release=(TIP, release_of(trial)), initial=conditions.initial)
         else:
             acting = replace(acting, loads=[(row, Course.of(trial.time, force, trial.hold))])
-        motion = system.motion(acting, laws, conditions.refinement)
-        response = motion.seen([Shown.of(row) for row in rows])
+        moved = motion_of(system, acting, laws, conditions.refinement)
+        response = moved.seen([Shown.of(row) for row in rows])
         return response.values, response.rates, behind * force
     loads = np.outer(force, row)
     for n in range(len(force)):

@@ -6,11 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import meshio
+
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from fe.wing.design import SHIPPED_DESIGN, load_design
-from scenarios import binding_files, scenario_files
+from scenarios import binding_files, scenario_files, structure_files
 
 DOCS = Path(__file__).parents[1] / "docs"
+INPUTS = Path(__file__).parents[1] / "tests" / "fe" / "structure" / "inputs"
 REFERENCE = Path(__file__).parents[1].parent / "shared" / "reference"
 CONFIG_HASH = "0" * 64
 """Of the configuration that the kept checkpoint belongs to."""
@@ -49,6 +52,7 @@ def make_files(folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     _texts(folder)
     for name, make in (
+        ("structure", _structure),
         ("campaign", _campaign),
         ("verdict", _verdict),
         ("laboratory", _laboratory),
@@ -90,6 +94,16 @@ def _texts(folder: Path) -> None:
         shutil.copy(library, folder / "strains.json")
 
 
+def _structure(folder: Path) -> None:
+    place = folder / "structure"
+    place.mkdir()
+    for file in structure_files().values():
+        for part in file.parent.glob(f"{file.stem}.*"):
+            shutil.copy(part, place)
+    shutil.copy(INPUTS / "pieces.bdf", place)
+    meshio.read(place / "bracket.inp").write(folder / "bracket.vtu", binary=False)
+
+
 def _campaign(folder: Path) -> None:
     _command("discrepancy", "example", "laboratory", folder / "campaign", "--model", "single_mass_rig")
 
@@ -115,14 +129,14 @@ def _run(folder: Path) -> None:
 
 
 def _checkpoint(folder: Path) -> None:
-    from tests.twin_master.mission.test_checkpoint import flown
-    from twin_master.mission.loop import CheckpointFile
+    from tests.twin_master.mission.test_checkpoint import made
+    from twin_master.mission.journal import JournalFile, turn_record
 
     place = folder / "checkpoint"
     place.mkdir()
-    with CheckpointFile(place, CONFIG_HASH) as file:
-        for turn, state in flown(4):
-            file.keep(turn, state)
+    with JournalFile(place, CONFIG_HASH) as file:
+        for number in range(4):
+            file.append(turn_record(made(number)) | {"asset_state": "c3RhdGU="})
 
 
 def _static(folder: Path) -> None:

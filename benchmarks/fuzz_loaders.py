@@ -40,6 +40,8 @@ from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.lumped import LumpedModel
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
+from fe.structure.design import load_structure
+from fe.structure.mesh_file import read_mesh
 from fe.wing.design import load_design
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import load_binding
@@ -49,12 +51,12 @@ from fmu_asset.ssp.reader import read_ssp
 from scenarios import binding_files
 from twin_master.assets.library_source import load_observation_library
 from twin_master.assets.strain_library_source import load_strain_library
-from twin_master.mission.loop import CheckpointFile
+from twin_master.mission.journal import JournalFile, reading_of, records_backwards
 from twin_master.report.reading import read_run as read_record
 from twin_master.run_folder import read_config
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario_check import check_scenario
-from twin_master.store.writing import finished_run, read_run
+from twin_master.store.writing import finished_run, open_run
 
 CPU_SECONDS = 20
 MEMORY = 4 * 1024**3
@@ -83,8 +85,10 @@ class Loader:
 
 
 def _checkpoint(path: Path) -> None:
-    with CheckpointFile(path.parent, CONFIG_HASH):
-        pass
+    with JournalFile(path.parent, CONFIG_HASH):
+        for record, begin, _ in records_backwards(path):
+            if begin:
+                reading_of(record)
 
 
 def _config(path: Path) -> None:
@@ -92,7 +96,16 @@ def _config(path: Path) -> None:
     parse_scenario(read_config(path.parent)["scenario"], str(path))
 
 
+def _mesh(path: Path) -> None:
+    read_mesh(path, 1e-3, "mm")
+
+
 LOADERS: dict[str, Loader] = {
+    "structure": Loader("structure/bracket.toml", load_structure, TEXT),
+    "deck": Loader("structure/bracket.inp", _mesh, TEXT),
+    "bulk data": Loader("structure/pieces.bdf", _mesh, TEXT),
+    "Gmsh": Loader("structure/stiffened_panel.msh", _mesh, TEXT),
+    "VTU": Loader("bracket.vtu", _mesh, TEXT),
     "scenario": Loader("scenario.toml", lambda path: check_scenario(load_scenario(path)), TEXT),
     "binding": Loader("binding.toml", load_binding, TEXT),
     "wing design": Loader("design.toml", load_design, TEXT),
@@ -105,7 +118,7 @@ LOADERS: dict[str, Loader] = {
     "patch, packing": Loader("verdict/patch.json", load_patch, TEXT),
     "verdict": Loader("verdict/verdict.json", read_verdict_file, TEXT),
     "residuals": Loader("verdict/residuals.nc", read_residuals, BINARY),
-    "run, store": Loader("run/run.nc", lambda path: read_run(path.parent), BINARY),
+    "run, store": Loader("run/run.nc", lambda path: open_run(path.parent), BINARY),
     "run, report": Loader("run/run.nc", lambda path: read_record(path.parent), BINARY),
     "checkpoint": Loader("checkpoint/journal.jsonl", _checkpoint, TEXT),
     "configuration": Loader("run/config.json", _config, TEXT),

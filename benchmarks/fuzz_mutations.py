@@ -89,9 +89,34 @@ def _swap_columns(content: bytes, draw: np.random.Generator) -> bytes:
     return b"\n".join(separator.join(row) for row in rows)
 
 
+PIECES = (
+    *(bytes([sign]) for sign in b"*,+=.$#-\n\t \"'[]{}"),
+    *(
+        b"1e999",
+        b"1.5-3",
+        b"7" * 5000,
+        b"\0",
+        "\u00e9".encode(),
+        b"1, 99999999",
+        b"a.a.a",
+        b'"""',
+        b"[[load]]",
+    ),
+    *(b"*NODE", b"*TIE", b"*RIGID BODY", b"GENERATE", b"ELSET=BODY", b"GRID", b"RBE2", b"CELAS1"),
+)
+"""What comes into the middle of a text: signs, numbers, words of decks."""
+
+
+def _insert(content: bytes, draw: np.random.Generator) -> bytes:
+    begin = int(draw.integers(len(content) + 1))
+    end = min(begin + int(draw.choice((0, 0, 0, 1, 1, 2, 10))), len(content))
+    return content[:begin] + PIECES[draw.integers(len(PIECES))] + content[end:]
+
+
 BINARY: dict[str, Mutation] = {"flip": _flip, "overwrite": _overwrite, "cut": _cut, "empty": _empty}
 TEXT: dict[str, Mutation] = {
     **BINARY,
+    **dict.fromkeys(("insert", "insert too", "replace", "replace too"), _insert),
     "delete line": _delete_line,
     "double line": _double_line,
     "number": _replace_number,

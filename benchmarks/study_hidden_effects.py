@@ -58,7 +58,8 @@ from twin_master.run_folder import create_run_folder
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.writing import store_mission
+from twin_master.store.results import groups_of
+from twin_master.store.writing import write_run
 
 TURNS = 50
 LIMIT = 0.6 - 1e-9
@@ -215,7 +216,7 @@ def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Fl
         "title": scenario.mission.title, "scenario": scenario.mission.name, "seed": seed,
         "parameter": knowledge.draws.name,
     }  # fmt: skip
-    store_mission(folder, result, attributes)
+    write_run(folder, groups_of(result), attributes)
     state = flight.state
     error = flight.filtered @ knowledge.model.states.coordinates - state
     held = in_credible_set(knowledge.model, flight.filtered, state, 0.9)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from fe.reduction.reduced_basis import MeasuredErrors, measured_errors, reduce_model, reduce_structure
+from fe.reduction.reduced_basis import MeasuredErrors, measured_errors, reduce_structure
 from fe.runtime.reduced import ReducedModel
 from fe.structure.operators import load_and_assemble
 from fe.wing.design import WingDesign, load_design
@@ -197,7 +197,7 @@ def measured(name: str, regions: int, states: int, folder: Path) -> dict[str, fl
     if name == "wing":
         design = wing(regions)
         full: Any = assemble(design)
-        reduction: Any = reduce_model(full)
+        reduction: Any = reduce_structure(full)
         build_fmu(reduction.model, folder / "wing.fmu")
     else:
         full = load_and_assemble({"plate": plate, "tube": tube, "bracket": bracket}[name](folder, regions))

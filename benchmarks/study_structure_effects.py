@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
 from discrepancy.model_choice import load_model
 from discrepancy.models.acting import Acting, Shown
-from discrepancy.models.second_order import SecondOrderSystem
+from discrepancy.models.linear_system import LinearSystem
+from discrepancy.models.motion import motion_of
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import investigate
 from fe.reduction.model_cache import reduced_structure
@@ -126,7 +127,7 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
     quantities = [Quantity.DISPLACEMENT, *[Quantity.STRAIN] * len(structure.gauges)]
     damping = structure.damping_alpha * mass + structure.damping_beta * stiffness
     end = rows[0]
-    system = SecondOrderSystem(
+    system = LinearSystem(
         mass, damping, stiffness, {PORT: end}, MODES if ringdown else 1, structure.damping_beta
     )
     laws = laws_of(ModelPatch(hidden.laws), system.ports)
@@ -146,9 +147,8 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
             release = Release(sign * DEFLECTION * (1.0, 0.7, 0.5, 0.3)[number], 0.02, mode_count=1)
             initial = np.zeros((1, 2))
             initial[0, 0] = release.deviation * random.standard_normal()
-            moved = system.motion(
-                Acting(time, np.zeros(len(end)), initial=initial, release=(end, release)), laws
-            )
+            acting = Acting(time, time, initial=initial, release=(end, release))
+            moved = motion_of(system, acting, laws)
             values = moved.seen([Shown.of(row) for row in rows]).values
         else:
             values = system.static(np.outer(hidden.force * force + hidden.tare, end), laws)[0] @ rows.T

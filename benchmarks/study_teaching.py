@@ -8,7 +8,6 @@ the decisions for 3g with z1 truly at or above the limit; the wing with nothing 
 """
 
 import argparse
-import os
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,12 +22,12 @@ from fe.runtime.patch import LocalStiffnessLoss, PointMass, Primitive, RootCompl
 from reporting.files import atomic_write_text
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
-from twin_master.assets.resolution import Overrides
 from twin_master.mission.journal import JOURNAL_NAME, records
+from twin_master.mission.opening import file_record
 from twin_master.scenario.reading import load_scenario
-from twin_master.watch import teaching, trial
+from twin_master.watch import teaching
 from twin_master.watch.feeds import file_feed
-from twin_master.watch.opening import begin_watch
+from twin_master.watch.opening import begun_watch
 
 HIDDEN: dict[str, tuple[Primitive, ...]] = {
     "nothing": (),
@@ -71,14 +70,10 @@ def scenario_of(place: Path, known: tuple[Primitive, ...]) -> Path:
 
 def watched(run: Path, folder: Path, scenario: Path, *, teach: bool) -> Watched:
     """Watch the strains of a run."""
-    watch, lock = begin_watch(
-        load_scenario(scenario), folder, Overrides(), SilentProgress(), replace_run=False
-    )
-    try:
+    loaded = load_scenario(scenario)
+    with begun_watch(loaded.scenario, file_record(loaded), folder, SilentProgress()) as watch:
         search = teaching.Search(folder, watch.scenario.mission.seed) if teach else None
         watch.run(file_feed(run / "run.nc", watch.scenario), lambda _decision: None, search=search)
-    finally:
-        os.close(lock)
     lines = [record for record, *_ in records(folder / JOURNAL_NAME)]
     turns = [record for record in lines if "filtered" in record]
     filtered, chosen = (np.array([turn[key] for turn in turns]) for key in ("filtered", "next_control"))
@@ -138,7 +133,7 @@ def main() -> int:
     parser.add_argument("--only", help="numbers of hidden effects from 0, with commas")
     given = parser.parse_args()
     names = [*HIDDEN] if given.only is None else [[*HIDDEN][int(number)] for number in given.only.split(",")]
-    trial.COURTESY = 0  # nothing else is to be served first
+    teaching.COURTESY = 0  # nothing else is to be served first
     with tempfile.TemporaryDirectory() as work:
         for seed in range(given.first_seed, given.first_seed + given.seeds):
             for name in names:

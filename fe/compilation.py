@@ -6,15 +6,19 @@ Without numba (extra `uav-twin[fast]`) they run as what they are, plain Python.
 import functools
 import hashlib
 import inspect
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any, ParamSpec, TypeVar, cast
 
 import numpy as np
 
 from fe.reduction.built_once import cache_folder
+from fe.runtime import laws, motion_arrays, motion_kernel, static_path
+from fe.runtime.motion import Kernel
 from reporting.progress import tell
 
 try:
@@ -23,8 +27,6 @@ try:
     from numba.extending import overload, register_jitable
 except ModuleNotFoundError:
     numba = None
-
-__all__ = ["callable_when_compiled", "choose_when_compiled", "compiled"]
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -132,24 +134,49 @@ def callable_when_compiled(
     return function
 
 
-def choose_when_compiled(chosen: Callable[..., Any], table: tuple[Callable[..., Any], ...]) -> None:
-    """Let compiled functions call `chosen(number, ...)`, which is `table[number](...)`.
+def _functions(module: ModuleType) -> list[Callable[..., Any]]:
+    found = inspect.getmembers(module, inspect.isfunction)
+    return [item for _, item in found if item.__module__ == module.__name__]
 
-    The table is one of functions of `callable_when_compiled` that make no arrays.
-    """
-    if numba is None:
-        return
-    # Written out as one function: a chain of functions would be compiled link by link.
+
+@functools.cache
+def law_functions() -> tuple[Callable[..., Any], ...]:
+    """Return the functions of `fe.runtime.laws`, which compiled functions can call from then on."""
+    tables = {choice: laws.answers(choice.__name__) for choice in (laws.advance, laws.pull)}
+    functions = [item for module in laws.MODULES for item in _functions(module)]
+    found = tuple(dict.fromkeys((*functions, *itertools.chain(*tables.values()))))
+    for function in found:
+        callable_when_compiled(function, makes_arrays=False)
+    for choice, table in tables.items() if numba is not None else ():
+        _choose_when_compiled(choice, table)
+    return found
+
+
+def _choose_when_compiled(choice: Callable[..., Any], table: tuple[Callable[..., Any], ...]) -> None:
+    """Let compiled functions call `choice(number, ...)`, which is `table[number](...)`."""
+    # Written out as one function: a chain of functions would be compiled link by link. Its signature is that
+    # of `compiled_choice`, as numba asks.
     scope: dict[str, Any] = {"Any": Any} | {f"answer_{number}": each for number, each in enumerate(table)}
-    lines = [
-        f"    if number == {number}: return answer_{number}(*given)"
-        for number, function in enumerate(table[:-1])
-        if function is not table[-1]
-    ]
+    lines = [f"    if number == {number}: return answer_{number}(*given)" for number in range(len(table) - 1)]
     head, end = "def choice(number: Any, *given: Any) -> Any:", f"    return answer_{len(table) - 1}(*given)"
     exec("\n".join([head, *lines, end]), scope)
 
     def compiled_choice(number: Any, *given: Any) -> Any:
         return scope["choice"]
 
-    overload(chosen, jit_options={"nogil": True, "_nrt": False, "forceinline": True})(compiled_choice)
+    overload(choice, jit_options={"nogil": True, "_nrt": False, "forceinline": True})(compiled_choice)
+
+
+@functools.cache
+def compiled_kernel() -> Kernel:
+    """Return the compiled loops of `fe.runtime.stepwise.advance` and `static_solution`, for their `kernel`.
+
+    The functions of `fe.runtime` stay plain; they can be called from compiled ones from then on.
+    """
+    inner = {*_functions(motion_arrays), *_functions(motion_kernel)} - {motion_kernel.integrate}
+    for function in inner:
+        callable_when_compiled(function, makes_arrays=False, inline=True)
+    callable_when_compiled(static_path.settle_port, makes_arrays=False)
+    callable_when_compiled(static_path.static_forces)
+    sources = (*law_functions(), *inner, static_path.settle_port)
+    return Kernel(compiled(motion_kernel.integrate, sources), compiled(static_path.static_path, sources))

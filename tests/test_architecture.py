@@ -36,8 +36,8 @@ BESIDE = {"benchmarks", "evidence", "tests"}
 # The rooms of each package from the ground up; a file at the root of its package is a room of its own.
 ROOMS = {
     "fe": (
-        "designs", "runtime", "elements", "full", "structure", "wing", "reduction", "compilation",
-        "verification",
+        "designs", "sentences", "runtime", "elements", "full", "structure", "wing", "reduction",
+        "compilation", "verification",
     ),
     "fmu_asset": (
         "errors", "folders", "slaves", "description", "instances", "worker", "archive", "compiled", "door",

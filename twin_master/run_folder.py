@@ -118,16 +118,12 @@ def read_config(folder: Path) -> dict[str, Any]:
     if not is_run_folder(folder):
         raise NotResumableError(f"{folder} is no run folder: it holds no {CONFIG_NAME} of a run.")
     config: dict[str, Any] = read_json(folder / CONFIG_NAME, NotResumableError)
-    for name in ("scenario", "scenario_file", "provenance"):
-        if not isinstance(config.get(name), dict):
+    for name in ("scenario", "scenario_file", "provenance", "inputs"):
+        if not isinstance(config.get(name, {} if name == "inputs" else None), dict):
             raise NotResumableError(
                 f"{folder / CONFIG_NAME} is damaged, its table `{name}` is missing: "
                 "fly the mission again with --replace."
             )
-    if not isinstance(config.get("inputs", {}), dict):
-        raise NotResumableError(
-            f"{folder / CONFIG_NAME} is damaged, `inputs` is no table: fly the mission again with --replace."
-        )
     return config
 
 

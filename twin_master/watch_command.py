@@ -142,16 +142,11 @@ def _write(text: str, *, flush: bool) -> bool:
 
 def _line(scenario: "Scenario", decision: Mapping[str, Any]) -> str:
     """Return a decision for people: a line of a terminal."""
-    from twin_master.scenario.section import printed_state
+    from twin_master.mission.replay import health_in_words
 
-    health = []
-    for name, known in decision["health"].items():
-        scale, unit = printed_state(known["unit"])
-        digits = ".0f" if unit == "%" else ".3g"
-        mean, deviation = (f"{scale * known[moment]:{digits}}" for moment in ("mean", "standard_deviation"))
-        health.append(f"{name} {mean} ± {deviation} {unit}")
+    health = ", ".join(f"{name} {said}" for name, said in health_in_words(decision).items())
     line = (
-        f"{scenario.mission.step_name} {decision['turn']}: {decision['control']}, {', '.join(health)}; "
+        f"{scenario.mission.step_name} {decision['turn']}: {decision['control']}, {health}; "
         f"next {decision['next_control']} with probability {decision['probability']:.3f}"
     )
     chosen = decision.get("decided_by", "model")

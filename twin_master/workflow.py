@@ -1,13 +1,11 @@
 """The whole chain: design -> reduced model -> FMU -> calibration -> mission -> store -> report."""
 
 import io
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,8 +18,8 @@ from twin_master.assets.mismatch import Misfit, find_misfit
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.errors import NotResumableError
 from twin_master.mission import loop
-from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.opening import begin_folder, file_record, restore, resume_folder
+from twin_master.mission.journal import JOURNAL_NAME, JournalFile
+from twin_master.mission.opening import begun_folder, file_record, restore, resumed_folder
 from twin_master.mission.planning import read_policy
 from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
 from twin_master.mission.turns import History
@@ -34,26 +32,15 @@ from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import another_truth
 from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
 
+if TYPE_CHECKING:
+    from xarray import DataTree
+
 POLICY_NAME = "policy.npy"
 """In the run folder: the policy that was given in the place of a plan, (S, U) or on the belief."""
 
 
 Begun = Callable[[Path], None]
 """Told the run folder once it is there and held, before anything is modelled."""
-
-
-@dataclass
-class _Clock:
-    """Wall-clock seconds of the stages."""
-
-    begin: float = field(default_factory=time.perf_counter)
-    stages: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        begin = time.perf_counter()
-        yield
-        self.stages[name] = time.perf_counter() - begin
 
 
 def fly(
@@ -105,13 +92,9 @@ def fly(
         progress.note(loaded.remark)
     restore(folder, progress)
     source = asset_source(resolved)
-    config, located, lock = begin_folder(
-        resolved, file_record(loaded), folder, source, files, replace=replace
-    )
-    try:
+    opened = begun_folder(resolved, file_record(loaded), folder, source, files, replace=replace)
+    with opened as (config, located):
         return _run(folder, config, located, progress, begun, report=report)
-    finally:
-        os.close(lock)
 
 
 def _policy_file(policy: ArrayLike | BeliefPolicy | Path, scenario: Scenario) -> bytes:
@@ -155,16 +138,13 @@ def resume(
     """
     folder, progress = Path(folder), progress or SilentProgress()
     restore(folder, progress)
-    config, scenario, lock = resume_folder(folder, loaded)
-    try:
+    with resumed_folder(folder, loaded) as (config, scenario):
         finished = finished_run(folder)
         if finished is not None and (finished.report or not report):
             progress.note(f"The run in {folder} is finished: nothing is flown again.")
             return finished
         check_versions(folder, config, scenario.mission.seed)
         return _run(folder, config, scenario, progress, begun, report=report)
-    finally:
-        os.close(lock)
 
 
 def _run(
@@ -179,31 +159,38 @@ def _run(
     tidy(folder)
     if begun is not None:
         begun(folder)
-    clock = _Clock()
+    start, stages = time.perf_counter(), dict[str, float]()
+
+    @contextmanager
+    def timed(name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        stages[name] = time.perf_counter() - begin
+
     source = asset_source(scenario)
-    with _unflown(folder), clock.stage("asset"):
+    with _unflown(folder), timed("asset"):
         hashes = dict(source.prepare(folder, progress))
         policy = _given_policy(folder, hashes)
     config = with_inputs(folder, config, hashes)
-    with _unflown(folder), clock.stage("calibration"), progress.stage("Calibrating and planning"):
+    with _unflown(folder), timed("calibration"), progress.stage("Calibrating and planning"):
         knowledge = _known(folder, config, scenario, source, policy, progress)
-    with clock.stage("mission"), _kept(folder):
+    with timed("mission"), _kept(folder):
         result = _fly(folder, config, knowledge, source, progress)
-    with clock.stage("store"), progress.stage("Storing"), _kept(folder):
+    with timed("store"), progress.stage("Storing"), _kept(folder):
         write_field = _field_writer(source, result)
         misfit = _misfit(knowledge, source)
-        store_flight(
+        stored = store_flight(
             folder, config, result, source.origin, steps=scenario.mission.steps, misfit=misfit,
             write_field=write_field,
         )  # fmt: skip
     timing = _timing(result.flight)
     del knowledge, result, write_field  # before the report is drawn
     if report:
-        with clock.stage("report"), progress.stage("Writing the report"), _kept(folder):
-            _report(folder)
-    timing |= {"stages_seconds": dict(clock.stages), "total_seconds": time.perf_counter() - clock.begin}
+        with timed("report"), progress.stage("Writing the report"), _kept(folder):
+            _report(folder, stored())
+    timing |= {"stages_seconds": stages, "total_seconds": time.perf_counter() - start}
     atomic_write_text(folder / TIMING_NAME, to_json(timing))  # the only file with figures of a clock
-    return read_outcome(folder)
+    return read_outcome(folder, stored)
 
 
 def _known(
@@ -290,15 +277,11 @@ def _fly(
 ) -> MissionResult:
     scenario = knowledge.scenario
     truth = knowledge.truth(scenario.mission.seed)
-    with closing(source.open()) as asset, loop.CheckpointFile(folder, hash_record(config)) as kept:
-        flight = loop.fly(
-            scenario,
-            knowledge.twin(),
-            knowledge.plant(truth, asset),
-            checkpoint=kept.checkpoint,
-            keep=kept.keep,
-            progress=progress,
-        )
+    with closing(source.open()) as asset, JournalFile(folder, hash_record(config)) as journal:
+        plant = knowledge.plant(truth, asset)
+        flown = loop.taken_up(journal, knowledge, plant)
+        keep = loop.kept_in(journal, plant)
+        flight = loop.fly(scenario, flown.twin, plant, keep, history=flown, progress=progress)
         return MissionResult(scenario, knowledge, flight, truth, asset.units)
 
 
@@ -338,7 +321,7 @@ def _timing(flight: History) -> dict[str, Any]:
     return record
 
 
-def _report(folder: Path) -> None:
+def _report(folder: Path, tree: "DataTree") -> None:
     from twin_master.report.page import write_report
 
-    write_report(folder)
+    write_report(folder, tree=tree)

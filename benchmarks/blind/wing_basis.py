@@ -24,11 +24,7 @@ from fe.wing.operators import (
     ROOT_UNKNOWNS,
     AffineOperators,
     assemble,
-    cell_density,
-    cell_elasticity,
     gauge_output,
-    modulus_variation,
-    point_mass_weights,
     point_masses,
     section_displacement,
 )
@@ -201,11 +197,8 @@ def _functionals(operators: AffineOperators) -> _Functionals:
     tip, middle = (lines[(lines > low) & (lines < high)] for low, high in HOLDER_SPAN.values())
     corner = design.planform.semi_span - design.tip_load.distance_from_tip
 
-    nodal = np.asarray(mesh.mass(np.arange(len(mesh.cells)), cell_density(mesh)).sum(axis=1))
-    for place in design.point_masses:
-        nodal = nodal + getattr(design.masses, place.kind) * point_mass_weights(mesh, place)
     weight = np.zeros(mesh.unknowns)
-    weight[2::3] = -STANDARD_GRAVITY * nodal
+    weight[2::3] = -STANDARD_GRAVITY * operators.body.nodal_mass
     weight = np.asarray(expansion.T @ weight)
 
     # Lift without weight, by the station of its unknowns; the root's unknowns lie at station 0.
@@ -270,15 +263,10 @@ def _region_stiffness(operators: AffineOperators, region: int) -> tuple[list[spa
     mesh = operators.wing_mesh
     start, end = (float(mesh.span_lines[k]) for k in REGION_LINES[region])
     inside = (mesh.centres[:, 1] > start) & (mesh.centres[:, 1] < end)
-    elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
     parts = []
     for term in range(3):
         cells = np.flatnonzero(inside & (mesh.region == term))
-        if cells.size:
-            matrix = mesh.stiffness(cells, elasticity[cells], variation[cells])
-        else:
-            matrix = sparse.csr_array((mesh.unknowns, mesh.unknowns))
-        parts.append((operators.expansion.T @ (matrix @ operators.expansion)).tocsr())
+        parts.append(operators.body.stiffness(cells))
     return parts, np.array([start, end])
 
 

@@ -93,7 +93,7 @@ class ByForce(Court[Explained]):
         """Return the unit of the force at the port of a hypothesis."""
         ports = self.force.ports
         places = [t.place for t in item.candidate.terms if t.place in ports]
-        return self.problem.model.port_unit(places[0] if places else ports[next(iter(item.processes))])
+        return self.problem.model.port_units(places[0] if places else ports[next(iter(item.processes))])[0]
 
     def gap(self) -> str:
         """Return size and port of the missing force, and the variable that orders it."""

@@ -15,14 +15,14 @@ from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.trial import SeenTrial
 from discrepancy.missing_force.view import Column, Motion, Part, View, combined
-from discrepancy.models.compiled_motion import law_functions
 from discrepancy.models.interface import Response
 from discrepancy.models.sensing import observe_response
-from fe.compilation import compiled
+from fe.compilation import compiled, law_functions
+from fe.runtime.arrays import HEAD, PLACE
 from fe.runtime.errors import InvalidPatchError
-from fe.runtime.laws import LAWS, advance, pull, steady
-from fe.runtime.laws.interface import HEAD, PARAMETERS, PortForce
-from fe.runtime.motion_arrays import FIRST_PARTS
+from fe.runtime.laws import LAWS, advance, pull
+from fe.runtime.laws.interface import PARAMETERS, PortForce
+from fe.runtime.laws.speed import steady
 from fe.runtime.patch import SENSORS, LoggerClock, ModelPatch
 from fe.runtime.sensors import clock_of
 
@@ -39,11 +39,11 @@ def along(
     """Fill `found` (F,) with the force of a law at positions and speeds (F,) that follow one another."""
     for k in range(len(x)):
         if of_speed:
-            found[k] = steady(number, law, x[k], v[k])
+            found[k] = steady(law, x[k], v[k])
         else:
-            advance(number, law, memory, x[k], FIRST_PARTS if k == 0 else 1)
-            memory[1] = x[k]
-            found[k] = pull(number, law, memory, x[k], 1.0, 1)[0]
+            advance(number, law, memory, x[k])
+            memory[PLACE] = x[k]
+            found[k] = pull(number, law, memory, x[k], 1.0)[0]
 
 
 @cache

@@ -344,7 +344,7 @@ def told_force(missing: MissingForce, model: Model) -> ForceAtPort:
     k = int(np.abs(course.force).argmax())
     most = (float(item[k]) for item in (course.time, course.force, course.position, course.speed))
     return ForceAtPort(
-        missing.port, model.port_unit(missing.port), rms, displacement, velocity,
+        missing.port, model.port_units(missing.port)[0], rms, displacement, velocity,
         ForceMoment(course.trial, *most), missing.evidence, missing.correlation_time, by_variable,
         ordered_by, missing.law,
     )  # fmt: skip

@@ -21,7 +21,6 @@ from discrepancy.campaign.records import BoolArray, FloatArray, Quantity, Trial
 from discrepancy.campaign.sampling import IntArray
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, moved
 from discrepancy.fits.problem import Problem
-from discrepancy.models.acting import refined
 from discrepancy.models.interface import PortedSystem
 
 from .kalman_kernels import driven
@@ -262,11 +261,10 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     interval = float(np.median(np.diff(trial.time)))
     fastest = float(np.max(np.abs(np.linalg.eigvals(base.generator)), initial=0.0))
     count = int(np.clip(np.ceil(fastest * interval / FINE_PHASE), COARSEST, FINEST))
-    fine = refined(trial, count)
 
     def moving(of_all: FloatArray, local: FloatArray) -> FloatArray:
         conditions = unknowns.conditions(trial, shared.parameters(of_all), local)
-        return np.stack(model.port_motion(fine, conditions))
+        return np.stack(model.port_motion(trial, conditions, count))
 
     here, local = moving(point.shared, point.local[number]), point.local[number]
     by_unknowns = [

@@ -1,7 +1,7 @@
 """What acts on a system in a trial, between the samples too and under a patch, and what its outputs show."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import isfinite, pi
 from typing import ClassVar, NamedTuple
@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline, PPoly
 
-from discrepancy.campaign.records import FloatArray, Hold, Quantity, Release, Start, Trial
+from discrepancy.campaign.records import FloatArray, Hold, Release, Start, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Memory, Place
 from fe.runtime.expression import Expression
@@ -56,6 +56,11 @@ class Course:
         key = (known, motion, time.tobytes(), values.tobytes())
         return _courses.get(key, lambda: Course(time, values, known, motion))
 
+    @staticmethod
+    def always(time: FloatArray) -> "Course":
+        """Return the course of what acts by one all the time."""
+        return Course.of(time, np.ones(len(time)))
+
     edges: ClassVar[tuple[float, ...]] = ()
     """Moments at which it jumps between the stamps: none."""
 
@@ -66,19 +71,13 @@ class Course:
         lower = [base.antiderivative(number) for number in range(self.motion or 0, 0, -1)]
         return [*lower, base, *(base.derivative(number) for number in range(1, 4 - len(lower)))]
 
-    @cached_property
-    def first_speed(self) -> float:
-        """Speed at the first stamp of a motion; zero where the record does not tell it from that.
-
-        It does not where the slope of a parabola through the first three stamps is as far from the spline's.
-        """
-        first = self.time[:1]
-        speed = float(self.at(first, 1)[0])
-        if self.motion == 0:
-            parabola = np.polynomial.Polynomial.fit(self.time[:3], self.values[:3], 2).deriv()
-            if abs(speed) <= abs(speed - float(parabola(first[0]))):
-                return 0.0
-        return speed
+    @property
+    def slope(self) -> "Course":
+        """Its derivative, of a linear one in steps."""
+        if self.hold is Hold.SMOOTH:
+            return Course(self.time, self.at(self.time, 1), Hold.SMOOTH)
+        slopes = np.diff(self.values) / np.diff(self.time)
+        return Course(self.time, np.append(slopes, slopes[-1]), Hold.ZERO_ORDER)
 
     def at(self, time: FloatArray, order: int = 0) -> FloatArray:
         """Return the values (N,) at times, of a held one that of just before, or a derivative of a spline."""
@@ -159,11 +158,11 @@ class Acting:
     Attributes
     ----------
     time : (N,) ndarray
-        Stamps of the inputs and of the samples [s].
-    constant : (n + m,) ndarray
-        Constant load.
+        Stamps of the inputs [s].
+    sampled : (N,) ndarray
+        Times at which the samples show the motion [s].
     loads : sequence of Load
-        What else pushes.
+        What pushes.
     drives : mapping of str to Course
         Prescribed motions by their inputs, in the order of `LinearSystem.drives`.
     begins : Start
@@ -174,59 +173,37 @@ class Acting:
     release : tuple of ((n,) ndarray, Release), optional
         How a structure was let go, and the row of the release point: row . u is its displacement, and the
         holding force acts along it.
-    basis : (K, n + m) ndarray, optional
-        Of a system of K unknowns, in whose coordinates all this is; None: it is in those of the system.
-    clock : tuple of float
-        Rate and zero of the samples beside the inputs.
     """
 
     time: FloatArray
-    constant: FloatArray
+    sampled: FloatArray
     loads: Sequence[Load] = ()
     drives: Mapping[str, Course] = field(default_factory=dict)
     begins: Start = Start.SETTLED
     initial: FloatArray = field(default_factory=lambda: np.zeros(0))
-    clock: tuple[float, float] = (0.0, 0.0)
     release: tuple[FloatArray, Release] | None = None
-    basis: FloatArray | None = None
-
-    def along(self, basis: FloatArray) -> "Acting":
-        """Return it in the coordinates of a basis (n + m, k)."""
-        release = None if self.release is None else (self.release[0] @ basis, self.release[1])
-        loads = [(row @ basis, course) for row, course in self.loads]
-        return replace(self, constant=self.constant @ basis, loads=loads, release=release, basis=basis)
-
-    @property
-    def sampled(self) -> FloatArray:
-        """Times (N,) at which the samples show the motion [s]."""
-        return (1.0 + self.clock[0]) * self.time + self.clock[1]
 
     @property
     def levels(self) -> tuple[FloatArray, FloatArray]:
         """Loads (k, n + m), and how much of each (L, k) acts in the rows of a trial at rest."""
         pushes = [(row, course.values) for row, course in self.loads if isinstance(course, Course)]
-        if self.constant.any():
-            pushes.append((self.constant, np.ones(len(self.time))))
         units, amounts = zip(*pushes, strict=True)
         return np.array(units), np.column_stack(amounts)
 
     def load_at(self, time: FloatArray, base: FloatArray) -> FloatArray:
         """Return the loads (T, B) in a base (n + m, B) at times, held ones as they were just before."""
-        return self.total([course.at(time) for _, course in self.loads], base, len(time))
+        return self._total([course.at(time) for _, course in self.loads], base, len(time))
 
     def ends(self, time: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the loads (K, B) at the begin and the end of the steps between times (K + 1,)."""
         found = [course.ends(time) for _, course in self.loads]
         begin, end = ([pair[side] for pair in found] for side in (0, 1))
-        return self.total(begin, base, len(time) - 1), self.total(end, base, len(time) - 1)
+        return self._total(begin, base, len(time) - 1), self._total(end, base, len(time) - 1)
 
-    def total(self, amounts: Sequence[FloatArray], base: FloatArray, count: int) -> FloatArray:
-        """Return the loads (T, B) of amounts (T,) of each beside the constant one."""
-        constant, *rows = np.array([self.constant, *(row for row, _ in self.loads)]) @ base
-        if not rows:
-            return np.tile(constant, (count, 1))
-        found: FloatArray = np.array(amounts).T @ np.array(rows)
-        return found + constant if constant.any() else found
+    def _total(self, amounts: Sequence[FloatArray], base: FloatArray, count: int) -> FloatArray:
+        """Return the loads (T, B) of amounts (T,) of each."""
+        rows = np.array([row for row, _ in self.loads]).reshape(len(self.loads), len(base))
+        return np.array(amounts).reshape(len(rows), count).T @ (rows @ base)
 
 
 class Shown(NamedTuple):
@@ -255,11 +232,6 @@ class Shown(NamedTuple):
         rows, n = np.zeros((4, len(row))), len(row) - states
         rows[order, :n], rows[further + 1, n:] = row[:n], row[n:]
         return cls(rows)
-
-
-def shown_rows(rows: Iterable[FloatArray], outputs: Sequence[tuple[str, Quantity]]) -> list[Shown]:
-    """Return what sensors of displacements and their derivatives show at rows (n,)."""
-    return [Shown.of(row, quantity.order) for row, (_, quantity) in zip(rows, outputs, strict=True)]
 
 
 def place_among(places: Sequence[str], place: Place, what: str, where: str = "a trial") -> str:
@@ -320,27 +292,6 @@ class LoadChange(NamedTuple):
         return np.asarray((1.0 + self.gain) * values + self.tare * (recorded != 0.0))
 
 
-def refined(trial: Trial, parts: int) -> Trial:
-    """Return a trial with stamps that are `parts` times denser, its inputs as they are between samples."""
-    count = len(trial.time)
-    at = np.arange((count - 1) * parts + 1) / parts
-    row = np.minimum(at.astype(np.int64), count - 2)
-    time = np.interp(at, np.arange(count), trial.time)
-    time[::parts] = trial.time
-
-    def dense(values: FloatArray) -> FloatArray:
-        share = (at - row).reshape((-1, *(1,) * (values.ndim - 1)))
-        return np.asarray((1.0 - share) * values[row] + share * values[row + 1])
-
-    def held(values: FloatArray, hold: Hold | None) -> FloatArray:
-        if hold is Hold.ZERO_ORDER:
-            return np.asarray(values[np.minimum((at + 1e-9).astype(np.int64), count - 1)])
-        return Course.of(trial.time, values, hold).at(time)
-
-    return replace(
-        trial, time=time, values=dense(trial.values), used=np.ones((len(time), trial.used.shape[1]), bool),
-        force=held(trial.force, trial.hold), load_factor=dense(trial.load_factor),
-        temperature=dense(trial.temperature),
-        health=dense(trial.health), health_deviation=dense(trial.health_deviation),
-        inputs=tuple(replace(item, values=held(item.values, item.hold)) for item in trial.inputs),
-    )  # fmt: skip
+def divided(time: FloatArray, parts: int) -> FloatArray:
+    """Return stamps whose intervals are divided into so many parts."""
+    return np.interp(np.arange((len(time) - 1) * parts + 1) / parts, np.arange(len(time)), time)

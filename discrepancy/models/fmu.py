@@ -10,7 +10,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Course, LoadChange, place_among, release_of
+from discrepancy.models.acting import Course, LoadChange, divided, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion, Motive, Sampled, record_of
 from discrepancy.models.fmu_runs import State
@@ -174,12 +174,15 @@ class FmuModel(DescribedModel):
         orders = [quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs]
         return [self.fmu.columns[output] for output, _ in outputs], orders
 
-    def _moving(self, asked: Asked, columns: list[int], orders: list[int]) -> Sampled:
-        """Return columns of the FMU's outputs in a dynamic trial, derived so many times, and their rates."""
-        (trial, conditions, laws, *_), (rate, zero) = asked, asked.conditions.clock
+    def _moving(self, asked: Asked, columns: list[int], orders: list[int], parts: int = 1) -> Sampled:
+        """Return columns of the FMU's outputs in a dynamic trial, derived so many times, and their rates.
+
+        At samples that are so many times as dense as those of the trial.
+        """
+        trial, conditions, laws, *_ = asked
         return self.fmu.motion(
-            trial, (1.0 + rate) * trial.time + zero, self._state(asked), self._motive(asked), laws, columns,
-            orders, conditions.refinement,
+            trial, divided(conditions.stamps(trial.time), parts), self._state(asked), self._motive(asked),
+            laws, columns, orders, conditions.refinement,
         )  # fmt: skip
 
     def _at_rest(self, asked: Asked) -> FloatArray:
@@ -230,10 +233,12 @@ class FmuModel(DescribedModel):
         rows, at_once = found.rows(*self._read(outputs))
         return PortedSystem(found.generator, self.ports(), found.push.T, position, speed, rows, at_once.T)
 
-    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
+    def port_motion(
+        self, trial: Trial, conditions: Conditions, parts: int = 1
+    ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         asked = self._asked(trial, conditions, self.patch)._replace(laws=NO_LAWS)
-        return self._moving(asked, self.fmu.x, [0] * len(self.fmu.x))
+        return self._moving(asked, self.fmu.x, [0] * len(self.fmu.x), parts)
 
     # ------------------------------------------------------------ trials in its names and units
 

@@ -18,14 +18,15 @@ from scipy.optimize import root_scalar
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course
-from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_runs import LINEAR, FmuRuns, Run, State
 from discrepancy.models.fmu_system import FmuSystem, fmu_system
 from discrepancy.models.interface import Memory
+from fe.compilation import compiled_kernel
+from fe.runtime.arrays import PLACE
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import Laws, static_solution
-from fe.runtime.motion_arrays import Samples
+from fe.runtime.motion_arrays import ModalMotion
 from fe.runtime.motion_arrays import State as Moving
 from fe.runtime.stepwise import ALIKE, Boundaries, steps_under
 
@@ -299,7 +300,7 @@ class FmuMotion(FmuRuns):
         if not even:  # as many lengths of steps as stamps would take long
             stamps = step * np.arange(ceil(end / step - 1e-6) + 1.0)
         states, forces = system.motion(
-            Acting(stamps, np.zeros(len(inputs)), loads), self._start(system, motive, amounts),
+            Acting(trial.time, stamps, loads), self._start(system, motive, amounts),
             still[self._x[at]], laws, self._x[at],
             np.array([inputs.index(self.forces[port]) for port in at], dtype=np.int64), refinement,
         )  # fmt: skip
@@ -355,8 +356,8 @@ class FmuMotion(FmuRuns):
         names, h = [self.forces[port] for port in at], run.step
         one = run._replace(steps=1, courses={name: course[:1] for name, course in run.courses.items()})
         free = self.followed(one)
-        pushed = ({name: one.courses.get(name, 0.0) + np.full(1, self.size(name))} for name in names)
-        kicked = (self.followed(one._replace(courses={**one.courses, **push})) for push in pushed)
+        pushes = ({name: one.courses.get(name, 0.0) + np.full(1, self.size(name))} for name in names)
+        kicked = (self.followed(one._replace(courses={**one.courses, **push})) for push in pushes)
         sizes = np.array([self.size(name) for name in names])
         gain = np.stack([item[1, v] - free[1, v] for item in kicked], axis=1) / sizes
         ports, unit = [self.ports[port] for port in at], np.eye(count)
@@ -369,28 +370,30 @@ class FmuMotion(FmuRuns):
             modal, Boundaries(np.array([0.0, h]), np.arange(2), np.array([h])), none, none.copy(),
             np.zeros((2, len(laws))),
         )  # fmt: skip
-        given = laws.at(laws.rows(modal.ports, count))._replace(acts=laws.rows(modal.actions, count))
-        q, speed, current = np.zeros(count), np.zeros(count), np.zeros(len(laws))
-        moving = Moving(q, speed, laws.memory(), current)
-        out = Samples(*(np.zeros((2, width)) for width in (count, count, len(laws), len(laws))))
+        rows, rigid = laws.rows(modal.ports, count), np.zeros(len(laws))
+        given = tuple(laws.at(rows, laws.rows(modal.actions, count), rigid, 0.0, go.transition))
+        moving = Moving(np.zeros(count), np.zeros(count), laws.memory())
+        (q, v_end), (pulls, lagged) = np.zeros((2, 2, count)), np.zeros((2, 2, len(laws)))
+        out = ModalMotion(q, v_end, pulls, lagged, moving.memory)
         before, taken = 2.0 * free[0, v] - free[1, v], np.zeros(count)
         friction = laws.of_speed == 1
         asset, first, courses = self.begun(run)
-        values, rows = [first], np.column_stack([*courses.values()])
+        values, acts = [first], np.column_stack([*courses.values()])
         pushed = [list(courses).index(name) for name in names]
-        for number, row in enumerate(rows):
+        for number, row in enumerate(acts):
             speed = values[-1][v]
             push = (speed - before + taken) / h
             moving.q[:], moving.v[:] = values[-1][x], speed
             go.push[:] = np.concatenate((0.5 * h * h * push, h * push))
             go.begin[:] = go.end[:] = push
-            moving.memory[friction, 1] = given.rows[friction] @ moving.q  # where it holds the port
-            moving.current[:] = 0.0
-            compiled_kernel().integrate(tuple(go), True, number > 0, tuple(given), tuple(moving), tuple(out))
+            moving.memory[friction, PLACE] = rows[friction] @ moving.q  # where it holds the port
+            compiled_kernel().integrate(
+                tuple(go), 0, 1, 0, True, number > 0, given, tuple(moving), tuple(out)
+            )
             before, taken = speed, speed + h * push - moving.v
             row[pushed] -= np.linalg.solve(gain, taken)
             if not np.isfinite(row).all():
-                return np.full((len(rows) + 1, len(first)), np.nan)
+                return np.full((len(acts) + 1, len(first)), np.nan)
             values.append(self.one_step(asset, dict(zip(courses, row.tolist(), strict=True))))
         return np.array(values)
 

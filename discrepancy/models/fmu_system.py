@@ -10,8 +10,8 @@ from scipy.signal import cont2discrete
 
 from discrepancy.campaign.records import FloatArray, Hold
 from discrepancy.models.acting import SMOOTH_PARTS, Acting
-from discrepancy.models.compiled_motion import compiled_kernel
 from discrepancy.models.interface import Memory
+from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import Laws
@@ -139,7 +139,7 @@ class FmuSystem:
         key = (laws.ports, columns.tobytes(), numbers.tobytes())
         acts, modal, law = self._kept.get(key, lambda: self._with_ports(laws.ports, columns, numbers))
         smooth = any(course.hold is Hold.SMOOTH for _, course in acting.loads)
-        boundaries = substeps(modal, laws, acting.time, refinement, SMOOTH_PARTS if smooth else 1)
+        boundaries = substeps(modal, laws, acting.sampled, refinement, SMOOTH_PARTS if smooth else 1)
         begin, end = acting.ends(boundaries.time, acts.T)
         feed = acting.load_at(boundaries.time, self.direct[columns].T)
         seen = self.outputs[columns[law]]
@@ -149,7 +149,7 @@ class FmuSystem:
         )
         steps = steps_under(modal, boundaries, begin, end, feed)
         found = advance(modal, laws, steps, first, compiled_kernel())
-        forces = acting.load_at(acting.time, np.eye(self.push.shape[1]))
+        forces = acting.load_at(acting.sampled, np.eye(self.push.shape[1]))
         np.subtract.at(forces.T, numbers, found.port_forces.T)
         return found.v[:, len(law) :], forces
 

@@ -1,7 +1,6 @@
 """What the workflow asks of a model: structural response under a patch, before any sensor touches it."""
 
 from abc import ABC, abstractmethod
-from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -20,6 +19,8 @@ from fe.runtime.state import Losses
 from reporting.words import brief, capital, counted
 
 Place = str | tuple[float, float]
+MOVES, TURNS, EITHER = ("N", "m"), ("N m", "rad"), ("N or N m", "m or rad")
+"""Units of a force and of a motion at a port."""
 KEPT = 400
 """Responses that a model keeps; the oldest goes first."""
 _Value = TypeVar("_Value")
@@ -37,13 +38,14 @@ class Memory:
         end: Callable[[Any], None] = lambda _: None,
     ) -> None:  # fmt: skip
         self._room, self._weight, self._end = size, weight, end
-        self._values: OrderedDict[Hashable, Any] = OrderedDict()
+        self._values: dict[Hashable, Any] = {}
 
     def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
         """Return what `make` returned for `key`, calling it if need be."""
         if key in self._values:
-            self._values.move_to_end(key)
-            return self._values[key]  # type: ignore[no-any-return]
+            found: _Value = self._values.pop(key)
+            self._values[key] = found
+            return found
         value = self._values[key] = make()
         self._room -= self._weight(value)
         while self._room < 0 and len(self._values) > 1:
@@ -56,7 +58,7 @@ class Memory:
             self._forget()
 
     def _forget(self) -> None:
-        value = self._values.popitem(last=False)[1]
+        value = self._values.pop(next(iter(self._values)))
         self._room += self._weight(value)
         self._end(value)
 
@@ -93,6 +95,10 @@ class Conditions:
     offset: tuple[float, ...] = ()
     components: bool = False
     refinement: int = 1
+
+    def stamps(self, time: FloatArray) -> FloatArray:
+        """Return the times at which samples with stamps (N,) show the motion [s]."""
+        return (1.0 + self.clock[0]) * time + self.clock[1]
 
     @property
     def key(self) -> tuple[object, ...]:
@@ -252,8 +258,13 @@ class Model(ABC):
         """Return natural sizes (L,) of the state at the begin of a trial; empty: it is never unknown."""
         return np.zeros(0)
 
-    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
-        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
+    def port_motion(
+        self, trial: Trial, conditions: Conditions, parts: int = 1
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws.
+
+        At samples that are so many times as dense as those of the trial.
+        """
         raise NotImplementedError
 
     def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
@@ -264,13 +275,12 @@ class Model(ABC):
         """Return forces as they act at the ports of `ported`."""
         return forces
 
-    def turns(self, port: str) -> bool | None:
-        """Return whether a port turns; None where the model does not say it."""
-        return None
+    def port_units(self, port: str) -> tuple[str, str]:
+        """Return the units of a force at a port and of what it acts on: `MOVES`, `TURNS`, or of a state.
 
-    def unit_of_state(self, port: str) -> str:
-        """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""
-        return ""
+        Both where the model does not say it.
+        """
+        return EITHER
 
     def check(self, trial: Trial) -> None:
         """Refuse a trial that it cannot follow."""
@@ -419,12 +429,6 @@ class Model(ABC):
         laws = self.patch.of(PortForce)
         rest = ModelPatch(tuple(item for item in self.patch if not isinstance(item, PortForce)))
         return self._changed(patch=rest, _kept=None), laws
-
-    def port_unit(self, port: str) -> str:
-        """Return the unit of a force: "N", "N m", both where the model does not say it, or that of a flow."""
-        if state := self.unit_of_state(port):
-            return f"{state}/s times capacity"
-        return {True: "N m", False: "N", None: "N or N m"}[self.turns(port)]
 
     def _changed(self, **attributes: object) -> Self:
         """Return the model with other attributes."""

@@ -1,4 +1,4 @@
-"""A linear system with ports: M z'' + C z' + K z = loads, its modes and its rest.
+"""A linear system with ports: M z'' + C z' + K z = loads, its modes and its rest; `motion` moves it.
 
 Displacements u and states x, M u'' + C u' + K u = F x + b(t), T x' + R x = G u' + H u + d(t): a state is the
 speed of a coordinate that has no stiffness, x = s', so that both are one equation in z = (u, s).
@@ -9,7 +9,7 @@ put right at every step. The wing, a structure on springs and a lumped rig are s
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.linalg import cho_factor, eigh, null_space
@@ -18,8 +18,8 @@ from scipy.linalg.lapack import dpotrs
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Shown
-from discrepancy.models.compiled_motion import compiled_kernel
-from discrepancy.models.interface import PortedSystem
+from discrepancy.models.interface import Memory, PortedSystem
+from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, static_solution
 
@@ -27,73 +27,22 @@ HEAVY = 1e12
 """Mass of a prescribed coordinate over the largest of the system."""
 LEAST_PIVOT = 1e-9
 """A system whose equilibrium is determined worse than this has none of its own."""
+KEPT_ANSWERS = 16
+"""Loads whose answers a structure keeps: outputs and ports are often the same."""
 ROUNDING = 1e-10
 """Share of the largest entry below which what couples modes is rounding."""
 
 
-Resting = Callable[[FloatArray], FloatArray]
-"""What returns displacements and states (L, N) at rest under loads (L, N)."""
+Flexibility = Callable[[FloatArray], FloatArray]
+"""What gives K^-1 loads, for loads (N,) or (N, k)."""
+Modes = tuple[FloatArray, FloatArray, int]
+"""Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
 
 
-def springs(stiffness: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what gives K^-1 loads for loads (n,) or (n, k); raises `ModelError` if K holds not all."""
-    try:
-        factor, lower = cho_factor(stiffness, check_finite=False)
-    except np.linalg.LinAlgError as cause:
-        raise ModelError(f"The structure has no stiffness left in some direction ({cause}).") from cause
-    # the LAPACK routine itself: checks of its arguments would take ten times as long
-    return lambda loads: np.asarray(dpotrs(factor, loads, lower=lower)[0])
-
-
-def at_rest(
-    resting: Resting,
-    units: FloatArray,
-    amounts: FloatArray,
-    laws: Laws,
-    rows: FloatArray,
-    memory: FloatArray | None = None,
-    before: FloatArray | None = None,
-    held: FloatArray | float = 0.0,
-    seen: FloatArray | None = None,
-) -> tuple[FloatArray, FloatArray | None]:
-    """Return displacements and states (L, N) under load levels that follow one another from zero.
-
-    The memory of the laws comes with them, None without laws.
-
-    Parameters
-    ----------
-    resting : Resting
-        Of what is loaded.
-    units, amounts : (k, N), (L, k) ndarray
-        Loads, and how much of each acts at each level.
-    laws : Laws
-        Internal forces.
-    rows : (J, N) ndarray
-        By which they see and act.
-    memory, before : ndarray, optional
-        Of the laws, and the amounts (k,) where the first level is reached from; by default never loaded.
-    held : (N,) ndarray, optional
-        Where something holds the system.
-    seen : (C, N) ndarray, optional
-        What these rows show (L, C) is returned instead.
-
-    Raises
-    ------
-    ModelError, SolutionError
-        If nothing holds the system, or a law takes more than it has.
-    """
-    found = resting(np.concatenate((units, rows)))
-    answers, flexible = found[: len(units)] + held, found[len(units) :]
-    at_ports, compliance = answers @ rows.T, rows @ flexible.T
-    if seen is not None:
-        answers, flexible = answers @ seen.T, flexible @ seen.T
-    if not len(laws):
-        return amounts @ answers, None
-    start = None if before is None else before @ at_ports
-    solution = static_solution(
-        laws, amounts @ at_ports, compliance, memory=memory, start=start, kernel=compiled_kernel()
-    )
-    return amounts @ answers - solution.forces @ flexible, solution.memory
+def _differs(matrix: FloatArray, other: FloatArray) -> bool:
+    """Whether two matrices differ by more than rounding."""
+    size = np.abs(matrix).max(initial=1e-300)
+    return bool(np.abs(matrix - other).max(initial=0.0) > ROUNDING * size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,10 +69,8 @@ class LinearSystem:
         Rows whose motion is prescribed.
     actions : mapping of str to (N,) ndarray
         Rows along which laws at ports act, where that is not how they see.
-    basis : (K, N) ndarray, optional
-        A system of K unknowns is this times the N that are followed here; None: all are.
-    known : tuple of ((M,) ndarray, (N, M) ndarray, int), optional
-        Its modes, as `modes` returns them, where they need not be computed.
+    known : callable, optional
+        What returns its modes by `flexibility`, where they are known or found in another way.
     compliance : (N, N) ndarray, optional
         K^-1, where it is known.
     """
@@ -138,8 +85,7 @@ class LinearSystem:
     states: int = 0
     drives: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     actions: Mapping[str, FloatArray] = field(default_factory=dict)
-    basis: FloatArray | None = None
-    known: tuple[FloatArray, FloatArray, int] | None = None
+    known: Callable[[Flexibility], Modes] | None = None
     compliance: FloatArray | None = None
 
     @property
@@ -158,10 +104,10 @@ class LinearSystem:
         return found
 
     @cached_property
-    def modes(self) -> tuple[FloatArray, FloatArray, int]:
-        """Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
+    def modes(self) -> Modes:
+        """Its modes."""
         if self.known is not None:
-            return self.known
+            return self.known(self.flexibility)
         n, most = self.displacements, self.mode_count
         mass, stiffness = self.mass[:n, :n], 0.5 * (self.stiffness[:n, :n] + self.stiffness[:n, :n].T)
         free = np.eye(n)
@@ -223,59 +169,51 @@ class LinearSystem:
     @cached_property
     def modal(self) -> ModalSystem:
         """What is free and the drives, with ports; what couples modes by rounding only does not."""
-        frequency, free = np.pad(self.angular_frequency, (0, len(self.drives))), self._free_shapes
+        frequency, free = np.pad(self.angular_frequency, (0, len(self.drives))), self.free_shapes
         damping, stiffness = (free.T @ matrix @ free for matrix in (self.damping, self.stiffness))
-        diagonal, loose = np.diag(np.diag(damping)), self.mode_count is None
-        if loose:
-            apart = np.abs(stiffness - np.diag(frequency**2)).max(initial=0.0)
-            loose = bool(apart > ROUNDING * np.abs(stiffness).max(initial=1e-300))
-        if np.abs(damping - diagonal).max(initial=0.0) <= ROUNDING * np.abs(diagonal).max(initial=1e-300):
-            damping = diagonal
+        diagonal = np.diag(np.diag(damping))
+        damping = damping if _differs(damping, diagonal) else diagonal
+        loose = self.mode_count is None and _differs(stiffness, np.diag(frequency**2))
         ports, actions = (
             {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
-            for rows in (self.ports, {**self.ports, **self.actions} if self.actions else {})
+            for rows in (self.ports, self.acts if self.actions else {})
         )
         whole, left_out = stiffness if loose else None, None
         if self.truncated and ports:
             rows = np.array(list(self.ports.values()))
-            left_out = np.einsum("pn,np->p", rows, self.residual @ rows.T)
+            left_out = np.einsum("pn,np->p", rows, self.residual(rows.T))
             all_of_it = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
             flexible = [name not in self.on_modes for name in ports]
             left_out = np.where((left_out > 1e-9 * all_of_it) & flexible, left_out, 0.0)  # less is rounding
         return ModalSystem(frequency, damping, ports, left_out, self.relaxation, whole, actions)
 
     @property
-    def _free_shapes(self) -> FloatArray:
+    def free_shapes(self) -> FloatArray:
         """Shapes (N, M + P) of what is free, and nothing for the drives."""
         return np.pad(self.shapes, ((0, 0), (0, len(self.drives))))
 
-    def port_rows(self, laws: Laws) -> FloatArray:
-        """Return the rows (J, N) of the laws' ports."""
-        return laws.rows(self.ports, len(self.mass))
+    def port_rows(self, laws: Laws, time: float | None = None) -> FloatArray:
+        """Return the rows (J, N) of the laws' ports, see `Laws.rows`."""
+        return laws.rows(self.ports, len(self.mass), time)
 
     # ------------------------------------------------------------ rest
 
     @cached_property
-    def flexibility(self) -> Callable[[FloatArray], FloatArray]:
-        """What gives K^-1 loads, for loads (n,) or (n, k), of a structure that springs hold."""
-        compliance = self.compliance
-        if compliance is None:
-            return springs(self.stiffness)
-        return lambda loads: np.asarray(compliance @ loads)
+    def flexibility(self) -> Flexibility:
+        """What gives K^-1 loads of a structure that springs hold; raises `ModelError` if K holds not all."""
+        if self.compliance is not None:
+            return partial(np.matmul, self.compliance)
+        try:
+            factor, lower = cho_factor(self.stiffness, check_finite=False)
+        except np.linalg.LinAlgError as cause:
+            raise ModelError(f"The structure has no stiffness left in some direction ({cause}).") from cause
+        # the LAPACK routine itself: checks of its arguments would take ten times as long
+        known, solve = Memory(KEPT_ANSWERS), partial(dpotrs, factor, lower=lower)
+        return lambda loads: known.get((loads.shape, loads.tobytes()), lambda: np.asarray(solve(loads)[0]))
 
-    @cached_property
-    def residual(self) -> FloatArray:
-        """The part (N, N) of K^-1 that the modes leave out."""
-        held = (self.shapes / self.angular_frequency**2) @ self.shapes.T
-        return self.flexibility(np.eye(len(self.mass))) - held
-
-    @cached_property
-    def _restoring(self) -> tuple[FloatArray, bool]:
-        """Matrix (M, M) of modal forces at rest by displacements and states; whether it tells the rest."""
-        free, moving = len(self.angular_frequency), self.moving
-        matrix = np.hstack((self.modal.whole[:free, :moving], self.modal.damping[:free, moving:free]))
-        values = np.linalg.svd(matrix, compute_uv=False) if matrix.size else np.ones(1)
-        return matrix, bool(values[-1] > LEAST_PIVOT * max(values[0], 1e-300))
+    def residual(self, loads: FloatArray) -> FloatArray:
+        """Return what the modes leave out of K^-1 loads, for loads (N,) or (N, k)."""
+        return self.flexibility(loads) - (self.shapes / self.angular_frequency**2) @ (self.shapes.T @ loads)
 
     def resting(self, loads: FloatArray) -> FloatArray:
         """Return displacements and states (L, N) at rest under loads (L, N).
@@ -287,9 +225,8 @@ class LinearSystem:
         """
         if self.mode_count is not None:
             return self.flexibility(loads.T).T
-        (restoring, tells), force = self._restoring, loads @ self.shapes
-        if tells:
-            return np.asarray(np.linalg.solve(restoring, force.T).T @ self.shapes.T)
+        free, moving, force = len(self.angular_frequency), self.moving, loads @ self.shapes
+        restoring = np.hstack((self.modal.whole[:free, :moving], self.modal.damping[:free, moving:free]))
         found = np.linalg.lstsq(restoring, force.T, rcond=LEAST_PIVOT)[0]
         if np.max(np.abs(restoring @ found - force.T)) > 1e-6 * max(float(np.max(np.abs(force))), 1e-300):
             size = float(np.max(np.abs(restoring), initial=0.0))
@@ -300,25 +237,59 @@ class LinearSystem:
         return np.asarray(found.T @ self.shapes.T)
 
     def static(
-        self, loads: FloatArray, laws: Laws = NO_LAWS, drive: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the rest under loads (L, N) that follow one another from zero, see `at_rest`.
+        self, units: FloatArray, laws: Laws = NO_LAWS, amounts: FloatArray | None = None,
+        memory: FloatArray | None = None, before: FloatArray | None = None,
+        held: FloatArray | float = 0.0, seen: FloatArray | None = None, time: float | None = None,
+    ) -> tuple[FloatArray, FloatArray | None]:  # fmt: skip
+        """Return the rest (L, N) under load levels that follow one another from zero, and the laws' memory.
 
-        `drive` (P,) is where the drives hold what they move; ports of states are at no position.
+        Parameters
+        ----------
+        units : (k, N) ndarray
+            Loads.
+        laws : Laws
+            Internal forces; ports of states are at no position. Without any there is no memory.
+        amounts : (L, k) ndarray, optional
+            How much of each acts at each level; by default they follow one another.
+        memory, before : ndarray, optional
+            Of the laws, and the amounts (k,) where the first level is reached from; by default never loaded.
+        held : (N,) ndarray, optional
+            Where something holds the system.
+        seen : (C, N) ndarray, optional
+            What these rows show (L, C) is returned instead.
+        time : float, optional
+            Of laws in windows those act that do then [s].
+
+        Raises
+        ------
+        ModelError, SolutionError
+            If nothing holds the system, or a law takes more than it has.
         """
-        rows, held = self.port_rows(laws), np.zeros(len(self.mass))
+        rows, levels = self.port_rows(laws, time), np.eye(len(units)) if amounts is None else amounts
         rows[:, self.displacements :] = 0.0
-        if drive is not None and len(drive):
-            held = self.lift @ drive
-            loads = loads - self.stiffness @ held
-        return at_rest(self.resting, loads, np.eye(len(loads)), laws, rows, held=held)
+        found = self.resting(np.concatenate((units, rows)))
+        answers, flexible = found[: len(units)] + held, found[len(units) :]
+        at_ports, compliance = answers @ rows.T, rows @ flexible.T
+        if seen is not None:
+            answers, flexible = answers @ seen.T, flexible @ seen.T
+        if not len(laws):
+            return levels @ answers, None
+        start = None if before is None else before @ at_ports
+        solution = static_solution(
+            laws, levels @ at_ports, compliance, memory=memory, start=start, kernel=compiled_kernel()
+        )
+        return levels @ answers - solution.forces @ flexible, solution.memory
 
     # ------------------------------------------------------------ what acts, and what is seen
 
-    def driven(self, number: int) -> list[FloatArray]:
-        """Return what resists a drive's motion, its speed and its acceleration, on the modes (M + P,)."""
-        along, free = self.lift[:, number], self._free_shapes
-        return [free.T @ (matrix @ along) for matrix in (self.stiffness, self.damping, self.mass)]
+    @property
+    def acts(self) -> Mapping[str, FloatArray]:
+        """Rows along which laws at all ports act."""
+        return {**self.ports, **self.actions}
+
+    def resisting(self, number: int) -> list[FloatArray]:
+        """Return what resists a drive's motion, its speed and its acceleration, on all unknowns (N,)."""
+        return [matrix @ self.lift[:, number] for matrix in (self.stiffness, self.damping, self.mass)]
 
     def by_order(self, shown: Sequence[Shown], shapes: FloatArray) -> FloatArray:
         """Return what outputs show of modal coordinates and their derivatives (4, C, M), in shapes (N, M)."""
@@ -337,14 +308,14 @@ class LinearSystem:
         ports, size = tuple(self.ports), len(self.mass)
         sees, acts = (
             np.array([rows[port] for port in ports]).reshape(len(ports), size)
-            for rows in (self.ports, {**self.ports, **self.actions})
+            for rows in (self.ports, self.acts)
         )
         force = np.zeros((len(ports), len(shown)))
         for number, item in enumerate(shown):
             if item.reaction is not None:
                 force[:, number] = acts @ self.lift[:, item.reaction]
             elif self.truncated:
-                force[:, number] = -acts @ (self.residual @ item.rows[0])
+                force[:, number] = -acts @ self.residual(item.rows[0])
         mass, *others = (shapes.T @ matrix @ shapes for matrix in (self.mass, self.damping, self.stiffness))
         sees, acts = sees @ shapes, acts @ shapes
         push, by_damping, by_stiffness = (np.linalg.solve(mass, item) for item in (acts.T, *others))

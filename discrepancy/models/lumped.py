@@ -1,7 +1,6 @@
 """A lumped linear structure as a model: masses, springs, dampers with named inputs, outputs and ports."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, NamedTuple, Self
 
@@ -12,10 +11,16 @@ from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInp
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, LoadChange, Shown, place_among
-from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
-from discrepancy.models.lumped_file import GAINS, ControllerSection, InputSection, LumpedDescription
+from discrepancy.models.interface import EITHER, MOVES, NO_PATCH, TURNS, Memory, Outputs, Place
+from discrepancy.models.linear_system import LinearSystem
+from discrepancy.models.lumped_file import (
+    GAINS,
+    ControllerSection,
+    InputSection,
+    LoadSection,
+    LumpedDescription,
+)
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.runtime import patch as changes
 from fe.runtime.laws import LAWS
@@ -28,83 +33,62 @@ MOST_MODES = 8
 """Modes that move of a structure on springs; the others follow without inertia."""
 
 
-@dataclass(frozen=True)
-class Loop:
-    """A controller in a rig of N unknowns, n of them displacements.
+class Loop(NamedTuple):
+    """A controller in a rig of N unknowns.
 
-    Attributes
-    ----------
-    section : ControllerSection
-        As in the file.
-    gains : sequence of float
-        Proportional, derivative and integral, times their factors.
-    sees : (4, N) ndarray
-        What it measures, as `Shown.rows`.
-    acts : (N,) ndarray
-        Along which it acts.
-    state : int or None
-        Unknown that is the integral of its error; None without an integral gain.
+    Its `section` of the file, `gains` (proportional, derivative and integral, times their factors), what it
+    `sees` and `gives` without a reference, (4, N) as `Shown.rows`, the load (N,) along which it `acts`, and
+    the unknown that is the integral of its error, None without an integral gain.
     """
 
     section: ControllerSection
     gains: Sequence[float]
     sees: FloatArray
+    gives: FloatArray
     acts: FloatArray
-    state: int | None
-
-    @property
-    def gives(self) -> FloatArray:
-        """What it gives without a reference, as `Shown.rows`."""
-        proportional, derivative, integral = self.gains
-        rows = -proportional * self.sees - derivative * np.roll(self.sees, 1, axis=0)
-        if self.state is not None:
-            rows[1, self.state] += integral
-        return np.asarray(rows)
+    integral: int | None
 
     def loads(self, trial: Trial, item: RecordedInput, offset: float) -> list[Load]:
         """Return what a recorded reference does, as loads; raises `ModelError` if it cannot be followed."""
-        section, time = self.section, trial.time
+        section, (proportional, derivative, _) = self.section, self.gains
         if item.quantity is not section.quantity:
             raise ModelError(
                 f"The controller {section.name!r} follows {section.quantity.value}, but the trial "
                 f"{trial.name!r} records its reference {item.name!r} as {item.quantity.value}."
             )
-        course = Course.of(time, item.values + offset, item.hold)
-        found: list[Load] = [(self.gains[0] * self.acts, course)]
-        if self.gains[1] != 0.0 and section.derivative_of == "error":
+        course = Course.of(trial.time, item.values + offset, item.hold)
+        found: list[Load] = [(proportional * self.acts, course)]
+        if derivative != 0.0 and section.derivative_of == "error":
             if course.hold is Hold.ZERO_ORDER:
                 raise ModelError(
                     f"The reference {section.reference!r} of the trial {trial.name!r} goes in steps, which "
                     f"the controller {section.name!r} cannot differentiate: say derivative_of = "
                     "'measurement' in the model, or hold = 'linear' in the campaign."
                 )
-            if course.hold is Hold.SMOOTH:
-                slope = Course(time, course.at(time, 1), Hold.SMOOTH)
-            else:
-                slopes = np.diff(course.values) / np.diff(time)
-                slope = Course(time, np.append(slopes, slopes[-1]), Hold.ZERO_ORDER)
-            found.append((self.gains[1] * self.acts, slope))
-        if self.state is not None:
-            found.append((np.eye(len(self.acts))[self.state], course))
+            found.append((derivative * self.acts, course.slope))
+        if self.integral is not None:
+            found.append((np.eye(len(self.acts))[self.integral], course))
         return found
 
 
 class Rig(NamedTuple):
     """A lumped model at values of its parameters, under a patch of its structure.
 
-    `factors` of terms by name, `terms` (N, N) by kind and those of parts by name, `constant` (N,), the load
-    that always acts, and `loops`, the controllers by name.
+    `factors` of terms by name, `terms` (N, N) by kind and those of parts by name, `loops`, the controllers by
+    name, and `systems` that were made of it.
     """
 
     factors: Mapping[str, float]
     terms: Mapping[str, FloatArray]
-    constant: FloatArray
     loops: dict[str, Loop]
+    systems: Memory
 
-    def along(self, row: FloatArray, through: str | None, name: str) -> FloatArray:
-        """Return a load (N,), through a matrix where it says so, times its own factor."""
-        acting = row if through is None else self.terms[through] @ row
-        return np.asarray(self.factors.get(name, 1.0) * acting)
+    def along(self, item: LoadSection, row: Sequence[float] | FloatArray) -> FloatArray:
+        """Return a load (N,) along a row, through a matrix where it says so, times its own factor."""
+        acting = np.zeros(len(self.terms["mass"]))
+        acting[: len(row)] = row
+        through = acting if item.through is None else self.terms[item.through] @ acting
+        return np.asarray(self.factors.get(item.name, 1.0) * through)
 
 
 class LumpedModel(DescribedModel, SystemModel):
@@ -123,14 +107,13 @@ class LumpedModel(DescribedModel, SystemModel):
         self.kinds = frozenset(TrialKind) - {TrialKind.FLIGHT}
         if not description.is_plain:
             self.kinds -= {TrialKind.RINGDOWN}
-        self.displacements, self.length = description.size, description.characteristic_length
+        self.length = description.characteristic_length
         self.port_rows = {item.name: padded(item.vector) for item in description.port}
-        acts = {item.name: padded(item.acts) for item in description.port if item.acts is not None}
-        self._acts, self._acting_rows = acts, self.port_rows | acts
+        self.acts = {item.name: padded(item.acts or item.vector) for item in description.port}
         self._stations = sorted(place.station for place in description.place)
         self._inputs = {item.name: item for item in description.input}
         self._outputs = {item.name: item for item in description.output}
-        self._rigs, self._systems = Memory(), Memory()
+        self._rigs = Memory()
 
     @classmethod
     def load(cls, path: Path | str) -> "LumpedModel":
@@ -174,10 +157,6 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the load (N,) of 1 N, or of what else an input is, at its place."""
         return self._moved_row(self.rig(state), self._input_at(place), LoadChange.of(change))
 
-    def constant(self, case: Case) -> FloatArray:
-        """Return the load (N,) that always acts."""
-        return self.rig(case.state).constant
-
     def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
         """Return loads and prescribed motions in a trial.
 
@@ -185,49 +164,34 @@ class LumpedModel(DescribedModel, SystemModel):
         output is its reaction; else it is free.
         """
         trial, _, patch, state = case
-        rig, change, known = self.rig(state), LoadChange.of(patch), self._inputs
-        loads = [load for loop in rig.loops.values() for load in self._reference(case, loop)]
-        followed = {loop.section.reference for loop in rig.loops.values()}
-        reactions = {item.reaction for item in self.description.output}
-        still = Course.of(trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, 0)
-        drives = {name: still for name in known if name in reactions}
+        rig, time, description = self.rig(state), trial.time, self.description
+        still = Course.of(time, np.zeros(len(time)), Hold.SMOOTH, 0)
+        drives = {item.reaction: still for item in description.output if item.reaction is not None}
+        loads: list[Load] = [(rig.along(item, item.vector), Course.always(time)) for item in description.load]
+        followed = {item.reference for item in description.controller}
+        for name in rig.loops:
+            loads += self._reference(case, name)
         for item, offset in self._recorded(case):
             if item.name in followed:
                 continue
-            if item.name not in known:
-                raise ModelError(
-                    f"The trial {trial.name!r} records the input {item.name!r}, which {self.what} does "
-                    f"not have; it has {', '.join(known) or 'none'}."
-                )
-            section = known[item.name]
-            if item.quantity is not section.quantity and item.quantity not in section.quantity.moving:
-                raise ModelError(
-                    f"The input {item.name!r} of {self.what} is {section.quantity.value}, but "
-                    f"the trial {trial.name!r} records {item.quantity.value}."
-                )
-            values = item.values + offset if offset else item.values
+            section = self._recorded_at(trial, item)
+            values = item.values + offset
             if section.quantity.moving:
-                if item.hold not in (None, Hold.SMOOTH):
-                    raise ModelError(
-                        f"The input {item.name!r} of the trial {trial.name!r} is a motion that "
-                        f"{self.name!r} prescribes, which no drive makes in steps or corners: leave "
-                        "`reference` and `hold` out."
-                    )
                 values = rig.factors.get(item.name, 1.0) * values
-                drives[item.name] = Course.of(trial.time, values, Hold.SMOOTH, item.quantity.order)
+                drives[item.name] = Course.of(time, values, Hold.SMOOTH, item.quantity.order)
                 continue
+            change = LoadChange.of(patch)
             if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
                 values = change.changed(values, item.values)
-            loads.append((self._moved_row(rig, section, change), Course.of(trial.time, values, item.hold)))
+            loads.append((self._moved_row(rig, section, change), Course.of(time, values, item.hold)))
         for load in (item for item in patch if isinstance(item, PortLoad)):
-            if load.port not in self._acting_rows:
+            if load.port not in self.acts:
                 raise ModelError(
                     f"A force acts at the port {load.port!r}, which {self.name!r} does not have; it has "
-                    f"{', '.join(self._acting_rows) or 'none'}."
+                    f"{', '.join(self.acts) or 'none'}."
                 )
             spans = tuple(window.span for window in load.windows)
-            course = FormulaCourse(course_of(load.force, load.kind), spans)
-            loads.append((self._acting_rows[load.port], course))
+            loads.append((self.acts[load.port], FormulaCourse(course_of(load.force, load.kind), spans)))
         return loads, drives
 
     def _recorded(self, case: Case) -> list[tuple[RecordedInput, float]]:
@@ -238,14 +202,33 @@ class LumpedModel(DescribedModel, SystemModel):
             recorded = (RecordedInput(item.name, item.quantity, trial.force, trial.hold),)
         return list(zip(recorded, (*case.conditions.offset, *(0.0,) * len(recorded)), strict=False))
 
-    def _reference(self, case: Case, loop: Loop) -> list[Load]:
+    def _recorded_at(self, trial: Trial, item: RecordedInput) -> InputSection:
+        """Return the input that a trial records; raises `ModelError` if it is not the model's."""
+        section = self._inputs.get(item.name)
+        if section is None:
+            raise ModelError(
+                f"The trial {trial.name!r} records the input {item.name!r}, which {self.what} does "
+                f"not have; it has {', '.join(self._inputs) or 'none'}."
+            )
+        moving = section.quantity.moving
+        if item.quantity is not section.quantity and item.quantity not in moving:
+            raise ModelError(
+                f"The input {item.name!r} of {self.what} is {section.quantity.value}, but "
+                f"the trial {trial.name!r} records {item.quantity.value}."
+            )
+        if moving and item.hold not in (None, Hold.SMOOTH):
+            raise ModelError(
+                f"The input {item.name!r} of the trial {trial.name!r} is a motion that "
+                f"{self.name!r} prescribes, which no drive makes in steps or corners: leave "
+                "`reference` and `hold` out."
+            )
+        return section
+
+    def _reference(self, case: Case, controller: str) -> list[Load]:
         """Return what the recorded reference of a controller does."""
-        return [
-            load
-            for item, offset in self._recorded(case)
-            if item.name == loop.section.reference
-            for load in loop.loads(case.trial, item, offset)
-        ]
+        loop, recorded = self.rig(case.state).loops[controller], self._recorded(case)
+        found = [loop.loads(case.trial, *own) for own in recorded if own[0].name == loop.section.reference]
+        return found[0] if found else []
 
     def _input_at(self, place: Place) -> InputSection:
         """Return the input of a load place; raises `ModelError` if there is none."""
@@ -263,35 +246,32 @@ class LumpedModel(DescribedModel, SystemModel):
                     "cannot move."
                 )
             row = row + change.along_span * np.array(item.station_derivative)
-            if item.chord_derivative is not None:
-                row = row + change.along_chord * np.array(item.chord_derivative)
-        return rig.along(self.description.padded(row), item.through, item.name)
+        return rig.along(item, row)
 
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
         """Return what each output shows under what acts; None: at rest."""
         drives = [] if acting is None else list(acting.drives)
-        found, description = [], self.description
+        found, description = list[Shown](), self.description
         for name, quantity in outputs:
             item = self._outputs[name]
             further = 0 if quantity is item.quantity else quantity.derivatives_of(item.quantity)
-            if item.reaction is not None:
-                if item.reaction not in drives:
-                    raise ModelError(
-                        f"The output {name!r} of {self.name!r} is the reaction of {item.reaction!r}, whose "
-                        "motion this trial does not prescribe."
-                    )
-                nothing = np.zeros((4, description.width))
-                found.append(Shown(nothing, reaction=drives.index(item.reaction)))
+            if item.vector is not None:
+                row, order = description.padded(item.vector), item.quantity.order + further
+                seen = Shown.of(row, order, further, description.width - description.size)
+                found.append(seen._replace(constant=item.constant * (not further)))
             elif item.controller is not None:
                 loop = self.rig(case.state).loops[item.controller]
                 along = loop.acts / float(loop.acts @ loop.acts)
-                loads = [] if acting is None else self._reference(case, loop)
+                loads = [] if acting is None else self._reference(case, item.controller)
                 courses = [(float(push @ along), course) for push, course in loads if push @ along != 0.0]
                 found.append(Shown(loop.gives, courses=courses))
+            elif item.reaction in drives:
+                found.append(Shown(np.zeros((4, description.width)), reaction=drives.index(item.reaction)))
             else:
-                row, order = description.padded(item.vector or ()), item.quantity.order + further
-                seen = Shown.of(row, order, further, description.width - description.size)
-                found.append(seen._replace(constant=item.constant * (not further)))
+                raise ModelError(
+                    f"The output {name!r} of {self.name!r} is the reaction of {item.reaction!r}, whose "
+                    "motion this trial does not prescribe."
+                )
         return found
 
     # ------------------------------------------------------------ ports
@@ -312,31 +292,26 @@ class LumpedModel(DescribedModel, SystemModel):
         description = self.description.model_copy(update={"law": []})
         return linear._changed(description=description), self.own_laws(self.prior_mean()) + laws
 
-    def unit_of_state(self, port: str) -> str:
-        """Return the unit of what a law at a port of states acts on; empty for a port that moves or turns."""
-        first = self.description.size
-        if not np.any(self.port_rows.get(port, np.zeros(0))[first:]):
-            return ""
-        read = {item.quantity for item in self.description.output if item.vector and any(item.vector[first:])}
-        return UNITS[read.pop()].si if len(read) == 1 else "of the state's unit"
-
-    def turns(self, port: str) -> bool | None:
-        """Return whether a port turns; None where the model does not say it.
+    def port_units(self, port: str) -> tuple[str, str]:
+        """Return the units of a force at a port and of what it acts on.
 
         It moves or turns as the unknowns do of which it is a sum or difference, and these as what is measured
         or prescribed of them.
         """
-        vector = self.port_rows.get(port)
-        if vector is None or not np.all(np.isin(vector, (-1.0, 0.0, 1.0))):
-            return None
-        told: dict[int, set[bool]] = {}
-        known = [(item.vector, item.quantity.moving) for item in self.description.output]
-        known += [(item.vector, item.quantity.moving) for item in self.description.input]
-        for row, moving in known:
-            if row is not None and moving and np.count_nonzero(row) == 1 and max(row) == 1.0:
-                told.setdefault(int(np.argmax(row)), set()).add(Quantity.ANGLE in moving)
-        kinds = set().union(*(told.get(int(at), {True, False}) for at in np.flatnonzero(vector)))
-        return kinds.pop() if len(kinds) == 1 else None
+        row, n, description = self.port_rows.get(port), self.description.size, self.description
+        if row is not None and not np.any(row[:n]):
+            states = {item.quantity for item in description.output if item.vector and any(item.vector[n:])}
+            unit = UNITS[states.pop()].si if len(states) == 1 else "of the state's unit"
+            return f"{unit}/s times capacity", unit
+        if row is None or not np.all(np.isin(row, (-1.0, 0.0, 1.0))):
+            return EITHER
+        told: dict[int, set[tuple[str, str]]] = {}
+        read = [(item.vector or (), item.quantity.moving) for item in description.output]
+        for vector, moving in (*read, *((item.vector, item.quantity.moving) for item in description.input)):
+            if moving and np.count_nonzero(vector) == 1 and max(vector) == 1.0:
+                told.setdefault(vector.index(1.0), set()).add(TURNS if Quantity.ANGLE in moving else MOVES)
+        units = set().union(*(told.get(at, {MOVES, TURNS}) for at in np.flatnonzero(row).tolist()))
+        return units.pop() if len(units) == 1 else EITHER
 
     # ------------------------------------------------------------ matrices
 
@@ -385,24 +360,25 @@ class LumpedModel(DescribedModel, SystemModel):
                 weighted, w = mass @ shapes, np.sqrt(np.maximum(square, 0.0))
                 own = (weighted * (2.0 * np.array(given.ratios) * w)) @ weighted.T
             damping += factors.get("damping", 1.0) * own
-        rig = Rig(factors, terms, np.zeros(description.width), {})
-        for load in description.load:
-            rig.constant[:] += rig.along(description.padded(load.vector), load.through, load.name)
-        state = n + description.states
+        rig = Rig(factors, terms, {}, Memory())
+        integral = n + description.states
         for item in description.controller:
             named = (factors.get(f"{item.name}.{gain}", 1.0) * getattr(item, gain) for gain in GAINS)
             gains = [factors.get(item.name, 1.0) * gain for gain in named]
             row, acts = description.padded(item.vector), description.padded(item.acts)
             sees = Shown.of(row, item.quantity.order, states=description.width - n).rows
-            rig.loops[item.name] = Loop(item, gains, sees, acts, state if item.integral else None)
-            state += item.integral != 0.0
+            gives = -gains[0] * sees - gains[1] * np.roll(sees, 1, axis=0)
+            if item.integral:
+                gives[1, integral] += gains[2]
+            rig.loops[item.name] = Loop(item, gains, sees, gives, acts, integral if item.integral else None)
+            integral += item.integral != 0.0
         return rig
 
-    def system(self, state: State) -> SecondOrderSystem:
+    def system(self, state: State) -> LinearSystem:
         """Return what moves, with prescribed motions and controllers as the state says."""
         rig = self.rig(state)
 
-        def made() -> tuple[Rig, SecondOrderSystem]:
+        def made() -> LinearSystem:
             description, terms, n = self.description, rig.terms, self.description.size
             own, rest = slice(n, n + description.states), slice(n + description.states, None)
             mass, damping = terms["mass"] + terms["capacity"], terms["damping"] + terms["conductance"]
@@ -419,15 +395,15 @@ class LumpedModel(DescribedModel, SystemModel):
             for loop in rig.loops.values() if state.closed else ():
                 for into, row, seen in zip((stiffness, damping), loop.gives[:2], loop.sees[:2], strict=True):
                     into -= np.outer(loop.acts, row)
-                    if loop.state is not None:
-                        into[loop.state] += seen
+                    if loop.integral is not None:
+                        into[loop.integral] += seen
             beta = description.damping.beta if description.damping is not None else None
             drives = [description.padded(self._inputs[name].vector) for name in state.drives]
-            return rig, SecondOrderSystem(  # the rig lives as long, so that its id stays its own
+            return LinearSystem(
                 mass, damping, stiffness, self.port_rows,
                 mode_count=MOST_MODES if description.is_plain else None,
                 relaxation=rig.factors.get("damping", 1.0) * (beta or 0.0),
-                states=len(mass) - n, drives=np.array(drives), actions=self._acts,
+                states=len(mass) - n, drives=np.array(drives), actions=self.acts,
             )  # fmt: skip
 
-        return self._systems.get((id(rig), state.drives, state.closed), made)[1]
+        return rig.systems.get((state.drives, state.closed), made)

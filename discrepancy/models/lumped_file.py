@@ -96,7 +96,6 @@ class InputSection(LoadSection):
 
     quantity: Quantity = Quantity.FORCE
     station_derivative: Vector | None = None
-    chord_derivative: Vector | None = None
 
 
 class OutputSection(NamedSection):
@@ -150,11 +149,9 @@ class LawSection(Section):
 
     @model_validator(mode="after")
     def _is_a_law(self) -> Self:
-        known = [law.kind for law in LAWS]
-        if self.kind not in known:
-            raise ValueError(
-                f"the law {self.name!r} has the kind {self.kind!r}, but known are {', '.join(known)}"
-            )
+        known = ", ".join(law.kind for law in LAWS)
+        if self.kind not in known.split(", "):
+            raise ValueError(f"the law {self.name!r} has the kind {self.kind!r}, but known are {known}")
         try:
             self.scaled(1.0).check()
         except InvalidPatchError as cause:
@@ -189,11 +186,7 @@ class ControllerSection(NamedSection):
     @model_validator(mode="after")
     def _does_something(self) -> Self:
         if not (self.proportional or self.derivative or self.integral):
-            raise ValueError(
-                f"controller {self.name!r} has no gain: give proportional, derivative or integral"
-            )
-        if not any(self.vector) or not any(self.acts):
-            raise ValueError(f"vector and acts of the controller {self.name!r} must not be zero")
+            raise ValueError(f"controller {self.name!r} has no gain: give one of {', '.join(GAINS)}")
         return self
 
 
@@ -214,12 +207,7 @@ class ScaledParameter(ParameterSection):
 
     terms: Annotated[tuple[Name, ...], BeforeValidator(_listed)]
     mean: Number = 1.0
-
-    @model_validator(mode="after")
-    def _in_range(self) -> Self:
-        if not 0.0 < self.low <= self.mean <= self.high:
-            raise ValueError("a factor needs 0 < low <= mean <= high")
-        return self
+    low: Positive
 
 
 class LumpedDescription(ModelDescription):
@@ -321,42 +309,41 @@ class LumpedDescription(ModelDescription):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
-        n = self.size
+        n, m, ratios = self.size, self.states, self.damping.ratios if self.damping is not None else None
+        missing = {
+            "mass is missing (or capacity, of states of first order)": not (n or m),
+            "stiffness is missing: give it, or [[stiffness_part]], or say `free = true`": not self.free
+            and n and not (self.stiffness or self.stiffness_part),
+            "'damping' is missing": not self.free and n and self.damping is None,
+            "conductance is missing: give it, or [[conductance_part]]": m
+            and not (self.conductance or self.conductance_part),
+            "[[input]] is missing: at least one force must be able to act": self.is_plain and not self.input,
+        }  # fmt: skip
+        for sentence, lacks in missing.items():
+            if lacks:
+                raise ValueError(sentence)
+        self._check_names()
         self._check_matrices()
-        if self.is_plain and not self.input:
-            raise ValueError("[[input]] is missing: at least one force must be able to act")
         for kind in ("input", "output", "port", "place", "load", "controller"):
             for item in getattr(self, kind):
                 self._check_vectors(kind, item)
         if self.root is not None and (len(self.root.lever) != n or not any(self.root.lever)):
             raise ValueError(f"lever of root needs {counted(n, 'entry', 'entries')}, not all zero")
-        if self.damping is not None and self.damping.ratios is not None and len(self.damping.ratios) != n:
-            came = counted(len(self.damping.ratios), "value")
+        if ratios is not None and len(ratios) != n:
+            came = counted(len(ratios), "value")
             raise ValueError(f"damping.ratios needs one value for each mode, {n} in all, but {came} came")
-        self._check_names()
         return self
 
     def _check_matrices(self) -> None:
         """Refuse matrices of another size, that are not symmetric, feed energy or leave something loose."""
         n, m = self.size, self.states
-        parts = [part.name for kind in KINDS for part in getattr(self, f"{kind}_part")]
-        self.check_unique("part", [*KINDS, *parts])
-        if n == 0 and m == 0:
-            raise ValueError("mass is missing (or capacity, of states of first order)")
-        if n and not (self.stiffness or self.stiffness_part or self.free):
-            raise ValueError("stiffness is missing: give it, or [[stiffness_part]], or say `free = true`")
-        if n and self.damping is None and not self.free:
-            raise ValueError("'damping' is missing")
         for kind in KINDS:
             count, reference = (m, "capacity") if kind in OF_STATES else (n, "mass")
-            given = self.given(kind)
-            for name, matrix in given.items():
-                if name == kind and not matrix and not (kind == "conductance" and m and len(given) == 1):
-                    continue
+            for name, matrix in self.given(kind).items():
                 base = "damping.matrix" if kind == "damping" else kind
                 place = base if name == kind else f"{kind}_part {name!r}"
-                if not count:
-                    raise ValueError(f"{place} is there, but {reference} is missing")
+                if not matrix and name == kind:
+                    continue
                 if [len(row) for row in matrix] != [count] * count:
                     raise ValueError(
                         f"{place} must be a {count} x {count} matrix (or {counted(count, 'diagonal value')})"
@@ -373,25 +360,24 @@ class LumpedDescription(ModelDescription):
             if content is not None and [len(row) for row in content] != [columns] * rows:
                 raise ValueError(f"coupling.{key} must be a {rows} x {columns} matrix by rows")
         terms = self.terms()
-        for kind in (*(KINDS[:2] if n else ()), *(("capacity",) if m else ())):
-            own = slice(n, n + m) if kind in OF_STATES else slice(n)
-            least, most = np.linalg.eigvalsh(terms[kind][own, own])[[0, -1]]
-            singular = kind == "stiffness" and self.free and least >= -1e-9 * max(abs(most), 1e-300)
-            if least <= 0.0 and not singular:
+        for kind, own in {"mass": slice(n), "stiffness": slice(n), "capacity": slice(n, n + m)}.items():
+            values = np.linalg.eigvalsh(terms[kind][own, own])
+            floating = kind == "stiffness" and self.free
+            if np.any(values < -1e-9 * np.max(np.abs(values), initial=0.0) if floating else values <= 0.0):
                 loose = LOOSE if kind == "stiffness" else ""
                 raise ValueError(f"{kind} (with its parts) must be positive definite{loose}")
 
     def _check_vectors(self, kind: str, item: NamedVector | OutputSection | ControllerSection) -> None:
         """Refuse vectors of another length and zero ones, and what sees both displacements and states."""
         n, m = self.size, self.states
-        for key in ("vector", "acts", "station_derivative", "chord_derivative"):
+        for key in ("vector", "acts", "station_derivative"):
             vector = getattr(item, key, None)
             if vector is not None and len(vector) != n + m:
                 came, has = counted(len(vector), "entry", "entries"), counted(n + m, "unknown")
                 raise ValueError(f"{key} of {kind} {item.name!r} has {came}, but the model has {has}")
+            if vector is not None and not any(vector) and key != "station_derivative":
+                raise ValueError(f"{key} of {kind} {item.name!r} is zero")
         row = np.array(item.vector or ())
-        if item.vector is not None and not any(row):
-            raise ValueError(f"vector of {kind} {item.name!r} is zero")
         if kind in ("port", "controller") and any(row[:n]) and any(row[n:]):
             raise ValueError(f"the {kind} {item.name!r} sees displacements or states, not both")
         if isinstance(item, PortSection) and item.acts is not None:
@@ -402,30 +388,29 @@ class LumpedDescription(ModelDescription):
                     f"`acts` of the port {item.name!r} is for states, and must take from what its vector sees"
                 )
         if isinstance(item, ControllerSection):
-            order, what = item.quantity.order, "a state" if any(row[n:]) else "a speed"
-            if order == 2:
-                raise ValueError(f"the controller {item.name!r} cannot follow an acceleration")
-            if item.derivative and (any(row[n:]) or order == 1):
+            order = item.quantity.order + any(row[n:])
+            if item.quantity.order == 2 or (item.derivative and order > 0):
                 raise ValueError(
-                    f"the controller {item.name!r} measures {what}, whose derivative it cannot take: "
-                    "leave `derivative` out"
+                    f"the controller {item.name!r} cannot follow an acceleration, nor the derivative of a "
+                    "speed or of a state: leave `derivative` out"
                 )
 
     def _check_names(self) -> None:
         """Refuse names that are there twice, and those that name nothing."""
-        names = {
-            kind: [item.name for item in getattr(self, kind)]
-            for kind in ("output", "port", "place", "load", "controller", "law", "parameter", "input")
-        }
+        kinds = ("output", "port", "place", "load", "controller", "law", "parameter", "input")
+        names = {kind: [item.name for item in getattr(self, kind)] for kind in kinds}
+        parts = [part.name for kind in KINDS for part in getattr(self, f"{kind}_part")]
         references = [item.reference for item in self.controller if item.reference]
-        parts = [name for kind in KINDS for name in self.given(kind) if name not in KINDS]
-        names["input or reference"] = [*names["input"], *references]
-        names["place station"] = [f"{place.station:g}" for place in self.place]
-        for kind, given in names.items():
+        further = {
+            "part": [*KINDS, *parts],
+            "input or reference": [*names["input"], *references],
+            "place station": [f"{place.station:g}" for place in self.place],
+        }
+        for kind, given in (names | further).items():
             self.check_unique(kind, given)
-        kinds = (*(KINDS[:3] if self.size else ()), *(OF_STATES if self.states else ()))
-        terms, gains = [*kinds, *parts], [f"{name}.{gain}" for name in names["controller"] for gain in GAINS]
+        terms = [*(KINDS[:3] if self.size else ()), *(OF_STATES if self.states else ()), *parts]
         more = ("law",) if self.is_plain else ("input", "load", "law", "controller")
+        gains = [f"{name}.{gain}" for name in names["controller"] for gain in GAINS]
         scaled = list(dict.fromkeys([*terms, *(name for kind in more for name in names[kind]), *gains]))
         driven = [item.name for item in self.input if item.quantity.moving]
         named = [(f"{item.name!r} acts through", item.through, terms) for item in (*self.input, *self.load)]

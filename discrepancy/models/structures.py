@@ -1,6 +1,6 @@
 """A structure as a model by its modes: any from a mesh or matrices, and the wing with its patches."""
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -14,11 +14,10 @@ from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Shown, place_among, shown_rows
-from discrepancy.models.interface import NO_PATCH, Memory, Outputs, Place
-from discrepancy.models.linear_system import Resting, springs
+from discrepancy.models.acting import Acting, Course, Load, Shown, place_among
+from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Memory, Outputs, Place
+from discrepancy.models.linear_system import Flexibility, LinearSystem, Modes
 from discrepancy.models.scales import PortScale
-from discrepancy.models.second_order import SecondOrderSystem
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime import patch as changes
@@ -27,7 +26,7 @@ from fe.runtime.motion import PLANFORM, STATION_PORTS
 from fe.runtime.patch import INTERNAL_FORCES, PRIMITIVES, SENSORS, ModelPatch, PointMass, Primitive
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import MODE_COUNT, ON_MODES, PatchedWing, motion_basis
-from fe.runtime.reduced import ReducedModel, ReducedState, dense_sum
+from fe.runtime.reduced import ReducedModel, ReducedState, dense_sum, lowest_modes
 from fe.runtime.state import Losses, wing_names
 from fe.runtime.wing_rows import LOAD_PLACE, PORTS, strain_gauge
 from fe.wing.design import WingDesign, load_design
@@ -51,6 +50,10 @@ paper, its masses, and the damping of the joint posterior, whose spread holds th
 
 
 ROTATING_PORT = "root"
+STIFFNESSES = changes.RootCompliance, changes.LocalStiffnessLoss, changes.ModulusTemperature
+"""Primitives on which the stiffness of a wing depends."""
+KEPT_SYSTEMS = 64
+"""Systems of a wing that are kept, 2 MB each."""
 Prior = Mapping[str, tuple[float, float]]
 """Means and standard deviations of calibrated parameters, by the names of `STATE`."""
 Design = WingDesign | None
@@ -96,21 +99,19 @@ class StructureModel(SystemModel):
         self.reference, self.load_places = (*self.forces, LOAD_FACTOR)[0], self.forces
         self.largest_force = 0.5 * min((model.validity[name][1] for name in self.forces), default=np.inf)
         _, outputs, accelerations = model.rows
-        strains, displacements = np.split(outputs, [len(model.gauges)])
-        named = (
-            (model.gauges, Quantity.STRAIN, strains),
-            (model.displacements, Quantity.DISPLACEMENT, displacements),
-            (model.accelerations, Quantity.ACCELERATION, accelerations),
-        )
-        self.quantities = {name: quantity for names, quantity, _ in named for name in names}
-        self._rows = {name: row for names, _, rows in named for name, row in zip(names, rows, strict=True)}
+        self.quantities = {
+            **dict.fromkeys(model.gauges, Quantity.STRAIN),
+            **dict.fromkeys(model.displacements, Quantity.DISPLACEMENT),
+            **dict.fromkeys(model.accelerations, Quantity.ACCELERATION),
+        }
+        self._rows = dict(zip(self.quantities, (*outputs, *accelerations), strict=True))
         self._systems = Memory()
         along = [self._load(self.prior_mean(), force) for force in self.forces]
         self.port_rows = {
-            name: row
+            name: self._rows[name]
             for push in along
-            for name, row in zip(model.displacements, displacements, strict=True)
-            if np.abs(row - push).max() <= SAME * np.abs(push).max()
+            for name in model.displacements
+            if np.abs(self._rows[name] - push).max() <= SAME * np.abs(push).max()
         }
         self.port_names = tuple(self.port_rows)
 
@@ -133,7 +134,7 @@ class StructureModel(SystemModel):
 
         Loads that always act shift what a motion shows.
         """
-        found = shown_rows((self._rows[output] for output, _ in outputs), outputs)
+        found = [Shown.of(self._rows[output], quantity.order) for output, quantity in outputs]
         always = self._always(case.state.parameters)
         if acting is None or not always.any():
             return found
@@ -156,20 +157,22 @@ class StructureModel(SystemModel):
         return self._load(state.parameters, place_among(self.forces or (LOAD_FACTOR,), place, self.what))
 
     def lift(self, state: State, change: ModelPatch) -> FloatArray:
-        """Return the loads (2, n) of the load factor and of its square, which is zero."""
-        row = self._load(state.parameters, LOAD_FACTOR)
-        return np.stack((row, np.zeros_like(row)))
+        """Return the load (1, n) of the load factor."""
+        return self._load(state.parameters, LOAD_FACTOR)[None]
 
     def _always(self, parameters: FloatArray) -> FloatArray:
         """Return the load (n,) of constant loads and of controls that no trial records."""
         recorded = {name: 0.0 for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls}
         return self._pull(parameters, recorded)
 
-    def constant(self, case: Case) -> FloatArray:
-        """Return the load (n,) that always acts at rest; in motion it is in what is shown."""
-        return self._always(case.state.parameters) * (not case.trial.is_dynamic)
+    def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
+        """Return loads in a trial; in motion what always acts is in what is shown."""
+        (loads, drives), trial = super().pushes(case), case.trial
+        if not trial.is_dynamic:
+            loads.append((self._always(case.state.parameters), Course.always(trial.time)))
+        return loads, drives
 
-    def system(self, state: State) -> SecondOrderSystem:
+    def system(self, state: State) -> LinearSystem:
         """Return the structure at parameters and losses, in the coordinates of `ReducedModel.at`.
 
         Raises
@@ -181,7 +184,7 @@ class StructureModel(SystemModel):
         key = parameters.tobytes(), losses
         return self._systems.get(key, lambda: self._made(self._at(parameters, {}, losses)))
 
-    def _made(self, vector: FloatArray) -> SecondOrderSystem:
+    def _made(self, vector: FloatArray) -> LinearSystem:
         model, state = self.model, ReducedState(self.model, vector)
         size, moving = len(state.shapes), model.modal_stiffness.shape[1]
         theta = model.stiffness_coefficients(vector)
@@ -193,9 +196,9 @@ class StructureModel(SystemModel):
         compliance[moving:, moving:] = inv(dense_sum(theta, model.static_stiffness))
         alpha, beta = model.damping
         modes = 2.0 * np.pi * state.modes.frequency, np.ascontiguousarray(state.shapes), model.mode_count
-        return SecondOrderSystem(
+        return LinearSystem(
             mass, alpha * mass + beta * stiffness, stiffness, self.port_rows, model.mode_count, float(beta),
-            known=modes, compliance=compliance,
+            known=lambda _: modes, compliance=compliance,
         )  # fmt: skip
 
 
@@ -220,7 +223,6 @@ class WingModel(SystemModel):
     load_point_displacement and displacement[y, x].
     """
 
-    missing = STATION_PORTS
     components = 3
     reference = LOAD_PLACE
 
@@ -233,7 +235,7 @@ class WingModel(SystemModel):
         self.name, self.parameters = name, wing_priors(box, **prior)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
         self.port_names, self._row = tuple(PORTS), cache(wing.output_row)
-        self._stiffnesses, self._systems, self._rows, self._answers = (Memory() for _ in range(4))
+        self._systems, self._rows = Memory(KEPT_SYSTEMS), Memory()
 
     @classmethod
     def shipped(cls, progress: Progress | None = None) -> "WingModel":
@@ -288,7 +290,7 @@ class WingModel(SystemModel):
         if factors is not None:
             gauges = np.array([strain_gauge(output) for output, _ in outputs])
             rows = rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
-        return shown_rows(rows if acting is None or acting.basis is None else rows @ acting.basis, outputs)
+        return [Shown.of(row, quantity.order) for row, (_, quantity) in zip(rows, outputs, strict=True)]
 
     @property
     def shown_outputs(self) -> tuple[str, ...]:
@@ -301,9 +303,9 @@ class WingModel(SystemModel):
         """Whether the wing can carry a primitive; it can carry all but forces by a formula in time."""
         return primitive in PRIMITIVES.values() and primitive is not changes.PortLoad
 
-    def turns(self, port: str) -> bool | None:
-        """Return whether a port turns; the others move up and down."""
-        return port == ROTATING_PORT
+    def port_units(self, port: str) -> tuple[str, str]:
+        """Return the units of force and motion at a port: the root turns, the others move up and down."""
+        return TURNS if port == ROTATING_PORT else MOVES
 
     def at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return forces as they act at ports of `port_rows`."""
@@ -317,10 +319,6 @@ class WingModel(SystemModel):
         """Return the parts (2, n) of the lift."""
         return self.wing.load_parts(change)
 
-    def constant(self, case: Case) -> FloatArray:
-        """Return nothing (n,): what always acts is in the zeros of readings."""
-        return np.zeros(self.wing.size)
-
     def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
         """Return the scales of a force over the planform, from those of its mean and the first mode."""
         share = self.wing.planform[1]
@@ -331,42 +329,23 @@ class WingModel(SystemModel):
 
     # ------------------------------------------------------------ structure
 
-    def rest(self, state: State) -> Resting:
-        """Return what gives the rest in a state."""
-        key, (_, solve) = _stiffness_key(state), self._stiffness(state)
-        return lambda loads: self._answers.get((key, loads.tobytes()), lambda: solve(loads.T).T)
+    def system(self, state: State) -> LinearSystem:
+        """Return the wing in a state."""
+        masses, kept = state.structure.of(PointMass), state.structure.of(*STIFFNESSES)
+        warmer = state.warmer if len(kept.of(changes.ModulusTemperature)) else 0.0
+        key = (state.parameters.tobytes(), state.losses, masses.primitives, kept.primitives, warmer)
+        return self._systems.get(key, lambda: self._made(state._replace(warmer=warmer), masses))
 
-    def _stiffness(self, state: State) -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
-        """Return the stiffness (n, n) in a state, and what gives K^-1 loads (n, k)."""
+    def _made(self, state: State, masses: ModelPatch) -> LinearSystem:
+        wing, (factor, servo, pitot, alpha, beta) = self.wing, state.parameters.tolist()
+        stiffness, mass = wing.stiffness(factor, *state[1:4]), wing.mass(servo, pitot, masses)
 
-        def make() -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
-            matrix = self.wing.stiffness(float(state.parameters[0]), *state[1:4])
-            return matrix, springs(matrix)
+        def modes(flexibility: Flexibility) -> Modes:
+            basis = motion_basis(flexibility, mass, wing.arrays.start_shapes, flexibility(wing.held.T))
+            frequency, own = lowest_modes(basis.T @ stiffness @ basis, basis.T @ mass @ basis, MODE_COUNT)
+            return 2.0 * np.pi * frequency, basis @ own, MODE_COUNT
 
-        return self._stiffnesses.get(_stiffness_key(state), make)
-
-    def system(self, state: State) -> SecondOrderSystem:
-        """Return the wing as it moves when let go, or pushed, at a place under forces at ports."""
-        masses, held = state.structure.of(PointMass), self.wing.held_ports(state.ports)
-        place = state.place or self.reference
-
-        def make() -> SecondOrderSystem:
-            _, servo, pitot, alpha, beta = state.parameters.tolist()
-            (stiffness, solve), mass = self._stiffness(state), self.wing.mass(servo, pitot, masses)
-            still = solve(np.vstack((self.wing.force_row(place), *held.values())).T)
-            basis = motion_basis(solve, mass, self.wing.arrays.start_shapes, still)
-            inertia, small = basis.T @ mass @ basis, basis.T @ stiffness @ basis
-            inertia, small = 0.5 * (inertia + inertia.T), 0.5 * (small + small.T)
-            rows = {port: row @ basis for port, row in held.items()}
-            damping = alpha * inertia + beta * small
-            return SecondOrderSystem(inertia, damping, small, rows, MODE_COUNT, beta, ON_MODES, basis=basis)
-
-        further = (masses.primitives, state.parameters[1:].tobytes(), place, tuple(held))
-        return self._systems.get((_stiffness_key(state), further), make)
-
-
-def _stiffness_key(state: State) -> Hashable:
-    """Return what the stiffness of a state depends on; primitives of other kinds are passed over."""
-    kept = state.structure.of(changes.RootCompliance, changes.LocalStiffnessLoss, changes.ModulusTemperature)
-    warmer = state.warmer if len(kept.of(changes.ModulusTemperature)) else 0.0
-    return float(state.parameters[0]), state.losses, kept.primitives, warmer
+        return LinearSystem(
+            mass, alpha * mass + beta * stiffness, stiffness, self.port_rows, MODE_COUNT, beta, ON_MODES,
+            known=modes,
+        )  # fmt: skip

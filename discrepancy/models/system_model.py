@@ -10,11 +10,12 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, release_of
+from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, divided, release_of
 from discrepancy.models.interface import NO_PATCH, Conditions, Model, Outputs, Place, PortedSystem, Response
-from discrepancy.models.linear_system import Resting, at_rest
+from discrepancy.models.linear_system import LinearSystem
+from discrepancy.models.motion import Motion, motion_of
+from discrepancy.models.port_scales import Ports
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
-from discrepancy.models.second_order import Motion, Moved, Rested, SecondOrderSystem, port_scales
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
@@ -35,8 +36,6 @@ class State(NamedTuple):
         What of a patch changes it.
     warmer : float
         Temperature above the reference [K].
-    place, ports : str or (float, float), tuple of str
-        Where it is let go or pushed, and where forces act: what a system of few coordinates must hold.
     drives : tuple of str
         Inputs whose motion is prescribed.
     closed : bool
@@ -47,8 +46,6 @@ class State(NamedTuple):
     losses: Losses = ()
     structure: ModelPatch = NO_PATCH
     warmer: float = 0.0
-    place: Place | None = None
-    ports: tuple[str, ...] = ()
     drives: tuple[str, ...] = ()
     closed: bool = True
 
@@ -69,44 +66,30 @@ class SystemModel(Model):
     ----------
     port_rows : mapping of str to (N,) ndarray
         Rows of all ports where laws act.
-    missing : tuple of str
-        Further ports of `port_rows` where missing forces are looked for.
     reference : str or None
         Place whose stiffness and modal mass are the natural ones; None: that of the first trial.
-    displacements : int or None
-        How many of the coordinates are displacements, the others being states; None: all.
     components : int
         3 if it tells transverse and shear strain, too; else 1.
     """
 
     port_rows: Mapping[str, FloatArray]
-    missing: tuple[str, ...] = ()
     reference: str | None = None
     kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
-    displacements: int | None = None
     components: ClassVar[int] = 1
     shows_ports: ClassVar[bool] = True
 
     # ------------------------------------------------------------ what each says
 
     @abstractmethod
-    def system(self, state: State) -> SecondOrderSystem:
+    def system(self, state: State) -> LinearSystem:
         """Return what moves in a state."""
-
-    def rest(self, state: State) -> Resting:
-        """Return what gives the rest in a state."""
-        return self.system(state).resting
 
     @abstractmethod
     def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
         """Return the load (N,) of 1 N at a place, as load primitives have it."""
 
-    @abstractmethod
-    def constant(self, case: Case) -> FloatArray:
-        """Return the load (N,) that always acts."""
-
     def lift(self, state: State, change: ModelPatch) -> FloatArray:
-        """Return the loads (2, N) of a load factor and of its square, as load primitives have them."""
+        """Return the loads (k, N) of a load factor and of its powers, as load primitives have them."""
         raise NotImplementedError
 
     def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
@@ -119,7 +102,7 @@ class SystemModel(Model):
         if trial.kind is TrialKind.FLIGHT:
             # where a mass has weight; other zeros are read with it in place
             rows = self.lift(state, patch.of(*LOADS, changes.PointMass))
-            amounts = [trial.load_factor, trial.load_factor**2]
+            amounts = [trial.load_factor**power for power in range(1, len(rows) + 1)]
         else:
             rows = self.force_row(trial.load_place, state, loads)[None]
             amounts = [LoadChange.of(loads).changed(trial.force, trial.force)]
@@ -157,7 +140,7 @@ class SystemModel(Model):
     def acting(self, case: Case) -> Acting:
         """Return what acts in a trial."""
         trial, conditions, patch, state = case
-        acting = Acting(trial.time, self.constant(case), begins=trial.begins, clock=conditions.clock)
+        acting = Acting(trial.time, conditions.stamps(trial.time), begins=trial.begins)
         if trial.kind is TrialKind.RINGDOWN:
             if len(patch.of(PortLoad)):
                 raise ModelError(
@@ -169,24 +152,22 @@ class SystemModel(Model):
         loads, drives = self.pushes(case)
         return replace(acting, loads=loads, drives=drives, initial=conditions.initial.ravel())
 
-    def begun(self, case: Case, ports: tuple[str, ...]) -> tuple[SecondOrderSystem, Acting]:
-        """Return what moves under forces at ports, and what acts on it."""
+    def begun(self, case: Case) -> tuple[LinearSystem, Acting]:
+        """Return what moves in a dynamic trial, and what acts on it."""
         acting = self.acting(case)
-        moving = case.state._replace(place=case.trial.load_place, ports=ports, drives=tuple(acting.drives))
-        system = self.system(moving)
-        return system, acting if system.basis is None else acting.along(system.basis)
+        return self.system(case.state._replace(drives=tuple(acting.drives))), acting
 
-    def moved(self, case: Case, laws: Laws = NO_LAWS, ports: tuple[str, ...] | None = None) -> Motion:
-        """Return the motion in a dynamic trial, `ports` being those of the laws unless it is said.
+    def moved(self, case: Case, laws: Laws = NO_LAWS) -> Motion:
+        """Return the motion in a dynamic trial.
 
         Raises
         ------
         ModelError
             If it cannot begin so, or what acts is not the model's.
         """
-        system, acting = self.begun(case, laws.ports if ports is None else ports)
+        system, acting = self.begun(case)
         try:
-            return system.motion(acting, laws, case.conditions.refinement)
+            return motion_of(system, acting, laws, case.conditions.refinement)
         except (ModelError, FiniteElementError) as cause:
             raise ModelError(f"The trial {case.trial.name!r} of {self.name!r}: {cause}") from cause
 
@@ -200,9 +181,9 @@ class SystemModel(Model):
         laws, case = self.laws(conditions.parameters, patch), self.case(trial, conditions, patch)
         if not trial.is_dynamic:
             return self._at_rest(case, outputs, laws, components)
-        motion = self.moved(case, laws)
-        shown = (self.shown(case, outputs, motion.acting, number) for number in components)
-        found, *further = map(motion.seen, shown)
+        moved = self.moved(case, laws)
+        shown = (self.shown(case, outputs, moved.acting, number) for number in components)
+        found, *further = map(moved.seen, shown)
         return Response(found.values, found.rates, *(part.values for part in further))
 
     def _at_rest(self, case: Case, outputs: Outputs, laws: Laws, components: range) -> Response:
@@ -220,19 +201,17 @@ class SystemModel(Model):
             case = case._replace(state=first._replace(losses=lost, warmer=warm))
             shown = [item for number in components for item in self.shown(case, outputs, None, number)]
             units, amounts = self.acting(case).levels
-            n = units.shape[1] if self.displacements is None else self.displacements
+            system, given = self.system(case.state), amounts[rows]
+            n = system.displacements
             for (_, quantity), item in zip(outputs, shown, strict=False):
                 if np.any(item.rows[2:, n:]) or (quantity.order > 0 and np.any(item.rows[1:, :n])):
                     raise ModelError(
                         f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
                         "acceleration."
                     )
-            ports = laws.rows(self.port_rows, units.shape[1])
-            ports[:, n:] = 0.0  # ports of states are at no position
             seen = np.array([np.concatenate((item.rows[0, :n], item.rows[1, n:])) for item in shown])
-            rest, given = self.rest(case.state), amounts[rows]
             try:
-                values[rows], memory = at_rest(rest, units, given, laws, ports, memory, before, seen=seen)
+                values[rows], memory = system.static(units, laws, given, memory, before, seen=seen)
             except (ModelError, FiniteElementError) as cause:
                 raise ModelError(f"The trial {trial.name!r} is at rest, but {cause}") from cause
             values[rows] += [item.constant for item in shown]
@@ -249,17 +228,16 @@ class SystemModel(Model):
             self.case(trial, Conditions(values, health=trial.health[:1]), patch)
             for values in (self.prior_mean(), parameters)
         )
-        (base, _), (system, acting) = (self.begun(item, self.missing) for item in (at_mean, case))
-        shapes = base.shapes
-        if base.basis is not None and system.basis is not None:
-            # both bases hold nearly the same shapes of the whole structure
-            shapes = np.asarray(np.linalg.lstsq(system.basis, base.basis @ shapes, rcond=None)[0])
-        return system.seen_by(self.shown(case, outputs, acting), shapes)
+        (base, _), (system, acting) = map(self.begun, (at_mean, case))
+        return system.seen_by(self.shown(case, outputs, acting), base.shapes)
 
-    def port_motion(self, trial: Trial, conditions: Conditions) -> tuple[FloatArray, FloatArray]:
+    def port_motion(
+        self, trial: Trial, conditions: Conditions, parts: int = 1
+    ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
-        case = self.case(trial, conditions, self.patch.in_trial(trial.name))
-        return self.moved(case, ports=self.missing).at_ports
+        system, acting = self.begun(self.case(trial, conditions, self.patch.in_trial(trial.name)))
+        moved = motion_of(system, replace(acting, sampled=divided(acting.sampled, parts)), NO_LAWS)
+        return moved.at(np.array(list(self.port_rows.values())))
 
     # ------------------------------------------------------------ sizes
 
@@ -275,8 +253,7 @@ class SystemModel(Model):
         channels = [campaign.channels[name] for name in trial.channels]
         outputs = tuple((channel.output, channel.quantity) for channel in channels)
         self.check_outputs(outputs)
-        shown = self.shown(case, outputs, moved.acting)
-        for column, item in enumerate(shown):
+        for column, item in enumerate(self.shown(case, outputs, moved.acting)):
             kept = trial.values[trial.used[:, column], column] - item.constant
             if item.reaction is not None or item.courses is not None or not kept.size:
                 continue
@@ -296,71 +273,76 @@ class SystemModel(Model):
         A structure that springs hold, which only forces move from rest, has scales of its own; for others
         what acts and moves is the measure.
         """
-        trials, parameters = campaign.trials, self.prior_mean(campaign)
-        state, names = State(parameters, (0.0,) * len(self.regions)), self.ports()
-        system, rest, laws = self.system(state), self.rest(state), self.laws(parameters)
+        trials, parameters, names = campaign.trials, self.prior_mean(campaign), self.ports()
+        state = State(parameters, (0.0,) * len(self.regions))
+        system, bare = self.system(state), self.system(state._replace(closed=False))
+        rows = np.array([self.port_rows[name] for name in names]).reshape(len(names), len(bare.mass))
         held = system.mode_count is not None and all(
             trial.kind is not TrialKind.DRIVEN and trial.begins is Start.SETTLED for trial in trials
         )
-        rows = np.array([self.port_rows[name] for name in names])
-        bare = self.system(state._replace(closed=False))
-        rests, motions = list[Rested](), list[Moved]()
-        conditions, largest = Conditions(parameters), [0.0, 0.0, 0.0]
+        ports, largest, driven_only = Ports(bare, rows), np.zeros(3), True
         for trial in trials:
-            case, fitted = self.case(trial, conditions), trial.is_dynamic and not trial.held_out
-            if not trial.is_dynamic or trial.kind is TrialKind.RINGDOWN:
-                still = self._held(case) @ rows.T if held and names else np.zeros((0, len(names)))
-                rests.append((still, fitted))
+            fitted = trial.is_dynamic and not trial.held_out
+            if trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN:
+                motion = self._driven(campaign, trial)
+                loads = ports.follow(motion, _measured(campaign, trial), fitted=fitted)
+                shapes = motion.system.all_shapes[: motion.system.displacements].T
+                felt = motion.q @ shapes, motion.velocity @ shapes, loads
+                largest = np.maximum(largest, [np.max(np.abs(item), initial=0.0) for item in felt])
                 continue
-            try:
-                motion = self.moved(case, laws)
-            except ModelError:
-                motion = self.moved(self.case(replace(trial, begins=Start.STILL), conditions), laws)
-            if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
-                initial = self.initial_sizes(campaign, trial)
-                motion = self.moved(self.case(trial, replace(conditions, initial=initial)), laws)
-            pushes = [
-                float(np.max(np.abs(trial.values[trial.used[:, column], column]), initial=0.0))
-                for column, name in enumerate(trial.channels)
-                if campaign.channels[name].quantity in (Quantity.FORCE, Quantity.TORQUE)
-            ]
-            motions.append((motion, max(pushes, default=0.0), fitted))
-            shapes = motion.system.all_shapes[: self.displacements].T
-            loads = motion.acting.load_at(motion.time, np.eye(len(motion.acting.constant)))
-            for number, item in enumerate((motion.q @ shapes, motion.velocity @ shapes, loads)):
-                largest[number] = max(largest[number], float(np.max(np.abs(item), initial=0.0)))
-        (peak, speed, weight), sizes = largest, campaign_sizes(campaign)
-        shape, stiff = np.zeros(0), [0.0] * len(names)
+            driven_only = False
+            if held:
+                ports.rest(self._held(self.case(trial, Conditions(parameters))), fitted=fitted)
+        (peak, speed, weight), sizes = largest.tolist(), campaign_sizes(campaign)
+        shape, stiff = np.zeros(0), np.zeros(len(names))
         if held:
             known = [*(trial.load_place for trial in trials), *(self.load_places or ())]
             row, shape = self.force_row(self.reference or known[0], state), system.shapes[:, 0]
-            shape = shape if system.basis is None else system.basis @ shape
-            stiff = [1.0 / float(own @ rest(own[None])[0]) for own in rows]
+            stiff = np.array([1.0 / float(own @ system.resting(own[None])[0]) for own in rows])
             frequency, participation = float(system.angular_frequency[0]), float(row @ shape) ** 2
             mass = 1.0 / participation if participation else float(np.trace(system.mass))
-            stiffness = 1.0 / float(row @ rest(row[None])[0])
+            stiffness = 1.0 / float(row @ system.resting(row[None])[0])
         else:
             elastic = system.angular_frequency[system.angular_frequency > 0.0]
             usual = speed / peak if peak > 0.0 < speed else 1.0 / sizes["duration"]
             frequency = float(elastic[0]) if len(elastic) else usual
             mass = float(np.trace(system.mass)) / max(len(system.mass), 1)
             stiffness = weight / peak if peak > 0.0 < weight else mass * frequency**2
-        found = port_scales(bare, dict(zip(names, stiff, strict=True)), rests, motions)
+        found = dict(zip(names, ports.scales(stiff.tolist(), driven_only=driven_only), strict=True))
         return Scales(
             **{**sizes, "force": sizes["force"] or weight},
             length=self.length or max(map(abs, self.stations() or (0.0,))) or 1.0,
-            tip_stiffness=stiffness,
-            modal_mass=mass,
-            angular_frequency=frequency,
+            tip_stiffness=stiffness, modal_mass=mass, angular_frequency=frequency,
             ports=found | self.spread(found, shape),
-        )
+        )  # fmt: skip
+
+    def _driven(self, campaign: Campaign, trial: Trial) -> Motion:
+        """Return the motion of a trial under recorded inputs, as far as these tell it."""
+        conditions = Conditions(self.prior_mean(campaign))
+        laws = self.laws(conditions.parameters)
+        try:
+            motion = self.moved(self.case(trial, conditions), laws)
+        except ModelError:
+            motion = self.moved(self.case(replace(trial, begins=Start.STILL), conditions), laws)
+        if not np.any(motion.q) and not np.any(motion.velocity):  # nothing drives it: it was let go
+            initial = self.initial_sizes(campaign, trial)
+            motion = self.moved(self.case(trial, replace(conditions, initial=initial)), laws)
+        return motion
 
     def _held(self, case: Case) -> FloatArray:
         """Return the displacements (L, N) in a trial at rest, or from which a ring-down is released."""
-        rest, acting = self.rest(case.state), self.acting(case)
+        rest, acting = self.system(case.state).resting, self.acting(case)
         if acting.release is None:
             units, amounts = acting.levels
             return np.asarray(amounts @ rest(units))
         row, release = acting.release
         shape = rest(row[None])
         return np.asarray(release.displacement / float(row @ shape[0]) * shape)
+
+
+def _measured(campaign: Campaign, trial: Trial) -> float:
+    """Return the largest force measured in a trial [N]."""
+    forces = [
+        campaign.channels[name].quantity in (Quantity.FORCE, Quantity.TORQUE) for name in trial.channels
+    ]
+    return float(np.max(np.abs(trial.values), where=trial.used & np.array(forces, bool), initial=0.0))

@@ -9,7 +9,7 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.document import PRIMITIVE_UNITS
 from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.judgement.conclusion import effects_text, probability_text
-from discrepancy.models.interface import Model
+from discrepancy.models.interface import EITHER, MOVES, TURNS, Model
 from discrepancy.verdict import (
     Estimate,
     ExplainedShare,
@@ -333,8 +333,7 @@ def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campa
         return unit_text(units.pop()) if len(units) == 1 and unit == CHANNEL_UNIT else ""
     if " or " in unit:
         port = str(getattr(primitive, "port", ""))
-        if state := model.unit_of_state(port):
-            return state if unit.startswith("m/s") else f"{state}/s times capacity"
-        moving, turning = unit.split(" or ")
-        return {True: turning, False: moving, None: unit}[model.turns(port)]
+        (moving, turning), (force, state) = unit.split(" or "), model.port_units(port)
+        of_state = state if unit.startswith("m/s") else force
+        return {MOVES[0]: moving, TURNS[0]: turning, EITHER[0]: unit}.get(force, of_state)
     return unit_text(unit)

@@ -12,20 +12,10 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.elements.cells import mass_blocks, stiffness_blocks
+from fe.structure.body import Body
 from fe.wing.design import WingDesign
 from fe.wing.mesh import WingMesh, build_mesh
-from fe.wing.operators import (
-    ROOT_UNKNOWNS,
-    all_point_mass_weights,
-    cell_density,
-    cell_elasticity,
-    gauge_output,
-    modulus_variation,
-    root_support,
-    section_displacement,
-    turn_load,
-    upward,
-)
+from fe.wing.operators import gauge_output, section_displacement, turn_load, upward, wing_body
 
 from .errors import IdentificationError
 
@@ -75,38 +65,32 @@ class WingPieces:
 
     Attributes
     ----------
-    mesh : WingMesh
-    elasticity, variation, density : (nc, 6, 6), (nc, 27), (nc,)
-        Of the cells.
-    term : (nc,)
-        Which stiffness term a cell belongs to.
-    expansion : csr (full, n)
-        Free to all unknowns.
-    springs : (3,)
-        Root springs.
+    body : Body
+        Mesh, root, cells and point masses.
     lift, tip : (full,)
         Load at load factor 1, and a unit force at the place of the static test.
     gauges : csr (G, full)
-    point_masses : tuple of two tuples of (nodes,)
-        Weights of the servos' and of the pitot's places.
     """
 
-    mesh: WingMesh
-    elasticity: FloatArray
-    variation: FloatArray
-    density: FloatArray
-    term: IntArray
-    expansion: sparse.csr_array
-    springs: FloatArray
+    body: Body[WingMesh]
     lift: FloatArray
     tip: FloatArray
     gauges: sparse.csr_array
-    point_masses: tuple[tuple[FloatArray, ...], ...]
+
+    @property
+    def mesh(self) -> WingMesh:
+        """Its mesh."""
+        return self.body.mesh
 
     @property
     def design(self) -> WingDesign:
         """The design."""
         return self.mesh.design
+
+    @property
+    def expansion(self) -> sparse.csr_array:
+        """Free to all unknowns, csr (full, n)."""
+        return self.body.supports.expansion
 
 
 def wing_pieces(design: WingDesign, base: WingPieces | None = None) -> WingPieces:
@@ -119,18 +103,18 @@ def wing_pieces(design: WingDesign, base: WingPieces | None = None) -> WingPiece
     """
     same_mesh = base is not None and _same_mesh(design, base.design)
     if base is not None and same_mesh:
-        mesh, expansion = replace(base.mesh, design=design), base.expansion
+        body = wing_body(replace(base.mesh, design=design))
+        if design.root == base.design.root:
+            body = replace(body, supports=base.body.supports)
     else:
-        mesh = build_mesh(design)
+        body = wing_body(build_mesh(design))
         if base is not None and (
-            mesh.cells.shape != base.mesh.cells.shape or np.any(mesh.cells != base.mesh.cells)
+            body.mesh.cells.shape != base.mesh.cells.shape or np.any(body.mesh.cells != base.mesh.cells)
         ):
             raise IdentificationError(
                 "a small change of the design changes the number of cells; change mesh.span_size or "
                 "mesh.chord_size a little."
             )
-        expansion = root_support(mesh).expansion
-    density = cell_density(mesh)
     same_gauges = base is not None and same_mesh and design.gauges == base.design.gauges
     places = design.point_masses
     relieved = design.lift.inertia_relief and base is not None
@@ -138,26 +122,16 @@ def wing_pieces(design: WingDesign, base: WingPieces | None = None) -> WingPiece
         base is not None
         and same_mesh
         and design.lift == base.design.lift
-        and not (relieved and (np.any(density != base.density) or places != base.design.point_masses))
+        and not (
+            relieved and (np.any(body.density != base.body.density) or places != base.design.point_masses)
+        )
     )
-    weights = all_point_mass_weights(mesh)
-    plan = design.planform
-    load = design.tip_load
-    tip = upward(section_displacement(mesh, plan.semi_span - load.distance_from_tip, load.chord))
-    lift = base.lift if base is not None and same_lift else turn_load(mesh)
-    root = design.root
+    plan, load = design.planform, design.tip_load
     return WingPieces(
-        mesh=mesh,
-        elasticity=cell_elasticity(mesh),
-        variation=modulus_variation(mesh),
-        density=density,
-        term=mesh.stiffness_term,
-        expansion=expansion,
-        springs=np.array([root.transverse_spring, root.flap_spring, root.yaw_spring]),
-        lift=lift,
-        tip=tip,
-        gauges=base.gauges if base is not None and same_gauges else gauge_output(mesh),
-        point_masses=weights,
+        body=body,
+        lift=base.lift if base is not None and same_lift else turn_load(body),
+        tip=upward(section_displacement(body.mesh, plan.semi_span - load.distance_from_tip, load.chord)),
+        gauges=base.gauges if base is not None and same_gauges else gauge_output(body.mesh),
     )
 
 
@@ -199,9 +173,9 @@ def reduced_difference(
     move = np.abs(one.mesh.corners - other.mesh.corners).max(axis=(1, 2))
     differ = (
         (move > STILL * move.max())
-        | np.any(one.elasticity != other.elasticity, axis=(1, 2))
-        | np.any(one.variation != other.variation, axis=1)
-        | (one.density != other.density)
+        | np.any(one.body.elasticity != other.body.elasticity, axis=(1, 2))
+        | np.any(one.body.variation != other.body.variation, axis=1)
+        | (one.body.density != other.body.density)
     )
     if own is not its:
         moved = np.any(own[0] != its[0], axis=1) | np.any(own[1] != its[1], axis=1)
@@ -216,24 +190,24 @@ def reduced_difference(
 
 def _cell_terms(pieces: WingPieces, cells: IntArray, static: FloatArray, modal: FloatArray) -> ReducedTerms:
     """Stiffness of the cells and mass of the structure on the expanded bases (full, N) and (full, m)."""
-    mesh, terms = pieces.mesh, len(pieces.design.regions) + 2
+    body, mesh, terms = pieces.body, pieces.mesh, len(pieces.body.parts)
     N, m = static.shape[1], modal.shape[1]
     both = np.hstack([static, modal])
     stiffness = np.zeros((terms, N, N))
     modal_stiffness = np.zeros((terms, m, m))
     mass = np.zeros((3, m, m))
     for term in range(terms):
-        chosen = cells[pieces.term[cells] == term]
+        chosen = cells[pieces.body.part[cells] == term]
         for start in range(0, len(chosen), _BATCH):
             part = chosen[start : start + _BATCH]
             local, nodes = both[mesh.unknowns_of(part)], mesh.nodes[part]
             strained = local - _rigid_part(nodes, local)
-            blocks = stiffness_blocks(mesh.kind, nodes, pieces.elasticity[part], pieces.variation[part])
+            blocks = stiffness_blocks(mesh.kind, nodes, body.elasticity[part], body.variation[part])
             forces = (blocks @ strained).reshape(-1, N + m)
             flat = strained.reshape(-1, N + m)
             stiffness[term] += flat[:, :N].T @ forces[:, :N]
             modal_stiffness[term] += flat[:, N:].T @ forces[:, N:]
-            blocks = mass_blocks(mesh.kind, nodes, pieces.density[part], mesh.kind.mass_rule)
+            blocks = mass_blocks(mesh.kind, nodes, body.density[part], mesh.kind.mass_rule)
             shapes = local[:, :, N:].reshape(len(part), len(blocks[0]), -1)
             mass[0] += shapes.reshape(-1, m).T @ (blocks @ shapes).reshape(-1, m)
     return ReducedTerms(
@@ -261,14 +235,13 @@ def _rigid_part(points: FloatArray, local: FloatArray) -> FloatArray:
 
 def _other_terms(pieces: WingPieces, static: FloatArray, modal: FloatArray) -> ReducedTerms:
     """Springs, point masses, loads and outputs on bases of free unknowns."""
-    terms, N, m = len(pieces.design.regions) + 2, static.shape[1], modal.shape[1]
+    terms, N, m = len(pieces.body.parts), static.shape[1], modal.shape[1]
     stiffness, modal_stiffness, mass = np.zeros((terms, N, N)), np.zeros((terms, m, m)), np.zeros((3, m, m))
-    root = slice(-ROOT_UNKNOWNS, None)
-    stiffness[-1] = static[root].T @ (pieces.springs[:, None] * static[root])
-    modal_stiffness[-1] = modal[root].T @ (pieces.springs[:, None] * modal[root])
+    springs = pieces.body.supports.stiffness
+    stiffness[-1], modal_stiffness[-1] = (basis.T @ (springs @ basis) for basis in (static, modal))
     full_static, full_modal = pieces.expansion @ static, pieces.expansion @ modal
-    for kind, places in enumerate(pieces.point_masses, start=1):
-        for weights in places:
+    for kind, masses in enumerate(pieces.body.masses, start=1):
+        for weights in masses.shares:
             for component in range(3):
                 row = weights @ full_modal[component::3]
                 mass[kind] += np.outer(row, row)

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.wing.design import WingDesign
-from fe.wing.operators import ROOT_UNKNOWNS, AffineWing, patch_pieces
+from fe.structure.affine import StiffnessTerm, designed
+from fe.wing.design import WingDesign, wing_structure
+from fe.wing.operators import ROOT_UNKNOWNS, AffineWing, outputs, patch_pieces, stiffness_parts
 from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY
 
 from .plate import FIELDS, A, B, Plate, Surface, U, V, W, plane_stress, surface_strain
@@ -81,14 +82,13 @@ def assemble_plate(design: WingDesign, *, straight_section: bool = False) -> Pla
     load_tip, tip = (
         _deflection(layout, distance, design.tip_load.chord) for distance in (load_place, plan.semi_span)
     )
-    return PlateOperators.of(
-        design.regions,
-        (*skins, (base + sparse.diags_array(springs)).tocsr()),
-        _mass_terms(layout),
-        (_lift(layout), load_tip),
-        _gauge_output(layout),
-        tip,
-        expansion,
+    terms = (*skins, (base + sparse.diags_array(springs)).tocsr())
+    mass, *point_masses = _mass_terms(layout)
+    named = wing_structure(design.regions, len(design.gauges.positions))
+    loads, rows = (_lift(layout), load_tip), outputs(_gauge_output(layout), tip)
+    return PlateOperators(
+        **designed(named, expansion, mass, point_masses, loads, rows),
+        stiffness_terms=tuple(map(StiffnessTerm, terms, *zip(*stiffness_parts(design.regions), strict=True))),
         design_hash=design.hash,
         kept=kept,
         plate=plate,

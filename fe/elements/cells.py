@@ -116,15 +116,11 @@ def axes_of(first: ArrayLike, second: ArrayLike) -> FloatArray:
 
 def rotate_elasticity(elasticity: FloatArray, axes: FloatArray) -> FloatArray:
     """Elasticity (n, 6, 6) in space of local elasticity (n, 6, 6) in axes (n, 3, 3), rows the local axes."""
-    unit = np.zeros((6, 3, 3))
-    for row, (i, j) in enumerate(_VOIGT):
-        unit[row, i, j] += 0.5 if i != j else 1.0
-        unit[row, j, i] += 0.5 if i != j else 0.0
-    turned = np.einsum("nai,kij,nbj->nkab", axes, unit, axes)
-    transform = np.empty((len(axes), 6, 6))
-    for row, (i, j) in enumerate(_VOIGT):
-        transform[:, row, :] = turned[:, :, i, j] * (1.0 if i == j else 2.0)
-    return np.asarray(np.swapaxes(transform, 1, 2) @ elasticity @ transform)
+    place = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])
+    tensor = elasticity[:, place[:, :, None, None], place]
+    turned = np.einsum("nabcd,nai,nbj,nck,ndl->nijkl", tensor, *[axes] * 4, optimize=True)
+    rows, columns = np.transpose(_VOIGT)
+    return np.asarray(turned[:, rows, columns][:, :, rows, columns])
 
 
 @dataclass(frozen=True)

@@ -46,9 +46,10 @@ _PRISMATIC_QUADRATIC = tuple(power for power in _POWERS if power[0] + power[1] +
 def gauss_points(order: int, dimensions: int = 3) -> Rule:
     """Tensor Gauss rule on the unit cube: points (q, dimensions), weights (q,)."""
     line, weight = np.polynomial.legendre.leggauss(order)
-    grids = np.meshgrid(*([0.5 * (line + 1.0)] * dimensions), indexing="ij")
-    weights = np.meshgrid(*([0.5 * weight] * dimensions), indexing="ij")
-    return np.stack([g.ravel() for g in grids], axis=1), np.prod([w.ravel() for w in weights], axis=0)
+    points, weights = (
+        np.array([*itertools.product(0.5 * values, repeat=dimensions)]) for values in (line + 1.0, weight)
+    )
+    return points, weights.prod(axis=1)
 
 
 def _simplex_rule(cell: type[RefTet] | type[RefTri], order: int) -> Rule:
@@ -130,11 +131,9 @@ class ElementKind:
 
     def inside(self, local: FloatArray, tolerance: float) -> BoolArray:
         """Whether local places (p, 3) lie in the reference cell, up to a tolerance."""
-        found = np.ones(len(local), dtype=bool)
-        for face in range(len(self.faces)):
-            corner, tangents = self.face_places(face, np.zeros((1, 2)))
-            found &= (local - corner) @ np.cross(*tangents) <= tolerance
-        return found
+        corner, tangents = self.face_frames
+        outwards = np.cross(tangents[:, 0], tangents[:, 1])
+        return np.asarray((((local[:, None] - corner) * outwards).sum(axis=2) <= tolerance).all(axis=1))
 
     def shape_functions(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Values (q, k) and local gradients (q, k, 3) at local places (q, 3), nodes as in the file."""
@@ -146,15 +145,17 @@ class ElementKind:
         gradients = [part @ self._coefficients for part in (dx * y * z, x * dy * z, x * y * dz)]
         return np.asarray(x * y * z @ self._coefficients), np.stack(gradients, axis=2)
 
-    def face_places(self, face: int, along: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Local places (q, 3) of places (q, 2) on a face, and its two local tangents (2, 3).
+    @cached_property
+    def face_frames(self) -> tuple[FloatArray, FloatArray]:
+        """First corner (f, 3) of each face and its two local tangents (f, 2, 3), to the corners beside it.
 
-        The places run over the unit triangle or the unit square; the tangents' cross product points outwards.
+        Faces are the unit triangle or square between these; the tangents' cross product points outwards.
         """
-        corner = np.array([self.corners[node] for node in self.faces[face]], dtype=np.float64)
         # Seen from outside, the corners of a face turn clockwise in Abaqus: the last one comes second here.
-        first, second = corner[-1] - corner[0], corner[1] - corner[0]
-        return corner[0] + along @ np.stack((first, second)), np.stack((first, second))
+        corner, last, second = (
+            np.array([self.corners[face[n]] for face in self.faces], dtype=np.float64) for n in (0, -1, 1)
+        )
+        return corner, np.stack((last - corner, second - corner), axis=1)
 
     def face_rule(self, face: int) -> Rule:
         """Integration points (q, 2) and weights (q,) on a face, exact for its shape functions' products."""

@@ -36,7 +36,6 @@ CORRECTION_LIMIT = 1e-4
 
 Thin cells make the condition number about 1e10, so that about 1e-6 is what double precision reaches.
 """
-_STRIP = 96  # rows that are added at once; only their part right of the diagonal is touched
 
 
 class Front(NamedTuple):
@@ -220,17 +219,7 @@ class Factorisation:
 
     def riesz(self, right_hand_side: FloatArray) -> FloatArray:
         """X^-1 f (n,) or (n, k) without a check of the residual, for iterations that check their own."""
-        found = self.whitened(right_hand_side)
-        values = found.reshape(len(found), -1)
-        with _threads().limit(limits=1):
-            for front, (lower, below) in zip(self._fronts[::-1], self._factors[::-1], strict=True):
-                own = values[front.start : front.end]
-                if len(front.boundary):
-                    own -= below.T @ values[front.boundary]
-                _substitute(lower, own, transposed=True)
-        solution = np.empty_like(found)
-        solution[self._order] = found
-        return solution
+        return self.unwhitened(self.whitened(right_hand_side))
 
     def whitened(self, right_hand_side: FloatArray) -> FloatArray:
         """L^-1 f (n,) or (n, k), X = L L', in the order of elimination; its length is the dual norm of f."""
@@ -243,9 +232,19 @@ class Factorisation:
                     values[front.boundary] -= below @ own
         return found
 
-    def product(self, vectors: FloatArray) -> FloatArray:
-        """Return X times vectors (n, k)."""
-        return np.asarray(self.stiffness @ vectors)
+    def unwhitened(self, whitened: FloatArray) -> FloatArray:
+        """L'^-1 y (n,) or (n, k) of what is in the order of elimination."""
+        found = np.array(whitened, dtype=np.float64, order="C")
+        values = found.reshape(len(found), -1)
+        with _threads().limit(limits=1):
+            for front, (lower, below) in zip(self._fronts[::-1], self._factors[::-1], strict=True):
+                own = values[front.start : front.end]
+                if len(front.boundary):
+                    own -= below.T @ values[front.boundary]
+                _substitute(lower, own, transposed=True)
+        solution = np.empty_like(found)
+        solution[self._order] = found
+        return solution
 
     def solve(self, right_hand_side: FloatArray) -> FloatArray:
         """Solution (n,) or (n, k), refined once, its backward error and its accuracy checked.
@@ -290,16 +289,12 @@ def _substitute(lower: FloatArray, values: FloatArray, *, transposed: bool) -> F
 def _extend_add(
     top: FloatArray, rest: FloatArray, boundary: IntArray, complement: FloatArray, local: IntArray
 ) -> None:
-    """Add a Schur complement, right of its diagonal, to the pivot rows and to the rest of a front."""
+    """Add a Schur complement to the pivot rows and to the rest of a front."""
     index, pivots = local[boundary], len(top)
     mine = int(np.searchsorted(index, pivots))
-    # One index into the flat array is gathered and scattered twice as fast as a pair of indices.
-    for target, first, start, end in ((top, 0, 0, mine), (rest, pivots, mine, len(index))):
-        flat, width = target.reshape(-1), target.shape[1]
-        for low in range(start, end, _STRIP):
-            high = min(low + _STRIP, end)
-            column = index[low:] - first
-            flat[column[: high - low, None] * width + column] += complement[low:high, low:]
+    later = index[mine:] - pivots
+    top[index[:mine, np.newaxis], index] += complement[:mine]
+    rest[later[:, np.newaxis], later] += complement[mine:, mine:]
 
 
 def most_moved(load: FloatArray, values: FloatArray, shapes: FloatArray) -> IntArray:

@@ -1,43 +1,56 @@
-"""Tools of the offline reduction: one factorised stiffness, its norm, and bases orthonormal in it."""
+"""Offline: bases that are orthonormal in the energy norm of one stiffness X = L L', and solutions near it.
+
+All is held in coordinates in which X is the identity: a displacement u as L' u, a load f as L^-1 f. They are
+the same for u = X^-1 f. The energy norm of a displacement, and the dual norm of a load, is the length, and
+what the condition number of X, about 1e10, would do to orthogonality is done to its root alone.
+"""
 
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy.linalg import qr
+from scipy.sparse.linalg import LinearOperator, cg
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import SolutionError
 
 from .factorisation import Factorisation
 
-Norm = Factorisation
-"""The energy norm of a stiffness is what its factorisation gives."""
 MOST_ITERATIONS = 100
 """Limit of conjugate gradients."""
-NEARLY_DEPENDENT = 0.1
-"""Where less than this fraction of a vector is new, the pair is made to fit together again."""
 
 
-def conjugate_gradients(
-    matrices: Sequence[Any], preconditioner: Norm, right: FloatArray, start: FloatArray, tolerance: float
-) -> FloatArray:
-    """Return solutions of several systems by preconditioned conjugate gradients.
+def affine_product(terms: Sequence[Any], coefficients: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Return the sum of coefficients (T,) or (T, k) times sparse terms (n, n), times vectors (n, k)."""
+    parts = (factor * (term @ vectors) for term, factor in zip(terms, coefficients, strict=True))
+    return np.asarray(sum(parts))
 
-    Applying the factors of the preconditioner to twelve columns takes hardly longer than to three.
+
+def turned(terms: FloatArray, directions: FloatArray) -> FloatArray:
+    """Return symmetric terms (T, n, n) in combinations (n, k) of the basis that they are in."""
+    found = directions.T @ terms @ directions
+    return np.asarray(0.5 * (found + found.swapaxes(1, 2)))  # what rounding made of the symmetry
+
+
+def solved_near(
+    factors: Factorisation, terms: Sequence[Any], coefficients: FloatArray, right: FloatArray,
+    start: FloatArray, tolerance: float,
+) -> FloatArray:  # fmt: skip
+    """Solve systems near a factorised one by conjugate gradients, all in its coordinates.
 
     Parameters
     ----------
-    matrices : sequence of sparse (n, n)
-        Each for as many of the columns, spectrally equivalent to the preconditioner.
-    preconditioner : Norm
-        The norm of a matrix nearby.
-    right : (n, k) ndarray
-        Right-hand sides.
-    start : (n, k) ndarray
-        Starting values.
+    factors : Factorisation
+        Of a matrix to which all are spectrally equivalent.
+    terms : sequence of sparse (n, n)
+        What they are made of.
+    coefficients : (T, k) ndarray
+        Coefficients of the terms, a system each column.
+    right, start : (n, k) ndarray
+        Right-hand sides and starting values.
     tolerance : float
-        Residual wanted, relative to the right-hand side, both in the norm dual to the preconditioner.
+        Largest residual, relative to the right-hand side.
 
     Returns
     -------
@@ -50,69 +63,49 @@ def conjugate_gradients(
         If the tolerance is not reached.
     """
 
-    def product(vectors: FloatArray) -> FloatArray:
-        parts = zip(matrices, np.split(vectors, len(matrices), axis=1), strict=True)
-        return np.concatenate([np.asarray(matrix @ part) for matrix, part in parts], axis=1)
+    def product(flat: FloatArray) -> FloatArray:
+        vectors = factors.unwhitened(flat.reshape(right.shape))
+        return factors.whitened(affine_product(terms, coefficients, vectors)).ravel()
 
-    solution = np.array(start)
-    wanted = tolerance**2 * np.einsum("ik,ik->k", right, preconditioner.riesz(right))
-    residual = right - product(solution)
-    direction = correction = preconditioner.riesz(residual)
-    size = np.einsum("ik,ik->k", residual, correction)
-    for _ in range(MOST_ITERATIONS + 1):
-        if np.all(size <= wanted):
-            return solution
-        image = product(direction)
-        curvature = np.einsum("ik,ik->k", direction, image)
-        step = np.divide(size, curvature, out=np.zeros_like(size), where=curvature > 0.0)
-        solution += step * direction
-        residual = residual - step * image
-        correction = preconditioner.riesz(residual)
-        before, size = size, np.einsum("ik,ik->k", residual, correction)
-        direction = (
-            correction + np.divide(size, before, out=np.zeros_like(size), where=before > 0.0) * direction
+    size = np.linalg.norm(right, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    operator = LinearOperator((right.size, right.size), matvec=product, dtype=np.float64)
+    given = ((right / size).ravel(), (start / size).ravel())
+    found, missed = cg(operator, *given, rtol=0.0, atol=tolerance, maxiter=MOST_ITERATIONS)
+    if missed:
+        raise SolutionError(
+            f"Conjugate gradients did not reach a residual of {tolerance:g} in {MOST_ITERATIONS} iterations; "
+            "the stiffness terms must be positive semi-definite."
         )
-    missed = size > wanted
-    reached = tolerance * float(np.sqrt(np.max(size[missed] / wanted[missed])))
-    raise SolutionError(
-        f"Conjugate gradients reached {reached:.2g} in {MOST_ITERATIONS} iterations, but {tolerance:g} "
-        "is needed; the stiffness terms must be positive semi-definite."
-    )
+    return np.asarray(found.reshape(right.shape) * size)
 
 
-class FunctionalBasis:
-    """A growing basis of functionals, orthonormal in the norm dual to X.
-
-    Functionals are whitened first: with X = L L' the dual norm of f is the length of L^-1 f, and QR with
-    pivots finds what is new in a block of them.
+class OrthonormalBasis:
+    """A growing orthonormal basis.
 
     Parameters
     ----------
-    unknowns : int
-        Length n of the functionals.
-    norm : Norm
-        The norm of X.
+    size : int
+        Length n of the vectors.
     drop : float
-        A direction is dropped if it is less than this fraction of every functional.
+        A direction is dropped if it is less than this fraction of every vector of its block.
 
     Attributes
     ----------
     vectors : (n, k) ndarray
-        The whitened basis.
+        The basis.
     dropped_square : float
-        Bound of the sum of squared norms of all that was dropped.
+        Bound of the sum of squared lengths of all that was dropped.
     """
 
-    def __init__(self, unknowns: int, norm: Norm, *, drop: float) -> None:
-        self.vectors = np.empty((unknowns, 0))
-        self.dropped_square = 0.0
-        self._norm, self._drop = norm, drop
+    def __init__(self, size: int, *, drop: float) -> None:
+        self.vectors = np.empty((size, 0))
+        self.dropped_square, self._drop = 0.0, drop
 
-    def extend(self, functionals: FloatArray) -> FloatArray:
-        """Add functionals (n, m); return their coordinates (k, m) in the basis."""
-        rest = self._norm.whitened(functionals)
-        scale = np.linalg.norm(rest, axis=0)
-        rest /= np.where(scale > 0.0, scale, 1.0)
+    def extend(self, block: FloatArray) -> FloatArray:
+        """Add vectors (n, m); return their coordinates (k, m) in the basis."""
+        scale = np.linalg.norm(block, axis=0)
+        rest = block / np.where(scale > 0.0, scale, 1.0)
         inside = np.zeros((self.vectors.shape[1], len(scale)))
         for _ in range(2):
             share = self.vectors.T @ rest
@@ -127,81 +120,40 @@ class FunctionalBasis:
         return np.concatenate((inside * scale, outside[new]))
 
 
-class ProjectedBasis:
-    """A growing basis, orthonormal in a norm, with sparse terms projected on it.
-
-    Gram-Schmidt in blocks, repeated, on pairs of vectors v and their products p = X v. With a condition
-    number of 1e10 either follows from the other to about 1e-6 only, so that what is left of both after a
-    projection no longer fits together. Therefore the products are taken anew from the vectors.
+class ProjectedBasis(OrthonormalBasis):
+    """A growing basis of displacements, orthonormal in the energy norm, with sparse terms projected on it.
 
     Parameters
     ----------
-    norm : Norm
-        The norm of X.
-    sums : sequence of tuples of csr (n, n)
+    factors : Factorisation
+        X.
+    *sums : tuple of csr (n, n)
         The terms of each sum.
     drop : float
-        A new vector is dropped if less than this fraction of it is new.
+        As of `OrthonormalBasis`.
 
     Attributes
     ----------
-    vectors : (n, k) ndarray
-        The basis.
+    displacements : (n, k) ndarray
+        The basis vectors themselves, L'^-1 `vectors`.
     inner : list of (T, k, k) ndarray
         The terms of each sum in the basis.
     """
 
-    def __init__(self, norm: Norm, sums: Sequence[tuple[Any, ...]], *, drop: float) -> None:
-        self.norm, self._sums, self._drop = norm, sums, drop
-        self.vectors = self._products = np.empty((sums[0][0].shape[0], 0))
+    def __init__(self, factors: Factorisation, *sums: tuple[Any, ...], drop: float) -> None:
+        super().__init__(factors.stiffness.shape[0], drop=drop)
+        self.displacements, self.factors, self._sums = self.vectors, factors, sums
         self.inner = [np.empty((len(terms), 0, 0)) for terms in sums]
 
-    def extend(self, vectors: FloatArray) -> list[list[FloatArray]]:
-        """Add what is new in vectors (n, m); return the terms of each sum times what was added."""
+    def add(self, block: FloatArray) -> list[FloatArray]:
+        """Add what is new in vectors (n, m); return the terms (T, n, new) of each sum times that."""
         before = self.vectors.shape[1]
-        if kept := self._new(vectors):
-            self.vectors = np.column_stack((self.vectors, *(vector for vector, _ in kept)))
-            self._products = np.column_stack((self._products, *(product for _, product in kept)))
-        new = self.vectors[:, before:]
-        images = [[np.asarray(term @ new) for term in terms] for terms in self._sums]
+        self.extend(block)
+        new = self.factors.unwhitened(self.vectors[:, before:])
+        self.displacements = np.concatenate((self.displacements, new), axis=1)
+        images = [np.stack([term @ new for term in terms]) for terms in self._sums]
         for number, (old, parts) in enumerate(zip(self.inner, images, strict=True)):
-            added = np.stack([self.vectors.T @ image for image in parts])
+            added = self.displacements.T @ parts
             beside = added[:, :before]
             self.inner[number] = np.block([[old, beside], [beside.swapaxes(1, 2), added[:, before:]]])
         return images
-
-    def _new(self, vectors: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-        """Return what is new enough in vectors (n, m), orthonormal, with its products."""
-        products = self.norm.product(vectors)
-        length = np.sqrt(np.maximum(np.einsum("ik,ik->k", vectors, products), 0.0))
-        used = np.flatnonzero(length > 0.0)
-        vectors, products = vectors[:, used] / length[used], products[:, used] / length[used]
-        for number in range(2):
-            vectors, products = self._outside(vectors, products)
-            if number == 0 and self.vectors.size:
-                products = self.norm.product(vectors)
-        kept: list[tuple[FloatArray, FloatArray]] = []
-        for vector, product in zip(vectors.T, products.T, strict=True):
-            vector, product = _without(kept, *_without(kept, vector, product))
-            size = float(vector @ product)
-            if size < NEARLY_DEPENDENT**2:
-                vector, product = self._outside(vector, self.norm.product(vector))
-                vector, product = _without(kept, vector, product)
-                size = float(vector @ product)
-            if size > self._drop**2:
-                kept.append((vector / np.sqrt(size), product / np.sqrt(size)))
-        return kept
-
-    def _outside(self, vectors: FloatArray, products: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return vectors (n,) or (n, m) and their products without what lies in the basis."""
-        share = self._products.T @ vectors
-        return vectors - self.vectors @ share, products - self._products @ share
-
-
-def _without(
-    others: list[tuple[FloatArray, FloatArray]], vector: FloatArray, product: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    for other, other_product in others:
-        part = other_product @ vector
-        vector, product = vector - part * other, product - part * other_product
-    return vector, product

@@ -2,20 +2,15 @@
 
 import logging
 import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TypeVar
 
-from fe.runtime.errors import ReducedModelFileError, ReductionError
+from fe.runtime.errors import ReducedModelFileError
 from reporting.errors import FileNotWrittenError
 
 _logger = logging.getLogger(__name__)
-
-_PAUSE = 0.1
-"""Between two looks whether another process has ended its work [s]."""
-_SILENT_LOOKS, _MOST_LOOKS = 10, 36_000
 
 _Kept = TypeVar("_Kept")
 
@@ -41,11 +36,6 @@ def built_once(
         Makes it.
     keep : callable
         Writes it; where that raises `FileNotWrittenError` it is used all the same, with a warning.
-
-    Raises
-    ------
-    ReductionError
-        If another process has been building it for an hour.
     """
     with suppress(OSError):  # not there, or not readable
         try:
@@ -83,24 +73,16 @@ def _locked(path: Path, what: Path) -> Iterator[None]:
 
 
 def _take(handle: int, what: Path) -> None:
-    """Take a lock; who waits for it for more than a second says so, and how the wait has ended."""
+    """Take a lock, which ends with the process that holds it; who waits for it says so."""
     import fcntl
 
-    for look in range(_MOST_LOOKS):
-        with suppress(BlockingIOError):
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            with suppress(OSError):  # such as a full disk: the number only informs those who wait
-                os.truncate(handle, 0)
-                os.pwrite(handle, str(os.getpid()).encode(), 0)
-            if look > _SILENT_LOOKS and not what.exists():
-                _logger.warning("The other process has ended without leaving %s; it is made here.", what)
-            return
-        if look == _SILENT_LOOKS:
-            number = os.pread(handle, 20, 0).decode()
-            holder = f"another process (number {number})" if number else "another process"
-            _logger.warning("Waiting for %s that makes %s.", holder, what)
-        time.sleep(_PAUSE)
-    raise ReductionError(
-        f"{holder.capitalize()} has been making {what} for more than "
-        f"{_MOST_LOOKS * _PAUSE / 60:.0f} minutes. Start again to wait on; if it hangs, end it first."
-    )
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        number = os.pread(handle, 20, 0).decode()
+        holder = f"another process (number {number})" if number else "another process"
+        _logger.warning("Waiting for %s that makes %s.", holder, what)
+        fcntl.flock(handle, fcntl.LOCK_EX)
+    with suppress(OSError):  # such as a full disk: the number only informs those who wait
+        os.truncate(handle, 0)
+        os.pwrite(handle, str(os.getpid()).encode(), 0)

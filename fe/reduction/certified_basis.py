@@ -1,119 +1,36 @@
 """Offline: the static part of a reduced model by a certified greedy search (pyMOR), for any affine structure.
 
-First approximate dual solutions, on which the sharpness of the error bound rests: either the solution at the
-nearest of several anchors is taken, or those at a few states are combined for each state, as a reduced basis
-of each output (Rozza, Huynh and Patera 2008). The method and what it reaches are in `docs/reduced_model.md`.
+First approximate dual solutions, on which the sharpness of the error bound rests: at each anchor a few of
+each output span what is combined for each state, a reduced basis of the output (Rozza, Huynh and Patera
+2008). The method and what it reaches are in `docs/reduced_model.md`. Displacements and loads are whitened,
+which `fe.full.subspace` explains.
 """
 
 from bisect import bisect_left
-from dataclasses import replace
+from collections.abc import Callable
 from math import ceil
 from typing import Any
 
 import numpy as np
 
-from fe.full.subspace import FunctionalBasis, Norm, ProjectedBasis
+from fe.full.subspace import OrthonormalBasis, ProjectedBasis, solved_near, turned
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel, StaticResponse
 from reporting.progress import Stage
+from reporting.words import counted
 
-from .settings import TOGETHER
+from .settings import StructureSettings
 from .terms import ReductionTerms, State
 
-DUAL_TOLERANCE, COMBINED_TOLERANCE = 0.05, 0.01
-"""Relative residual of approximate dual solutions at their own states, taken alone and combined."""
+TOGETHER = 4
+"""Full solutions of the search, and states whose modes are refined, at once."""
+DUAL_TOLERANCE = 0.01
+"""Relative residual of approximate dual solutions at their own states."""
+LEAST_DUAL = 1e-5
+"""What rounding may leave of an output beside the residual of its dual solution, relative to it."""
 DEPENDENT = 1e-3
 """Combinations of the dual solutions of an output that are shorter, relative to the longest, are left out."""
-MOST_COLUMNS = 48
-"""Columns of approximate dual solutions that are iterated together."""
-
-
-def dual_solutions(
-    terms: ReductionTerms, norm: Norm, stage: Stage
-) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Solve K psi = l for each output l, roughly: the norms of what that leaves are computed, not assumed.
-
-    Parameters
-    ----------
-    terms : ReductionTerms
-        The full model.
-    norm : Norm
-        Energy norm X of one stiffness.
-    stage : Stage
-        Told one more part, and of what.
-
-    Returns
-    -------
-    products : (A or M, n, O) ndarray
-        X times the functions, whitened.
-    arrays : dict of str to ndarray
-        `dual_residual`, `dual_stiffness` and `dual_output` of `ReducedArrays`.
-    """
-    states, combined = terms.dual_states()
-    at_once = max(1, MOST_COLUMNS // terms.outputs.shape[1])
-    start, found = norm.riesz(terms.outputs), []
-    for first in range(0, len(states), at_once):
-        chosen = states[first : first + at_once]
-        tolerance = COMBINED_TOLERANCE if combined else DUAL_TOLERANCE
-        found += terms.solved_together(norm, chosen, terms.outputs, [start] * len(chosen), tolerance)
-        stage.advance(len(chosen), "dual solutions")
-    solutions = np.stack(found)
-    del found  # as large as they are
-    duals, arrays = (_combined if combined else _nearest)(terms, norm, solutions)
-    return np.stack([norm.whitened(norm.product(dual)) for dual in duals]), arrays
-
-
-def _nearest(
-    terms: ReductionTerms, norm: Norm, duals: FloatArray
-) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Take the solutions (A, n, O) at anchors alone, with the norms of their residuals elsewhere."""
-    factors = []
-    for dual in duals:
-        *varied, constant = (np.asarray(term @ dual) for term in terms.stiffness_terms)
-        functionals = np.stack((terms.outputs - constant, *varied), axis=2)
-        factors.append([_factor(norm, part) for part in functionals.swapaxes(0, 1)])
-    count = terms.outputs.shape[1]
-    none = np.empty((count, len(terms.stiffness_terms), 0, 0))
-    arrays = {"dual_stiffness": none, "dual_output": np.empty((count, 0))}
-    return duals, {"dual_residual": np.array(factors), **arrays}
-
-
-def _combined(
-    terms: ReductionTerms, norm: Norm, solutions: FloatArray
-) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Make the solutions (M, n, O) at states orthonormal for each output, to be combined."""
-    duals, kept = np.ascontiguousarray(solutions.transpose(2, 1, 0)), 0  # (O, n, M)
-    for dual in duals:
-        square, turn = np.linalg.eigh(dual.T @ norm.product(dual))
-        used = np.flatnonzero(square > DEPENDENT**2 * square[-1])[::-1]
-        basis = dual @ (turn[:, used] / np.sqrt(square[used]))
-        dual[:, : len(used)], dual[:, len(used) :] = basis, 0.0
-        kept = max(kept, len(used))
-    duals = duals[:, :, :kept]
-    stiffness = np.empty((len(duals), len(terms.stiffness_terms), kept, kept))
-    factors = []
-    for dual, output, inner in zip(duals, terms.outputs.T, stiffness, strict=True):
-        images = [np.asarray(term @ dual) for term in terms.stiffness_terms]
-        inner[:] = [dual.T @ image for image in images]
-        factors.append(_factor(norm, np.column_stack((output, *images))))
-    absent = np.asarray(~duals.any(axis=1))
-    stiffness[:, -1] += absent[:, :, np.newaxis] * np.eye(kept)  # a function that is not there gets no part
-    return duals.transpose(2, 1, 0), {
-        "dual_residual": np.array([factors]),
-        "dual_stiffness": stiffness,
-        "dual_output": np.einsum("no,onm->om", terms.outputs, duals),
-    }
-
-
-def _factor(norm: Norm, functionals: FloatArray) -> Any:
-    """Return R (k, k) with |functionals (n, k) @ c| = |R @ c| in the dual norm."""
-    found = np.linalg.qr(norm.whitened(functionals), mode="r")
-    if not np.isfinite(found).all():
-        raise ReductionError("The dual residuals are not finite; the full model holds a value that is not.")
-    return found
-
-
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that its basis can be compressed after."""
 LOOKED_AT = 6
@@ -125,6 +42,67 @@ ROUNDING_FACTOR, LEAST_ROUNDING = 8.0, 5e-6
 with condition numbers of 1e10, full solutions differ by 1e-6 among themselves."""
 
 
+def fewest_directions(snapshots: FloatArray, least: int, good: Callable[[FloatArray], bool]) -> FloatArray:
+    """Return the fewest singular directions (N, K) of snapshots (N, S), at their unit lengths, that are good.
+
+    They are taken to become better with their number, from `least` on; all of them if fewer do not suffice.
+    """
+    unit = snapshots / np.linalg.norm(snapshots, axis=0)
+    directions, singular, _ = np.linalg.svd(unit, full_matrices=False)
+    most = int(np.sum(singular > 1e-7 * singular[0]))
+    number = bisect_left(range(most), True, min(least, most), key=lambda count: good(directions[:, :count]))
+    return np.asarray(directions[:, :number])
+
+
+def dual_solutions(
+    terms: ReductionTerms, outputs: FloatArray, stage: Stage
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Solve K psi = l for each output l, roughly: the norms of what that leaves are computed, not assumed.
+
+    Parameters
+    ----------
+    terms : ReductionTerms
+        The full model.
+    outputs : (n, O) ndarray
+        Its outputs.
+    stage : Stage
+        Told one more part, and of what.
+
+    Returns
+    -------
+    functions : (A, M, O, n) ndarray
+        What the solutions at each anchor span, orthonormal for each output; zero where that is less.
+    arrays : dict of str to ndarray
+        `dual_residual`, `dual_stiffness` and `dual_output` of `ReducedArrays`.
+    """
+    factors, (size, count), functions = terms.factors, outputs.shape, []
+    residual, stiffness = [], []
+    for anchor in terms.anchors():
+        solutions = []
+        for theta in anchor:
+            system = terms.stiffness_terms, np.tile(theta[:, np.newaxis], count)
+            solutions.append(solved_near(factors, *system, outputs, outputs, DUAL_TOLERANCE))
+            stage.advance(1, "dual solutions")
+        own, lengths, _ = np.linalg.svd(np.stack(solutions, axis=2).swapaxes(0, 1), full_matrices=False)
+        own *= (lengths > DEPENDENT * lengths[:, :1])[:, np.newaxis]
+        functions.append(own.transpose(2, 0, 1))
+        moved = factors.unwhitened(own.swapaxes(0, 1).reshape(size, -1)).reshape(size, count, -1)
+        for output, displacement in zip(outputs.T, moved.swapaxes(0, 1), strict=True):
+            images = [np.asarray(term @ displacement) for term in terms.stiffness_terms]
+            stiffness.append(np.stack([displacement.T @ image for image in images]))
+            # a function that is not there gets no part
+            stiffness[-1][-1] += np.diag(np.diagonal(stiffness[-1].sum(axis=0)) == 0.0)
+            forces = np.column_stack((output, factors.whitened(np.concatenate(images, axis=1))))
+            rounded = LEAST_DUAL * np.linalg.norm(output) * np.eye(1, forces.shape[1])
+            residual.append(np.concatenate((np.linalg.qr(forces, mode="r"), rounded)))
+    duals = np.array(functions)
+    inner, norms = (
+        np.array(part).reshape(len(duals), count, *np.shape(part)[1:]) for part in (stiffness, residual)
+    )
+    of_output = np.einsum("no,amon->aom", outputs, duals)
+    return duals, {"dual_residual": norms, "dual_stiffness": inner, "dual_output": of_output}
+
+
 class StaticReduction:
     """State of the greedy search: the bases that full solutions have given.
 
@@ -132,8 +110,6 @@ class StaticReduction:
     ----------
     terms : ReductionTerms
         The full model.
-    norm : Norm
-        Energy norm at the reference of the terms.
     fixed : dict of str to anything
         What a reduced model holds beside the statics, by the names of its fields.
     modal_basis : (n, Nm) ndarray
@@ -143,85 +119,99 @@ class StaticReduction:
     """
 
     def __init__(
-        self, terms: ReductionTerms, norm: Norm, fixed: dict[str, Any], modal_basis: FloatArray, stage: Stage
+        self, terms: ReductionTerms, fixed: dict[str, Any], modal_basis: FloatArray, stage: Stage
     ) -> None:
-        self.terms, self.norm, self.modal_basis, self.stage = terms, norm, modal_basis, stage
-        self.least = terms.least(norm)
-        n, count = len(terms.loads), len(terms.stiffness_terms)
-        self.basis = ProjectedBasis(norm, [terms.stiffness_terms], drop=1e-7)
-        self.rounding = 0.0
-        self.residual_basis = FunctionalBasis(n, norm, drop=1e-8)
-        self.residual_load = self.residual_basis.extend(terms.loads)
-        self.residual_stiffness = np.empty((len(self.residual_load), count, 0))
-        products, duals = dual_solutions(terms, norm, stage)
-        self.fixed: dict[str, Any] = fixed | duals
-        self.dual_products = np.swapaxes(products, 1, 2)
-        self.correction = self.dual_products @ self.residual_basis.vectors
-        self.snapshots: list[State] = []
+        self.terms, self.modal_basis, self.stage = terms, modal_basis, stage
+        self.loads, self.outputs = (terms.factors.whitened(own) for own in (terms.loads, terms.outputs))
+        self.least = terms.least(self.loads, self.outputs)
+        self.basis = ProjectedBasis(terms.factors, terms.stiffness_terms, drop=1e-7)
+        self.residuals = OrthonormalBasis(len(self.loads), drop=1e-8)
+        self.residual_load = self.residuals.extend(self.loads)
+        self.residual_stiffness = np.empty((len(self.residual_load), len(terms.stiffness_terms), 0))
+        self.duals, arrays = dual_solutions(terms, self.outputs, stage)
+        self.correction = self.duals @ self.residuals.vectors
+        self.fixed = fixed | arrays
+        self.rounding, self.snapshots = 0.0, list[State]()
 
     def add_snapshots(self, states: list[State]) -> bool:
         """Solve the full model for all loads at several states and extend the bases."""
-        thetas = [self.terms.theta(state) for state in states]
+        terms, loads = self.terms, self.loads.shape[1]
+        thetas = [terms.theta(state) for state in states]
         # a basis vector may be rough, since errors are bounded by residuals; the first one measures rounding
         tolerance = SNAPSHOT_TOLERANCE if self.snapshots else FIRST_TOLERANCE
-        starts = [self._galerkin(theta) for theta in thetas]
-        solutions = self.terms.solved_together(self.norm, thetas, self.terms.loads, starts, tolerance)
-        (images,) = self.basis.extend(np.concatenate(solutions, axis=1))
-        if not images[0].size:
+        right, coefficients = np.tile(self.loads, len(states)), np.repeat(thetas, loads, axis=0).T
+        start = np.concatenate([self._galerkin(theta) for theta in thetas], axis=1)
+        solutions = solved_near(terms.factors, terms.stiffness_terms, coefficients, right, start, tolerance)
+        (images,) = self.basis.add(solutions)
+        if not images.size:
             return False  # rounding is reached; what the search reached is judged after it
-        known = self.residual_basis.vectors.shape[1]
-        found = self.residual_basis.extend(np.concatenate(images, axis=1))
-        added = self.dual_products @ self.residual_basis.vectors[:, known:]
-        self.correction = np.concatenate((self.correction, added), axis=2)
+        known = self.residuals.vectors.shape[1]
+        found = self.residuals.extend(terms.factors.whitened(np.concatenate(images, axis=1)))
+        added = self.duals @ self.residuals.vectors[:, known:]
+        self.correction = np.concatenate((self.correction, added), axis=3)
         # what was there lies in the basis that was there
         self.residual_load = _with_rows(self.residual_load, len(found))
+        stiffness = _with_rows(self.residual_stiffness, len(found))
         self.residual_stiffness = np.concatenate(
-            (_with_rows(self.residual_stiffness, len(found)), found.reshape(len(found), len(images), -1)),
-            axis=2,
+            (stiffness, found.reshape(len(found), len(images), -1)), axis=2
         )
         if not self.snapshots:
-            self.rounding = self._rounding(thetas[0], self.terms.outputs.T @ solutions[0])
+            self.rounding = self._rounding(self._galerkin(thetas[0]), solutions)
         self.snapshots.extend(states)
         return True
 
     def _galerkin(self, theta: FloatArray) -> FloatArray:
         """Return the solutions (n, L) in the present basis."""
         basis, stiffness = self.basis.vectors, np.tensordot(theta, self.basis.inner[0], 1)
-        return np.asarray(basis @ np.linalg.solve(stiffness, basis.T @ self.terms.loads))
+        return np.asarray(basis @ np.linalg.solve(stiffness, basis.T @ self.loads))
 
-    def _rounding(self, theta: FloatArray, wanted: FloatArray) -> float:
-        """Return the relative difference of outputs between full solutions and the basis that holds them."""
-        difference = np.abs(self.terms.outputs.T @ self._galerkin(theta) - wanted)
-        return max(
-            float(np.divide(largest, size, out=np.zeros_like(size), where=size > 0.0).max())
+    def _rounding(self, found: FloatArray, solutions: FloatArray) -> float:
+        """Return the relative difference of outputs between full solutions and those of their basis."""
+        wanted = np.abs(self.outputs.T @ solutions)
+        difference = np.abs(self.outputs.T @ (found - solutions))
+        shares = [
+            difference[rows].max(axis=0) / np.maximum(wanted[rows].max(axis=0), least)
             for rows, least in zip(self.terms.groups, self.least, strict=True)
-            for largest, size in (
-                (difference[rows].max(axis=0), np.maximum(np.abs(wanted[rows]).max(axis=0), least)),
-            )
-        )
+        ]
+        return float(np.max(shares))
 
-    def model(self) -> ReducedModel:
-        """Return the reduced model of the present bases."""
-        terms, basis, (stiffness,) = self.terms, self.basis.vectors, self.basis.inner
-        # residuals in the images of the basis under the norm, then in what is orthogonal to them
-        own = np.tensordot(self.residual_stiffness, terms.reference, (1, 0))
-        across, images = np.linalg.qr(own)[0], self.residual_stiffness[:, :-1]
-        load = self.residual_load - across @ (across.T @ self.residual_load)
-        images = images - np.tensordot(across, np.tensordot(across, images, (0, 0)), 1)
+    def model(self, directions: FloatArray | None = None) -> ReducedModel:
+        """Return the reduced model of the present basis, or of combinations of it.
+
+        Parameters
+        ----------
+        directions : (N, K) ndarray, optional
+            Orthonormal combinations of the N basis vectors.
+        """
+        terms, rounding = self.terms, ROUNDING_FACTOR * self.rounding
+        turn = np.eye(self.basis.vectors.shape[1]) if directions is None else directions
+        basis, images = self.basis.vectors @ turn, self.residual_stiffness @ turn
+        # along the images of the basis under the norm a solution leaves nothing
+        own = np.linalg.qr(np.tensordot(images, terms.reference, (1, 0)))[0]
+        # what changes with health first, loads, then the rest: columns of the triangular factor become longer
+        lasting = terms.stiffness_factors[:-1, 1] == 0
+        order, first = np.argsort(lasting, kind="stable"), turn.shape[1] * np.count_nonzero(~lasting)
+        columns = images[:, order].reshape(len(images), -1)
+        columns = np.concatenate((columns[:, :first], self.residual_load, columns[:, first:]), axis=1)
+        across, factor = np.linalg.qr(columns - own @ (own.T @ columns))
+        loads = slice(first, first + self.loads.shape[1])
+        changes = np.delete(factor, loads, axis=1).reshape(len(factor), len(order), -1)
         # |sum c_q a_j d_qj| <= |c| |a| |d| with c = (1, theta); plus rounding
-        largest = (terms.reference + terms.farthest())[:-1]
-        dropped = np.sqrt((2.0 + largest @ largest) * self.residual_basis.dropped_square)
+        high, low = [ends[1] for ends in terms.parameters], [ends[0] for ends in terms.losses]
+        largest = terms.theta((*high, *low))
+        dropped = np.sqrt((1.0 + largest @ largest) * self.residuals.dropped_square)
+        moved = self.basis.displacements @ turn
         return ReducedModel(
-            static_stiffness=0.5 * (stiffness + stiffness.transpose(0, 2, 1)),
-            static_load=terms.loads.T @ basis,
-            static_output=terms.outputs.T @ basis,
+            static_stiffness=turned(self.basis.inner[0], turn),
+            static_load=self.loads.T @ basis,
+            static_output=self.outputs.T @ basis,
             bound_reference=terms.reference[:-1],
-            residual_load=np.concatenate((basis.T @ terms.loads, load)),
-            residual_stiffness=np.concatenate((np.moveaxis(stiffness[:-1], 1, 0), images)),
+            residual_load=factor[:, loads],
+            residual_stiffness=changes[:, np.argsort(order)],
             residual_allowance=float(dropped) + 1e-7,
-            rounding_allowance=max(ROUNDING_FACTOR * self.rounding, LEAST_ROUNDING),
-            dual_correction=np.concatenate((self.correction @ own, self.correction), axis=2),
-            cross_mass=np.stack([self.modal_basis.T @ (term @ basis) for term in terms.mass_terms]),
+            rounding_allowance=max(rounding, LEAST_ROUNDING),
+            dual_correction=self.correction @ across,
+            cross_mass=np.stack([self.modal_basis.T @ (term @ moved) for term in terms.structure.mass_terms]),
             **self.fixed,
         )
 
@@ -247,59 +237,58 @@ class StaticReduction:
                 worst = max(worst, error / max(float(np.abs(values).max()), floor))
         return worst
 
+    def search(self, settings: StructureSettings) -> tuple[float, ...]:
+        """Run the weak greedy search with the certified bound as its surrogate.
 
-def greedy(
-    static: StaticReduction, states: list[State], *, tolerance: float, most_snapshots: int
-) -> list[float]:
-    """Run the weak greedy search with the certified bound as its surrogate.
+        Returns
+        -------
+        tuple of float
+            Largest bound on the training set before each round of full solutions and at the end.
 
-    Parameters
-    ----------
-    static : StaticReduction
-        Takes the full solutions.
-    states : list of State
-        Where it is looked at.
-    tolerance : float
-        Relative bound wanted; the search goes on to `SEARCH_MARGIN` of it.
-    most_snapshots : int
-        Limit of full solutions.
-
-    Returns
-    -------
-    list of float
-        Largest bound before each full solution and at the end.
-    """
-    wanted, places = SEARCH_MARGIN * tolerance, np.array(states)
-    known, history = np.full(len(states), np.inf), []
-    # nothing to bound yet: begin in the middle
-    chosen = [states[int(((places - places.mean(axis=0)) ** 2).sum(axis=1).argmin())]]
-    for number in range(1 + ceil((most_snapshots - 1) / TOGETHER)):
-        if number:
-            few = len(states) // LOOKED_AT if number > 1 and static.fixed["dual_output"].size else 0
-            bounds = _bounds(static, states, known, few, wanted)
+        Raises
+        ------
+        ReductionError
+            If the bound stays too large.
+        """
+        states, wanted = self.terms.training(), SEARCH_MARGIN * settings.bound_tolerance
+        places, history = np.array(states), list[float]()
+        known = np.full(len(states), np.inf)
+        # nothing to bound yet: begin in the middle
+        chosen = [states[int(((places - places.mean(axis=0)) ** 2).sum(axis=1).argmin())]]
+        for _ in range(1 + ceil((settings.most_snapshots - 1) / TOGETHER)):
+            grown, left = self.add_snapshots(chosen), settings.most_snapshots - len(self.snapshots)
+            self.stage.advance(len(chosen), f"full solution {len(self.snapshots)}")
+            last = not (grown and left)
+            model, bounds = self.model(), np.zeros(len(states))
+            few = len(states) // LOOKED_AT if history and not last else len(states)
+            for place, number in enumerate(np.argsort(-known, kind="stable")):
+                if place == few and bounds.max() > wanted:
+                    break
+                bounds[number] = known[number] = self.bound(model, states[number])
             history.append(float(bounds.max()))
-            if history[-1] <= wanted:
-                return history
-            chosen = _spread(places, bounds, min(TOGETHER, most_snapshots - len(static.snapshots)), wanted)
-        if not static.add_snapshots(chosen):
-            break
-        static.stage.advance(len(chosen), f"full solution {len(static.snapshots)}")
-    return [*history, float(_bounds(static, states, known, len(states), wanted).max())]
+            if history[-1] <= wanted or last:
+                break
+            chosen = _spread(places, bounds, min(TOGETHER, left), wanted)
+        if history[-1] > settings.bound_tolerance:
+            raise ReductionError(
+                f"After {counted(len(self.snapshots), 'full solution')} the error bound of "
+                f"{self.terms.structure.design.name} is {history[-1]:.2g} of the largest output, but "
+                f"{settings.bound_tolerance:.2g} was asked for; raise most_solutions (now "
+                f"{settings.most_snapshots}) or tolerance in the table [reduction] of a structure file, or "
+                "narrow the ranges of parameters and losses."
+            )
+        return tuple(history)
 
+    def compressed(self, tolerance: float) -> FloatArray:
+        """Return the fewest combinations (N, K) of the basis whose bound keeps a tolerance."""
+        model, states = self.model(), self.terms.training()
+        solutions = [found.coordinates for state in states for found in self.responses(model, state)]
 
-def _bounds(
-    static: StaticReduction, states: list[State], known: FloatArray, few: int, wanted: float
-) -> FloatArray:
-    """Bounds of the `few` states that were worst when last looked at; of all where these are good enough."""
-    present, bounds = static.model(), np.zeros(len(states))
-    order, first = np.argsort(-known, kind="stable"), 0
-    for count in (few, len(states)):
-        for number in order[first:count]:
-            bounds[number] = known[number] = static.bound(present, states[number])
-        first = count
-        if bounds.max() > wanted:
-            break
-    return bounds
+        def good(directions: FloatArray) -> bool:
+            smaller = self.model(directions)
+            return all(self.bound(smaller, state) <= tolerance for state in states)
+
+        return fewest_directions(np.array(solutions).T, 2, good)
 
 
 def _with_rows(array: FloatArray, count: int) -> FloatArray:
@@ -319,77 +308,3 @@ def _spread(states: FloatArray, bounds: FloatArray, count: int, least: float) ->
             break
         chosen.append(int(score.argmax()))
     return [tuple(states[number].tolist()) for number in chosen]
-
-
-def compressed(model: ReducedModel, directions: FloatArray) -> ReducedModel:
-    """Return the model on fewer static basis vectors, its residuals on as few as they then need.
-
-    Parameters
-    ----------
-    model : ReducedModel
-        A model with N static basis vectors.
-    directions : (N, K) ndarray
-        Orthonormal combinations of them.
-
-    Returns
-    -------
-    ReducedModel
-        The Galerkin model on the combinations; its bound is as certified as before.
-    """
-    stiffness = directions.T @ model.static_stiffness @ directions
-    stiffness = 0.5 * (stiffness + stiffness.transpose(0, 2, 1))
-    # what changes with health first, the loads, then the rest: columns of the triangular factor become longer
-    lasting = model.stiffness_factors[:-1, 1] == 0
-    order, first = np.argsort(lasting, kind="stable"), directions.shape[1] * np.count_nonzero(~lasting)
-    images = (model.residual_stiffness @ directions)[:, order].reshape(len(model.residual_load), -1)
-    images = np.concatenate((images[:, :first], model.residual_load, images[:, first:]), axis=1)
-    own = np.eye(len(images), len(directions)) @ directions
-    orthonormal, factor = np.linalg.qr(images - own @ (own.T @ images))
-    loads = slice(first, first + len(model.load_factors))
-    terms = np.delete(factor, loads, axis=1).reshape(len(factor), len(order), -1)[:, np.argsort(order)]
-    static_load = model.static_load @ directions
-    return replace(
-        model,
-        static_stiffness=stiffness,
-        static_load=static_load,
-        static_output=model.static_output @ directions,
-        residual_load=np.concatenate((static_load.T, factor[:, loads])),
-        residual_stiffness=np.concatenate((np.moveaxis(stiffness[:-1], 1, 0), terms)),
-        dual_correction=model.dual_correction @ np.concatenate((own, orthonormal), axis=1),
-        cross_mass=model.cross_mass @ directions,
-    )
-
-
-def fewest_directions(
-    model: ReducedModel, static: StaticReduction, states: list[State], tolerance: float
-) -> FloatArray:
-    """Return the fewest singular directions of the reduced solutions that keep the bound below a tolerance.
-
-    Parameters
-    ----------
-    model : ReducedModel
-        The model that the greedy search made.
-    static : StaticReduction
-        What it was made of.
-    states : list of tuple
-        States to look at.
-    tolerance : float
-        Relative bound wanted.
-
-    Returns
-    -------
-    (N, K) ndarray
-        Orthonormal combinations of its static basis vectors; all of them if fewer do not suffice.
-    """
-    solutions = []
-    for state in states:
-        for response in static.responses(model, state):
-            solutions.append(response.coordinates / np.linalg.norm(response.coordinates))
-    directions = np.linalg.svd(np.array(solutions).T, full_matrices=False)[0]
-
-    def good(count: int) -> bool:
-        smaller = compressed(model, directions[:, :count])
-        return all(static.bound(smaller, state) <= tolerance for state in states)
-
-    most = directions.shape[1]
-    return directions[:, : bisect_left(range(most), True, min(2, most), key=good)]

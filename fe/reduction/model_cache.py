@@ -10,7 +10,6 @@ from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import KeptArrays
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
@@ -24,12 +23,13 @@ from reporting.provenance import hash_bytes, hash_tree
 
 from .built_once import built_once, cache_folder
 from .fields import WingFields, field_basis
-from .settings import PatchSettings, StructureSettings
+from .settings import StructureSettings
 
 MODELLING_ROOMS = ("runtime", "elements", "full", "structure", "wing", "reduction")
 """The rooms that decide what a reduced model holds; a change in any of their files makes a new entry."""
 
 _Kept = TypeVar("_Kept", bound=KeptArrays)
+Settings = StructureSettings | None
 
 
 def modelling_hash() -> str:
@@ -51,21 +51,14 @@ def _once(
 ) -> _Kept:
     """Return the arrays of a design from their file, or else build them in one thread, and keep them."""
     path = entry(name, design_hash, settings)
-
-    def load() -> _Kept:
-        arrays = kind.load(path)
-        if arrays.design_hash != design_hash:
-            raise ReducedModelFileError(f"{path} holds {kind.what} of another design; delete it.")
-        return arrays
-
     built: Callable[[], _Kept] = threadpool_limits.wrap(limits=1)(build)
-    return built_once(path, load, built, lambda made: atomic_write_bytes(path, made.to_bytes()))
+    return built_once(
+        path, lambda: kind.load(path), built, lambda made: atomic_write_bytes(path, made.to_bytes())
+    )
 
 
 def reduced_model(
-    design: WingDesign | None = None,
-    progress: Progress | None = None,
-    settings: StructureSettings | None = None,
+    design: WingDesign | None = None, progress: Progress | None = None, settings: Settings = None
 ) -> ReducedModel:
     """Return the reduced model of a wing, from the cache if it is there.
 
@@ -84,32 +77,32 @@ def reduced_model(
         If the design cannot be modelled or reduced.
     """
     wing = design or load_design()
-    return _once(
-        ReducedModel, "wing", wing.hash, settings, lambda: wing_fields(wing, progress, settings).model
-    )
+
+    def build() -> ReducedModel:
+        return wing_fields(wing, progress, settings).model
+
+    return _once(ReducedModel, "wing", wing.hash, settings, build)
 
 
 def wing_fields(
-    design: WingDesign | None = None,
-    progress: Progress | None = None,
-    settings: StructureSettings | None = None,
+    design: WingDesign | None = None, progress: Progress | None = None, settings: Settings = None
 ) -> WingFields:
     """Return the reduced model of a wing with its bases on the mesh, from the cache if it is there.
 
     Parameters and errors as of `reduced_model`.
     """
     wing = design or load_design()
-    return _once(WingFields, "fields", wing.hash, settings, lambda: build(wing, progress, settings))
+    return _once(WingFields, "fields", wing.hash, settings, lambda: build_fields(wing, progress, settings))
 
 
-def build(
-    design: WingDesign, progress: Progress | None = None, settings: StructureSettings | None = None
+def build_fields(
+    design: WingDesign, progress: Progress | None = None, settings: Settings = None
 ) -> WingFields:
     """Build the reduced model and the bases of a wing, without the cache; see `reduced_model`."""
-    from .reduced_basis import reduce_model
+    from .reduced_basis import reduce_structure
 
     operators = _assembled(design, progress)
-    return field_basis(operators, reduce_model(operators, settings, progress))
+    return field_basis(operators, reduce_structure(operators, settings, progress))
 
 
 def _assembled(design: WingDesign, progress: Progress | None) -> AffineOperators:
@@ -117,37 +110,24 @@ def _assembled(design: WingDesign, progress: Progress | None) -> AffineOperators
         return assemble(design)
 
 
-def patch_arrays(
-    design: WingDesign | None = None,
-    progress: Progress | None = None,
-    settings: PatchSettings | None = None,
-) -> PatchArrays:
+def patch_arrays(design: WingDesign | None = None, progress: Progress | None = None) -> PatchArrays:
     """Return the wing for patches of a design, from the cache if it is there.
 
-    Parameters and errors are those of `reduced_model`; the settings say how far changes may go and how well
-    they are held.
+    Parameters and errors are those of `reduced_model`.
     """
     wing = design or load_design()
-    return _once(
-        PatchArrays, "patches", wing.hash, settings, lambda: build_patch_arrays(wing, progress, settings)
-    )
+    return _once(PatchArrays, "patches", wing.hash, None, lambda: build_patch_arrays(wing, progress))
 
 
-def build_patch_arrays(
-    design: WingDesign, progress: Progress | None = None, settings: PatchSettings | None = None
-) -> PatchArrays:
+def build_patch_arrays(design: WingDesign, progress: Progress | None = None) -> PatchArrays:
     """Build the wing for patches of a design, without the cache; see `patch_arrays`."""
     from .patch_basis import reduce_patches
 
-    return reduce_patches(_assembled(design, progress), settings, progress)
+    return reduce_patches(_assembled(design, progress), progress)
 
 
 def reduced_structure(
-    file: Path | str,
-    settings: StructureSettings | None = None,
-    progress: Progress | None = None,
-    *,
-    memory_limit: float | None = None,
+    file: Path | str, progress: Progress | None = None, *, memory_limit: float | None = None
 ) -> ReducedModel:
     """Return the reduced model of a structure file, from the cache if it is there.
 
@@ -155,8 +135,6 @@ def reduced_structure(
     ----------
     file : Path or str
         The structure file, beside its mesh.
-    settings : StructureSettings, optional
-        How well it is to hold; by default as its file says.
     progress : Progress, optional
         Where a build reports.
     memory_limit : float, optional
@@ -167,16 +145,15 @@ def reduced_structure(
     FiniteElementError
         If the structure cannot be read, modelled or reduced.
     """
-    design_hash, chosen = _asked(Path(file), settings)
 
-    def build_structure() -> ReducedModel:
+    def build() -> ReducedModel:
         from .reduced_basis import reduce_structure
 
         with (progress or SilentProgress()).stage("Reading the mesh and assembling"):
             structure = assemble_structure(file, memory_limit)
-        return reduce_structure(structure, chosen, progress).model
+        return reduce_structure(structure, progress=progress).model
 
-    return _once(ReducedModel, "structure", design_hash, chosen, build_structure)
+    return _once(ReducedModel, "structure", *_asked(Path(file)), build)
 
 
 def check_structure(file: Path | str) -> None:
@@ -191,7 +168,7 @@ def check_structure(file: Path | str) -> None:
         assemble_structure(file)
 
 
-def _asked(file: Path, settings: StructureSettings | None = None) -> tuple[str, StructureSettings]:
+def _asked(file: Path) -> tuple[str, object]:
     """Return the hash of a structure file with its mesh, and how it is to be reduced."""
     design = load_structure(file)
-    return structure_hash(design, file.parent), settings or StructureSettings.of(design)
+    return structure_hash(design, file.parent), design.reduction

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import eigh
 
-from fe.full.subspace import Norm
+from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
 from fe.runtime.patch_arrays import PatchArrays
@@ -22,8 +22,11 @@ from fe.wing.operators import AffineOperators
 from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
 from reporting.progress import Progress, SilentProgress
 
-from .settings import PatchSettings
-
+LARGEST_LOSS, COMPLIANCE_SHARE, LARGEST_MASS = 0.7, 0.4, 0.25
+"""How far changes may go: loss of stiffness in a box along the span, root compliance as a share of the tip's,
+point mass [kg]."""
+VECTORS, STATES = 240, 240
+"""Size n of the basis, and patched states that are solved in the working basis."""
 DAMAGED_ANCHOR = 0.7
 """Stiffness loss of every damage region in the second state of health at which the full model is solved."""
 LIFT_MOMENTS = 6
@@ -36,17 +39,13 @@ WORKING_TOLERANCE = 3e-7
 """Squared size, relative to the largest, of a direction that the working basis leaves out."""
 
 
-def reduce_patches(
-    operators: AffineOperators, settings: PatchSettings | None = None, progress: Progress | None = None
-) -> PatchArrays:
+def reduce_patches(operators: AffineOperators, progress: Progress | None = None) -> PatchArrays:
     """Make the arrays of a wing that can be patched.
 
     Parameters
     ----------
     operators : AffineOperators
         The full model.
-    settings : PatchSettings, optional
-        How far and how well.
     progress : Progress, optional
         Where to report.
 
@@ -55,24 +54,26 @@ def reduce_patches(
     SolutionError
         If the full model cannot be solved.
     """
-    settings, progress = settings or PatchSettings(), progress or SilentProgress()
+    progress = progress or SilentProgress()
     with progress.stage("Solving the wing for changes"):
-        full = assemble_patch_operators(operators, settings.strip_count)
+        full = assemble_patch_operators(operators)
         healthy, damaged = _responses(full, 0.0), _responses(full, DAMAGED_ANCHOR)
         snapshots = np.concatenate((healthy, damaged), axis=1)
         values, vectors = np.linalg.eigh(snapshots.T @ (operators.stiffness() @ snapshots))
         kept = values > WORKING_TOLERANCE * values[-1]
         basis = snapshots @ (vectors[:, kept] / np.sqrt(values[kept]))
     with progress.stage("Reducing the patched wing"):
-        directions = _directions(project(full, basis, settings), settings)
-        return project(full, basis @ directions, settings)
+        return project(full, basis @ _directions(project(full, basis)))
 
 
 def _responses(full: PatchOperators, loss: float) -> FloatArray:
     """Return solutions (n, k) of the full model, all damage regions with one loss, in their natural sizes."""
     operators, rows, stations = full.operators, full.rows, full.plain["stations"]
     health = dict.fromkeys(operators.regions, loss)
-    norm, modes = Norm(operators.stiffness(None, health)), natural_frequencies(operators, MODES, health)[1]
+    factors, (frequency, modes) = (
+        Factorisation(operators.stiffness(None, health)),
+        natural_frequencies(operators, MODES, health),
+    )
     step = max(1, len(stations) // 13)
     along_x, along_y, elastic, *others = rows["line_rows"]
     along, *turned = rows["strain_rows"]
@@ -87,8 +88,9 @@ def _responses(full: PatchOperators, loss: float) -> FloatArray:
     inertia = [(term @ modes[:, :SHAPES]).T for term in operators.mass_terms]
     several = (line.toarray() for line in lines)
     loads = (along.toarray(), *single, moments.T @ rows["lift_rows"], *several, *inertia)
-    solutions = np.concatenate((norm.riesz(np.vstack(loads).T), modes), axis=1)
-    solutions /= np.sqrt(np.einsum("ik,ik->k", solutions, norm.product(solutions)))
+    answers = factors.whitened(np.vstack(loads).T)
+    answers = factors.unwhitened(answers / np.linalg.norm(answers, axis=0))
+    solutions = np.concatenate((answers, modes / (2.0 * np.pi * frequency)), axis=1)
     # what each part of the skin does to the main solutions, and to the gauges near it
     places, edges = full.plain["gauge_stations"], full.plain["strip_lines"]
     gauges, under_loads, _ = np.split(solutions, [len(places), len(places) + 2], axis=1)
@@ -99,7 +101,7 @@ def _responses(full: PatchOperators, loss: float) -> FloatArray:
         part @ np.concatenate((main, gauges[:, close]), axis=1)
         for part, close in zip(full.strips, near, strict=True)
     ]
-    return np.concatenate((solutions, norm.riesz(np.concatenate(changes, axis=1))), axis=1)
+    return np.concatenate((solutions, factors.riesz(np.concatenate(changes, axis=1))), axis=1)
 
 
 def _inner(matrix: sparse.csr_array, basis: FloatArray) -> FloatArray:
@@ -110,7 +112,7 @@ def _inner(matrix: sparse.csr_array, basis: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (product + product.T))
 
 
-def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) -> PatchArrays:
+def project(full: PatchOperators, basis: FloatArray) -> PatchArrays:
     """Return the arrays of a wing in a basis (n_full, n), without reducing it further."""
     lower, operators = np.tril_indices(basis.shape[1]), full.operators
     rows: dict[str, Any] = {
@@ -121,18 +123,16 @@ def project(full: PatchOperators, basis: FloatArray, settings: PatchSettings) ->
         np.stack([_inner(term, basis) for term in terms])
         for terms in ([term.matrix for term in operators.stiffness_terms], operators.mass_terms)
     )
-    whole, tip = stiffness.sum(axis=0), rows["load_tip"]
+    whole, tip, load_place = stiffness.sum(axis=0), rows["load_tip"], full.plain["load_place"]
     nominal = np.tensordot((1.0, *operators.masses.values()), mass, 1)
     shapes = eigh(whole, nominal, subset_by_index=[0, START_SHAPES - 1])[1]
     return PatchArrays(
         design_hash=operators.design_hash,
         regions=operators.regions,
         validity_box=np.array(list(operators.ranges.values())),
-        largest_loss=settings.largest_loss,
-        largest_compliance=settings.compliance_share
-        * float(tip @ np.linalg.solve(whole, tip))
-        / full.plain["load_place"] ** 2,
-        largest_mass=settings.largest_mass,
+        largest_loss=LARGEST_LOSS,
+        largest_compliance=COMPLIANCE_SHARE * float(tip @ np.linalg.solve(whole, tip)) / load_place**2,
+        largest_mass=LARGEST_MASS,
         stiffness=stiffness,
         mass=mass,
         strip_stiffness=np.stack([_inner(part, basis)[lower].astype(np.float32) for part in full.strips]),
@@ -158,7 +158,7 @@ PLAIN_WEIGHT = 10.0
 """How much more the wing as it was counts than one of the patched states."""
 
 
-def _directions(arrays: PatchArrays, settings: PatchSettings) -> FloatArray:
+def _directions(arrays: PatchArrays) -> FloatArray:
     """Return the kept directions (N, n) of the working basis."""
     wing = PatchedWing(arrays)
     eta, upwards = arrays.stations / wing.span, arrays.line_rows[2:]
@@ -174,13 +174,13 @@ def _directions(arrays: PatchArrays, settings: PatchSettings) -> FloatArray:
     weights = np.repeat((LOAD_WEIGHT, 1.0, TURNED_WEIGHT), [len(rows) for rows in groups])
     all_snapshots = np.zeros((wing.size, wing.size))
     numbers = len(TAKEN) + CHANGED + len(arrays.validity_box) - 2
-    places = np.random.default_rng(settings.seed).random((settings.states, numbers))
+    places = np.random.default_rng(1).random((STATES, numbers))
     for number, shares in enumerate(places):
         structure = _patched_state(wing, shares, plain=number == 0)
         solutions, modes = _unit(structure.static(columns)), _unit(structure.lowest(MODES).shapes)
         shapes = np.concatenate((solutions * weights, modes * MODE_WEIGHTS), axis=1)
         all_snapshots += shapes @ shapes.T * (1.0 if number else PLAIN_WEIGHT**2)
-    first = max(0, wing.size - settings.vectors)
+    first = max(0, wing.size - VECTORS)
     return np.asarray(eigh(all_snapshots, subset_by_index=[first, wing.size - 1])[1][:, ::-1])
 
 

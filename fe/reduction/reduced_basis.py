@@ -6,7 +6,6 @@ of many states, computed in the working basis, are compressed by singular values
 reaches are in `docs/reduced_model.md`.
 """
 
-from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,21 +14,25 @@ import numpy as np
 from scipy.linalg import eigh
 
 from fe.full.factorisation import most_moved
-from fe.full.subspace import Norm, ProjectedBasis
+from fe.full.subspace import ProjectedBasis, affine_product, turned
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import TIP_FORCE
-from fe.structure.affine import AffineStructure, affine_sum, natural_frequencies, static_response
-from fe.wing.operators import AffineWing
+from fe.structure.affine import AffineStructure, natural_frequencies, static_response
 from reporting.progress import Progress, SilentProgress, Stage
-from reporting.words import counted
 
-from .certified_basis import StaticReduction, compressed, fewest_directions, greedy
-from .settings import TOGETHER, ModalSettings, StructureSettings, loss_splits
-from .terms import ModalState, ReductionTerms, State
+from .certified_basis import TOGETHER, StaticReduction, fewest_directions
+from .settings import StructureSettings
+from .terms import ModalState, ReductionTerms, State, loss_at
 
 START_ITERATIONS = 4
+FURTHER_MODES = 2
+"""Modes that are looked for beyond those wanted, because modes change places."""
+RESIDUAL_TOLERANCE, FREQUENCY_TOLERANCE = 3e-3, 1e-5
+"""Relative residual of the sampled modes in the working basis, of which frequencies err by about the square,
+and relative error of any frequency that compression may add."""
+MOST_CORRECTIONS = 12
+"""Limit of Davidson corrections for one state."""
 
 
 def eigenmodes(
@@ -41,23 +44,17 @@ def eigenmodes(
     return np.asarray(values), np.asarray(vectors)
 
 
-def modal_basis(
-    system: ReductionTerms, norm: Norm, settings: ModalSettings, stage: Stage, followed_load: int | None
-) -> tuple[FloatArray, dict[str, Any]]:
+def modal_basis(terms: ReductionTerms, count: int, stage: Stage) -> tuple[FloatArray, dict[str, Any]]:
     """Make a basis (n, Nm) for the first modes of any structure, and the modal fields of `ReducedArrays`.
 
     Parameters
     ----------
-    system : ReductionTerms
+    terms : ReductionTerms
         The full model, where the working basis is refined, and whose modes are compressed together.
-    norm : Norm
-        The energy norm of one of its stiffnesses.
-    settings : ModalSettings
-        Accuracy.
+    count : int
+        Number of modes.
     stage : Stage
         Advances after each sampled state.
-    followed_load : int, optional
-        As of `reduce_structure`.
 
     Raises
     ------
@@ -65,42 +62,41 @@ def modal_basis(
         If the modes of a sampled state do not converge, there are too few unknowns for the modes, or masses
         move in too few ways.
     """
-    unknowns, count = system.stiffness_terms[0].shape[0], settings.sought
-    if unknowns <= 2 * count:
+    structure, factors, sought = terms.structure, terms.factors, count + FURTHER_MODES
+    if structure.unknowns <= 2 * sought:
         raise ReductionError(
-            f"{settings.mode_count} modes cannot be had from {unknowns} unknowns; ask for fewer or refine."
+            f"{count} modes cannot be had from {structure.unknowns} unknowns; ask for fewer or refine."
         )
-    working = ProjectedBasis(norm, (system.stiffness_terms, system.mass_terms), drop=1e-6)
-    matrix = affine_sum([1.0, *(0.5 * (low + high) for low, high in system.masses)], system.mass_terms)
+    working = ProjectedBasis(factors, terms.stiffness_terms, structure.mass_terms, drop=1e-6)
+    middle = np.append(1.0, terms.masses.mean(axis=1))
     # inverse iteration on a block; what it leaves is refined below
-    vectors = np.random.default_rng(1).normal(size=(unknowns, count + 4))
+    vectors = np.random.default_rng(1).normal(size=(structure.unknowns, sought + 4))
     for _ in range(START_ITERATIONS):
-        vectors = np.linalg.qr(norm.riesz(np.asarray(matrix @ vectors)))[0]
-    working.extend(vectors)
-    sampled = system.sampled_modes()
+        inertia = affine_product(structure.mass_terms, middle, factors.unwhitened(vectors))
+        vectors = np.linalg.qr(factors.whitened(inertia))[0]
+    working.add(vectors)
+    sampled = terms.sampled_modes()
     try:
         for first in range(0, len(sampled), TOGETHER):
-            for _ in _refined(system, working, sampled[first : first + TOGETHER], settings):
+            for _ in _refined(terms, working, sampled[first : first + TOGETHER], sought):
                 stage.advance()
-        directions = _compress(working, system.compressed_modes(), settings)
+        directions = _compressed(working, terms.compressed_modes(), count)
     except np.linalg.LinAlgError:
         raise ReductionError(
-            f"The masses of {system.structure.design.name} move in fewer ways than the {count} modes that "
-            "are looked for; give its materials a density."
+            f"The masses of {structure.design.name} move in fewer ways than the {sought} modes that are "
+            "looked for; give its materials a density."
         ) from None
-    stiffness, mass = (
-        # What rounding made of the symmetry of large entries is averaged out.
-        0.5 * (terms + terms.transpose(0, 2, 1))
-        for terms in (directions.T @ inner @ directions for inner in working.inner)
-    )
-    basis = working.vectors @ directions
-    load, followed = system.loads.T @ basis, np.empty((0, basis.shape[1]))
-    if followed_load is not None:
-        square, shapes = eigenmodes((stiffness, mass), *system.nominal, settings.mode_count)
-        followed = shapes[:, most_moved(load[followed_load], square, shapes)].T
-    output = (system.outputs.T @ basis, system.structure.acceleration_output @ basis)
+    stiffness, mass = (turned(inner, directions) for inner in working.inner)
+    basis = working.displacements @ directions
+    load, followed = terms.loads.T @ basis, np.empty((0, basis.shape[1]))
+    if structure.followed_load is not None:
+        healthy = terms.theta((*structure.parameters.values(), *np.zeros(len(terms.losses))))
+        nominal = np.array((1.0, *structure.masses.values()))
+        square, shapes = eigenmodes((stiffness, mass), healthy, nominal, count)
+        followed = shapes[:, most_moved(load[structure.followed_load], square, shapes)].T
+    output = (terms.outputs.T @ basis, structure.acceleration_output @ basis)
     return basis, {
-        "mode_count": settings.mode_count,
+        "mode_count": count,
         "modal_stiffness": stiffness,
         "modal_mass": mass,
         "modal_load": load,
@@ -110,59 +106,46 @@ def modal_basis(
 
 
 def _refined(
-    system: ReductionTerms, working: ProjectedBasis, states: list[ModalState], settings: ModalSettings
+    terms: ReductionTerms, working: ProjectedBasis, states: list[ModalState], sought: int
 ) -> Iterator[int]:
     """Add Davidson corrections X^-1 (K - omega^2 M) phi until all modes are found; yield at each state."""
-    open_states = [(*state, system.stiffness(state[0]), system.mass(state[1])) for state in states]
     largest = np.inf
-    for _ in range(settings.most_corrections):
-        modes = [
-            eigenmodes(working.inner, theta, mass_theta, settings.sought)
-            for theta, mass_theta, _, _ in open_states
-        ]
-        residual = []
-        for (_, _, stiffness, mass), (square, coefficients) in zip(open_states, modes, strict=True):
-            shape = working.vectors @ coefficients
-            residual.append(stiffness @ shape - (mass @ shape) * square)
-        residuals = np.concatenate(residual, axis=1)
-        correction = working.norm.riesz(residuals)
-        # (r, X^-1 r) / (phi, K phi); phi is mass-normalised
+    for _ in range(MOST_CORRECTIONS):
+        modes = [eigenmodes(working.inner, *state, sought) for state in states]
+        theta, mass_theta = (np.repeat(part, sought, axis=0).T for part in zip(*states, strict=True))
         squares = np.concatenate([square for square, _ in modes])
-        sizes = np.sqrt(np.einsum("ik,ik->k", residuals, correction) / squares)
-        too_large = sizes > settings.residual_tolerance
-        still = too_large.reshape(len(open_states), -1).any(axis=1)
+        shapes = working.displacements @ np.concatenate([shape for _, shape in modes], axis=1)
+        residuals = affine_product(terms.stiffness_terms, theta, shapes)
+        residuals -= affine_product(terms.structure.mass_terms, mass_theta * squares, shapes)
+        corrections = working.factors.whitened(residuals)
+        # (r, X^-1 r) / (phi, K phi); phi is mass-normalised
+        sizes = np.linalg.norm(corrections, axis=0) / np.sqrt(squares)
+        too_large = sizes > RESIDUAL_TOLERANCE
+        still = too_large.reshape(len(states), -1).any(axis=1)
         yield from range(int(np.sum(~still)))
         if not still.any():
             return
         largest = float(sizes.max())
-        working.extend(correction[:, np.flatnonzero(too_large)])
-        open_states = [state for state, chosen in zip(open_states, still, strict=True) if chosen]
+        working.add(corrections[:, too_large])
+        states = [state for state, chosen in zip(states, still, strict=True) if chosen]
     raise ReductionError(
-        f"The modes of a sampled state reached a residual of {largest:.2g} only, "
-        f"{settings.residual_tolerance:.2g} was asked for; allow more corrections."
+        f"The modes of a sampled state reached a residual of {largest:.2g} only in {MOST_CORRECTIONS} "
+        f"corrections, but {RESIDUAL_TOLERANCE:g} is needed."
     )
 
 
-def _compress(working: ProjectedBasis, states: list[ModalState], settings: ModalSettings) -> FloatArray:
+def _compressed(working: ProjectedBasis, states: list[ModalState], count: int) -> FloatArray:
     """Return the fewest singular directions (k, Nm) of many states' modes that keep every frequency."""
-    modes = [eigenmodes(working.inner, *state, settings.sought) for state in states]
-    kept = settings.mode_count
-    snapshots = np.concatenate(
-        [shape[:, :kept] / np.linalg.norm(shape[:, :kept], axis=0) for _, shape in modes], axis=1
-    )
-    directions, singular, _ = np.linalg.svd(snapshots, full_matrices=False)
-    most = int(np.sum(singular > 1e-7 * singular[0]))
+    modes = [eigenmodes(working.inner, *state, count) for state in states]
 
-    def good(size: int) -> bool:
-        smaller = [directions[:, :size].T @ inner @ directions[:, :size] for inner in working.inner]
-        worst = max(
-            float(np.max(eigenmodes(smaller, *state, kept)[0] / square[:kept]))
-            for state, (square, _) in zip(states, modes, strict=True)
-        )
-        return 0.5 * (worst - 1.0) <= settings.frequency_tolerance
+    def good(directions: FloatArray) -> bool:
+        smaller = [turned(inner, directions) for inner in working.inner]
+        found = [eigenmodes(smaller, *state, count)[0] for state in states]
+        worst = np.max(np.array(found) / np.array([square for square, _ in modes]))
+        return bool(0.5 * (worst - 1.0) <= FREQUENCY_TOLERANCE)
 
     # the error falls with size, because the bases are nested
-    return directions[:, : bisect_left(range(most), True, kept, key=good)]
+    return fewest_directions(np.concatenate([shape for _, shape in modes], axis=1), count, good)
 
 
 @dataclass(frozen=True)
@@ -191,10 +174,7 @@ class Reduction:
 
 
 def reduce_structure(
-    structure: AffineStructure,
-    settings: StructureSettings | None = None,
-    progress: Progress | None = None,
-    followed_load: int | None = None,
+    structure: AffineStructure, settings: StructureSettings | None = None, progress: Progress | None = None
 ) -> Reduction:
     """Make the reduced model of a structure.
 
@@ -206,8 +186,6 @@ def reduce_structure(
         How well it is to hold; by default as its design says.
     progress : Progress, optional
         Where to report.
-    followed_load : int, optional
-        Number of the load by which two modes are followed: those that contribute most to its compliance.
 
     Raises
     ------
@@ -217,40 +195,23 @@ def reduce_structure(
         If the full model cannot be solved.
     """
     settings, progress = settings or StructureSettings.of(structure.design), progress or SilentProgress()
-    structure = replace(structure, ranges=structure.ranges | settings.ranges)
-    terms, name = ReductionTerms(structure), structure.design.name
-    _check(terms, name)
+    terms = ReductionTerms(replace(structure, ranges=structure.ranges | settings.ranges))
+    _check(terms)
     with progress.stage("Factorising the structure"):
-        norm = Norm(affine_sum(terms.reference, terms.stiffness_terms))
+        _ = terms.factors
     with progress.stage("Reducing the modes") as stage:
-        basis, modal = modal_basis(terms, norm, settings.modal, stage, followed_load)
+        basis, modal = modal_basis(terms, settings.mode_count, stage)
     with progress.stage("Reducing the statics") as stage:
-        fixed, states = _named(terms, name) | modal, terms.training()
-        static = StaticReduction(terms, norm, fixed, basis, stage)
-        history = greedy(
-            static, states, tolerance=settings.bound_tolerance, most_snapshots=settings.most_snapshots
-        )
-    if history[-1] > settings.bound_tolerance:
-        raise ReductionError(
-            f"After {counted(len(static.snapshots), 'full solution')} the error bound of {name} is "
-            f"{history[-1]:.2g} of the largest output, but {settings.bound_tolerance:.2g} was asked for; "
-            f"raise most_solutions (now {settings.most_snapshots}) or tolerance in the table [reduction] of "
-            "a structure file, or narrow the ranges of parameters and losses."
-        )
-    model = static.model()
-    directions = fewest_directions(model, static, states, settings.bound_tolerance)
-    return Reduction(
-        compressed(model, directions),
-        static.basis.vectors @ directions,
-        basis,
-        tuple(static.snapshots),
-        tuple(history),
-    )
+        static = StaticReduction(terms, _named(terms) | modal, basis, stage)
+        history = static.search(settings)
+        directions = static.compressed(settings.bound_tolerance)
+    static_basis = static.basis.displacements @ directions
+    return Reduction(static.model(directions), static_basis, basis, tuple(static.snapshots), history)
 
 
-def _check(terms: ReductionTerms, name: str) -> None:
+def _check(terms: ReductionTerms) -> None:
     """Refuse a structure that a twin can do nothing with; raises `ReductionError`."""
-    structure = terms.structure
+    structure, name = terms.structure, terms.structure.design.name
     for missing, what in (
         (not structure.regions, "[[damage]]: a twin needs a region that may lose stiffness"),
         (not len(terms.load_factors), "[[load]] that does anything: nothing would strain it"),
@@ -264,7 +225,7 @@ def _check(terms: ReductionTerms, name: str) -> None:
         )
 
 
-def _named(terms: ReductionTerms, name: str) -> dict[str, Any]:
+def _named(terms: ReductionTerms) -> dict[str, Any]:
     """Return the fields of `ReducedArrays` that no basis changes: names, ranges, factors, damping."""
     structure = terms.structure
     chosen = (*structure.parameters, *structure.regions, *structure.masses, *structure.controls)
@@ -272,26 +233,22 @@ def _named(terms: ReductionTerms, name: str) -> dict[str, Any]:
     kinds = ("regions", "parameters", "masses", "controls", "gauges", "displacements", "accelerations")
     return {
         "design_hash": structure.design_hash,
-        "name": name,
+        "name": structure.design.name,
         **{kind: tuple(getattr(structure, kind)) for kind in kinds},
-        "control_units": tuple(structure.control_units[name] for name in structure.controls),
+        "control_units": tuple(part.unit for part in structure.design.control),
         "validity_box": np.array([structure.ranges[name] for name in chosen], dtype=np.float64),
         "nominal": np.array([nominal.get(name, 0.0) for name in chosen], dtype=np.float64),
-        "damping": np.array((structure.damping_alpha, structure.damping_beta)),
+        "damping": np.array((structure.design.damping.alpha, structure.design.damping.beta)),
         "stiffness_factors": terms.stiffness_factors,
         "load_factors": terms.load_factors,
-        "dual_counts": np.array(terms.counts, dtype=np.int64),
+        "dual_counts": terms.counts,
         "dual_split": np.concatenate(
-            [loss_splits(ends, count) for ends, count in zip(terms.losses, terms.counts, strict=True)]
+            [
+                loss_at(ends, np.arange(1, count) / count)
+                for ends, count in zip(terms.losses, terms.counts, strict=True)
+            ]
         ),
     }
-
-
-def reduce_model(
-    wing: AffineWing, settings: StructureSettings | None = None, progress: Progress | None = None
-) -> Reduction:
-    """Make the reduced model of a wing, its flapwise bendings followed; see `reduce_structure`."""
-    return reduce_structure(wing, settings, progress, TIP_FORCE)
 
 
 @dataclass(frozen=True)
@@ -341,32 +298,23 @@ def measured_errors(
     SolutionError
         If the full model cannot be solved.
     """
-    random = np.random.default_rng(seed)
-    low, high = model.validity_box.T
-    first_control = len(model.chosen) - len(model.controls)
-    broken = set()
-    worst = {"strain": np.nan, "displacement": np.nan, "bound": 0.0, "frequency": 0.0}
-    for number in range(states):
-        vector = low + (high - low) * random.random(len(low))
-        nominal = model.nominal[first_control:]
-        vector[first_control:] = np.where(
-            nominal == 0.0, np.clip(1.0, *model.validity_box[first_control:].T), nominal
-        )
+    (low, high), first = model.validity_box.T, len(model.chosen) - len(model.controls)
+    vectors = low + (high - low) * np.random.default_rng(seed).random((states, len(low)))
+    one = np.clip(1.0, low, high)
+    vectors[:, first:] = np.where(model.nominal == 0.0, one, model.nominal)[first:]
+    errors, frequency = np.full((2, states, 2), np.nan), 0.0  # missed and bound, of strains and displacements
+    for number, vector in enumerate(vectors):
         values = dict(zip(model.chosen, vector.tolist(), strict=True))
         full, found = static_response(structure, values), model.static_response(vector)
-        for what, wanted in (("strain", full.strain), ("displacement", full.output)):
-            came, error = getattr(found, what), getattr(found, f"{what}_error_bound")
-            if wanted.size:
-                size, missed = float(np.abs(wanted).max()), float(np.abs(came - wanted).max())
-                worst[what] = np.fmax(worst[what], missed / size)
-                if missed > error:
-                    broken.add(number)
-                worst["bound"] = max(worst["bound"], error / size)
+        if full.strain.size:
+            missed = np.abs(found.strain - full.strain).max(), found.strain_error_bound
+            errors[:, number, 0] = missed / np.abs(full.strain).max()
+        if full.output.size:
+            missed = np.abs(found.displacement - full.output).max(), found.displacement_error_bound
+            errors[:, number, 1] = missed / np.abs(full.output).max()
         if number in (0, states - 1):
-            ratio = (
-                model.modes(vector).frequency / natural_frequencies(structure, model.mode_count, values)[0]
-            )
-            worst["frequency"] = max(worst["frequency"], float(np.abs(ratio - 1.0).max()))
-    return MeasuredErrors(
-        **{name: float(value) for name, value in worst.items()}, states=states, broken=len(broken)
-    )
+            wanted = natural_frequencies(structure, model.mode_count, values)[0]
+            frequency = max(frequency, float(np.abs(model.modes(vector).frequency / wanted - 1.0).max()))
+    (strain, displacement), bound = np.fmax.reduce(errors[0]), np.nanmax(errors[1])
+    broken = int((errors[0] > errors[1]).any(axis=1).sum())
+    return MeasuredErrors(float(strain), float(displacement), float(bound), frequency, states, broken)

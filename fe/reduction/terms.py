@@ -1,17 +1,17 @@
 """Offline: a structure as its reduction sees it, where it is looked at, and how a reduced model is judged."""
 
 import itertools
-from collections.abc import Iterable, Sequence
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 
-from fe.full.subspace import Norm, conjugate_gradients
+from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
-from fe.structure.affine import AffineStructure, AffineSum
+from fe.structure.affine import AffineStructure, affine_sum
 
-from .settings import MOST_GRID_REGIONS, remaining_levels
-
+MOST_GRID_REGIONS = 3
+"""Regions up to which the states that are looked at form a full grid; with more, they are chosen."""
 State = tuple[float, ...]
 """Parameters and losses."""
 ModalState = tuple[FloatArray, FloatArray]
@@ -28,6 +28,12 @@ CHOSEN_STATES, CHOSEN_OF_MANY = 128, 1024
 """States inside the box on the training set, beside corners; of more regions than a grid would take."""
 
 
+def loss_at(ends: FloatArray, share: FloatArray) -> FloatArray:
+    """Return losses at shares of their ranges (K, 2) or (2,), by equal ratios of what is kept."""
+    low, high = ends.T
+    return np.asarray(1.0 - (1.0 - low) * ((1.0 - high) / (1.0 - low)) ** share)
+
+
 def halton(dimensions: int, count: int) -> FloatArray:
     """Return the first points (N, D) of the Halton sequence."""
     from scipy.stats import qmc  # takes a second to load, and who has the reduced model needs no points
@@ -35,17 +41,15 @@ def halton(dimensions: int, count: int) -> FloatArray:
     return np.asarray(qmc.Halton(dimensions, scramble=False).random(count))
 
 
-def loss_corners(regions: int) -> list[tuple[int, ...]]:
-    """Return which end of its range each loss takes, (K,) of 0 and 1, where modes are computed.
+def corners(dimensions: int) -> FloatArray:
+    """Return corners (N, D) of a unit cube: all up to four dimensions, of more those on one edge with two.
 
-    All corners up to `MOST_GRID_REGIONS`; beyond, all healthy, all damaged, each region alone damaged, and
-    each alone healthy.
+    These two are where all coordinates are 0, and 1; in the others one differs from all the others.
     """
-    if regions <= MOST_GRID_REGIONS:
-        return list(itertools.product((0, 1), repeat=regions))
-    alone = [tuple(int(number == chosen) for number in range(regions)) for chosen in range(regions)]
-    others = [tuple(1 - end for end in corner) for corner in alone]
-    return [(0,) * regions, *alone, *others, (1,) * regions]
+    if dimensions <= MOST_GRID_REGIONS:
+        return np.array(list(itertools.product((0.0, 1.0), repeat=dimensions)))
+    alone, ends = np.eye(dimensions), np.zeros((1, dimensions))
+    return np.concatenate((ends, alone, 1.0 - alone, 1.0 - ends))
 
 
 class ReductionTerms:
@@ -76,132 +80,98 @@ class ReductionTerms:
         count, gauges = outputs.shape[1], len(structure.gauges)
         groups = (slice(0, gauges), slice(gauges, count))
         self.stiffness_terms = tuple(matrix for matrix, _ in terms)
-        self.mass_terms = structure.mass_terms
-        self.stiffness, self.mass = (
-            AffineSum(part).matrix for part in (self.stiffness_terms, self.mass_terms)
-        )
-        self.loads = (
-            np.stack(list(columns.values()), axis=1) if columns else np.empty((structure.unknowns, 0))
-        )
+        self.loads = np.stack([np.zeros(structure.unknowns), *columns.values()], axis=1)[:, 1:]
         self.outputs = np.asarray(outputs.toarray())
         self.groups = tuple(part for part in groups if part.stop > part.start)
-        self.parameters = [structure.ranges[name] for name in parameters]
-        self.losses = [structure.ranges[name] for name in regions]
-        self.masses = [structure.ranges[name] for name in masses]
-        # two approximate dual solutions along each loss, or one where they are combined
-        self.counts = (2 if len(regions) <= MOST_GRID_REGIONS else 1,) * len(regions)
-        self.reference = self._coefficients(
-            np.array([np.mean(ends) for ends in self.parameters]),
-            np.array([remaining_levels(ends, 1)[0] for ends in self.losses]),
+        self.parameters, self.losses, self.masses = (
+            np.array([structure.ranges[name] for name in names], dtype=np.float64).reshape(-1, 2)
+            for names in (parameters, regions, masses)
         )
+        self.middle = [float(np.mean(ends)) for ends in self.parameters]
+        # anchors along each loss, in equal ratios; with many regions there is but one
+        self.counts = np.full(len(regions), 2 if len(regions) <= MOST_GRID_REGIONS else 1)
+        self.reference = self.theta((*self.middle, *self.levels(0.5)[0]))
 
-    def _coefficients(self, parameters: FloatArray, kept: FloatArray) -> FloatArray:
-        """Coefficients (T,) of the stiffness terms at parameters and what the regions have kept."""
-        factor, left = np.append(1.0, parameters), np.append(1.0, kept)
-        return np.asarray(factor[self.stiffness_factors[:, 0]] * left[self.stiffness_factors[:, 1]])
+    @cached_property
+    def factors(self) -> Factorisation:
+        """The factorised stiffness at the reference, whose energy norm is that of the reduction."""
+        return Factorisation(affine_sum(self.reference, self.stiffness_terms))
 
     def theta(self, state: State) -> FloatArray:
         """Coefficients (T,) of the stiffness terms at parameters and losses."""
         values, count = np.array(state), len(self.parameters)
-        return self._coefficients(values[:count], 1.0 - values[count:])
+        factor, kept = np.append(1.0, values[:count]), np.append(1.0, 1.0 - values[count:])
+        return np.asarray(factor[self.stiffness_factors[:, 0]] * kept[self.stiffness_factors[:, 1]])
 
-    def dual_states(self) -> tuple[list[FloatArray], bool]:
-        """Coefficients (T,) where dual solutions are wanted, and whether they are to be combined."""
-        kept = [remaining_levels(ends, 1)[0] for ends in self.losses]
-        middle, split = np.array([*(np.mean(ends) for ends in self.parameters), *kept]), len(self.parameters)
-        combined = len(self.losses) > MOST_GRID_REGIONS
-        if combined:
-            ends = np.array([*self.parameters, *(1.0 - np.array(self.losses))])
-            one_by_one = zip(np.eye(len(middle)), ends, strict=True)
-            alone = [np.where(row, end, middle) for row, span in one_by_one for end in span]
-            states = [middle, *alone]
-        else:
-            levels = itertools.product(*map(remaining_levels, self.losses, self.counts))
-            states = [np.array([*middle[:split], *left]) for left in levels]
-        return [self._coefficients(values[:split], values[split:]) for values in states], combined
+    def levels(self, *shares: float) -> FloatArray:
+        """Losses (B, K) at shares of all their ranges."""
+        return loss_at(self.losses, np.array(shares)[:, np.newaxis])
 
-    def corners(self) -> list[State]:
-        """Corners of parameters and losses: all of a few, else those of `loss_corners`."""
-        box = (*self.parameters, *self.losses)
-        return [
-            tuple(float(span[end]) for span, end in zip(box, ends, strict=True))
-            for ends in loss_corners(len(box))
-        ]
+    def anchors(self) -> list[list[FloatArray]]:
+        """Coefficients (T,) where dual solutions are wanted, at each anchor; the last loss changes first.
+
+        At a single anchor for many regions what is varied is moved to each end by itself, too.
+        """
+        if self.counts.max() > 1:
+            return [
+                [self.theta((*self.middle, *losses))]
+                for losses in itertools.product(*self.levels(0.25, 0.75).T)
+            ]
+        middle = np.array([*self.middle, *self.levels(0.5)[0]])
+        ends = np.array([*self.parameters, *self.losses])
+        one_by_one = zip(np.eye(len(ends)), ends, strict=True)
+        alone = [np.where(row, end, middle) for row, span in one_by_one for end in span]
+        return [[self.theta(tuple(state)) for state in (middle, *alone)]]
+
+    def states(self, shares: FloatArray) -> list[State]:
+        """States at shares (B, P + K) of the ranges; a loss goes by equal ratios of what is kept."""
+        first, (low, high) = len(self.parameters), np.concatenate((self.parameters, self.losses)).T
+        places = low + (high - low) * shares
+        places[:, first:] = loss_at(self.losses, shares[:, first:])
+        return [tuple(state) for state in np.clip(places, low, high).tolist()]
 
     def training(self) -> list[State]:
         """States on which the greedy search looks for the largest bound: corners, and points between them."""
+        varied = len(self.parameters) + len(self.losses)
         count = CHOSEN_STATES if len(self.losses) <= MOST_GRID_REGIONS else CHOSEN_OF_MANY
-        points = halton(len(self.parameters) + len(self.losses), count)
-        return [*self.corners(), *self.inside(points)]
-
-    def inside(self, shares: FloatArray) -> list[State]:
-        """States at shares (B, P + K) of the ranges; a loss goes by equal ratios of what is kept."""
-        columns = [
-            low + (high - low) * share for (low, high), share in zip(self.parameters, shares.T, strict=False)
-        ] + [
-            1.0 - (1.0 - low) * ((1.0 - high) / (1.0 - low)) ** share
-            for (low, high), share in zip(self.losses, shares.T[len(self.parameters) :], strict=True)
-        ]
-        return [tuple(state) for state in np.column_stack(columns).tolist()]
+        return self.states(np.concatenate((corners(varied), halton(varied, count))))
 
     def sampled_modes(self) -> list[ModalState]:
         """Corners under least and largest masses in turns, and a few states inside."""
-        at_corners = [
-            (state, [ends[(number + place) % 2] for place, ends in enumerate(self.masses)])
-            for number, state in enumerate(self.corners())
-        ]
-        return self._modal_states(at_corners, SAMPLED_INSIDE)
+        ends = corners(len(self.parameters) + len(self.losses))
+        turns = np.add.outer(np.arange(len(ends)), np.arange(len(self.masses))) % 2
+        return self._modal_states(np.concatenate((ends, turns), axis=1), SAMPLED_INSIDE)
 
     def compressed_modes(self) -> list[ModalState]:
         """Corners under all least and largest masses, at most 64 of them, and states inside."""
-        masses = list(itertools.islice(itertools.product(*self.masses), 64))
-        return self._modal_states(itertools.product(self.corners(), masses), 4 * SAMPLED_INSIDE)
+        masses = list(itertools.product((0.0, 1.0), repeat=len(self.masses)))[:64]
+        ends = itertools.product(corners(len(self.parameters) + len(self.losses)), masses)
+        return self._modal_states(np.array([np.append(*pair) for pair in ends]), 4 * SAMPLED_INSIDE)
 
-    def _modal_states(self, corners: Iterable[tuple[State, Sequence[float]]], count: int) -> list[ModalState]:
-        """Return states with their masses, and after them `count` of a Halton sequence inside."""
-        varied = len(self.parameters) + len(self.losses)
-        points = halton(varied + len(self.masses), 1 + count)[1:]
-        low, high = np.array(self.masses).reshape(-1, 2).T
-        inside = zip(self.inside(points[:, :varied]), low + (high - low) * points[:, varied:], strict=True)
-        return [(self.theta(state), np.array((1.0, *chosen))) for state, chosen in (*corners, *inside)]
+    def _modal_states(self, ends: FloatArray, count: int) -> list[ModalState]:
+        """Return states at shares of all ranges and masses, and after them `count` inside."""
+        shares = np.concatenate((ends, halton(ends.shape[1], 1 + count)[1:]))
+        varied, (low, high) = len(self.parameters) + len(self.losses), self.masses.T
+        masses = low + (high - low) * shares[:, varied:]
+        return [
+            (self.theta(state), np.append(1.0, chosen))
+            for state, chosen in zip(self.states(shares[:, :varied]), masses, strict=True)
+        ]
 
-    def farthest(self) -> FloatArray:
-        """Largest distance (T,) of each coefficient from its reference."""
-        factor = np.array([(1.0, 1.0), *self.parameters])[self.stiffness_factors[:, 0]]
-        kept = 1.0 - np.array([(0.0, 0.0), *self.losses])[self.stiffness_factors[:, 1]]
-        ends = (factor[:, :, np.newaxis] * kept[:, np.newaxis, :]).reshape(len(factor), -1)
-        return np.asarray(np.abs(ends - self.reference[:, np.newaxis]).max(axis=1))
+    def least(self, loads: FloatArray, outputs: FloatArray) -> FloatArray:
+        """Return the outputs (groups, L) below which a load is not seen; see `LEAST_COSINE`.
 
-    @property
-    def nominal(self) -> ModalState:
-        """The structure as it is nominally, healthy."""
-        parameters = np.array([*self.structure.parameters.values()])
-        masses = np.array((1.0, *self.structure.masses.values()))
-        return self._coefficients(parameters, np.ones(len(self.losses))), masses
-
-    def least(self, norm: Norm) -> FloatArray:
-        """Return the outputs (groups, L) below which a load is not seen; see `LEAST_COSINE`."""
+        Loads (n, L) and outputs (n, O) are those of the structure, whitened by `factors`.
+        """
         controls, masses = (
             np.abs([(1.0, 1.0), *(self.structure.ranges[name] for name in names)]).max(axis=1)
             for names in (self.structure.controls, self.structure.masses)
         )
         largest = controls[self.load_factors[:, 0]] * masses[self.load_factors[:, 1]]  # coefficients
-        seen = np.abs(self.outputs.T @ norm.riesz(self.loads))
-        loads, outputs = (
-            np.linalg.norm(norm.whitened(columns), axis=0) for columns in (self.loads, self.outputs)
-        )
-        found = []
+        seen, found = np.abs(outputs.T @ loads), []
         for part in self.groups:
-            least, size = LEAST_COSINE * loads * outputs[part].max(), seen[part].max(axis=0)
+            most = np.linalg.norm(outputs[:, part], axis=0).max() * np.linalg.norm(loads, axis=0)
+            least, size = LEAST_COSINE * most, seen[part].max(axis=0)
             of_others = UNSEEN_SHARE * (size * largest).max() / largest
             found.append(np.where(size < least, np.maximum(least, of_others), least))
         return np.array(found)
-
-    def solved_together(
-        self, norm: Norm, at: list[FloatArray], right: FloatArray, starts: list[FloatArray], tolerance: float
-    ) -> list[FloatArray]:
-        """Solve the full model at coefficients (T,) for the same right-hand sides (n, k); (n, k) each."""
-        matrices = [self.stiffness(theta) for theta in at]
-        rights, begin = (np.concatenate(part, axis=1) for part in ([right] * len(at), starts))
-        solved = conjugate_gradients(matrices, norm, rights, begin, tolerance)
-        return np.split(solved, len(at), axis=1)

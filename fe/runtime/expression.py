@@ -6,7 +6,6 @@ NumPy and relative imports only: this file is copied into the FMU.
 import ast
 import re
 from collections.abc import Callable, Collection, Mapping
-from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import lru_cache, reduce
 from types import CodeType
@@ -32,18 +31,13 @@ RESERVED = frozenset({*_FUNCTIONS, "pi", "place", "time"})
 """What names in an expression mean already: no event and no parameter can have one of them."""
 
 
-@lru_cache(maxsize=1024)
-def _parsed(text: str) -> ast.expr:
-    return ast.parse(text, mode="eval").body
-
-
 @lru_cache(maxsize=1024)  # an expression is evaluated at every step of a fit
-def _compiled(text: str) -> CodeType:
-    tree = deepcopy(_parsed(text))
+def _read(text: str) -> tuple[ast.expr, CodeType]:
+    tree = ast.parse(text, mode="eval")
     for node in ast.walk(tree):
-        if isinstance(node, ast.Constant):
-            node.value = float(node.value)  # type: ignore[arg-type]  # no integer grows beyond a float's range
-    return compile(ast.Expression(tree), "an expression", "eval")
+        if isinstance(node, ast.Constant) and type(node.value) is int:
+            node.value = float(node.value)  # no integer grows beyond a float's range
+    return tree.body, compile(tree, "an expression", "eval")
 
 
 @dataclass(frozen=True)
@@ -73,15 +67,13 @@ class Expression:
     where: str = field(repr=False)
 
     def __post_init__(self) -> None:
-        self._check(self._tree())
-
-    def _tree(self) -> ast.expr:
         if len(self.text) > LONGEST:
             self._refuse(f" must have at most {LONGEST} characters, but has {len(self.text)}")
         try:
-            return _parsed(self.text.strip())
-        except (SyntaxError, ValueError, RecursionError, MemoryError):
+            tree, _ = _read(self.text.strip())
+        except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError):
             self._refuse(f" is not an arithmetic expression: {self.text!r}")
+        self._check(tree)
 
     def _check(self, node: ast.expr) -> None:
         match node:
@@ -105,7 +97,7 @@ class Expression:
             case _:
                 self._refuse(
                     f" may hold numbers, names, + - * / **, brackets and {', '.join(_FUNCTIONS)}, but holds "
-                    f"{ast.unparse(node)!r}"
+                    f"{ast.get_source_segment(self.text.strip(), node)!r}"
                 )
 
     def _refuse(self, fault: str) -> NoReturn:
@@ -130,7 +122,7 @@ class Expression:
         try:
             with np.errstate(all="ignore"):
                 # `_check` lets pass nothing but numbers, the known names and functions, and operators
-                result = eval(_compiled(self.text.strip()), _KNOWN, dict(values))
+                result = eval(_read(self.text.strip())[1], _KNOWN, dict(values))
         except NameError as cause:
             self._refuse(f": {self.text!r} needs {cause.name!r}, which has no value at this place")
         except (ArithmeticError, ValueError, TypeError) as cause:
@@ -141,11 +133,7 @@ class Expression:
 
     def used(self) -> frozenset[str]:
         """Return the names that it uses."""
-        return frozenset(
-            node.id
-            for node in ast.walk(self._tree())
-            if isinstance(node, ast.Name) and node.id not in _FUNCTIONS
-        )
+        return frozenset(_read(self.text.strip())[1].co_names) - _FUNCTIONS.keys()
 
     def with_numbers(self, values: Mapping[str, float]) -> str:
         """Return the text with numbers in the place of names; powers of negative ones stay what they are."""

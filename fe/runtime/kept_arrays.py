@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import ReducedModelFileError
+from .state import MOST_REGIONS, GivenLosses, Losses, losses_of
 
 _TIMESTAMP = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip archive can hold
 
@@ -111,32 +112,37 @@ def require_arrays(arrays: Mapping[str, npt.NDArray[Any]], where: str, wanted: I
 
 @dataclass(frozen=True, repr=False)
 class KeptArrays:
-    """Arrays and plain numbers that were made of one design; a kind of record is a subclass with its fields.
+    """Arrays and plain numbers that were made of one design with K damage regions, 1 to 8.
 
-    An array is declared with its axes, `Annotated[FloatArray, "loads", 2]`: a number is the length, and a
-    name means one length in all arrays, which `_lengths` or else the first array with that axis tells. A
-    number may be declared with its least and largest value, `Annotated[float, 0.0, 1.0]`. A tuple holds
-    names.
+    A kind of record is a subclass with its fields. An array is declared with its axes,
+    `Annotated[FloatArray, "loads", 2]`: a number is the length, and a name means one length in all arrays,
+    which `_lengths` or else the first array with that axis tells. A number may be declared with its least and
+    largest value, `Annotated[float, 0.0, 1.0]`. A tuple holds names.
 
     Class attributes
     ----------------
     what : str
         What it is, with its article, for sentences.
-    layout : mapping of str to int
-        Name and value of the entry of the file that tells the version of its layout; empty for none.
+    version : int
+        Version of the layout of its file.
 
     Attributes
     ----------
     design_hash : str
         Hash of the design.
+    regions : tuple of str
+        Names of the damage regions in the order of their stiffness terms.
     """
 
     what: ClassVar[str]
-    layout: ClassVar[Mapping[str, int]] = {}
+    version: ClassVar[int]
 
     design_hash: str
+    regions: tuple[str, ...]
 
     def __post_init__(self) -> None:
+        if not 1 <= len(self.regions) <= MOST_REGIONS:
+            self.refuse(f"must have 1 to {MOST_REGIONS} damage regions, but names {len(self.regions)}")
         lengths = self._lengths()
         for item in fields(self):
             axes: tuple[str | int, ...] = getattr(item.type, "__metadata__", ())
@@ -157,9 +163,18 @@ class KeptArrays:
                     f"shape {array.shape} and type {array.dtype}"
                 )
 
+    def __repr__(self) -> str:
+        told = ((item.name, getattr(self, item.name)) for item in fields(self))
+        plain = (f"{name}={value!r}" for name, value in told if not isinstance(value, np.ndarray))
+        return f"{type(self).__name__}({', '.join(plain)})"
+
     def refuse(self, fault: str) -> NoReturn:
         """Refuse a record that cannot be: `fault` says what is wrong with it."""
         raise ReducedModelFileError(f"{self.what[0].upper()}{self.what[1:]} {fault}; build it anew.")
+
+    def losses(self, stiffness_loss: GivenLosses) -> Losses:
+        """Return one stiffness loss for each region, in their order; see `fe.runtime.state.losses_of`."""
+        return losses_of(stiffness_loss, self.regions)
 
     def _lengths(self) -> dict[str | int, int]:
         """Return the lengths of axes that follow from others or from names."""
@@ -167,7 +182,7 @@ class KeptArrays:
 
     def to_bytes(self) -> bytes:
         """Return the bytes of an `.npz` file; equal records give equal bytes."""
-        values = {**self.layout, **{item.name: getattr(self, item.name) for item in fields(self)}}
+        values = {"format": self.version, **{item.name: getattr(self, item.name) for item in fields(self)}}
         kinds = {tuple: np.str_}  # also of no names at all
         return arrays_to_bytes(
             {name: np.array(value, dtype=kinds.get(type(value))) for name, value in values.items()}
@@ -190,12 +205,12 @@ class KeptArrays:
             If the archive is damaged, incomplete or of another layout.
         """
         where = where or f"The {cls.what.removeprefix('a ')}"
-        arrays = arrays_from_bytes(content, where, cls.layout)
-        for name, version in cls.layout.items():
-            if arrays[name].tolist() != version:
-                raise ReducedModelFileError(
-                    f"{where} has the format {arrays[name]}, but this version reads {version}; build it anew."
-                )
+        arrays = arrays_from_bytes(content, where, ["format"])
+        if arrays["format"].tolist() != cls.version:
+            raise ReducedModelFileError(
+                f"{where} has the format {arrays['format']}, but this version reads {cls.version}; build it "
+                "anew."
+            )
         require_arrays(arrays, where, (item.name for item in fields(cls)))
         try:
             values: dict[str, Any] = {

@@ -231,17 +231,21 @@ def _exponential(
     matrix[:, v, f] = own / unit
     scaled = matrix * lengths[:, None, None, None]
     scaled[:, :, f, s] = own  # the force changes by one over the step
-    both = slice(0, 2 * count)
-    norm = float(np.max(np.sum(np.abs(scaled[:, :, both]), axis=3), initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.5))))  # squares double rounding
-    scaled /= 2.0**squarings
-    unity = np.eye(4 * count)
-    result = np.broadcast_to(unity, scaled.shape)
-    for order in range(_TAYLOR, 0, -1):
-        result = unity + scaled @ result / order
-    for _ in range(squarings):
-        result = result @ result
+    both, result = slice(0, 2 * count), exponential(scaled)
     scale = np.concatenate((np.ones_like(unit), unit), axis=1).repeat(count, axis=1)
     slope, whole = result[:, :, both, s] * scale, result[:, :, both, f] * scale
     transition = result[:, :, both, both] * scale / scale.transpose(0, 2, 1)
     return np.ascontiguousarray(transition), whole - slope, np.ascontiguousarray(slope)
+
+
+def exponential(matrix: FloatArray) -> FloatArray:
+    """Return e^A of matrices (..., n, n), by a Taylor polynomial of A in small parts, and squares."""
+    norm = float(np.max(np.sum(np.abs(matrix), axis=-1), initial=0.0))
+    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.5))))  # squares double rounding
+    part, unity = matrix / 2.0**squarings, np.eye(matrix.shape[-1])
+    result = np.broadcast_to(unity, matrix.shape)
+    for order in range(_TAYLOR, 0, -1):
+        result = unity + part @ result / order
+    for _ in range(squarings):
+        result = result @ result
+    return np.asarray(result)

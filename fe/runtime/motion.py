@@ -1,7 +1,7 @@
 """Internal forces at ports: laws from a patch, and the static solution under them.
 
 `fe.runtime.stepwise` moves a structure under them. NumPy and relative imports only: this file is
-copied into the FMU. The loops run as plain Python here; `discrepancy.models.compiled_motion` has the same
+copied into the FMU. The loops run as plain Python here; `fe.compilation` has the same
 functions compiled, to be given as `kernel`.
 """
 
@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .arrays import BoolArray, FloatArray, IntArray
+from .arrays import HEAD, BoolArray, FloatArray, IntArray
 from .errors import InvalidPatchError, SolutionError
 from .laws import LAWS
-from .laws.interface import HEAD, PARAMETERS, PortForce
+from .laws.interface import PARAMETERS, PortForce
 from .modal_system import ModalSystem
-from .motion_arrays import Ports
+from .motion_arrays import SPEED, STILL, Ports
 from .motion_kernel import integrate
 from .patch import ModelPatch, StiffnessDrift
 from .primitive import Primitive
@@ -102,9 +102,12 @@ class Laws:
         """Whether there is nothing to do."""
         return not self.ports and self.rate == 0.0
 
-    def rows(self, ports: Mapping[str, FloatArray], width: int) -> FloatArray:
-        """Return the port row of each law, (J, width)."""
-        return np.array([ports[name] for name in self.ports], dtype=np.float64).reshape(len(self), width)
+    def rows(self, ports: Mapping[str, FloatArray], width: int, time: float | None = None) -> FloatArray:
+        """Return the port row of each law, (J, width); at a `time` [s], nothing of laws that do not act."""
+        found = np.array([ports[name] for name in self.ports], dtype=np.float64).reshape(len(self), width)
+        if time is not None:
+            found[~self.act_at(time)] = 0.0
+        return found
 
     @property
     def edges(self) -> tuple[float, ...]:
@@ -117,17 +120,6 @@ class Laws:
         return np.array(
             [not own or any(begin <= time < end for begin, end in own) for own in spans], dtype=bool
         )
-
-    def only(self, chosen: BoolArray) -> "Laws":
-        """Return some of the laws, as they are while they act."""
-        names = tuple(name for name, taken in zip(self.ports, chosen, strict=True) if taken)
-        return Laws(names, self.numbers[chosen], self.values[chosen], self.rate)
-
-    def filled(self, memory: FloatArray, chosen: BoolArray) -> FloatArray:
-        """Return the memory of all laws from that of `only` some of them; the others were never loaded."""
-        whole = self.memory()
-        whole[chosen] = memory
-        return whole
 
     def alike(self, other: "Laws") -> bool:
         """Return whether these are the same laws at the same ports, whose memory then stays."""
@@ -143,10 +135,24 @@ class Laws:
         """Return the memory (J, 5 + E) of laws that have never been loaded, E at least 1."""
         return np.zeros((len(self), HEAD + max(1, self.values.shape[1] - PARAMETERS)))
 
-    def at(self, rows: FloatArray) -> Ports:
-        """Return the laws at ports (J, M), for the loops; modes hold all that the ports yield."""
-        none, feed = np.zeros((2, len(self)))
-        return Ports(rows, self.numbers, self.of_speed, self.values, none, 0.0, feed, rows, self.rate)
+    def at(
+        self, rows: FloatArray, acts: FloatArray, flexibility: FloatArray, relaxation: float,
+        transition: FloatArray,
+    ) -> Ports:  # fmt: skip
+        """Return the laws at ports (J, M), for the loops, in steps of `transition` (S, 2M, 2M)."""
+        weight, on_modes = np.sum(rows * acts, axis=1), (self.of_speed == 1) & (flexibility == 0.0)
+        places = list(zip(self.ports, on_modes.tolist(), (weight == 0.0).tolist(), strict=True))
+        first = np.array([places.index(place) for place in places], dtype=np.int64)
+        return Ports(
+            rows, acts, weight, np.where(weight == 0.0, STILL, np.where(on_modes, SPEED, first)),
+            np.ascontiguousarray(acts @ transition[:, :, rows.shape[1] :].transpose(0, 2, 1)), self.numbers,
+            self.of_speed, self.values, flexibility, relaxation, self.rate,
+        )  # fmt: skip
+
+    def at_rest(self) -> Ports:
+        """Return the laws at ports which no modes move."""
+        none = np.zeros((len(self), 0))
+        return self.at(none, none, np.zeros(len(self)), 0.0, np.zeros((0, 0, 0)))
 
 
 NO_LAWS = Laws((), np.zeros(0, dtype=np.int64), np.zeros((0, PARAMETERS)))
@@ -271,7 +277,7 @@ def static_solution(
         level = (kernel or PLAIN).static_path(
             linear,
             np.ascontiguousarray(compliance, dtype=np.float64),
-            tuple(laws.at(np.zeros((len(laws), 0)))),
+            tuple(laws.at_rest()),
             memory,
             np.zeros(len(laws)) if start is None else np.ascontiguousarray(start, dtype=np.float64),
             positions,

@@ -5,16 +5,14 @@ NumPy and relative imports only: this file is copied into the FMU.
 
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from .arrays import FloatArray as FloatArray
 from .arrays import IntArray as IntArray
 
 Unnamed = tuple[Any, ...]
 """The fields of one of the records below."""
 
-FIRST_PARTS = 400
-"""Parts in which the way from a law's last position to the first one of a motion is followed."""
+SPEED, STILL = -1, -2
+"""In the place of a leader: of a law of speed that acts on the modes, and of one whose port does not move."""
 
 
 class Steps(NamedTuple):
@@ -56,14 +54,6 @@ class Steps(NamedTuple):
     stiffness: FloatArray
     damping: FloatArray
 
-    def between(self, first: int, last: int) -> "Steps":
-        """Return the steps between two boundaries, each of which is a sample."""
-        steps, boundaries = slice(first, last), slice(first, last + 1)
-        return self._replace(
-            which=self.which[steps], push=self.push[steps], begin=self.begin[steps], end=self.end[steps],
-            feed=self.feed[boundaries], time=self.time[boundaries], sample=np.arange(last - first + 1),
-        )  # fmt: skip
-
 
 class Ports(NamedTuple):
     """Laws and the ports that they act on.
@@ -72,6 +62,15 @@ class Ports(NamedTuple):
     ----------
     rows : (J, M) ndarray
         Row of the port of each law: what it sees.
+    acts : (J, M) ndarray
+        Row along which each law acts; that of its port, but for flows from one store into another.
+    weight : (J,) ndarray
+        rows . acts, what the law's port sees of its own push.
+    leader : (J,) ndarray of int
+        The first law that acts at the same position of a port, which the port's flexibility yields to; or
+        `SPEED`, or `STILL`.
+    answer : (S, J, 2M) ndarray
+        State to a unit impulse after a step of each length.
     numbers : (J,) ndarray of int
         Laws.
     of_speed : (J,) ndarray of int
@@ -79,79 +78,51 @@ class Ports(NamedTuple):
     values : (J, 5 + E) ndarray
         Their parameters, and those of their elements.
     flexibility : (J,) ndarray
-        R: position of each law's port by a unit force there that the modes do not hold; laws with the same
-        row have the same, or zero, which leaves a law to the modes.
+        R: position of each law's port by a unit force there that the modes do not hold.
     relaxation : float
         beta of that flexibility [s].
-    feed : (J,) ndarray
-        What loads add to the ports' positions beyond the modes, at the end of the step that is taken.
-    acts : (J, M) ndarray
-        Row along which each law acts; that of its port, but for flows from one store into another.
     rate : float
         Stiffness drift r of the whole structure [1/s].
     """
 
     rows: FloatArray
+    acts: FloatArray
+    weight: FloatArray
+    leader: IntArray
+    answer: FloatArray
     numbers: IntArray
     of_speed: IntArray
     values: FloatArray
     flexibility: FloatArray
     relaxation: float
-    feed: FloatArray
-    acts: FloatArray
     rate: float
 
 
 class State(NamedTuple):
-    """What moves: `q`, `v` (M,), the `memory` (J, 5 + E) of the laws, and their forces `current` (J,)."""
+    """What moves: `q`, `v` (M,) and the `memory` (J, 5 + E) of the laws."""
 
     q: FloatArray
     v: FloatArray
     memory: FloatArray
-    current: FloatArray
 
 
-class Acting(NamedTuple):
-    """How the laws act on the modes, and what is kept of the begin of a step.
+class Kept(NamedTuple):
+    """What is kept of the begin of a step.
 
     Attributes
     ----------
-    route : (J,) ndarray of int
-        `STILL`, `SPEED`, `POSITION` or `FLEXIBLE` of `motion_kernel`.
-    leader : (J,) ndarray of int
-        The first law at the same flexible port; -1 elsewhere.
-    springs : (J,) ndarray of int
-        Room for the leaders of the laws of position alone.
-    weight : (J,) ndarray
-        p . b, what the law's port sees of its own push.
-    strength : (J,) ndarray
-        Of a law of speed, for the port's speed.
-    give : (J,) ndarray
-        Position at the port after a step with a unit kick at its begin.
-    pull : (J, M) ndarray
-        Change of the modes for one unit of change at the port.
-    answer : (J, 2M) ndarray
-        State after a step to a unit kick at its begin.
     q, v : (M,) ndarray
-        State at the begin.
+        State.
     room : (2M,) ndarray
         For a new state.
     forces : (J,) ndarray
-        Forces of the laws at the begin.
+        Forces of the laws.
     speed, lost : (J,) ndarray
-        Speed of the port of a law of speed at the begin, and what its first half kick took of it.
+        Speed of the port of a law of speed, and what its first half kick took of it.
     freed : (J,) ndarray
         1 where friction let go in this step.
     """
 
-    route: IntArray
-    leader: IntArray
-    springs: IntArray
-    weight: FloatArray
-    strength: FloatArray
-    give: FloatArray
-    pull: FloatArray
-    answer: FloatArray
     q: FloatArray
     v: FloatArray
     room: FloatArray
@@ -161,13 +132,17 @@ class Acting(NamedTuple):
     freed: FloatArray
 
 
-class Samples(NamedTuple):
-    """Results at the samples: `q`, `v` (N, M), `forces`, `lagged` (N, J), as in `stepwise.ModalMotion`."""
+class ModalMotion(NamedTuple):
+    """Motion at samples: `q`, `v` (N, M), `port_forces` (N, J) of the laws, their `memory` at the end.
+
+    `lagged` (N, J) are the forces as what the modes leave out follows them.
+    """
 
     q: FloatArray
     v: FloatArray
-    forces: FloatArray
+    port_forces: FloatArray
     lagged: FloatArray
+    memory: FloatArray
 
 
 def at_port(rows: FloatArray, j: int, q: FloatArray) -> float:
@@ -178,7 +153,7 @@ def at_port(rows: FloatArray, j: int, q: FloatArray) -> float:
     return x
 
 
-def add(target: FloatArray, along: FloatArray, size: float, duration: float) -> None:
-    """Add to modal coordinates or speeds what a force or an impulse along a port gives them."""
+def add(target: FloatArray, along: FloatArray, size: float) -> None:
+    """Add to modal coordinates or speeds what an impulse along a port gives them."""
     for m in range(len(target)):
-        target[m] += along[m] * size * duration
+        target[m] += along[m] * size

@@ -14,237 +14,186 @@ its own position: a monotone equation in one unknown. Dry friction is then an el
 stiffness 1/R.
 
 Written in the subset of Python that numba compiles too. NumPy and relative imports only: this file is copied
-into the FMU. `discrepancy.models.compiled_motion` has the same compiled.
+into the FMU. `fe.compilation` has the same compiled.
 """
 
 import numpy as np
 
 from . import laws
-from .arrays import FloatArray
-from .motion_arrays import FIRST_PARTS, Acting, Ports, Samples, State, Steps, Unnamed, add, at_port
-from .static_path import pull_of, settle_port
-
-STILL, SPEED, POSITION, FLEXIBLE = 0, 1, 2, 3
-"""How a law acts: not, its port being still; on the modes, by speed or position; on what they leave out."""
+from .arrays import FADING, FORCE, HELD, LAGGED, PLACE, FloatArray
+from .laws import speed
+from .motion_arrays import SPEED, STILL, Kept, ModalMotion, Ports, State, Steps, Unnamed, add, at_port
+from .static_path import settle_port
 
 
 def integrate(
-    steps: Unnamed, coupled: bool, known: bool, at_ports: Unnamed, begin: Unnamed, out: Unnamed
-) -> None:
-    """Integrate over steps; the state is changed in place, `out` is filled.
+    steps: Unnamed, first: int, last: int, sample: int, coupled: bool, known: bool, at_ports: Unnamed,
+    begin: Unnamed, out: Unnamed,
+) -> None:  # fmt: skip
+    """Integrate from boundary `first` to `last`, the state in place; `out` is filled from `sample` on.
 
-    Given are the fields of `Steps`, `Ports`, `State` and `Samples` without their names: numba takes three
+    Given are the fields of `Steps`, `Ports`, `State` and `ModalMotion` without their names: numba takes three
     times as long for a tuple with names as for one without. `coupled`: steps couple modes. `known`: the
     memory is that of a state; otherwise each law is loaded from zero to its first position.
     """
-    go, ports, state, samples = Steps(*steps), Ports(*at_ports), State(*begin), Samples(*out)
-    modes, count = len(state.q), len(ports.numbers)
-    none, whole, still = np.zeros((7, count)), np.zeros((3, count), dtype=np.int64), np.zeros((2, modes))
-    acting = Acting(
-        whole[0], whole[1], whole[2], none[0], none[1], none[2], np.zeros((count, modes)),
-        np.zeros((count, 2 * modes)), still[0], still[1], np.zeros(2 * modes), none[3], none[4], none[5],
-        none[6],
-    )  # fmt: skip
-    last = go.which[0]
-    take(ports.feed, go.feed[0])
-    find_routes(ports, acting)
-    begin_on_modes(go, ports, acting, state, known)
-    begin_flexible(ports, acting, state, go.length[last], known)
-    record(go, ports, acting, state, go.begin[0], 0, samples)
-    sample = 1
-    for k in range(len(go.which)):
-        if go.which[k] != last:
-            last = go.which[k]
-            for j in range(count):
-                if acting.route[j] == SPEED:
-                    find_answer(go, last, ports, acting, j)
-        h = go.length[last]
-        take(ports.feed, go.feed[k + 1])
-        first_half(go, k, ports, acting, state, h)
-        if coupled:
-            move(go, k, state, acting.room)
-        else:
-            move_alone(go, k, state)
-        hold(ports, acting, state, h)
-        carry_flexible(ports, acting, state, h)
-        second_half(go, k, ports, acting, state, h)
-        if k + 1 == go.sample[sample]:
-            record(go, ports, acting, state, go.end[k], sample, samples)
+    go, ports, state, samples = Steps(*steps), Ports(*at_ports), State(*begin), ModalMotion(*out)
+    none, still = np.zeros((4, len(ports.numbers))), np.zeros((4, len(state.q)))
+    kept = Kept(still[0], still[1], still[2:].ravel(), none[0], none[1], none[2], none[3])
+    begin_laws(ports, state, known)
+    # At the begin, a step of no duration: the lagged forces stay, or follow at once.
+    h, keep, fade = 0.0, 1.0 if known and ports.relaxation > 0.0 else 0.0, 1.0
+    for k in range(first, last + 1):
+        if k > first:
+            h = go.length[go.which[k - 1]]
+            keep = ports.relaxation / (ports.relaxation + h)
+            fade = keep
+            first_half(go, k - 1, ports, kept, state, h)
+            move(go, k - 1, state, kept.room, coupled)
+            hold(go, k - 1, ports, kept, state, h)
+        carry(go, k, ports, state, h, keep, fade, known)
+        if k > first:
+            second_half(go, k - 1, ports, kept, state, h)
+        if k == go.sample[sample]:
+            record(go, k, ports, state, go.end[k - 1] if k > first else go.begin[k], sample, samples)
             sample += 1
 
 
-def take(into: FloatArray, given: FloatArray) -> None:
-    """Copy numbers; numba takes two seconds to compile `into[:] = given`."""
-    for i in range(len(into)):
-        into[i] = given[i]
-
-
-def find_routes(ports: Ports, acting: Acting) -> None:
-    """Set how each law acts, and what its port and the modes do to each other."""
-    modes = ports.rows.shape[1]
+def begin_laws(ports: Ports, state: State, known: bool) -> None:
+    """Set what the laws pull with at the begin; without a known memory those of speed move steadily."""
     for j in range(len(ports.numbers)):
-        acting.leader[j] = -1
-        acting.weight[j] = at_port(ports.rows, j, ports.acts[j])
-        moves = False
-        for m in range(modes):
-            moves = moves or ports.rows[j, m] != 0.0
-        if acting.weight[j] == 0.0:
-            acting.route[j] = STILL
-            continue
-        for m in range(modes):
-            acting.pull[j, m] = ports.acts[j, m] / acting.weight[j]
-        if moves and ports.flexibility[j] > 0.0:
-            acting.route[j] = FLEXIBLE
-            for k in range(j, -1, -1):
-                same = acting.route[k] == FLEXIBLE
-                for m in range(modes):
-                    same = same and ports.rows[j, m] == ports.rows[k, m]
-                if same:
-                    acting.leader[j] = k
-        else:
-            acting.route[j] = SPEED if ports.of_speed[j] == 1 else POSITION
+        x, v = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
+        law, memory = ports.values[j], state.memory[j]
+        if ports.leader[j] == SPEED:
+            memory[FORCE] = 0.0
+            if speed.holds(law) and v == 0.0 and speed.strength(law, x, ports.weight[j]) > 0.0:
+                memory[HELD], memory[PLACE] = 1.0, x
+        elif ports.leader[j] == STILL:
+            memory[FORCE] = memory[LAGGED] = 0.0
+        elif ports.of_speed[j] == 0:
+            memory[FORCE], _ = laws.pull(ports.numbers[j], law, memory, memory[PLACE], 1.0)
+        elif not known:
+            memory[FORCE] = memory[LAGGED] = speed.steady(law, x, v)
 
 
-def find_answer(go: Steps, which: int, ports: Ports, acting: Acting, j: int) -> None:
-    """Set what a unit kick at the port of a law of speed does in a step of a length."""
-    modes = ports.rows.shape[1]
-    for m in range(2 * modes):
-        acting.answer[j, m] = 0.0
-        for k in range(modes):
-            acting.answer[j, m] += go.transition[which, m, modes + k] * ports.acts[j, k]
-    acting.give[j] = at_port(ports.rows, j, acting.answer[j, :modes])
-
-
-def begin_on_modes(go: Steps, ports: Ports, acting: Acting, state: State, known: bool) -> None:
-    """Take the laws that act on the modes, and those of speed on flexible ports, to the first sample."""
-    for j in range(len(ports.numbers)):
-        if acting.route[j] == STILL:
-            continue
-        x, speed = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
-        if acting.route[j] == FLEXIBLE:
-            if ports.of_speed[j] == 1 and known:
-                state.current[j] = state.memory[j, 4]
-            elif ports.of_speed[j] == 1:  # moving steadily
-                state.current[j] = laws.steady(ports.numbers[j], ports.values[j], x, speed)
-                state.memory[j, 2] = state.current[j]
-        elif acting.route[j] == SPEED:
-            acting.strength[j] = laws.strength(ports.numbers[j], ports.values[j], acting.weight[j])
-            find_answer(go, go.which[0], ports, acting, j)
-            if laws.holds(ports.numbers[j], ports.values[j]) and speed == 0.0 and acting.strength[j] > 0.0:
-                state.memory[j, 0] = 1.0
-                state.memory[j, 1] = x
-        else:
-            laws.advance(ports.numbers[j], ports.values[j], state.memory[j], x, FIRST_PARTS)
-            state.current[j], _ = pull_of(ports, state, j, x, 1.0, 1)
-
-
-def first_half(go: Steps, k: int, ports: Ports, acting: Acting, state: State, h: float) -> None:
+def first_half(go: Steps, k: int, ports: Ports, kept: Kept, state: State, h: float) -> None:
     """Give the modes the first half of the impulse of the internal forces."""
     half = 0.5 * h
     modes, count = len(state.q), len(ports.numbers)
-    for j in range(count):
-        acting.forces[j] = state.current[j]
     for m in range(modes):
-        acting.q[m] = state.q[m]
-        acting.v[m] = state.v[m]
+        kept.q[m], kept.v[m] = state.q[m], state.v[m]
     for j in range(count):
-        if acting.route[j] != SPEED:
+        kept.forces[j], kept.freed[j], kept.lost[j] = state.memory[j, FORCE], 0.0, 0.0
+        if ports.leader[j] != SPEED:
             continue
-        acting.freed[j] = 0.0
-        acting.lost[j] = 0.0
-        speed, x = at_port(ports.rows, j, state.v), at_port(ports.rows, j, state.q)
-        acting.speed[j] = speed
-        if state.memory[j, 0] == 1.0:
+        kept.speed[j] = at_port(ports.rows, j, state.v)
+        if state.memory[j, HELD] == 1.0:
             continue
-        now = acting.strength[j] * laws.share(ports.numbers[j], ports.values[j], x)
+        now = speed.strength(ports.values[j], at_port(ports.rows, j, state.q), ports.weight[j])
         # dry friction is not stopped at zero: the turn is looked for after the step
-        acting.lost[j] = speed - laws.kick(ports.numbers[j], ports.values[j], speed, now, half, True)
-        add(state.v, acting.pull[j], -acting.lost[j], 1.0)
+        kept.lost[j] = kept.speed[j] - speed.kick(ports.values[j], kept.speed[j], now, half, True)
+        add(state.v, ports.acts[j], -kept.lost[j] / ports.weight[j])
     for j in range(count):
-        if state.current[j] != 0.0:
-            add(state.v, ports.acts[j], -state.current[j], half)
+        if kept.forces[j] != 0.0:
+            add(state.v, ports.acts[j], -kept.forces[j] * half)
     if ports.rate != 0.0:
         for m in range(modes):
             state.v[m] -= half * ports.rate * go.time[k] * go.stiffness[m] * state.q[m]
 
 
-def move(go: Steps, k: int, state: State, new: FloatArray) -> None:
-    """Move the linear structure; exact."""
-    modes, step = len(state.q), go.which[k]
-    for i in range(2 * modes):
-        total = go.push[k, i]
-        for m in range(modes):
-            total += go.transition[step, i, m] * state.q[m] + go.transition[step, i, modes + m] * state.v[m]
-        new[i] = total
-    for m in range(modes):
-        state.q[m] = new[m]
-        state.v[m] = new[modes + m]
-
-
-def move_alone(go: Steps, k: int, state: State) -> None:
-    """Move the linear structure whose modes move each by itself; exact."""
+def move(go: Steps, k: int, state: State, new: FloatArray, coupled: bool) -> None:
+    """Move the linear structure, exactly; modes that are not coupled each by itself."""
     modes, step = len(state.q), go.which[k]
     for m in range(modes):
-        i, q, v = modes + m, state.q[m], state.v[m]
-        state.q[m] = go.transition[step, m, m] * q + go.transition[step, m, i] * v + go.push[k, m]
-        state.v[m] = go.transition[step, i, m] * q + go.transition[step, i, i] * v + go.push[k, i]
+        i, low, high = modes + m, 0 if coupled else m, modes if coupled else m + 1
+        q, v = go.push[k, m], go.push[k, i]
+        for n in range(low, high):
+            q += go.transition[step, m, n] * state.q[n] + go.transition[step, m, modes + n] * state.v[n]
+            v += go.transition[step, i, n] * state.q[n] + go.transition[step, i, modes + n] * state.v[n]
+        new[m], new[i] = q, v
+    for m in range(modes):
+        state.q[m], state.v[m] = new[m], new[modes + m]
 
 
-def hold(ports: Ports, acting: Acting, state: State, h: float) -> None:
+def hold(go: Steps, k: int, ports: Ports, kept: Kept, state: State, h: float) -> None:
     """Keep the ports that friction holds in place, by an impulse at the begin of the step."""
     modes = len(state.q)
     for j in range(len(ports.numbers)):
-        if acting.route[j] != SPEED or state.memory[j, 0] != 1.0:
+        if ports.leader[j] != SPEED or state.memory[j, HELD] != 1.0:
             continue
-        now = acting.strength[j] * laws.share(ports.numbers[j], ports.values[j], state.memory[j, 1])
-        limit = laws.holding_limit(ports.numbers[j], ports.values[j], now, 0.5 * h)
-        impulse = (state.memory[j, 1] - at_port(ports.rows, j, state.q)) / acting.give[j]
-        if abs(impulse) * acting.weight[j] > limit:
-            state.memory[j, 0] = 0.0
-            acting.freed[j] = 1.0
-            impulse = (limit if impulse > 0.0 else -limit) / acting.weight[j]
-        add(state.q, acting.answer[j], impulse, 1.0)
-        add(state.v, acting.answer[j, modes:], impulse, 1.0)
+        answer = ports.answer[go.which[k], j]
+        place, weight = state.memory[j, PLACE], ports.weight[j]
+        limit = speed.holding_limit(ports.values[j], speed.strength(ports.values[j], place, weight), 0.5 * h)
+        impulse = (place - at_port(ports.rows, j, state.q)) / at_port(ports.rows, j, answer[:modes])
+        if abs(impulse) * weight > limit:
+            state.memory[j, HELD], kept.freed[j] = 0.0, 1.0
+            impulse = (limit if impulse > 0.0 else -limit) / weight
+        add(state.q, answer, impulse)
+        add(state.v, answer[modes:], impulse)
 
 
-def second_half(go: Steps, k: int, ports: Ports, acting: Acting, state: State, h: float) -> None:
+def carry(
+    go: Steps, k: int, ports: Ports, state: State, h: float, keep: float, fade: float, known: bool
+) -> None:
+    """Carry the laws at flexible positions to boundary `k`, and give the second half of their impulse.
+
+    `keep` of the lagged forces stays, `fade` of what gone loads add; a rigid port has neither.
+    """
+    for port in range(len(ports.numbers)):
+        if ports.leader[port] != port:
+            continue
+        r, x = ports.flexibility[port], at_port(ports.rows, port, state.q)
+        if r > 0.0:
+            x += go.feed[k, port] + fade * state.memory[port, FADING]
+            for j in range(len(ports.numbers)):
+                if ports.leader[j] == port:
+                    x -= r * keep * state.memory[j, LAGGED]
+            x = settle_port(port, ports, state.memory, x, (1.0 - keep) * r, h)
+        for j in range(len(ports.numbers)):
+            if ports.leader[j] != port:
+                continue
+            memory, stays = state.memory[j], keep if r > 0.0 else 0.0
+            if ports.of_speed[j] == 0:
+                laws.advance(ports.numbers[j], ports.values[j], memory, x)
+            if ports.of_speed[j] == 0 or h > 0.0 or not known:
+                memory[PLACE] = x
+            if r == 0.0:
+                memory[FORCE], _ = laws.pull(ports.numbers[j], ports.values[j], memory, x, 1.0)
+            memory[LAGGED] = stays * memory[LAGGED] + (1.0 - stays) * memory[FORCE]
+            memory[FADING] *= fade
+            add(state.v, ports.acts[j], -0.5 * h * memory[FORCE])
+
+
+def second_half(go: Steps, k: int, ports: Ports, kept: Kept, state: State, h: float) -> None:
     """Give the modes the second half of the impulse; look for friction that turned over."""
     half = 0.5 * h
-    modes, count = len(state.q), len(ports.numbers)
-    for j in range(count):
-        if acting.route[j] != POSITION:
-            continue
-        x = at_port(ports.rows, j, state.q)
-        laws.advance(ports.numbers[j], ports.values[j], state.memory[j], x, 1)
-        state.current[j], _ = pull_of(ports, state, j, x, 1.0, 1)
-        add(state.v, ports.acts[j], -state.current[j], half)
     if ports.rate != 0.0:
-        for m in range(modes):
+        for m in range(len(state.q)):
             state.v[m] -= half * ports.rate * (go.time[k] + h) * go.stiffness[m] * state.q[m]
-    for j in range(count - 1, -1, -1):
-        if acting.route[j] != SPEED:
+    for j in range(len(ports.numbers) - 1, -1, -1):
+        if ports.leader[j] != SPEED:
             continue
-        x, speed = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
-        if state.memory[j, 0] == 1.0:
-            now = acting.strength[j] * laws.share(ports.numbers[j], ports.values[j], state.memory[j, 1])
-            limit = laws.holding_limit(ports.numbers[j], ports.values[j], now, half)
-            taken = speed
-            if abs(speed) > limit:
-                taken = limit if speed > 0.0 else -limit
-                state.memory[j, 0] = 0.0
-            add(state.v, acting.pull[j], -taken, 1.0)
+        x, v = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
+        law, memory = ports.values[j], state.memory[j]
+        if memory[HELD] == 1.0:
+            limit = speed.holding_limit(law, speed.strength(law, memory[PLACE], ports.weight[j]), half)
+            if abs(v) > limit:
+                v = limit if v > 0.0 else -limit
+                memory[HELD] = 0.0
+            add(state.v, ports.acts[j], -v / ports.weight[j])
             continue
-        now = acting.strength[j] * laws.share(ports.numbers[j], ports.values[j], x)
-        end = speed - acting.lost[j]
-        can_hold = laws.holds(ports.numbers[j], ports.values[j])
-        if can_hold and acting.freed[j] == 0.0 and acting.speed[j] != 0.0 and acting.speed[j] * end <= 0.0:
-            turn_over(go, k, ports, acting, state, j, now, h)
+        now, can_hold = speed.strength(law, x, ports.weight[j]), speed.holds(law)
+        if (
+            can_hold
+            and kept.freed[j] == 0.0
+            and kept.speed[j] != 0.0
+            and kept.speed[j] * (v - kept.lost[j]) <= 0.0
+        ):
+            turn_over(go, k, ports, kept, state, j, now, h)
         else:
-            after = laws.kick(ports.numbers[j], ports.values[j], speed, now, half, False)
+            after = speed.kick(law, v, now, half, False)
             if after == 0.0 and can_hold and now > 0.0:
-                state.memory[j, 0] = 1.0
-                state.memory[j, 1] = x
-            add(state.v, acting.pull[j], after - speed, 1.0)
+                memory[HELD], memory[PLACE] = 1.0, x
+            add(state.v, ports.acts[j], (after - v) / ports.weight[j])
 
 
 def acceleration(
@@ -260,125 +209,59 @@ def acceleration(
 
 
 def turn_over(
-    go: Steps, k: int, ports: Ports, acting: Acting, state: State, j: int, now: float, h: float
+    go: Steps, k: int, ports: Ports, kept: Kept, state: State, j: int, now: float, h: float
 ) -> None:
     """Correct speed and position of a port whose friction turned over within a step."""
-    at_begin = -2.0 * acting.lost[j] / h  # acceleration at both ends, as friction of the first sign has it
+    at_begin = -2.0 * kept.lost[j] / h  # acceleration at both ends, as friction of the first sign has it
     at_end = at_begin
     for m in range(len(state.q)):
-        first = acceleration(go, ports, acting.q, acting.v, acting.forces, go.begin[k, m], go.time[k], m)
-        last = acceleration(go, ports, state.q, state.v, state.current, go.end[k, m], go.time[k] + h, m)
+        first = acceleration(go, ports, kept.q, kept.v, kept.forces, go.begin[k, m], go.time[k], m)
+        last = acceleration(
+            go, ports, state.q, state.v, state.memory[:, FORCE], go.end[k, m], go.time[k] + h, m
+        )
         at_begin += ports.rows[j, m] * first
         at_end += ports.rows[j, m] * last
-    speed = at_port(ports.rows, j, state.v)
-    change, way, held = laws.crossing(
-        ports.numbers[j], ports.values[j], acting.speed[j], speed - acting.lost[j], (at_begin, at_end),
-        acting.lost[j], now, h,
-    )  # fmt: skip
+    v = at_port(ports.rows, j, state.v)
+    change, way, held = speed.crossing(
+        ports.values[j], kept.speed[j], v - kept.lost[j], (at_begin, at_end), kept.lost[j], now, h
+    )
     if held == 1.0:
-        change = -speed
+        change = -v
         x = at_port(ports.rows, j, state.q)
-        way += at_port(ports.rows, j, acting.q) - x
-        state.memory[j, 0] = 1.0
-        state.memory[j, 1] = x + way
-    add(state.q, acting.pull[j], way, 1.0)
-    add(state.v, acting.pull[j], change, 1.0)
+        way += at_port(ports.rows, j, kept.q) - x
+        state.memory[j, HELD], state.memory[j, PLACE] = 1.0, x + way
+    add(state.q, ports.acts[j], way / ports.weight[j])
+    add(state.v, ports.acts[j], change / ports.weight[j])
 
 
 def record(
-    go: Steps, ports: Ports, acting: Acting, state: State, push: FloatArray, sample: int, out: Samples
+    go: Steps, k: int, ports: Ports, state: State, push: FloatArray, sample: int, out: ModalMotion
 ) -> None:
     """Write state and forces at a sample, where modal forces push."""
-    modes, count, time = len(state.q), len(ports.numbers), go.time[go.sample[sample]]
-    for m in range(modes):
-        out.q[sample, m] = state.q[m]
-        out.v[sample, m] = state.v[m]
-    for j in range(count):
-        out.forces[sample, j] = state.current[j]
-        out.lagged[sample, j] = state.memory[j, 2] if acting.route[j] == FLEXIBLE else state.current[j]
-        if acting.route[j] != SPEED:
-            continue
-        x, speed = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
-        out.forces[sample, j] = laws.steady(ports.numbers[j], ports.values[j], x, speed)
-        if state.memory[j, 0] == 1.0:  # what it takes to hold the port
-            need = 0.0
-            for m in range(modes):
-                own = acceleration(go, ports, state.q, state.v, state.current, push[m], time, m)
-                need += ports.rows[j, m] * own / acting.weight[j]
-            if laws.dry(ports.numbers[j], ports.values[j]):
-                most = acting.strength[j] * laws.share(ports.numbers[j], ports.values[j], x)
-                need = min(max(need, -most / acting.weight[j]), most / acting.weight[j])
-            out.forces[sample, j] = need
-        out.lagged[sample, j] = out.forces[sample, j]
-
-
-# ---------------------------------------------------------------- on what the modes leave out
-
-
-def begin_flexible(ports: Ports, acting: Acting, state: State, h: float, known: bool) -> None:
-    """Take the laws on flexible ports to the first sample; without a known memory they follow at once."""
-    count = len(ports.numbers)
-    at_once = 1.0 if ports.relaxation == 0.0 or not known else 0.0
-    for port in range(count):
-        if acting.leader[port] != port:  # one law for each flexible port
-            continue
-        y = ports.feed[port] + state.memory[port, 3]
-        y += at_port(ports.rows, port, state.q)
-        springs = -1
-        for j in range(count):
-            acting.springs[j] = -1
-            if acting.leader[j] != port:
-                continue
-            damped = ports.of_speed[j] == 1
-            y -= ports.flexibility[port] * state.memory[j, 2] * (1.0 if damped else 1.0 - at_once)
-            if not damped:
-                springs = j if springs < 0 else springs
-                acting.springs[j] = springs
-                last = state.memory[j, 1]
-                state.current[j], _ = pull_of(ports, state, j, last, h, FIRST_PARTS)
-        x = y
-        if springs >= 0:
-            r = at_once * ports.flexibility[port]
-            x = settle_port(springs, acting.springs, ports, state, y, r, h, FIRST_PARTS)
-        for j in range(count):
-            if acting.leader[j] != port:
-                continue
-            if ports.of_speed[j] == 0:
-                arrive(ports, state, j, x, FIRST_PARTS)
-                if at_once == 1.0:
-                    state.memory[j, 2] = state.current[j]
-            elif not known:
-                state.memory[j, 1] = x
-
-
-def arrive(ports: Ports, state: State, j: int, x: float, least: int) -> None:
-    """Carry the memory of a law of position to `x`, where its force is known."""
-    laws.advance(ports.numbers[j], ports.values[j], state.memory[j], x, least)
-    state.memory[j, 1] = x
-
-
-def carry_flexible(ports: Ports, acting: Acting, state: State, h: float) -> None:
-    """Carry the laws on flexible ports to the step's end, and give the second half of their impulse."""
-    count = len(ports.numbers)
-    keep = ports.relaxation / (ports.relaxation + h)
-    ease = 1.0 - keep
-    for port in range(count):
-        if acting.leader[port] != port:
-            continue
-        y = ports.feed[port] + keep * state.memory[port, 3]
-        y += at_port(ports.rows, port, state.q)
-        for j in range(count):
-            if acting.leader[j] == port:
-                y -= ports.flexibility[port] * keep * state.memory[j, 2]
-        x = settle_port(port, acting.leader, ports, state, y, ease * ports.flexibility[port], h, 1)
-        for j in range(count):
-            if acting.leader[j] != port:
-                continue
-            if ports.of_speed[j] == 1:
-                state.memory[j, 1] = x
-                state.memory[j, 4] = state.current[j]
-            else:
-                arrive(ports, state, j, x, 1)
-            state.memory[j, 2] = keep * state.memory[j, 2] + ease * state.current[j]
-            state.memory[j, 3] *= keep
-            add(state.v, ports.acts[j], -state.current[j], 0.5 * h)
+    for m in range(len(state.q)):
+        out.q[sample, m], out.v[sample, m] = state.q[m], state.v[m]
+    for j in range(len(ports.numbers)):
+        law, memory, weight = ports.values[j], state.memory[j], ports.weight[j]
+        force = memory[FORCE]
+        if ports.leader[j] == SPEED:
+            x, v = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
+            force = speed.steady(law, x, v)
+            if memory[HELD] == 1.0:  # what it takes to hold the port
+                force = 0.0
+                for m in range(len(state.q)):
+                    own = acceleration(
+                        go,
+                        ports,
+                        state.q,
+                        state.v,
+                        state.memory[:, FORCE],
+                        push[m],
+                        go.time[k],
+                        m,
+                    )
+                    force += ports.rows[j, m] * own / weight
+                if law[1] == 0.0:
+                    most = speed.strength(law, x, weight) / weight
+                    force = min(max(force, -most), most)
+            memory[LAGGED] = force
+        out.port_forces[sample, j], out.lagged[sample, j] = force, memory[LAGGED]

@@ -16,14 +16,14 @@ import numpy as np
 from .arrays import FloatArray
 from .errors import InvalidPatchError
 from .laws import LAWS
-from .laws.bouc_wen import BoucWen as BoucWen
-from .laws.free_play import FreePlay as FreePlay
+from .laws.hysteresis import BoucWen as BoucWen
+from .laws.hysteresis import MicroSlip as MicroSlip
 from .laws.interface import PortForce as PortForce
-from .laws.micro_slip import MicroSlip as MicroSlip
-from .laws.overflow import Overflow as Overflow
-from .laws.power_damping import PowerDamping as PowerDamping
-from .laws.power_stiffness import PowerStiffness as PowerStiffness
-from .laws.sine_force import SineForce as SineForce
+from .laws.speed import Overflow as Overflow
+from .laws.speed import PowerDamping as PowerDamping
+from .laws.springs import FreePlay as FreePlay
+from .laws.springs import PowerStiffness as PowerStiffness
+from .laws.springs import SineForce as SineForce
 from .primitive import Primitive as Primitive
 from .primitive import Window as Window
 from .primitive import course_of as course_of

@@ -3,24 +3,23 @@
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf
 from sys import float_info
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
 from .arrays import FloatArray, IntArray
-from .reduced_arrays import RegionArrays
+from .kept_arrays import KeptArrays
 from .state import wing_names
 
 Positive = Annotated[float, float_info.min, inf]
 
 
 @dataclass(frozen=True, repr=False)
-class PatchArrays(RegionArrays):
+class PatchArrays(KeptArrays):
     """Dense matrices and rows of a wing in a basis of n vectors, made for changes of `fe.runtime.patch`.
 
     Attributes
@@ -79,7 +78,7 @@ class PatchArrays(RegionArrays):
     """
 
     what = "a wing for patches"
-    layout: ClassVar[Mapping[str, int]] = {"patch_format": 3}
+    version = 4
 
     validity_box: Annotated[FloatArray, "chosen", 2]
     largest_loss: Positive
@@ -114,12 +113,8 @@ class PatchArrays(RegionArrays):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        strips = len(self.strip_lines) - 1
-        if len(self.strip_of) and not (
-            self.strip_of.min() >= 0
-            and self.strip_of.max() < strips
-            and set(self.term_of) <= set(range(len(self.regions) + 1))
-        ):
+        places = ((self.strip_of, len(self.strip_lines) - 1), (self.term_of, len(self.regions) + 1))
+        if any(not set(numbers) <= set(range(count)) for numbers, count in places):
             self.refuse("has strips that do not fit its strip lines")
         if np.any(np.diff(self.stations) <= 0.0) or np.any(np.diff(self.strip_lines) <= 0.0):
             self.refuse("must have stations that rise from the root to the tip")
@@ -130,13 +125,6 @@ class PatchArrays(RegionArrays):
             "chosen": len(wing_names(self.regions)),
             "terms": len(self.regions) + 2,
             "triangle": size * (size + 1) // 2,
-            "parts": len(self.strip_of),
             "chords": max(chords, 2),
             "directions": chords + 2,
         }
-
-    def __repr__(self) -> str:
-        return (
-            f"PatchArrays(design_hash={self.design_hash!r}, basis={len(self.load_tip)}, "
-            f"strips={len(self.strip_lines) - 1}, gauges={self.strain_rows.shape[1]})"
-        )

@@ -194,8 +194,7 @@ class PatchedState:
         self._gains = [item for item in patch if isinstance(item, LoadGain)]
         self.stiffness, self.mass = stiffness, mass
         self.laws = laws_of(wing.internal_forces(patch), wing.port_rows)
-        held = wing.held_ports(self.laws.ports)
-        self._held = np.vstack((arrays.load_tip, *held.values()))
+        self._held = wing.held
         force = wing.force_row(LOAD_PLACE, patch.of(*LOADS))
         ports = self.laws.rows(wing.port_rows, wing.size)
         parts = wing.load_parts(patch.of(*LOADS, PointMass))

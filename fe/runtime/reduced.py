@@ -143,13 +143,6 @@ class ReducedModel(ReducedArrays):
         )
         return stiffness, load
 
-    def __repr__(self) -> str:
-        return (
-            f"ReducedModel(name={self.name!r}, design_hash={self.design_hash!r}, regions={self.regions}, "
-            f"controls={self.controls}, gauges={len(self.gauges)}, static_basis={len(self.static_load.T)}, "
-            f"modal_basis={len(self.modal_load.T)}, modes={self.mode_count})"
-        )
-
     @property
     def gauge_count(self) -> int:
         """Number of strain gauges G."""

@@ -5,11 +5,10 @@ equations are in `docs/reduced_model.md`. NumPy and relative imports only: this 
 """
 
 from bisect import bisect_right
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from math import inf, sqrt
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 from numpy import einsum
@@ -17,36 +16,14 @@ from numpy.linalg import solve
 
 from .arrays import FloatArray, IntArray
 from .kept_arrays import KeptArrays
-from .state import MOST_REGIONS, GivenLosses, Losses, losses_of
+from .state import Losses
 
 MOST_ANCHORS = 16
 """Largest number of approximate dual solutions of a reduced model."""
 
 
 @dataclass(frozen=True, repr=False)
-class RegionArrays(KeptArrays):
-    """Arrays of a structure with K damage regions, 1 to 8.
-
-    Attributes
-    ----------
-    regions : tuple of str
-        Names of the damage regions in the order of their stiffness terms.
-    """
-
-    regions: tuple[str, ...]
-
-    def losses(self, stiffness_loss: GivenLosses) -> Losses:
-        """Return one stiffness loss for each region, in their order; see `fe.runtime.state.losses_of`."""
-        return losses_of(stiffness_loss, self.regions)
-
-    def __post_init__(self) -> None:
-        if not 1 <= len(self.regions) <= MOST_REGIONS:
-            self.refuse(f"must have 1 to {MOST_REGIONS} damage regions, but names {len(self.regions)}")
-        super().__post_init__()
-
-
-@dataclass(frozen=True, repr=False)
-class ReducedArrays(RegionArrays):
+class ReducedArrays(KeptArrays):
     """Affine dense matrices, outputs, modal data, error bound and ranges of a reduced structure, with names.
 
     What can be chosen are the parameters, the losses of the damage regions, the free masses [kg] and the
@@ -89,8 +66,8 @@ class ReducedArrays(RegionArrays):
     bound_reference : (T - 1,) ndarray
         Coefficients of the stiffness terms whose sum is the norm of the error bound; the last is one.
     residual_load : (R, L) ndarray
-        Loads in an orthonormal basis of the residuals (norm dual to the one of `bound_reference`). Its first
-        N directions are the norm's own images of the static basis, along which a solution leaves nothing.
+        Loads in an orthonormal basis of the residuals (norm dual to the one of `bound_reference`), without
+        the norm's own images of the static basis, along which a solution leaves nothing.
     residual_stiffness : (R, T - 1, N) ndarray
         Stiffness terms times static basis vectors, in the same basis: the residual is that of the loads less
         the changes of the coefficients from `bound_reference` times these.
@@ -100,19 +77,18 @@ class ReducedArrays(RegionArrays):
         Part of the norm of the strains, and of displacements, added to the bounds for rounding: a
         multiple of the difference seen where the reduced model holds the full solution itself.
     dual_counts : (K,) ndarray of int64
-        Number of approximate dual solutions along each loss; their product is A, at most 16. One along each
-        where the M dual functions of an output are combined instead.
+        Number of anchors along each loss; their product is A, at most 16. At each, M dual functions of an
+        output are combined to its approximate dual solution.
     dual_split : (sum of dual_counts less K,) ndarray
-        Values of the losses at which the next approximate dual solution takes over, region by region.
-    dual_correction : (A or M, O', R) ndarray
-        Approximate dual solutions, applied to the basis of the residuals; the last region's change first.
-    dual_residual : (A, O', T, T) or (1, O', F, 1 + T M) ndarray
-        Factors of the dual residuals: their norm is that of the factor times (1, -theta_1, -theta_2, ...),
-        with the coefficients theta of all stiffness terms but the last, which is times one. Of combined
-        functions: times (1, -theta_1 c, -theta_2 c, ...), with their coefficients c (M,) in the solution.
-    dual_stiffness : (O', T, M, M) ndarray
-        Stiffness terms in the dual functions of each output; M is 0 where none are combined.
-    dual_output : (O', M) ndarray
+        Values of the losses at which the next anchor takes over, region by region.
+    dual_correction : (A, M, O', R) ndarray
+        Dual functions, applied to the basis of the residuals; the anchors of the last region change first.
+    dual_residual : (A, O', F, 1 + T M) ndarray
+        Factors of the dual residuals: their norm is that of the factor times (1, -theta_1 c, -theta_2 c,
+        ...), with the coefficients theta of the stiffness terms and c (M,) of the functions.
+    dual_stiffness : (A, O', T, M, M) ndarray
+        Stiffness terms in the dual functions of each output.
+    dual_output : (A, O', M) ndarray
         Each output of its dual functions.
     modal_stiffness : (T, Nm, Nm) ndarray
         Stiffness terms in the modal basis.
@@ -127,7 +103,7 @@ class ReducedArrays(RegionArrays):
     """
 
     what = "a reduced model"
-    layout: ClassVar[Mapping[str, int]] = {"format": 6}
+    version = 7
 
     name: str
     parameters: tuple[str, ...]
@@ -154,10 +130,10 @@ class ReducedArrays(RegionArrays):
     rounding_allowance: Annotated[float, 0.0, inf]
     dual_counts: Annotated[IntArray, "regions"]
     dual_split: Annotated[FloatArray, "splits"]
-    dual_correction: Annotated[FloatArray, "duals", "outputs", "residual"]
+    dual_correction: Annotated[FloatArray, "anchors", "functions", "outputs", "residual"]
     dual_residual: Annotated[FloatArray, "anchors", "outputs", "dual rows", "dual columns"]
-    dual_stiffness: Annotated[FloatArray, "outputs", "terms", "functions", "functions"]
-    dual_output: Annotated[FloatArray, "outputs", "functions"]
+    dual_stiffness: Annotated[FloatArray, "anchors", "outputs", "terms", "functions", "functions"]
+    dual_output: Annotated[FloatArray, "anchors", "outputs", "functions"]
     modal_stiffness: Annotated[FloatArray, "terms", "modal", "modal"]
     modal_mass: Annotated[FloatArray, "masses", "modal", "modal"]
     modal_load: Annotated[FloatArray, "loads", "modal"]
@@ -172,7 +148,7 @@ class ReducedArrays(RegionArrays):
             or not 1 <= counts.min(initial=1) <= counts.prod() <= MOST_ANCHORS
         ):
             self.refuse(
-                f"must have 1 to {MOST_ANCHORS} approximate dual solutions, at least one along a loss, but "
+                f"must have 1 to {MOST_ANCHORS} anchors of dual functions, at least one along a loss, but "
                 f"has {counts.tolist()}"
             )
         super().__post_init__()
@@ -199,8 +175,6 @@ class ReducedArrays(RegionArrays):
 
     def _lengths(self) -> dict[str | int, int]:
         terms, masses, regions = len(self.stiffness_factors), len(self.masses), len(self.regions)
-        anchors, functions = int(self.dual_counts.prod()), self.dual_output.shape[-1]
-        factor = (self.dual_residual.shape[-2], 1 + terms * functions) if functions else (terms, terms)
         return {
             "chosen": len(self.chosen),
             "terms": terms,
@@ -210,15 +184,10 @@ class ReducedArrays(RegionArrays):
             "all outputs": self.static_count + len(self.accelerations),
             "regions": regions,
             "splits": int(self.dual_counts.sum()) - regions,
-            "anchors": anchors,
-            "duals": functions or anchors,
-            **dict(zip(("dual rows", "dual columns"), factor, strict=True)),
+            "anchors": int(self.dual_counts.prod()),
+            "dual columns": 1 + terms * self.dual_output.shape[-1],
             "masses": 1 + masses,
         }
-
-
-Dual = Callable[[FloatArray, Losses], tuple[FloatArray, FloatArray]]
-multiply_outer = np.multiply.outer
 
 
 class OnlineArrays:
@@ -237,23 +206,48 @@ class OnlineArrays:
         Stiffness terms, flat.
     """
 
-    __slots__ = ("_allowance", "_dual", "_load", "_output", "_reference", "_residual", "square", "stiffness")
-
     def __init__(self, arrays: ReducedArrays) -> None:
-        stiffness = arrays.static_stiffness
+        stiffness, residual, split = arrays.static_stiffness, arrays.residual_load, arrays.dual_counts - 1
         self.square = stiffness.shape[1:]
         self.stiffness = np.ascontiguousarray(stiffness.reshape(len(stiffness), -1))
         self._load, self._output = arrays.static_load, arrays.static_output
-        residual = arrays.residual_load[len(stiffness[0]) :]
-        terms = arrays.residual_stiffness[len(stiffness[0]) :].reshape(len(residual), -1)
         # times the loads, then the changes of the coefficients times the coordinates: the residual
+        terms = arrays.residual_stiffness.reshape(len(residual), -1)
         self._residual = np.concatenate((residual, -terms), axis=1)
         self._allowance = arrays.residual_allowance
         self._reference = np.append(arrays.bound_reference, 1.0)
-        self._dual = (_combined if arrays.dual_output.shape[-1] else _nearest)(arrays)
+        self._splits = [part.tolist() for part in np.split(arrays.dual_split, np.cumsum(split)[:-1])]
+        of_terms = arrays.dual_stiffness.swapaxes(1, 2).reshape(len(arrays.dual_output), len(stiffness), -1)
+        by_output = np.ascontiguousarray(arrays.dual_correction.swapaxes(1, 2))
+        output = arrays.dual_output[..., np.newaxis]
+        self._anchors = list(zip(of_terms, output, by_output, arrays.dual_residual, strict=True))
+        self._last: tuple[object, tuple[FloatArray, FloatArray]] | None = None
+
+    def _dual(self, theta: FloatArray, loss: Losses) -> tuple[FloatArray, FloatArray]:
+        """Return dual solutions applied to the basis of residuals (O, R), and norms (O,) of what they leave.
+
+        They are the Galerkin solutions of the outputs in their functions of the anchor at the losses.
+        """
+        last, key = self._last, (theta.tobytes(), loss)  # a course of loads meets the same health again
+        if last is not None and last[0] == key:
+            return last[1]
+        number = 0
+        for split, value in zip(self._splits, loss, strict=True):
+            number = number * (len(split) + 1) + bisect_right(split, value)
+        stiffness, output, corrections, factor = self._anchors[number]
+        outputs, functions, _ = output.shape
+        weights = solve((theta @ stiffness).reshape(outputs, functions, functions), output)
+        across = weights.transpose(0, 2, 1)
+        coefficients = np.empty((outputs, factor.shape[2], 1))
+        coefficients[:, 0] = 1.0
+        coefficients[:, 1:] = (-theta[:, np.newaxis] * across).reshape(outputs, -1, 1)
+        left = (factor @ coefficients)[:, :, 0]
+        found = (across @ corrections)[:, 0], np.sqrt(einsum("ij,ij->i", left, left))
+        self._last = key, found
+        return found
 
     def solution(
-        self, theta: FloatArray, load: FloatArray, loss: tuple[float, ...]
+        self, theta: FloatArray, load: FloatArray, loss: Losses
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return coordinates (N,), outputs (O,) and certified bounds (O,) of their errors, rounding left out.
 
@@ -264,70 +258,16 @@ class OnlineArrays:
         load : (L,) ndarray
             Coefficients of the loads.
         loss : tuple of float
-            Stiffness losses of the damage regions, by which the approximate dual solution is chosen.
+            Stiffness losses of the damage regions, by which the anchor is chosen.
         """
         stiffness = (theta @ self.stiffness).reshape(self.square)
         coordinates = np.asarray(solve(stiffness, load @ self._load), dtype=np.float64)
 
         # |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha, norms dual to the reference
-        coefficients = np.empty(self._residual.shape[1])
-        loads = load.size
-        coefficients[:loads] = load
         change = (theta - self._reference)[:-1]
-        multiply_outer(change, coordinates, out=coefficients[loads:].reshape(change.size, -1))
-        residual = self._residual @ coefficients
+        residual = self._residual @ np.concatenate((load, np.multiply.outer(change, coordinates).ravel()))
         correction, dual = self._dual(theta, loss)
         coercivity = min((theta / self._reference).tolist())
         outside = self._allowance * sqrt(coordinates @ coordinates)
         remainder = (sqrt(residual @ residual) + outside) / coercivity
-        bound = remainder * np.sqrt(einsum("ij,ij->i", dual, dual)) + np.abs(correction @ residual)
-        return coordinates, self._output @ coordinates, bound
-
-
-# An approximate dual solution, at coefficients (T,) of the stiffness and losses of the regions, is what it
-# gives applied to the basis of the residuals (O, R), and the dual residuals of the outputs (O, F).
-
-
-def _nearest(arrays: ReducedArrays) -> Dual:
-    """Return the dual solution of the anchor that is next to the losses."""
-    (terms, inside, _), dual = arrays.static_stiffness.shape, arrays.dual_residual
-    # to be multiplied by theta, as the stiffness
-    factors = np.concatenate((-dual[..., 1:], dual[..., :1]), axis=-1)
-    anchors = [
-        (np.ascontiguousarray(correction), np.ascontiguousarray(factor.reshape(-1, terms)))
-        for correction, factor in zip(arrays.dual_correction[..., inside:], factors, strict=True)
-    ]
-    splits = np.split(arrays.dual_split, np.cumsum(arrays.dual_counts - 1)[:-1])
-    return partial(_at_anchor, anchors, [split.tolist() for split in splits])
-
-
-def _at_anchor(
-    anchors: list[tuple[FloatArray, FloatArray]], splits: list[list[float]], theta: FloatArray, loss: Losses
-) -> tuple[FloatArray, FloatArray]:
-    number = 0
-    for split, value in zip(splits, loss, strict=True):
-        number = number * (len(split) + 1) + bisect_right(split, value)
-    correction, factor = anchors[number]
-    return correction, (factor @ theta).reshape(-1, theta.size)
-
-
-def _combined(arrays: ReducedArrays) -> Dual:
-    """Return the Galerkin solution of each output in its M dual functions."""
-    terms, inside, _ = arrays.static_stiffness.shape
-    by_output = arrays.dual_correction[..., inside:].transpose(1, 0, 2)
-    stiffness = np.ascontiguousarray(arrays.dual_stiffness.transpose(1, 0, 2, 3)).reshape(terms, -1)
-    corrections, factor = np.ascontiguousarray(by_output), arrays.dual_residual[0]
-    return partial(_galerkin, stiffness, arrays.dual_output[:, :, np.newaxis], corrections, factor)
-
-
-def _galerkin(
-    stiffness: FloatArray, output: FloatArray, corrections: FloatArray, factor: FloatArray, theta: FloatArray,
-    loss: Losses,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-    outputs, functions, _ = output.shape
-    weights = solve((theta @ stiffness).reshape(outputs, functions, functions), output)
-    across = weights.transpose(0, 2, 1)
-    coefficients = np.empty((outputs, factor.shape[2], 1))
-    coefficients[:, 0] = 1.0
-    coefficients[:, 1:] = (-theta[:, np.newaxis] * across).reshape(outputs, -1, 1)
-    return (across @ corrections)[:, 0], (factor @ coefficients)[:, :, 0]
+        return coordinates, self._output @ coordinates, remainder * dual + np.abs(correction @ residual)

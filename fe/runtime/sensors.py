@@ -10,13 +10,13 @@ NumPy and relative imports only: this file is copied into the FMU.
 
 from collections.abc import Callable, Sequence
 from itertools import islice
-from math import exp, expm1, factorial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .arrays import FloatArray
 from .errors import InvalidPatchError
+from .modal_system import exponential
 from .patch import EVERY_CHANNEL, Clock, HighPass, LoggerClock, ModelPatch, Sensor, SensorGain, SensorRotation
 from .patch import SensorRecord as SensorRecord
 from .primitive import Primitive
@@ -205,8 +205,7 @@ class FilterMemory:
 def high_pass_step(states: FloatArray, increment: float, ratio: float) -> FloatArray:
     """Return the outputs of a chain of equal first-order high-pass stages after a linear change of its input.
 
-    The outputs obey y_i' = x' - (y_1 + ... + y_i) / tau, whose matrix -L / tau has the single eigenvalue
-    -1 / tau: its exponential is a finite sum.
+    The outputs obey y_i' = x' - (y_1 + ... + y_i) / tau.
 
     Parameters
     ----------
@@ -218,16 +217,7 @@ def high_pass_step(states: FloatArray, increment: float, ratio: float) -> FloatA
         Duration of the change over tau.
     """
     count = len(states)
-    lower = np.tril(np.ones((count, count)), -1)
-    decay, power = exp(-ratio), np.eye(count)
-    transition = decay * power
-    rest = np.zeros(count)  # exp(-ratio L) e_1 without the term of the unit matrix
-    for k in range(1, count):
-        power = power @ lower
-        term = decay * (-ratio) ** k / factorial(k) * power
-        transition += term
-        rest += term[:, 0]
-    # (e_1 - exp(-ratio L) e_1) / ratio is the mean of the response over the change
-    gain = -rest / ratio
-    gain[0] += -expm1(-ratio) / ratio
-    return np.asarray(transition @ states + gain * increment)
+    matrix = np.zeros((count + 1, count + 1))  # of the outputs, and the increment as one more that stays
+    matrix[:count, :count] = -ratio * np.tri(count)
+    matrix[:count, count] = increment
+    return np.asarray(exponential(matrix)[:count] @ np.append(states, 1.0))

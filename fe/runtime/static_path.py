@@ -7,37 +7,20 @@ into the FMU.
 import numpy as np
 
 from . import laws
-from .motion_arrays import FloatArray, IntArray, Ports, State, Unnamed
+from .arrays import FADING, FORCE, LAGGED, PLACE
+from .motion_arrays import FloatArray, Ports, Unnamed
 
 
-def static_forces(
-    x: FloatArray, ports: Ports, memory: FloatArray, least: IntArray
-) -> tuple[FloatArray, FloatArray]:
+def static_forces(x: FloatArray, ports: Ports, memory: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return forces and slopes (J,) at positions `x` (J,) reached from `memory`, which stays as it is.
 
-    `least` (J,) is the least number of parts in which a hysteretic law follows the way; laws of speed are
-    zero at rest.
+    Laws of speed are zero at rest.
     """
     forces, slopes = np.zeros(len(x)), np.zeros(len(x))
     for j in range(len(x)):
         if ports.of_speed[j] == 0:
-            forces[j], slopes[j] = laws.pull(
-                ports.numbers[j], ports.values[j], memory[j], x[j], 1.0, least[j]
-            )
+            forces[j], slopes[j] = laws.pull(ports.numbers[j], ports.values[j], memory[j], x[j], 1.0)
     return forces, slopes
-
-
-def arrive_at_rest(
-    x: FloatArray, ports: Ports, memory: FloatArray, least: IntArray, forces: FloatArray
-) -> None:
-    """Carry the memory to positions `x` (J,) where the laws rest with `forces` (J,)."""
-    for j in range(len(x)):
-        if ports.of_speed[j] == 0:
-            laws.advance(ports.numbers[j], ports.values[j], memory[j], x[j], least[j])
-        memory[j, 1] = x[j]
-        memory[j, 2] = forces[j]
-        memory[j, 3] = 0.0
-        memory[j, 4] = 0.0
 
 
 def static_path(
@@ -68,20 +51,15 @@ def static_path(
     int
         -1, or the number of the level that has no solution.
     """
-    ports = Ports(*at_ports)
-    levels, count = linear.shape
-    old = start.copy()
-    x = memory[:, 1].copy()
+    ports, count = Ports(*at_ports), len(start)
+    old, x = start.copy(), memory[:, PLACE].copy()
     own, unit = np.zeros(count), np.eye(count)
-    least = np.zeros(count, dtype=np.int64)
-    for level in range(levels):
+    for level in range(len(linear)):
         done, step = 0.0, 1.0
         while done < 1.0:
             goal = old + (linear[level] - old) * min(done + step, 1.0)
-            for j in range(count):  # fixed during the iteration, so that the force is a smooth function
-                least[j] = laws.parts(ports.numbers[j], ports.values[j], abs(goal[j] - x[j]))
             guess = x.copy()
-            own, slopes = static_forces(guess, ports, memory, least)
+            own, slopes = static_forces(guess, ports, memory)
             yielded = compliance @ own  # what a law that pulls without a load moves
             scale = np.max(np.abs(goal)) + np.max(np.abs(x)) + np.max(np.abs(yielded)) + 1e-300
             residual = guess + yielded - goal
@@ -92,23 +70,25 @@ def static_path(
                 # A singular matrix is moved off its zero. Compiled, `solve` takes five seconds longer.
                 move = np.linalg.inv(unit + compliance * slopes + 1e-14 * unit) @ residual
                 fraction, before = 1.0, size
-                for _ in range(12):
+                while size == before and fraction > 4e-4:
                     candidate = guess - fraction * move
-                    trial, trial_slopes = static_forces(candidate, ports, memory, least)
+                    trial, trial_slopes = static_forces(candidate, ports, memory)
                     rest = candidate + compliance @ trial - goal
                     if np.max(np.abs(rest)) < size:
                         guess, own, slopes, residual = candidate, trial, trial_slopes, rest
                         size = np.max(np.abs(rest))
-                        break
                     fraction *= 0.5
                 if size == before:
                     break
             # What is left may be rounding, or a kink met exactly. A solution that is not stable lies on
             # another branch, beyond a snap.
-            stable = np.linalg.det(unit + compliance * slopes) > -1e-9
-            if size <= 1e-9 * scale and stable:
+            if size <= 1e-9 * scale and np.linalg.det(unit + compliance * slopes) > -1e-9:
                 x = guess
-                arrive_at_rest(guess, ports, memory, least, own)
+                for j in range(count):
+                    if ports.of_speed[j] == 0:
+                        laws.advance(ports.numbers[j], ports.values[j], memory[j], x[j])
+                    memory[j, PLACE], memory[j, FADING] = x[j], 0.0
+                    memory[j, LAGGED] = memory[j, FORCE] = own[j]
                 done = min(done + step, 1.0)
                 step *= 2.0
             else:
@@ -122,39 +102,32 @@ def static_path(
     return -1
 
 
-def pull_of(ports: Ports, state: State, j: int, x: float, h: float, least: int) -> tuple[float, float]:
-    """Return force and slope of a law at `x`, its memory left as it is."""
-    return laws.pull(ports.numbers[j], ports.values[j], state.memory[j], x, h, least)  # type: ignore[no-any-return]
+def settle_port(port: int, ports: Ports, memory: FloatArray, y: float, r: float, h: float) -> float:
+    """Return the position x of a port with laws, x + r sum F(x) = y; their forces go to the memory.
 
-
-def settle_port(
-    port: int, leader: IntArray, ports: Ports, state: State, y: float, r: float, h: float, least: int
-) -> float:
-    """Return the position x of a port with laws, x + r sum F(x) = y; their forces go to `state.current`.
-
-    The laws are those whose `leader` is `port`; of those of position, `state.current` has the forces at the
-    last position. Dry friction first: where it can hold the port, it does. The memories are left as they are.
+    The laws are those whose leader is `port`; of those of position, the memory has the forces at the last
+    position. Dry friction first: where it can hold the port, it does. Without a duration `h` forces of speed
+    stay what they are. Nothing else of the memory changes.
     """
     count = len(ports.numbers)
-    last = state.memory[port, 1]
+    last = memory[port, PLACE]
     start, level, tolerance = 0.0, 0.0, 1e-12
     for j in range(count):
-        if leader[j] != port:
+        if ports.leader[j] != port:
             continue
-        if ports.of_speed[j] == 0:
-            start += state.current[j]
+        if ports.of_speed[j] == 0 or h == 0.0:
+            start += memory[j, FORCE]
             continue
         tolerance = 1e-15  # a speed is a small difference of positions
-        state.current[j] = 0.0
-        if laws.dry(ports.numbers[j], ports.values[j]):
-            own, _ = pull_of(ports, state, j, last, h, least)
-            level += own
+        memory[j, FORCE] = 0.0
+        if ports.values[j, 1] == 0.0:
+            level += laws.pull(ports.numbers[j], ports.values[j], memory[j], last, h)[0]
     push = y - last - r * start
     if level > 0.0 and abs(push) <= r * level:
         for j in range(count):
-            if leader[j] == port and laws.dry(ports.numbers[j], ports.values[j]):
-                own, _ = pull_of(ports, state, j, last, h, least)
-                state.current[j] = push / r * own / level
+            if ports.leader[j] == port and ports.of_speed[j] == 1 and ports.values[j, 1] == 0.0:
+                own, _ = laws.pull(ports.numbers[j], ports.values[j], memory[j], last, h)
+                memory[j, FORCE] = push / r * own / level
         return float(last)
     sign = 1.0 if push > 0.0 else -1.0
     # the root lies that way from the last position, if the structure is stable
@@ -164,16 +137,17 @@ def settle_port(
     for _ in range(80):
         total, slope, steepest = 0.0, 1.0, -1.0
         for j in range(count):
-            if leader[j] != port:
+            if ports.leader[j] != port:
                 continue
-            own, change = pull_of(ports, state, j, x, h, least)
-            if laws.dry(ports.numbers[j], ports.values[j]):
-                own, change = sign * own, sign * change
-            state.current[j] = own
-            total += own
-            slope += r * change
-            if change > steepest:
-                steep, steepest = j, change
+            if ports.of_speed[j] == 0 or h > 0.0:
+                own, change = laws.pull(ports.numbers[j], ports.values[j], memory[j], x, h)
+                if ports.of_speed[j] == 1 and ports.values[j, 1] == 0.0:
+                    own, change = sign * own, sign * change
+                memory[j, FORCE] = own
+                slope += r * change
+                if change > steepest:
+                    steep, steepest = j, change
+            total += memory[j, FORCE]
         rest, at = x + r * total - y, x
         if abs(rest) <= 1e-13 * abs(push) + tolerance * (abs(x) + abs(y)):
             return float(x)
@@ -188,5 +162,5 @@ def settle_port(
         else:
             x += sign * abs(rest)
     if r > 0.0:  # a force that rises within rounding gives what is missing
-        state.current[steep] -= rest / r
+        memory[steep, FORCE] -= rest / r
     return float(at)

@@ -4,7 +4,7 @@ Steps are those of `ModalSystem.exact_steps`; lengths that differ by less than `
 usual one are one. NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise
@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .arrays import BoolArray, FloatArray, IntArray
+from .arrays import PLACE, FloatArray, IntArray
 from .modal_system import ModalSystem
 from .motion import PLAIN, Kernel, Laws, port_flexibility
-from .motion_arrays import Samples, State, Steps
+from .motion_arrays import ModalMotion, State, Steps
 
 SLOWEST_PHASE, FASTEST_PHASE = 0.05, 0.4
 """Longest substep with laws: radians of the slowest and of the fastest mode that it may span."""
@@ -111,19 +111,6 @@ def steps_under(
     )
 
 
-class ModalMotion(NamedTuple):
-    """Motion at samples: `q`, `v` (N, M), `port_forces` (N, J) of the laws, their `memory` at the end.
-
-    `lagged` (N, J) are the forces as what the modes leave out follows them.
-    """
-
-    q: FloatArray
-    v: FloatArray
-    port_forces: FloatArray
-    lagged: FloatArray
-    memory: FloatArray
-
-
 class Begin(NamedTuple):
     """Modal displacements and speeds (M + P,), and the laws' memory; None: loaded from zero at once."""
 
@@ -140,40 +127,25 @@ def advance(
     Where laws begin or end, a new section does: modes and the laws that go on keep their state, a law that
     begins has been loaded from zero to where its port is. A stamp at an edge belongs to what begins there.
     """
-    (q, v, memory), modes, count = begin, len(begin.q), len(laws)
-    sample = np.arange(len(steps.time)) if laws.spans else steps.sample
-    out = Samples(*(np.empty((len(sample), width)) for width in (modes, modes, count, count)))
-    kept = laws.memory() if memory is None else memory.copy()
-    state = State(np.array(q, dtype=float), np.array(v, dtype=float), kept, np.zeros(count))
-    rows = laws.rows(system.ports, modes)
-    acts = laws.rows(system.actions, modes) if system.actions else rows
-    flexibility, before = port_flexibility(system, laws), np.ones(count, dtype=bool)
-    for first, last, acting in _sections(laws, steps.time):
-        now = acting[:, None]
-        ports = laws.at(rows * now)._replace(
-            flexibility=flexibility, relaxation=float(system.relaxation), acts=acts * now
-        )
+    known, modes, count, size = begin.memory is not None, len(begin.q), len(laws), len(steps.sample)
+    memory = laws.memory() if begin.memory is None else begin.memory.copy()
+    state, before = State(begin.q.astype(float), begin.v.astype(float), memory), np.ones(count, dtype=bool)
+    none, forces = np.empty((2, size, modes)), np.empty((2, size, count))
+    found = ModalMotion(none[0], none[1], forces[0], forces[1], memory)
+    flexibility, actions = port_flexibility(system, laws), system.actions or system.ports
+    given, time = tuple(map(np.ascontiguousarray, steps)), steps.time
+    edges = [moment for moment in laws.edges if time[0] < moment < time[-1]]
+    cuts = np.unique(np.concatenate(([0, len(time) - 1], np.searchsorted(time, edges)))).tolist()
+    for first, last in pairwise(map(int, cuts)):
+        moment = 0.5 * float(time[first] + time[first + 1])
+        rows, acting = laws.rows(system.ports, modes, moment), laws.act_at(moment)
         for j in np.flatnonzero(acting & ~before):
             state.memory[j] = 0.0
             if laws.of_speed[j]:
-                state.memory[j, 1] = rows[j] @ state.q
-        state.current[:] = 0.0
-        own, part = steps, out
-        if laws.spans:
-            own = steps.between(first, last)
-            part = Samples(*(item[first : last + 1] for item in out))
-        known = memory is not None or first > 0
-        given = tuple(map(np.ascontiguousarray, own))
-        kernel.integrate(given, system.coupled, known, tuple(ports), tuple(state), tuple(part))
-        before = acting
-    if laws.spans:
-        out = Samples(*(item[steps.sample] for item in out))
-    return ModalMotion(*out, kept)
-
-
-def _sections(laws: Laws, time: FloatArray) -> Iterator[tuple[int, int, BoolArray]]:
-    """Yield first and last boundary of the steps during which the same laws act, and which (J,) these are."""
-    inside = [moment for moment in laws.edges if time[0] < moment < time[-1]]
-    cuts = np.unique(np.concatenate(([0, len(time) - 1], np.searchsorted(time, inside)))).astype(int)
-    for first, last in pairwise(cuts.tolist()):
-        yield first, last, laws.act_at(0.5 * float(time[first] + time[first + 1]))
+                state.memory[j, PLACE] = rows[j] @ state.q
+        acts, sample = laws.rows(actions, modes, moment), int(np.searchsorted(steps.sample, first))
+        ports = laws.at(rows, acts, flexibility, float(system.relaxation), steps.transition)
+        by, into = (given, first, last, sample, system.coupled, known), (tuple(state), tuple(found))
+        kernel.integrate(*by, tuple(ports), *into)
+        known, before = True, acting
+    return found

@@ -9,7 +9,7 @@ NumPy and relative imports only: this file is copied into the FMU. Laws are impo
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import exp, isfinite
 from typing import TYPE_CHECKING, Any, Protocol
@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from .arrays import FloatArray
+from .arrays import FADING, HEAD, LAGGED, FloatArray
 from .errors import InvalidStateError
 from .modal_system import ModalSystem, rayleigh_damping_ratio
 
 if TYPE_CHECKING:
     from .motion import Laws
-    from .stepwise import ModalMotion
+    from .motion_arrays import ModalMotion
 
 
 INSTANT = 1e-6
@@ -42,21 +42,18 @@ class TransientState:
         Their rates [m kg^1/2 / s].
     load : (L,) ndarray
         Coefficients of the loads at this moment; of a wing the load factor [1] and the tip force [N].
-    forces : (J,) ndarray
-        Forces of laws, as omitted modes follow them.
     memory : (J, 5 + E) ndarray
-        What the laws remember.
+        What the laws remember; in a column the forces as omitted modes follow them.
     """
 
     displacement: FloatArray
     velocity: FloatArray
     load: FloatArray
-    forces: FloatArray = field(default_factory=lambda: np.zeros(0))
-    memory: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    memory: FloatArray = field(default_factory=lambda: np.zeros((0, HEAD)))
 
     def to_list(self) -> list[float]:
-        """Return the state as 2 M + L + J (6 + E) plain floats; `from_list` gives it back to the last bit."""
-        parts = (self.displacement, self.velocity, self.load, self.forces, self.memory)
+        """Return the state as 2 M + L + J (5 + E) plain floats; `from_list` gives it back to the last bit."""
+        parts = (self.displacement, self.velocity, self.load, self.memory)
         return [float(value) for part in parts for value in part.ravel()]
 
     @classmethod
@@ -75,11 +72,10 @@ class TransientState:
                 f"A transient state of {mode_count} modes needs at least {2 * mode_count} finite numbers, "
                 f"but {len(values)} came, {sum(isfinite(value) for value in values)} of them finite."
             )
-        memory = np.zeros((0, 0)) if laws is None else laws.memory()
-        ends = np.cumsum([mode_count, mode_count, len(values) - 2 * mode_count - len(memory) - memory.size])
-        array = np.array(values, dtype=np.float64)
-        place, velocity, load, forces, rest = np.split(array, [*ends, len(array) - memory.size])
-        return cls(place, velocity, load, forces, rest.reshape(memory.shape))
+        memory = np.zeros((0, HEAD)) if laws is None else laws.memory()
+        ends = (mode_count, 2 * mode_count, len(values) - memory.size)
+        place, velocity, load, rest = np.split(np.array(values, dtype=np.float64), ends)
+        return cls(place, velocity, load, rest.reshape(memory.shape))
 
 
 class StructureState(Protocol):
@@ -145,6 +141,8 @@ class ModalIntegrator:
     ----------
     structure : StructureState
         The structure at this state.
+    modes : object
+        Its modes.
     damping_ratio : (M,) ndarray
         Damping ratios of its modes, eq. (18).
 
@@ -166,13 +164,9 @@ class ModalIntegrator:
                 raise InvalidStateError(f"{name} must be zero or a positive finite number, but is {value!r}.")
         self.structure: StructureState = model.at(vector, *changes)
         self._rayleigh = damping_alpha, damping_beta
-        self._laws = self.structure.laws
-        self._loads = self.structure.loads.shape[1] - (0 if self._laws is None else len(self._laws))
-
-    @property
-    def modes(self) -> Any:
-        """The modes at this state."""
-        return self.structure.modes
+        self.modes, self._laws = self.structure.modes, self.structure.laws
+        self._count = 0 if self._laws is None else len(self._laws)
+        self._loads = self.structure.loads.shape[1] - self._count
 
     @cached_property
     def damping_ratio(self) -> FloatArray:
@@ -246,31 +240,39 @@ class ModalIntegrator:
             If laws have no equilibrium on the way.
         """
         acting, none = np.array(load, dtype=np.float64), np.zeros(0)
-        if self._laws is None or not len(self._laws):
+        if not self._count:
             return TransientState(none, none, acting)
+        answers = self._port_answers
+        _, memory = self._loaded(
+            answers[:, : self._loads] @ acting,
+            answers[:, self._loads :],
+            None if before is None else before.memory,
+            None if before is None else answers[:, : self._loads] @ before.load,
+        )
+        return TransientState(none, none, acting, memory)
+
+    def _loaded(
+        self, linear: FloatArray, compliance: FloatArray, memory: FloatArray | None, start: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return forces (J,) and memory of the laws at linear positions (J,), see `static_solution`."""
         from .motion import static_solution
 
-        answers = self._port_answers
-        found = static_solution(
-            self._laws,
-            (answers[:, : self._loads] @ acting)[np.newaxis],
-            answers[:, self._loads :],
-            memory=None if before is None else before.memory,
-            start=None if before is None else answers[:, : self._loads] @ before.load,
-        )
-        return TransientState(none, none, acting, found.forces[0], found.memory)
+        assert self._laws is not None
+        found = static_solution(self._laws, linear[np.newaxis], compliance, memory=memory, start=start)
+        return found.forces[0], found.memory
 
     def at_rest(self, load: npt.ArrayLike) -> TransientState:
         """Return the state of equilibrium under loads (L,); raises `SolutionError` as `settled`."""
         return self._moving(self.settled(load))
 
-    def _moving(self, rest: TransientState) -> TransientState:
-        place = self._modal_static @ self._still(rest)
-        return TransientState(place, np.zeros_like(place), rest.load, rest.forces, rest.memory)
+    def _moving(self, rest: TransientState, held: FloatArray | float = 0.0) -> TransientState:
+        """Return a state at rest in its modes, which a force moves by `held`."""
+        place = self._modal_static @ self._still(rest) + held
+        return replace(rest, displacement=place, velocity=np.zeros_like(place))
 
     @staticmethod
     def _still(state: TransientState) -> FloatArray:
-        return np.concatenate((state.load, -state.forces)) if len(state.forces) else state.load
+        return np.concatenate((state.load, -state.memory[:, LAGGED]))
 
     def released(self, aside: float, load: npt.ArrayLike, point: int) -> TransientState:
         """Return the state just after a structure that was held aside is let go.
@@ -293,38 +295,29 @@ class ModalIntegrator:
         """
         rest, answers = self.settled(load), self.structure.answers[:, point]
         held = aside / float(self.structure.outputs[-1] @ answers) if aside else 0.0
-        if self._laws is None or not len(self._laws):
-            return self._let_go(rest, held, point)
-        along, resting = self._port_answers[:, point], self._port_answers[:, : self._loads] @ rest.load
-        if held:
-            from .motion import static_solution
-
+        if held and self._count:
             # with the point held where it is moved to: x = x_linear - (C - a a^T / a_0) F
-            compliance = float(self.structure.loads[:, point] @ answers)
-            before = along / compliance * (along @ rest.forces)
-            moved = static_solution(
-                self._laws,
-                (resting + held * along - before)[np.newaxis],
+            along, resting = self._port_answers[:, point], self._port_answers[:, : self._loads] @ rest.load
+            compliance, forces = self.structure.loads[:, point] @ answers, rest.memory[:, LAGGED]
+            start = resting - along / compliance * (along @ forces)
+            moved, memory = self._loaded(
+                start + held * along,
                 self._port_answers[:, self._loads :] - np.outer(along, along) / compliance,
-                memory=rest.memory,
-                start=resting - before,
+                rest.memory,
+                start,
             )
-            held += float(along @ (moved.forces[0] - rest.forces)) / compliance
-            rest = TransientState(rest.displacement, rest.velocity, rest.load, moved.forces[0], moved.memory)
+            held += float(along @ (moved - forces) / compliance)
             # of the ports' positions; fades after the release
-            rest.memory[:, 3] = held * (self.structure.loads[:, self._loads :].T @ self._left_out[:, point])
-        state = self._let_go(rest, held, point)
-        felt = self._moved(state, rest.load, INSTANT, 0.0)
-        return TransientState(state.displacement, state.velocity, state.load, felt.lagged[0], state.memory)
-
-    def _let_go(self, rest: TransientState, held: float, point: int) -> TransientState:
-        """Return a state at rest whose modes are where a force at a point holds them."""
-        state = self._moving(rest)
-        fading = np.zeros(self._loads)
+            memory[:, FADING] = held * (self.structure.loads[:, self._loads :].T @ self._left_out[:, point])
+            rest = replace(rest, memory=memory)
+        state = self._moving(rest, self._modal_static[:, point] * held)
         if self.structure.holding is not None and self._rayleigh[1] > 0.0:
-            fading[self.structure.holding] = held
-        place = state.displacement + self._modal_static[:, point] * held
-        return TransientState(place, state.velocity, state.load + fading, state.forces, state.memory)
+            state = replace(state, load=state.load + held * np.eye(self._loads)[self.structure.holding])
+        if self._count:
+            memory = rest.memory.copy()
+            memory[:, LAGGED] = self._moved(state, rest.load, INSTANT, 0.0).lagged[0]
+            state = replace(state, memory=memory)
+        return state
 
     def advance(
         self, state: TransientState, duration: float, load: npt.ArrayLike, time: float = 0.0
@@ -361,15 +354,14 @@ class ModalIntegrator:
             free = transition @ np.concatenate((state.displacement - static, state.velocity))
             # plus zero: a structure at rest has the velocity 0, not -0
             place, velocity = free[: len(static)] + static, free[len(static) :] + 0.0
-            forces, memory = state.forces, state.memory
+            memory = state.memory
         else:
             moved = self._moved(state, acting, duration, time)
-            place, velocity = moved.q[-1], moved.v[-1]
-            forces, memory = moved.lagged[-1], moved.memory
+            place, velocity, memory = moved.q[-1], moved.v[-1], moved.memory
         holding, (_, beta) = self.structure.holding, self._rayleigh
         if holding is not None and state.load[holding] != 0.0:
             acting[holding] = state.load[holding] * exp(-duration / beta)
-        return TransientState(place, velocity, acting, forces, memory)
+        return TransientState(place, velocity, acting, memory)
 
     def displacement(self, state: TransientState) -> FloatArray:
         """Return the displacement (n,) at a state, in the coordinates of the structure.
@@ -415,18 +407,17 @@ class ModalIntegrator:
 
         `state` is in the modes of `before`, the integrator of the same model that it belongs to.
         """
-        load, memory, forces = state.load, state.memory, state.forces
+        load, memory = state.load, state.memory
         if self._laws is not None and not (before._laws is not None and self._laws.alike(before._laws)):
             memory = self._laws.memory()
-            forces = np.zeros(len(memory))
             if not len(state.displacement):  # at rest: reached from no load
                 load = np.zeros_like(load)
         if not len(state.displacement):
-            return TransientState(state.displacement, state.velocity, load, forces, memory)
+            return replace(state, load=load, memory=memory)
         if self.structure.holding is not None:
             load = load.copy()
             load[self.structure.holding] = 0.0
         place = before.structure.shapes @ state.displacement + before._left_out[:, : len(load)] @ load
         to_modes = self.structure.to_modes
         velocity = to_modes @ (before.structure.shapes @ state.velocity)
-        return TransientState(to_modes @ place, velocity, load, forces, memory)
+        return TransientState(to_modes @ place, velocity, load, memory)

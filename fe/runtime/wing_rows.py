@@ -259,13 +259,10 @@ class WingRows:
         places = (self.arrays.flap_row, self.arrays.load_tip, self.arrays.station_weights @ upwards)
         return dict(zip((*PORTS, *STATION_PORTS), (*places, *stations), strict=True))
 
-    def held_ports(self, ports: tuple[str, ...]) -> dict[str, FloatArray]:
-        """Return the rows (n,) of the ports whose static shapes a motion with forces on `ports` holds.
-
-        They are `PORTS`, and the stations of the planform where forces act on these.
-        """
-        spread = any(port in STATION_PORTS for port in ports)
-        return {name: row for name, row in self.port_rows.items() if spread or name in PORTS}
+    @cached_property
+    def held(self) -> FloatArray:
+        """Rows (s, n) of the load point and of `PORTS`, whose static shapes a motion holds."""
+        return np.vstack((self.arrays.load_tip, *(self.port_rows[name] for name in PORTS)))
 
     def output_row(self, name: str, component: int = 0) -> FloatArray | None:
         """Return the row (n,) of an output, None if there is no such output.

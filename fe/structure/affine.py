@@ -7,7 +7,7 @@ where acceleration fields act on the free masses too.
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +17,7 @@ from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidStateError, SolutionError
 from fe.runtime.state import losses_of
+from fe.sentences import said
 
 from .tables import StructureDesign
 
@@ -27,38 +28,6 @@ def affine_sum(coefficients: ArrayLike, terms: tuple[Any, ...]) -> Any:
     """Return the sparse matrix sum of `coefficients` times `terms`."""
     first, *others = (factor * term for factor, term in zip(np.asarray(coefficients), terms, strict=True))
     return sum(others, first).tocsr()
-
-
-class AffineSum:
-    """The sums of coefficients times the same sparse terms, the places of their entries found once.
-
-    Five times faster than `affine_sum`; the entries of a row may stand in another order.
-
-    Parameters
-    ----------
-    terms : tuple of csr (n, n)
-        The terms.
-    """
-
-    def __init__(self, terms: tuple[Any, ...]) -> None:
-        self._shape = terms[0].shape
-        rows, columns = self._shape
-        for term in terms:
-            term.sum_duplicates()  # and sorts it, once for whatever else is done with it
-        entries = [term.tocoo() for term in terms]
-        keys = np.concatenate([part.row.astype(np.int64) * columns + part.col for part in entries])
-        found, place = np.unique(keys, return_inverse=True)
-        self._indptr = np.searchsorted(found, columns * np.arange(rows + 1, dtype=np.int64)).astype(np.int32)
-        self._indices = (found % columns).astype(np.int32)
-        # Each entry of the sum is a row, which holds the entry of each term.
-        term_of = np.repeat(np.arange(len(terms)), [part.nnz for part in entries])
-        values = np.concatenate([part.data for part in entries])
-        self._entries = sparse.coo_array((values, (place, term_of)), (len(found), len(terms))).tocsr()
-
-    def matrix(self, coefficients: ArrayLike) -> sparse.csr_array:
-        """Return the sum; its arrays of places are shared with all others."""
-        data = self._entries @ np.asarray(coefficients, dtype=np.float64)
-        return sparse.csr_array((data, self._indices, self._indptr), shape=self._shape)
 
 
 class StiffnessTerm(NamedTuple):
@@ -87,8 +56,6 @@ class AffineStructure:
         What was asked for.
     parameters, masses, controls : dict of str to float
         Nominal values of the parameters [1], free masses [kg] and controls [each in its unit].
-    control_units : dict of str to str
-        Their units.
     ranges : dict of str to (float, float)
         Least and largest value for which a reduced model is to hold, of these and of the losses, by name.
     regions : tuple of str
@@ -109,8 +76,6 @@ class AffineStructure:
         Rows that give a displacement, or with second derivatives an acceleration.
     expansion : csr (full, n)
         Free unknowns to the displacements of all nodes (3 node + component).
-    damping_alpha, damping_beta : float
-        Rayleigh damping [1/s] and [s].
     design_hash : str
         Hash of the design with its mesh.
     """
@@ -119,7 +84,6 @@ class AffineStructure:
     parameters: dict[str, float]
     masses: dict[str, float]
     controls: dict[str, float]
-    control_units: dict[str, str]
     ranges: dict[str, tuple[float, float]]
     regions: tuple[str, ...]
     stiffness_terms: tuple[StiffnessTerm, ...]
@@ -133,9 +97,10 @@ class AffineStructure:
     displacement_output: sparse.csr_array
     acceleration_output: sparse.csr_array
     expansion: sparse.csr_array
-    damping_alpha: float
-    damping_beta: float
     design_hash: str
+
+    followed_load: ClassVar[int | None] = None
+    """Number of the load by which two modes are followed: those that contribute most to its compliance."""
 
     @property
     def unknowns(self) -> int:
@@ -195,12 +160,14 @@ class AffineStructure:
         values : mapping of str to float
             Parameters, losses, free masses and controls; what is left out is nominal, and healthy.
         """
-        parameters, losses, masses = (
-            {name: values[name] for name in names if name in values}
-            for names in (self.parameters, self.regions, self.masses)
-        )
+        parameters, losses, masses = self.parted(values)
         loads = (self.load(name, values.get(control or ""), masses) for name, control in self.loads.items())
         return self.stiffness(parameters, losses), self.mass(masses), sum(loads, np.zeros(self.unknowns))
+
+    def parted(self, values: Values) -> tuple[dict[str, float], ...]:
+        """Return the parameters, the losses and the free masses among values by name."""
+        kinds = (self.parameters, self.regions, self.masses)
+        return tuple({name: values[name] for name in names if name in values} for names in kinds)
 
     def full_displacement(self, free: FloatArray) -> FloatArray:
         """Displacements (nodes, 3) [m] of all nodes from free unknowns (n,)."""
@@ -251,7 +218,6 @@ def designed(
         "parameters": {part.name: part.nominal for part in design.parameter},
         "masses": {part.name: part.mass for part in design.mass if part.free},
         "controls": {part.name: part.nominal for part in design.control},
-        "control_units": {part.name: part.unit for part in design.control},
         "ranges": design.ranges,
         "regions": tuple(part.name for part in design.damage),
         "mass_terms": tuple((restriction @ (own @ expansion)).tocsr() for own in masses.values()),
@@ -262,8 +228,6 @@ def designed(
         "accelerations": tuple(part.name for part in design.acceleration),
         **{f"{key}_output": (rows @ expansion).tocsr() for key, rows in outputs.items()},
         "expansion": expansion,
-        "damping_alpha": design.damping.alpha,
-        "damping_beta": design.damping.beta,
     }
 
 
@@ -271,9 +235,8 @@ def _updated(nominal: dict[str, float], changed: Values | None, what: str) -> di
     """Return the factors of terms by what they are times: of nothing one, then values by name."""
     unknown = set(changed or {}) - set(nominal)
     if unknown:
-        raise InvalidStateError(
-            f"The structure has no {what} named {min(unknown)!r}; there are {', '.join(nominal) or 'none'}."
-        )
+        known = ", ".join(nominal) or "none"
+        raise InvalidStateError(said("structure.unknown", what=what, name=min(unknown), known=known))
     factors: dict[str | None, float] = {None: 1.0}
     factors.update(nominal | dict(changed or {}))
     return factors
@@ -348,10 +311,8 @@ def natural_frequencies(
         If there is no mass, there are not so many modes, or the iteration did not converge.
     """
     if count >= structure.unknowns:
-        raise SolutionError(
-            f"{count} modes were asked for, but a structure of {structure.unknowns} free unknowns gives at "
-            f"most {structure.unknowns - 1}."
-        )
+        most = structure.unknowns - 1
+        raise SolutionError(said("structure.modes", count=count, unknowns=structure.unknowns, most=most))
     stiffness, mass, _ = structure.at(values or {})
     if not mass.diagonal().any():
         raise SolutionError("The structure has no mass, hence no modes; give its materials a density.")

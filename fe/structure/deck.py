@@ -20,16 +20,17 @@ from fe.elements.cells import axes_of
 from fe.elements.kinds import KINDS, ElementKind
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
+from fe.sentences import said
 from reporting.section import shown
 from reporting.text_file import read_text
 from reporting.toml_file import parse_toml
 
 from .mesh import StructureMesh
 
-FLAT = {
-    "vertex": (1, 1), "line": (2, 2), "line3": (3, 2), "triangle": (3, 3), "triangle6": (6, 3),
-    "quad": (4, 4), "quad8": (8, 4), "quad9": (9, 4),
-}  # fmt: skip
+_DIALECTS = parse_toml(
+    resources.files("fe.structure").joinpath("deck_words.toml").read_bytes(), "decks", MeshError
+)
+FLAT: dict[str, list[int]] = _DIALECTS["flat"]
 """Elements that only name nodes and faces, by their names in meshio: how many nodes and corners they have."""
 _MOST_NUMBERS = 5_000_000
 """Numbers that all sets may hold together: a short line can ask for any."""
@@ -50,20 +51,22 @@ class Words(NamedTuple):
         What a word would do, and the remedy: without it the model would be another.
     read : dict of str to list of str
         Words that are read, each with the parameters that are.
+    flat : dict of str to str
+        Elements in `FLAT`, as other programs hand on lines and surfaces: without a section they only name.
     """
 
     mark: str
     harmless: frozenset[str]
     refused: dict[str, str]
     read: dict[str, list[str]]
+    flat: dict[str, str]
 
 
 def words_of(dialect: str) -> Words:
     """Return the words of "abaqus" or "nastran"."""
-    text = resources.files("fe.structure").joinpath("deck_words.toml").read_text(encoding="utf-8")
-    found = parse_toml(text, "deck_words.toml", MeshError)[dialect]
+    found = _DIALECTS[dialect]
     refused = {word: group["remedy"] for group in found["refused"] for word in group["words"]}
-    return Words(found["mark"], frozenset(found["harmless"]), refused, found.get("read", {}))
+    return Words(found["mark"], frozenset(found["harmless"]), refused, found.get("read", {}), found["flat"])
 
 
 def fail(where: str, sentence: str) -> NoReturn:
@@ -193,14 +196,9 @@ class Deck:
         _, first = np.unique(np.sort(cells, axis=1), axis=0, return_index=True)
         twins = np.delete(numbers, first)
         if len(twins):
-            fail(
-                source, f"{len(twins)} elements, such as {twins[0]}, have the nodes of another; delete them."
-            )
+            fail(source, said("deck.twins", count=len(twins), number=twins[0]))
 
         points, own = np.array(list(self.nodes.values())), np.array(list(self.nodes), dtype=np.int64)
-        if not np.isfinite(points).all():
-            number = own[~np.isfinite(points).all(axis=1)][0]
-            fail(source, f"the coordinates of node {number} are not finite numbers.")
         used = np.zeros(len(points), dtype=bool)
         used[cells] = True
         kept = np.where(used, np.cumsum(used) - 1, -1)
@@ -248,14 +246,10 @@ class Deck:
         """Return the one kind of the solid elements."""
         counts = Counter(kind for kind, _ in self.elements.values() if kind not in FLAT)
         if len(counts) != 1 or not counts.keys() <= KINDS.keys():
-            readable = ", ".join(kind.name for kind in KINDS.values())
-            names = {name: KINDS[name].name if name in KINDS else name for name in counts}
-            came = ", ".join(f"{counts[name]} {title}" for name, title in names.items())
-            fail(
-                [str(self.path), *self._solids.values()][-1],
-                f"a whole mesh of one kind of elements is expected ({readable}), but "
-                f"{came or 'none that is solid'} came; mesh it with tetrahedra alone.",
-            )
+            named = {name: kind.name for name, kind in KINDS.items()}
+            came = ", ".join(f"{count} {named.get(name, name)}" for name, count in counts.items())
+            sentence = said("deck.kinds", known=", ".join(named.values()), came=came or "none that is solid")
+            fail([str(self.path), *self._solids.values()][-1], sentence)
         return KINDS[next(iter(counts))]
 
     def _places(self, members: Iterable[int], what: str) -> list[int]:
@@ -276,10 +270,7 @@ class Deck:
             fail(str(self.path), f"the set {name!r} names element {lost}, which is not there.")
         section = self.sections.get(name.casefold())
         if members and section:
-            what = (
-                f"{len(members)} bars, membranes or shells of the set {name!r} have a section and bear loads"
-            )
-            fail(section, f"{what}, but solids alone are read; delete one or the other.")
+            fail(section, said("deck.section", count=len(members), name=name))
         return [(nodes, FLAT[kind][1]) for kind, nodes in map(self.elements.__getitem__, members)]
 
     def _of_surface(

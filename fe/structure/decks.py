@@ -23,13 +23,8 @@ _ABAQUS_COMMENT = re.compile(r"^\s*\*\*.*")
 _ABAQUS_INCLUDE = re.compile(r"\s*\*\s*INCLUDE\s*,\s*INPUT\s*=(.*)", re.IGNORECASE)
 _VARIANT = re.compile(r"(C3D\d+)(?:[IMR]?H?|T)")
 """Reduced, hybrid and other variants are the same cells; they are integrated here as the plain ones."""
-_ABAQUS_FLAT = {
-    "T3D2": "line", "T3D3": "line3", "CPS3": "triangle", "CPS4": "quad", "CPS6": "triangle6", "CPS8": "quad8",
-}  # fmt: skip
-"""Elements by which Gmsh and others hand on lines and surfaces: they only name nodes and faces here."""
-_TYPES = {kind.calculix: (kind.file_type, kind.node_count) for kind in KINDS.values()} | {
-    name: (kind, FLAT[kind][0]) for name, kind in _ABAQUS_FLAT.items()
-}
+_TYPES = {kind.calculix: (kind.file_type, kind.node_count) for kind in KINDS.values()}
+_TYPES |= {name: (kind, FLAT[kind][0]) for name, kind in words_of("abaqus").flat.items()}
 
 
 class _Block(NamedTuple):
@@ -166,12 +161,7 @@ _ORDER = {
     "wedge15": (*range(9), *range(12, 15), *range(9, 12)),
 }
 """Nastran counts the middles of the upright edges before those of the top."""
-_NASTRAN_FLAT = {
-    "CTRIA3": "triangle", "CTRIAR": "triangle", "CTRIA6": "triangle6",
-    "CQUAD4": "quad", "CQUADR": "quad", "CQUAD8": "quad8",
-    "CBAR": "line", "CBEAM": "line", "CROD": "line", "CTUBE": "line",
-}  # fmt: skip
-"""Shells and bars, by which Gmsh and others hand on surfaces and lines: without a property they only name."""
+_NASTRAN_FLAT = words_of("nastran").flat
 _SECTIONS = re.compile("P(BAR|BEAM|BCOMP|COMP|LPLANE|ROD|SHEAR|SHELL|TUBE)[GL]?")
 _SYSTEM = re.compile(r"CORD([12])([RCS])")
 _NASTRAN_COMMENT = re.compile(r"\$.*")
@@ -210,25 +200,52 @@ def read_nastran(path: Path) -> Deck:
         If it cannot be read, or holds what the mesh would lose; the sentence names the line.
     """
     deck = Deck(path, words_of("nastran"))
-    points = _Points()
+    systems, grids, system_of_grids = dict[int, _Card](), dict[int, _Card](), 0
     for card in cards(path):
         word = card.word
         if word == "GRID":
-            if points.grids.setdefault(card.whole(0), card).fields != card.fields:
+            if grids.setdefault(card.whole(0), card).fields != card.fields:
                 fail(card.where, f"the grid point {card.whole(0)} is there twice; delete one.")
         elif word == "GRDSET":
-            points.system_of_grids = card.whole(1)
+            system_of_grids = card.whole(1)
         elif _SYSTEM.fullmatch(word):
             for first in (0, 4) if word[4] == "1" and card.whole(4) else (0,):
-                points.systems[card.whole(first)] = card._replace(fields=card.fields[first:])
+                systems[card.whole(first)] = card._replace(fields=card.fields[first:])
         elif word in _SOLIDS or word in _NASTRAN_FLAT:
             _add_element(deck, card)
         elif _SECTIONS.fullmatch(word):
             deck.sections[f"nastran:ref={card.whole(0)}"] = card.where
         else:
             deck.word(word, card.where)
-    for number, card in points.grids.items():
-        deck.add_node(card.where, number, points.place(number, card.where))
+
+    # Coordinate systems may be given by grid points, and these in other systems.
+    def place(number: int, where: str, depth: int = 0) -> FloatArray:
+        if number not in grids:
+            fail(where, f"the grid point {number} is not there.")
+        card = grids[number]
+        return system(card.whole(1, system_of_grids), card.where, depth).place(card.reals(2, 3))
+
+    known: dict[int, System] = {0: GLOBAL}
+
+    def system(number: int, where: str, depth: int) -> System:
+        if number in known:
+            return known[number]
+        if number not in systems:
+            fail(where, f"the coordinate system {number} is not there.")
+        if depth > _DEEPEST:
+            fail(where, f"the coordinate system {number} rests on itself, or on too many others.")
+        card = systems[number]
+        if card.word[4] == "1":
+            points = np.array([place(card.whole(field), card.where, depth + 1) for field in (1, 2, 3)])
+        else:
+            reference = system(card.whole(1), card.where, depth + 1)
+            points = reference.place(np.reshape(card.reals(2, 9), (3, 3)))
+        axes = frame(card.where, points, (1, 2, 0))  # origin, a point on z, one in the plane of x and z
+        known[number] = System(points[0], axes, card.word[5])
+        return known[number]
+
+    for number, card in grids.items():
+        deck.add_node(card.where, number, place(number, card.where))
     return deck
 
 
@@ -246,40 +263,6 @@ def _add_element(deck: Deck, card: _Card) -> None:
         nodes = [nodes[place] for place in _ORDER.get(kind, range(len(nodes)))]
     deck.add_element(card.where, number, kind, nodes)
     deck.members("ELSET", f"nastran:ref={card.whole(1, number)}").append(number)
-
-
-class _Points:
-    """Grid points and the coordinate systems that they are given in, which may be given by grid points."""
-
-    def __init__(self) -> None:
-        self.grids: dict[int, _Card] = {}
-        self.systems: dict[int, _Card] = {}
-        self.system_of_grids = 0
-        self._found: dict[int, System] = {0: GLOBAL}
-
-    def place(self, number: int, where: str, depth: int = 0) -> FloatArray:
-        """Return the place (3,) of a grid point."""
-        if number not in self.grids:
-            fail(where, f"the grid point {number} is not there.")
-        card = self.grids[number]
-        return self._system(card.whole(1, self.system_of_grids), card.where, depth).place(card.reals(2, 3))
-
-    def _system(self, number: int, where: str, depth: int) -> System:
-        if number not in self._found:
-            if number not in self.systems:
-                fail(where, f"the coordinate system {number} is not there.")
-            if depth > _DEEPEST:
-                fail(where, f"the coordinate system {number} rests on itself, or on too many others.")
-            card = self.systems[number]
-            if card.word[4] == "1":
-                given = [self.place(card.whole(field), card.where, depth + 1) for field in (1, 2, 3)]
-                points = np.array(given)
-            else:
-                reference = self._system(card.whole(1), card.where, depth + 1)
-                points = reference.place(np.reshape(card.reals(2, 9), (3, 3)))
-            axes = frame(card.where, points, (1, 2, 0))  # origin, a point on z, one in the plane of x and z
-            self._found[number] = System(points[0], axes, card.word[5])
-        return self._found[number]
 
 
 def cards(path: Path) -> list[_Card]:

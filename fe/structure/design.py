@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from fe.elements.cells import axes_of, isotropic_compliance, orthotropic_compliance, rotate_elasticity
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.runtime.state import MOST_REGIONS
+from fe.sentences import said
 from reporting.section import checked
 from reporting.toml_file import read_toml
 
@@ -86,6 +87,7 @@ class Gauged(tables.Part):
 SetName = Annotated[str, Field(min_length=1, max_length=200)]
 Poisson = Annotated[float, Field(gt=-1.0, lt=0.5)]
 Spring = Annotated[float, Field(ge=0.0, le=1e15, description="N/m")]
+Springs = tuple[Spring, Spring, Spring] | tuple[Spring, Spring, Spring, Spring, Spring, Spring]
 
 
 def unit_vector(vector: tables.Vector) -> FloatArray:
@@ -132,10 +134,7 @@ class Material(tables.Given):
     @model_validator(mode="after")
     def _is_stable(self) -> "Material":
         if self.axes is not None and np.linalg.eigvalsh(self.compliance)[0] <= 0.0:
-            raise ValueError(
-                "the moduli and Poisson's ratios belong to no stable material: its compliance is not "
-                "positive definite"
-            )
+            raise ValueError(said("design.unstable"))
         return self
 
     @property
@@ -166,9 +165,7 @@ class Support(tables.Part):
 
     set: SetName
     hold: tuple[Literal["x", "y", "z", "rx", "ry", "rz"], ...] = ()
-    springs: tuple[Spring, Spring, Spring] | tuple[Spring, Spring, Spring, Spring, Spring, Spring] | None = (
-        None
-    )
+    springs: Springs | None = None
     rigid_about: tables.Vector | None = None
 
     @model_validator(mode="after")
@@ -176,10 +173,7 @@ class Support(tables.Part):
         springs = self.springs or ()
         turns = len(springs) > 3 or any(name not in tables.MOTIONS[:3] for name in self.hold)
         if self.rigid_about is None and (turns or bool(self.hold) == any(springs)):
-            raise ValueError(
-                'either hold = ["x", "y", "z"] or springs = [x, y, z] in N/m is expected; what turns, '
-                "too, is a rigid set, with the point `rigid_about`"
-            )
+            raise ValueError(said("design.support"))
         if not self.hold and not any(springs):
             raise ValueError("a rigid set needs hold, springs or both")
         for name, spring in zip(tables.MOTIONS, springs, strict=False):
@@ -248,7 +242,11 @@ class MeshDesign(tables.StructureDesign, Gauged):
 
 
 FileName = Annotated[str, Field(min_length=1)]
-Files = Annotated[tuple[FileName, ...], Field(min_length=1)]
+Files = Annotated[
+    tuple[FileName, ...],
+    Field(min_length=1),
+    BeforeValidator(lambda files: (files,) if isinstance(files, str) else files),
+]
 Node = Annotated[int, Field(ge=0)]
 
 
@@ -338,11 +336,6 @@ class MatrixDesign(tables.StructureDesign):
     what = "matrix"
     scaled_table = "part"
 
-    @field_validator("stiffness_matrix", "mass_matrix", mode="before")
-    @classmethod
-    def _one_or_several(cls, files: Any) -> Any:
-        return (files,) if isinstance(files, str) else files
-
     @model_validator(mode="after")
     def _regions_have_parts(self) -> "MatrixDesign":
         self._check_ties("part", "damage", "damage", "is of the region", "has no stiffness: no part names it")
@@ -414,7 +407,6 @@ def structure_hash(design: tables.StructureDesign, folder: Path) -> str:
         try:
             digest.update((folder / name).read_bytes())
         except OSError as error:
-            raise MeshError(
-                f"The {design.what} file {folder / name} cannot be read: {error.strerror}."
-            ) from None
+            place, why = folder / name, error.strerror
+            raise MeshError(said("design.unread", what=design.what, path=place, why=why)) from None
     return digest.hexdigest()

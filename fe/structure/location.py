@@ -5,7 +5,6 @@ nodal displacements.
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +13,7 @@ from scipy import sparse
 from fe.elements.cells import CellMesh
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError
+from fe.sentences import said
 
 from .design import Gauge, Load, Rosette
 from .mesh import StructureMesh, Surface
@@ -62,8 +62,9 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
     near = np.linalg.norm(mesh.centres - point, axis=1) <= 1.001 * mesh.cell_radius
     kind, cells = mesh.kind, np.flatnonzero(near)
     start = np.tile(np.mean(kind.corners, axis=0), (len(cells), 1))
+    axes = np.tile(np.eye(3), (len(cells), 1, 1))
     local, residual, _ = _nearest(
-        mesh, cells, point, start, lambda place: (place, np.eye(3)), lambda place: np.clip(place, -2.0, 3.0)
+        mesh, cells, point, start, 0.0, axes, lambda place: np.clip(place, -2.0, 3.0)
     )
     inside = kind.inside(local, _INSIDE) & (np.linalg.norm(residual, axis=1) <= 1e-9 * mesh.size)
     if inside.any():
@@ -78,7 +79,8 @@ def _nearest(
     cells: IntArray,
     point: FloatArray,
     along: FloatArray,
-    places: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    corner: FloatArray | float,
+    tangents: FloatArray,
     kept: Callable[[FloatArray], FloatArray],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Find the places in cells (n,) that are nearest to a point, by Gauss and Newton.
@@ -93,8 +95,8 @@ def _nearest(
         The point.
     along : (n, t)
         Coordinates to start from.
-    places : callable
-        Returns local places (n, 3) at coordinates, and their derivatives (t, 3).
+    corner, tangents : (n, 3), (n, t, 3)
+        Local places where the coordinates are zero, and how they go on along each.
     kept : callable
         Returns the nearest coordinates that are allowed.
 
@@ -105,14 +107,16 @@ def _nearest(
     """
     nodes, moved = mesh.nodes[cells], np.inf
     for step in range(_STEPS + 1):
-        local, tangents = places(along)
+        local = corner + np.einsum("nt,ntj->nj", along, tangents)
         values, slopes = mesh.kind.shape_functions(local)
         residual = point - np.einsum("na,nai->ni", values, nodes)
-        edges = np.einsum("nai,naj,tj->nti", nodes, slopes, tangents)
+        edges = np.einsum("nai,naj,ntj->nti", nodes, slopes, tangents)
         if step == _STEPS or moved < 1e-14:
             break
         gram = edges @ edges.swapaxes(1, 2)
-        if len(tangents) == 3:  # outside its cell the map may fold: no solution, wherever the next step leads
+        if (
+            along.shape[1] == 3
+        ):  # outside its cell the map may fold: no solution, wherever the next step leads
             gram[np.linalg.det(gram) == 0.0] = np.eye(3)
         move = np.linalg.solve(gram, edges @ residual[..., None])[..., 0]
         before, along = along, kept(along + move)
@@ -131,28 +135,23 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     kind, surface, (centre, radius) = mesh.kind, mesh.boundary, mesh.face_spheres
     away = np.linalg.norm(centre - point, axis=1)
     near = np.flatnonzero(away - 1.1 * radius <= away.min())
-    cells = surface.cell[near]
-    local, residual, edges = (np.empty((len(near), *shape)) for shape in ((3,), (3,), (2, 3)))
-    for number in np.unique(surface.face[near]).tolist():
-        on, triangle = np.flatnonzero(surface.face[near] == number), len(kind.faces[number]) == 3
-        local[on], residual[on], edges[on] = _nearest(
-            mesh,
-            cells[on],
-            point,
-            np.full((len(on), 2), 1.0 / 3.0 if triangle else 0.5),
-            partial(kind.face_places, number),
-            _on_triangle if triangle else lambda along: np.clip(along, 0.0, 1.0),
-        )
+    cells, (corner, tangents) = surface.cell[near], (part[surface.face[near]] for part in kind.face_frames)
+    triangle = np.array([len(face) == 3 for face in kind.faces])[surface.face[near]]
+
+    def kept(along: FloatArray) -> FloatArray:
+        return np.where(triangle[:, None], _on_triangle(along), np.clip(along, 0.0, 1.0))
+
+    start = np.where(triangle[:, None], 1.0 / 3.0, [0.5, 0.5])
+    local, residual, edges = _nearest(mesh, cells, point, start, corner, tangents, kept)
     distance, normal = np.linalg.norm(residual, axis=1), np.cross(edges[:, 0], edges[:, 1])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     best = int(distance.argmin())
     size = float(radius[near[best]])
     if distance[best] > FARTHEST * size:
-        inside = float(residual[best] @ normal[best]) < 0.0
+        inside = ", inside" if float(residual[best] @ normal[best]) < 0.0 else ""
+        far, place = distance[best] / mesh.unit, mesh.place(point - residual[best])
         raise InvalidDesignError(
-            f"{where} lies {distance[best] / mesh.unit:.3g} {mesh.unit_name} off the surface of "
-            f"{mesh.source}{', inside' if inside else ''}; the nearest point of the surface is "
-            f"{mesh.place(point - residual[best])}."
+            said("mesh.off", where=where, distance=far, mesh=mesh, inside=inside, place=place)
         )
     same = (distance <= distance[best] + _SAME_PLACE * size) & (normal @ normal[best] > _SAME_SIDE)
     mean = normal[same].mean(axis=0)
@@ -181,7 +180,8 @@ def face_areas(mesh: CellMesh, surface: Surface) -> tuple[FloatArray, FloatArray
     for number in np.unique(surface.face).tolist():
         cells = surface.cell[surface.face == number]
         along, weight = kind.face_rule(number)
-        local, tangents = kind.face_places(number, along)
+        corner, tangents = (part[number] for part in kind.face_frames)
+        local = corner + along @ tangents
         values, slopes = kind.shape_functions(local)
         edges = np.einsum("nai,qaj,tj->nqti", mesh.nodes[cells], slopes, tangents, optimize=True)
         normals = np.cross(edges[:, :, 0], edges[:, :, 1]) * weight[:, None]
@@ -256,15 +256,11 @@ def gauge_rows(mesh: StructureMesh, gauges: tuple[Gauge, ...]) -> tuple[sparse.c
         if gauge.length or gauge.width:
             inside, corners = _spots(mesh, gauge, direction, np.cross(found.normal, direction))
             wide = f" and {gauge.width:g} {mesh.unit_name} wide" if gauge.width else ""
-            spots = [
-                on_surface(
-                    mesh,
-                    point + off,
-                    f"{where}: {gauge.length:g} {mesh.unit_name} long{wide}, the gauge reaches over the "
-                    f"edge; its point {mesh.place(point + off)}",
-                )
-                for off in (*inside, *corners)
-            ][: len(inside)]
+            over = said("mesh.edge", where=where, gauge=gauge, mesh=mesh, wide=wide)
+            places = [point + off for off in (*inside, *corners)]
+            spots = [on_surface(mesh, place, f"{over} {mesh.place(place)}") for place in places][
+                : len(inside)
+            ]
         for spot in spots:
             along = _in_surface(direction, spot.normal, where)
             share = 1.0 / (len(spots) * len(spot.cell))  # the mean of the cells that meet there
@@ -293,10 +289,9 @@ def _in_surface(direction: FloatArray, normal: FloatArray, where: str) -> FloatA
     direction = direction / np.linalg.norm(direction)
     angle = float(np.degrees(np.arcsin(min(1.0, abs(float(direction @ normal))))))
     if angle > STEEPEST:
+        towards = ", ".join(f"{value + 0.0:.3g}" for value in normal)
         raise InvalidDesignError(
-            f"{where}: its direction points {angle:.0f} degrees out of the surface, whose normal there is "
-            f"({', '.join(f'{value + 0.0:.3g}' for value in normal)}); at most {STEEPEST:g} degrees are "
-            "allowed."
+            said("mesh.direction", where=where, angle=angle, normal=towards, most=STEEPEST)
         )
     inside = direction - (direction @ normal) * normal
     return np.asarray(inside / np.linalg.norm(inside))

@@ -16,9 +16,10 @@ from scipy import sparse
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError, SolutionError
+from fe.sentences import said
 
 from .affine import AffineStructure, StiffnessTerm, designed
-from .design import Extension, MatrixDesign, MatrixLoad, MatrixMass, NodeOutput, unit_vector
+from .design import Extension, MatrixDesign, MatrixLoad, MatrixMass, unit_vector
 from .matrix_files import Place, read_matrix, read_unknowns, read_vector
 from .tables import MOTIONS, Vector
 
@@ -74,10 +75,9 @@ class Matrices:
         if place not in self.rows:
             node, component = place
             own = ", ".join(str(other) for number, other in sorted(self.rows) if number == node)
+            known = f"its components {own}" if own else "no such node"
             raise MeshError(
-                f"{where}: node {node} has no component {component} in the matrices, which know "
-                f"{f'its components {own}' if own else 'no such node'}; what is held or tied when they are "
-                "written is not among them: name another node."
+                said("matrices.component", where=where, node=node, component=component, known=known)
             )
         return self.rows[place]
 
@@ -91,10 +91,7 @@ class Matrices:
         """
         own, found = self.rows_of(place, where), np.zeros(len(self.places))
         if len(own) not in shares:
-            raise MeshError(
-                f"{where}: node {place[0]} has {len(own)} rows of component {place[1]}, and how these share "
-                "what acts on the node is not known; name another node, or give a vector."
-            )
+            raise MeshError(said("matrices.rows", where=where, place=place, count=len(own)))
         found[own] = shares[len(own)]
         return found
 
@@ -106,10 +103,7 @@ class Matrices:
     def everywhere(self, field: Vector, where: str) -> FloatArray:
         """Vector (n,) of a shift of all nodes; raises `MeshError` where turns may look like shifts."""
         if len(self.rows) < len(self.places):
-            raise MeshError(
-                f"{where}: several rows of the matrices carry one name, as those of expanded shells and "
-                "beams do, and rows that turn cannot be told from rows that shift; give the load as a vector."
-            )
+            raise MeshError(said("matrices.turns", where=where))
         return np.array([[*field, 0.0, 0.0, 0.0][component - 1] for _, component in self.places])
 
     def vector(self, name: str, where: str, shares: Shares = READ) -> FloatArray:
@@ -135,21 +129,15 @@ class Matrices:
         if partial and matrix.shape[0] < size:
             matrix.resize((size, size))
         if matrix.shape[0] != size:
-            raise MeshError(
-                f"{place} has {matrix.shape[0]} rows, but there are {size} unknowns; matrices and unknowns "
-                "must be of the same run."
-            )
+            raise MeshError(said("matrices.size", where=place, rows=matrix.shape[0], size=size))
         largest = abs(matrix).max() if matrix.nnz else 0.0
         if not np.isfinite(largest):
             raise MeshError(f"{place} holds a number that is not finite.")
         skew = abs(matrix - matrix.T).tocoo()
         if skew.nnz and skew.max() > _UNSYMMETRIC * largest:
             worst = int(skew.data.argmax())
-            first, second = (_named(self.places[int(axis[worst])]) for axis in skew.coords)
-            raise MeshError(
-                f"{place} is not symmetric: its entries between {first} and {second} differ by "
-                f"{skew.data[worst]:.3g}; friction, follower loads and gyroscopic terms cannot be taken."
-            )
+            both = [_named(self.places[int(axis[worst])]) for axis in skew.coords]
+            raise MeshError(said("matrices.skew", where=place, both=both, apart=skew.data[worst]))
         return sparse.csr_array(0.5 * (matrix + matrix.T))
 
 
@@ -168,9 +156,9 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
         for key in ("stiffness_matrix", "mass_matrix")
     )
     moves = (stiffness.diagonal() != 0.0) | (mass.diagonal() != 0.0)
-    for number, part in enumerate(design.support, start=1):
+    for where, part in design.numbered("support"):
         for node, motion in itertools.product(part.nodes, part.hold):
-            moves[files.rows_of((node, MOTIONS.index(motion) + 1), f"support[{number}]")] = False
+            moves[files.rows_of((node, MOTIONS.index(motion) + 1), where)] = False
     free = np.flatnonzero(moves)
     if not len(free):
         raise MeshError(f"{folder}: the matrices have no row that is free and has stiffness or mass.")
@@ -180,8 +168,8 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
         design,
         sparse.eye_array(len(moves), format="csc")[:, free].tocsr(),
         mass,
-        (_point_mass(part, design.unit, files, f"mass[{n}]") for n, part in enumerate(design.mass, start=1)),
-        (_load(part, design.unit, files, f"load[{n}]") for n, part in enumerate(design.load, start=1)),
+        (_point_mass(part, design.unit, files, where) for where, part in design.numbered("mass")),
+        (_load(part, design.unit, files, where) for where, part in design.numbered("load")),
         {
             key: sparse.csr_array(np.array([*_rows(design, files, key)]).reshape(-1, len(moves)))
             for key in ("gauge", "displacement", "acceleration")
@@ -201,10 +189,7 @@ def _places(design: MatrixDesign, folder: Path) -> list[Place]:
     for name in design.stiffness_matrix:
         _, own = read_matrix(folder, name)
         if own is None:
-            raise MeshError(
-                f"{folder / name} does not say which node and component each row is; name a file with a line "
-                "for each row, such as `97.3`, by the key unknowns."
-            )
+            raise MeshError(said("matrices.unnamed", path=folder / name))
         found.update(own)
     return sorted(found)
 
@@ -230,9 +215,8 @@ def _load(load: MatrixLoad, unit: float, files: Matrices, where: str) -> FloatAr
 
 def _rows(design: MatrixDesign, files: Matrices, key: str) -> Iterator[FloatArray]:
     """Yield the rows (n,) of outputs, displacements and accelerations in metres."""
-    parts: tuple[Extension | NodeOutput, ...] = getattr(design, key)
-    for number, part in enumerate(parts, start=1):
-        where, scale = f"{key}[{number}] ({part.name})", 1.0 if key == "gauge" else design.unit
+    for place, part in design.numbered(key):
+        where, scale = f"{place} ({part.name})", 1.0 if key == "gauge" else design.unit
         if part.vector is not None:
             yield scale * files.vector(part.vector, where)
             continue
@@ -261,22 +245,17 @@ def _stiffness_terms(
 ) -> Iterator[StiffnessTerm]:
     """Yield the parts, then what they leave of the whole; each at least semidefinite."""
     rest, nominal = whole, {part.name: part.nominal for part in design.parameter}
-    for number, part in enumerate(design.part, start=1):
-        where = f"part[{number}]"
+    for where, part in design.numbered("part"):
         if part.changed is not None and part.times is not None:
             own = (whole - files.matrix(part.changed, where)) / (1.0 - part.times)
         else:
             own = files.matrix(str(part.matrix), where, partial=True)
         rest = rest - own
-        inside = _part_of(
-            whole, own, free, f"{where} takes stiffness away somewhere; its file is of another run or part"
-        )
+        inside = _part_of(whole, own, free, said("matrices.softened", where=where))
         if not inside.nnz:
             raise MeshError(f"{where} has no stiffness: its matrix changes nothing that is free.")
         yield StiffnessTerm(inside / nominal.get(part.scaled_by or "", 1.0), part.scaled_by, part.damage)
-    left = _part_of(
-        whole, rest, free, "the parts are together stiffer than the whole; two parts must not overlap"
-    )
+    left = _part_of(whole, rest, free, said("matrices.overlap"))
     if left.nnz:
         yield StiffnessTerm(left)
 
@@ -297,7 +276,7 @@ def _check_definite(matrix: sparse.csr_array, sentence: str) -> None:
     try:
         Factorisation(sparse.csr_array(matrix))
     except SolutionError:
-        raise MeshError(f"{sentence}.") from None
+        raise MeshError(sentence) from None
 
 
 def _check_whole(stiffness: sparse.csr_array, mass: sparse.csr_array, places: list[Place]) -> None:
@@ -316,21 +295,15 @@ def _check_whole(stiffness: sparse.csr_array, mass: sparse.csr_array, places: li
     except SolutionError:
         _refuse_singular(stiffness, places)
     floor = np.where(heavy > 0.0, heavy, heavy.mean() or 1.0)
-    sentence = "the mass matrix is indefinite: some motion of the structure has negative mass"
-    _check_definite(mass + sparse.diags_array(1e-6 * floor), sentence)
+    _check_definite(mass + sparse.diags_array(1e-6 * floor), said("matrices.indefinite_mass"))
 
 
 def _refuse_singular(stiffness: sparse.csr_array, places: list[Place]) -> None:
     """Say which motions a stiffness that cannot be solved with leaves free, or that it is indefinite."""
     scale, identity = sparse.diags_array(1.0 / np.sqrt(stiffness.diagonal())), sparse.eye_array(len(places))
     lifted = sparse.csr_array(scale @ stiffness @ scale + _INDEFINITE * identity)
-    _check_definite(
-        lifted, "the stiffness is indefinite: some motion of the structure has negative stiffness"
-    )
+    _check_definite(lifted, said("matrices.indefinite_stiffness"))
     values, shapes = lowest_eigenpairs(lifted, identity, min(_MOST_FREE, len(places) - 1))
     free = int((values < _INDEFINITE + _FREE).sum())
     moved = int(np.abs(scale @ shapes[:, 0]).argmax())
-    raise MeshError(
-        f"motions that the stiffness leaves free, or nearly: {free or 1}; in one {_named(places[moved])} "
-        "moves most. Hold the structure by [[support]], or before its matrices are written."
-    )
+    raise MeshError(said("matrices.free", count=free or 1, place=_named(places[moved])))

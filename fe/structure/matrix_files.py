@@ -18,6 +18,7 @@ from scipy import sparse
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import MeshError
+from fe.sentences import said
 from reporting.text_file import read_text
 
 from .deck import fail
@@ -45,10 +46,7 @@ def read_unknowns(path: Path) -> list[Place]:
         if match is not None:
             found.append((int(match[1]), int(match[2])))
         elif line.strip():
-            fail(
-                f"{path}, line {number}",
-                f"a node and its component from 1 to 6 are expected, but {line!r} came.",
-            )
+            fail(f"{path}, line {number}", said("matrices.unknowns", came=line))
     return found
 
 
@@ -72,11 +70,7 @@ def read_matrix(folder: Path, name: str) -> tuple[sparse.csr_array, list[Place] 
         return sparse.csr_array(table, dtype=np.float64), None
     width = table.shape[1]
     if width not in (3, 5) or not table.size or not np.array_equal(table[:, :-1], np.rint(table[:, :-1])):
-        fail(
-            str(path),
-            "lines of row, column and value, or of node, component, node, component and value, are expected, "
-            f"but {table.shape[0]} lines of {width} numbers came.",
-        )
+        fail(str(path), said("matrices.lines", count=len(table), width=width))
     whole, places = table[:, :-1].astype(np.int64), None
     if width == 5:
         own, number = np.unique(whole.reshape(-1, 2), axis=0, return_inverse=True)
@@ -120,11 +114,7 @@ def read_vector(folder: Path, name: str, named: Callable[[Place], FloatArray], s
         return np.asarray(np.sum(parts, axis=0))
     values = np.asarray(found.todense() if sparse.issparse(found) else found, dtype=np.float64)
     if values.size != size or max(values.shape) != size:
-        fail(
-            str(folder / file),
-            f"a vector of {size} numbers, or lines of node, component and value, are expected, but an array "
-            f"of shape {values.shape} came.",
-        )
+        fail(str(folder / file), said("matrices.vector", size=size, shape=values.shape))
     return values.ravel()
 
 

@@ -3,10 +3,10 @@
 Last what its supports hold, what springs they set, what is rigid, and whether it is free to move.
 """
 
-from collections.abc import Sized
+from collections.abc import Iterable, Sized
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -14,6 +14,7 @@ from scipy import sparse
 from fe.elements.cells import CellMesh
 from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import MeshError
+from fe.sentences import said
 
 from .design import MeshDesign, Support
 from .tables import MOTIONS
@@ -113,17 +114,19 @@ class StructureMesh(CellMesh):
         centre, radius = np.empty((len(surface), 3)), np.empty(len(surface))
         for number, nodes in enumerate(self.kind.face_nodes):
             on = np.flatnonzero(surface.face == number)
-            middle = np.full((1, 2), 1.0 / 3.0 if len(self.kind.faces[number]) == 3 else 0.5)
-            values, _ = self.kind.shape_functions(self.kind.face_places(number, middle)[0])
-            points = self.nodes[surface.cell[on]]
-            centre[on] = np.einsum("a,nai->ni", values[0], points)
-            radius[on] = np.linalg.norm(points[:, list(nodes)] - centre[on, None], axis=2).max(axis=1)
+            points = self.nodes[surface.cell[on]][:, list(nodes)]
+            centre[on] = points.mean(axis=1)
+            radius[on] = np.linalg.norm(points - centre[on, None], axis=2).max(axis=1)
         return centre, radius
 
     def place(self, point: FloatArray) -> str:
         """Return a place [m] as it stands in a sentence, in the unit of the file."""
         text = ", ".join(f"{value / self.unit + 0.0:.6g}" for value in point)
         return f"({text}) {self.unit_name}"
+
+    def cell(self, number: int) -> str:
+        """Return a cell as it stands in a sentence: its number in the file, and where it is."""
+        return f"{self.cell_numbers[number]} at {self.place(self.centres[number])}"
 
     def cells_of(self, name: str, where: str) -> IntArray:
         """Cells (m,) of a set; `where` is the place in the design, for the sentence.
@@ -149,21 +152,15 @@ class StructureMesh(CellMesh):
         found = self._content(self.node_sets, name, "nodes or faces", "node", where)
         left_out = int((found < 0).sum())
         if left_out:
-            raise MeshError(
-                f"{where}: {left_out} of the nodes of the set {name!r} of {self.source} touch no cell; take "
-                "them out of the set."
-            )
+            raise MeshError(said("mesh.loose", where=where, count=left_out, name=name, mesh=self))
         return found
 
     def _content(self, sets: dict[str, _Content], name: str, kind: str, member: str, where: str) -> _Content:
         found = _named(sets, name)
         if found is None:
-            names = [*sets]
-            more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-            raise MeshError(
-                f"{where}: {self.source} holds no set of {kind} named {name!r}; there are "
-                f"{', '.join(names[:_LISTED]) or 'none'}{more}."
-            )
+            more = f" and {len(sets) - _LISTED} more" if len(sets) > _LISTED else ""
+            known = (", ".join([*sets][:_LISTED]) or "none") + more
+            raise MeshError(said("mesh.unknown", where=where, mesh=self, kind=kind, name=name, known=known))
         if not len(found):
             raise MeshError(f"{where}: the set {name!r} of {self.source} holds no {member}.")
         return found
@@ -178,10 +175,7 @@ class StructureMesh(CellMesh):
         """
         surface = self.faces_between(name, self.nodes_of(name, where))
         if not len(surface):
-            raise MeshError(
-                f"{where}: no face of the surface lies in the set {name!r} of {self.source}; a set of faces, "
-                "or all nodes of the faces, is expected."
-            )
+            raise MeshError(said("mesh.faces", where=where, name=name, mesh=self))
         return surface
 
     def faces_between(self, name: str, nodes: IntArray) -> Surface:
@@ -206,9 +200,8 @@ _FREE = 1e-8
 """A rigid motion that the supports resist by less than this share of the stiffest one is free."""
 
 
-@dataclass(frozen=True)
-class RigidSet:
-    """Nodes (m,) that move as a rigid body.
+class RigidSet(NamedTuple):
+    """Nodes that move as a rigid body.
 
     Attributes
     ----------
@@ -216,72 +209,68 @@ class RigidSet:
         Numbers of the nodes.
     point : (3,) m
         About which it turns.
-    motions : (3 m, 6)
-        Displacements of the nodes by 1 m along x, y, z and 1 rad about them.
     held : (6,) bool
-        Motions that are held.
+        Motions along x, y, z and about them that are held.
     springs : (6,) N/m, N m/rad
         Springs to the ground.
     """
 
     nodes: IntArray
     point: FloatArray
-    motions: FloatArray
     held: BoolArray
     springs: FloatArray
 
 
-@dataclass(frozen=True)
-class SupportedUnknowns:
-    """Held displacements and springs of all unknowns (3 node + component), and rigid sets.
+class Supports(NamedTuple):
+    """The n free unknowns: displacements, then the motions of rigid sets by 1 m and 1 rad.
 
     Attributes
     ----------
-    held : (full,) bool
-        Whether a displacement is held at zero.
-    springs : (full,) N/m
+    expansion : csr (full, n)
+        Free unknowns to the displacements of all nodes (3 node + component).
+    alone : (f,)
+        Displacements that are free unknowns by themselves, the first of these.
+    springs : (n,) N/m, N m/rad
         Springs to the ground.
-    rigid : tuple of RigidSet
-        Their nodes are not among the held ones.
     """
 
-    held: BoolArray
+    expansion: sparse.csr_array
+    alone: IntArray
     springs: FloatArray
-    rigid: tuple[RigidSet, ...] = ()
-
-    @cached_property
-    def alone(self) -> IntArray:
-        """Unknowns (f,) that are free by themselves."""
-        found = ~self.held
-        for part in self.rigid:
-            found[_unknowns(part.nodes)] = False
-        return np.flatnonzero(found)
-
-    @cached_property
-    def expansion(self) -> sparse.csr_array:
-        """Free unknowns to all unknowns, csr (full, n); the motions of rigid sets come last."""
-        size, count = len(self.held), len(self.alone)
-        parts = [sparse.coo_array((np.ones(count), (self.alone, np.arange(count))), (size, count))]
-        for part in self.rigid:
-            moving = sparse.coo_array(part.motions[:, ~part.held])
-            rows = _unknowns(part.nodes)[moving.row]
-            parts.append(sparse.coo_array((moving.data, (rows, moving.col)), (size, moving.shape[1])))
-        return sparse.hstack(parts).tocsr()
 
     @property
     def stiffness(self) -> sparse.csr_array:
-        """Stiffness (n, n) of the springs on the free unknowns."""
-        ground = self.expansion.T @ sparse.diags_array(self.springs) @ self.expansion
-        turns = [part.springs[~part.held] for part in self.rigid]
-        own = np.concatenate([np.zeros(len(self.alone)), *turns])
-        return sparse.csr_array(ground + sparse.diags_array(own))
+        """Stiffness (n, n) of the springs."""
+        return sparse.diags_array(self.springs).tocsr()
 
 
-def _unknowns(nodes: IntArray) -> IntArray:
-    return np.asarray(3 * nodes[:, None] + np.arange(3)).ravel()
+def supports(
+    points: FloatArray, held: BoolArray, springs: FloatArray, bodies: Iterable[RigidSet]
+) -> Supports:
+    """Return what is free of nodes, of which some are held, sprung or rigid.
+
+    Parameters
+    ----------
+    points : (nodes, 3) m
+        Places of the nodes.
+    held, springs : (nodes, 3) bool, (nodes, 3) N/m
+        Displacements that are held, and springs to the ground, of nodes that belong to no rigid set.
+    bodies : iterable of RigidSet
+        The rigid sets.
+    """
+    free, moved, stiff = ~held, [], []
+    for body in bodies:
+        free[body.nodes] = False
+        moving = sparse.coo_array(rigid_motions(points[body.nodes], body.point, 2.0)[:, ~body.held])
+        places = (3 * body.nodes[moving.row // 3] + moving.row % 3, moving.col)
+        moved.append(sparse.coo_array((moving.data, places), (free.size, moving.shape[1])))
+        stiff.append(body.springs[~body.held])
+    alone = np.flatnonzero(free)
+    expansion = sparse.hstack((sparse.eye_array(free.size, format="csc")[:, alone], *moved))
+    return Supports(expansion.tocsr(), alone, np.concatenate((springs.ravel()[alone], *stiff)))
 
 
-def supported(design: MeshDesign, mesh: StructureMesh) -> SupportedUnknowns:
+def supported(design: MeshDesign, mesh: StructureMesh) -> Supports:
     """Collect the supports of a design.
 
     Raises
@@ -293,7 +282,7 @@ def supported(design: MeshDesign, mesh: StructureMesh) -> SupportedUnknowns:
     rigid: dict[str, RigidSet] = {}
     held = np.zeros((len(mesh.points), 3), dtype=bool)
     springs = np.zeros((len(mesh.points), 3))
-    for where, part in ((f"support[{number}]", part) for number, part in enumerate(design.support, start=1)):
+    for where, part in design.numbered("support"):
         nodes = mesh.nodes_of(part.set, where)
         if part.rigid_about is not None:
             rigid[where] = _rigid_set(part, mesh, nodes, where)
@@ -306,26 +295,22 @@ def supported(design: MeshDesign, mesh: StructureMesh) -> SupportedUnknowns:
     for where, body in rigid.items():
         shared = body.nodes[taken[body.nodes]]
         if len(shared):
-            raise MeshError(
-                f"{where}: {len(shared)} nodes of the rigid set belong to another support, too, such as that "
-                f"at {mesh.place(mesh.points[shared[0]])}; say what holds it in its own table."
-            )
+            place = mesh.place(mesh.points[shared[0]])
+            raise MeshError(said("mesh.rigid_shared", where=where, count=len(shared), place=place))
         taken[body.nodes] = True
     bodies = tuple(rigid.values())
     _check_rigid_motions(mesh, held, springs, bodies)
-    return SupportedUnknowns(held.ravel(), springs.ravel(), bodies)
+    return supports(mesh.points, held, springs, bodies)
 
 
 def _rigid_set(part: Support, mesh: StructureMesh, nodes: IntArray, where: str) -> RigidSet:
     point = mesh.unit * np.asarray(part.rigid_about)
     motions = rigid_motions(mesh.points[nodes], point, 2.0)
     if np.linalg.matrix_rank(motions, _FREE * np.linalg.norm(motions)) < len(MOTIONS):
-        raise MeshError(
-            f"{where}: the nodes of the rigid set {part.set!r} lie on a line, about which it could turn."
-        )
+        raise MeshError(said("mesh.rigid", where=where, name=part.set))
     springs = np.zeros(len(MOTIONS))
     springs[: len(part.springs or ())] = part.springs or ()
-    return RigidSet(nodes, point, motions, np.isin(MOTIONS, part.hold), springs)
+    return RigidSet(nodes, point, np.isin(MOTIONS, part.hold), springs)
 
 
 def rigid_motions(points: FloatArray, centre: FloatArray, size: float) -> FloatArray:
@@ -352,10 +337,8 @@ def _check_rigid_motions(
     _, values, directions = np.linalg.svd(np.vstack((resisted, np.zeros((6, 6)))), full_matrices=False)
     free = directions[values <= _FREE * max(float(values[0]), 1e-300)]
     if len(free):
-        raise MeshError(
-            f"{mesh.source}: the supports leave {len(free)} of the six rigid motions free, among them "
-            f"{_described(free[0], mesh, centre)}; hold further directions."
-        )
+        motion = _described(free[0], mesh, centre)
+        raise MeshError(said("mesh.free", mesh=mesh, count=len(free), motion=motion))
 
 
 def _described(motion: FloatArray, mesh: StructureMesh, centre: FloatArray) -> str:

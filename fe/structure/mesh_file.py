@@ -19,6 +19,7 @@ from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.full.factorisation import analyse
 from fe.runtime.arrays import IntArray
 from fe.runtime.errors import MeshError
+from fe.sentences import said
 from reporting.memory import memory_left
 
 from .deck import FLAT, Deck
@@ -54,10 +55,8 @@ def read_mesh(path: Path, unit: float, unit_name: str) -> StructureMesh:
         Jacobian, a mid-edge node far from its edge, parts that do not hang together.
     """
     if not path.is_file():
-        raise MeshError(
-            f"The mesh file {path} is {'a folder' if path.is_dir() else 'not there'}; `mesh` must name it as "
-            "seen from the structure file."
-        )
+        what = "a folder" if path.is_dir() else "not there"
+        raise MeshError(said("mesh.missing", path=path, what=what))
     if not path.stat().st_size:
         raise MeshError(f"The mesh file {path} is empty; write it anew.")
     mesh = _READERS.get(path.suffix.lower(), read_by_meshio)(path).mesh(unit, unit_name)
@@ -75,11 +74,8 @@ def _check_edges(mesh: StructureMesh) -> None:
         far = shift > LARGEST_EDGE_SHIFT * np.linalg.norm(end - start, axis=1)
         if far.any():
             cell = int(far.argmax())
-            raise MeshError(
-                f"{mesh.source}: node {mesh.node_numbers[mesh.cells[cell, first + number]]} of element "
-                f"{mesh.cell_numbers[cell]} at {mesh.place(mesh.centres[cell])} lies far from the middle of "
-                "its edge; the nodes of the element stand in another order, or the edge is bent too much."
-            )
+            node = mesh.node_numbers[mesh.cells[cell, first + number]]
+            raise MeshError(said("mesh.bent", mesh=mesh, node=node, cell=mesh.cell(cell)))
 
 
 def _check_jacobians(mesh: StructureMesh) -> None:
@@ -88,12 +84,8 @@ def _check_jacobians(mesh: StructureMesh) -> None:
     least = np.concatenate([np.linalg.det(jacobians(mesh.kind, part, local)).min(axis=1) for part in parts])
     bad = ~((least > 0.0) & (least < np.inf))
     if bad.any():
-        worst = int(least.argmin())
-        raise MeshError(
-            f"{mesh.source}: {bad.sum()} of {len(bad)} elements are inside out or flat (their Jacobian is "
-            f"not positive everywhere), the worst is element {mesh.cell_numbers[worst]} at "
-            f"{mesh.place(mesh.centres[worst])}."
-        )
+        worst, count = mesh.cell(int(least.argmin())), bad.sum()
+        raise MeshError(said("mesh.inverted", mesh=mesh, count=count, all=len(bad), cell=worst))
 
 
 def _check_parts(mesh: StructureMesh) -> None:
@@ -105,11 +97,8 @@ def _check_parts(mesh: StructureMesh) -> None:
         part = part[mesh.cells[:, 0]]
         cells = np.bincount(part, minlength=count)
         first = int((part == cells.argmin()).argmax())
-        raise MeshError(
-            f"{mesh.source}: the mesh falls into {count} parts that share no node; the smallest, of "
-            f"{cells.min()} elements, is around {mesh.place(mesh.centres[first])}. Merge the nodes where "
-            "the parts touch, or leave parts out."
-        )
+        place = mesh.place(mesh.centres[first])
+        raise MeshError(said("mesh.parts", mesh=mesh, count=count, cells=cells.min(), place=place))
 
 
 def read_by_meshio(path: Path) -> Deck:
@@ -140,44 +129,37 @@ def read_by_meshio(path: Path) -> Deck:
         ("ELSET", numbers, found.cell_sets, found.cell_data),
         ("NSET", [np.array(list(deck.nodes))], point_sets, point_data),
     ):
-        named = [
-            (name, number, np.asarray(chosen, dtype=np.int64))
-            for name, parts in sets.items()
-            for number, chosen in enumerate(parts)
-            if chosen is not None and not name.startswith("gmsh:")
-        ]
-        named += [
-            (name, number, chosen)
-            for label, arrays in data.items()
-            for number in range(len(members))
-            for name, chosen in _named(found, label, arrays, number)
-            if name not in sets
-        ]
-        for name, number, chosen in named:
-            deck.members(key, name).extend(members[number][chosen].tolist())
+        for number, own in enumerate(members):
+            named = [
+                (name, np.asarray(parts[number], dtype=np.int64))
+                for name, parts in sets.items()
+                if parts[number] is not None and not name.startswith("gmsh:")
+            ]
+            for label, arrays in data.items():
+                tagged = _named(found, label, arrays, number)
+                named += [(name, places) for name, places in tagged if name not in sets]
+            for name, places in named:
+                deck.members(key, name).extend(own[places].tolist())
     return deck
 
 
 def _found_by_meshio(path: Path) -> Any:
     """Return what meshio reads of a file, or say in one sentence why it does not."""
-    said = io.StringIO()
+    printed = io.StringIO()
     try:
         # meshio writes what it thinks of a file to the terminal, and ends the program where it fails.
         with (
             contextlib.redirect_stdout(io.StringIO()),
-            contextlib.redirect_stderr(said),
+            contextlib.redirect_stderr(printed),
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore")
             return meshio_with_wedges().read(path)
     except SystemExit:
-        why = said.getvalue().removeprefix("Error: ")
+        why = printed.getvalue().removeprefix("Error: ")
     except Exception as error:  # noqa: BLE001 - the readers of formats fail in any way
         why = getattr(error, "strerror", None) or str(error) or "its format is not known"
-    raise MeshError(
-        f"The mesh file {path} cannot be read as {path.suffix}: {' '.join(why.split()).rstrip('.')}; it is "
-        "damaged, cut off, or of another dialect. Write it anew, or as .msh, .inp, .med or .bdf."
-    )
+    raise MeshError(said("mesh.unread", path=path, why=" ".join(why[:500].split()).rstrip(".")))
 
 
 def _named(found: Any, label: str, arrays: list[Any], number: int) -> Iterator[tuple[str, IntArray]]:
@@ -241,8 +223,5 @@ def check_memory(mesh: StructureMesh, limit: float | None = None) -> None:
     entries = 9 * mesh.cells.size * mesh.cells.shape[1]  # four times those that are left of them
     bulky = _PROGRAM + _MATRICES * _ENTRY * entries / 4.0 + _BULKY * mesh.unknowns ** (4.0 / 3.0)
     if bulky > allowed and (needed := memory_estimate(mesh)) > allowed:
-        raise MeshError(
-            f"{mesh.source}: {mesh.unknowns:,} unknowns would take about {needed / GIB:.1f} GiB, but "
-            f"{allowed / GIB:.1f} GiB are {'left on this machine' if limit is None else 'allowed'}; coarsen "
-            "the mesh."
-        )
+        of = "left on this machine" if limit is None else "allowed"
+        raise MeshError(said("mesh.memory", mesh=mesh, needed=needed / GIB, allowed=allowed / GIB, of=of))

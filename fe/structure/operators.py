@@ -1,6 +1,6 @@
 """From a structure file and its mesh to affine operators, and their fields as VTU files for ParaView."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,15 @@ from scipy import sparse
 from fe.elements.kinds import meshio_with_wedges
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import InvalidDesignError, MeshError
+from fe.sentences import said
 from reporting.files import atomic_file
 
-from .affine import AffineStructure, StiffnessTerm, designed, static_response
-from .design import Damage, Material, MatrixDesign, MeshDesign, load_structure, structure_hash, unit_vector
+from .affine import AffineStructure, static_response
+from .body import Body, PointMass
+from .design import MatrixDesign, MeshDesign, load_structure, structure_hash, unit_vector
 from .location import gauge_rows, nodal_load, point_shares
 from .matrices import assemble_matrices
-from .mesh import StructureMesh, SupportedUnknowns, supported
+from .mesh import StructureMesh, supported
 from .mesh_file import check_memory, read_mesh
 
 
@@ -30,27 +32,26 @@ class Structure(AffineStructure):
     ----------
     design : MeshDesign
         What was asked for.
-    mesh : StructureMesh
-        Its mesh.
+    body : Body
+        Its mesh, and what it is made of.
     material_of : (nc,)
         Number of the material of each cell.
     region_of : (nc,)
         Number of the damage region of each cell, -1 for none.
-    unknowns_held : SupportedUnknowns
-        What the supports hold and spring.
     gauges_moved : (gauges,) m
         How far each gauge lies from where it was asked for.
-    nodal_mass : (nodes,) kg
-        Share of each node in the mass of the structure with its point masses.
     """
 
     design: MeshDesign
-    mesh: StructureMesh
+    body: Body[StructureMesh]
     material_of: IntArray
     region_of: IntArray
-    unknowns_held: SupportedUnknowns
     gauges_moved: FloatArray
-    nodal_mass: FloatArray
+
+    @property
+    def mesh(self) -> StructureMesh:
+        """Its mesh."""
+        return self.body.mesh
 
 
 def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
@@ -72,17 +73,15 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
     return replace(mesh, node_sets=mesh.node_sets | sets["nodes"], cell_sets=mesh.cell_sets | sets["cells"])
 
 
-def _owners(mesh: StructureMesh, key: str, parts: Sequence[Material | Damage], what: str) -> IntArray:
+def _owners(mesh: StructureMesh, design: MeshDesign, key: str, what: str) -> IntArray:
     """Find the number (nc,) of the part whose set holds each cell, -1 for none.
 
     Parameters
     ----------
-    mesh : StructureMesh
-        The mesh.
+    mesh, design : StructureMesh, MeshDesign
+        The mesh and its design.
     key : str
         The table of the parts in the design.
-    parts : sequence of Material or Damage
-        The parts.
     what : str
         What they are, for the sentence.
 
@@ -92,16 +91,13 @@ def _owners(mesh: StructureMesh, key: str, parts: Sequence[Material | Damage], w
         If a set is missing or empty, or two overlap.
     """
     owner = np.full(len(mesh.cells), -1, dtype=np.int64)
-    for number, part in enumerate(parts):
-        where = f"{key}[{number + 1}]"
+    for number, (where, part) in enumerate(design.numbered(key)):
         cells = mesh.cells_of(part.set, where)
         taken = cells[owner[cells] >= 0]
         if len(taken):
-            raise MeshError(
-                f"{where}: the {what}s {part.name!r} and {parts[owner[taken[0]]].name!r} share {len(taken)} "
-                f"elements, such as {mesh.cell_numbers[taken[0]]} at {mesh.place(mesh.centres[taken[0]])}; "
-                "their sets must not overlap."
-            )
+            other, count = getattr(design, key)[owner[taken[0]]], len(taken)
+            both = {"what": what, "name": part.name, "other": other.name, "cell": mesh.cell(taken[0])}
+            raise MeshError(said("mesh.shared", where=where, count=count, **both))
         owner[cells] = number
     return owner
 
@@ -131,14 +127,43 @@ def load_and_assemble(
     file = Path(file)
     design = load_structure(file)
     if isinstance(design, MatrixDesign):
-        raise InvalidDesignError(
-            f"{file} is a structure from matrices: without a mesh there is no field to draw, and nothing "
-            "that CalculiX could solve."
-        )
+        raise InvalidDesignError(said("design.without_mesh", file=file))
     mesh = structure_mesh(design, file)
     check_memory(mesh, memory_limit)
-    digest = structure_hash(design, file.parent)
-    return assemble(design, mesh, digest, mass_as_stiffness=mass_as_stiffness)
+    material_of = _owners(mesh, design, "material", "material")
+    bare = np.flatnonzero(material_of < 0)
+    if len(bare):
+        counts = {"count": len(bare), "all": len(mesh.cells)}
+        raise MeshError(said("mesh.bare", mesh=mesh, cell=mesh.cell(bare[0]), **counts))
+    region_of = _owners(mesh, design, "damage", "damage region")
+    parameters, regions = ([*(part.name for part in own), None] for own in (design.parameter, design.damage))
+    scaled = np.array([parameters.index(part.scaled_by) for part in design.material])
+    pairs, part = np.unique(
+        np.column_stack((scaled[material_of], region_of % len(regions))), axis=0, return_inverse=True
+    )
+    body = Body(
+        mesh,
+        supported(design, mesh),
+        np.array([own.elasticity for own in design.material])[material_of],
+        np.array([own.density for own in design.material])[material_of],
+        part,
+        tuple((parameters[first], regions[second]) for first, second in pairs.tolist()),
+        tuple(
+            PointMass(own.name, own.mass, point_shares(mesh, own.point, where)[None])
+            for where, own in design.numbered("mass")
+        ),
+        mass_rule=mesh.kind.stiffness_rule if mass_as_stiffness else None,
+    )
+    gauges, moved = gauge_rows(mesh, design.gauge)
+    loads = (nodal_load(mesh, load, where).ravel() for where, load in design.numbered("load"))
+    points = {key: _point_rows(design, mesh, key) for key in ("displacement", "acceleration")}
+    return Structure(
+        **body.assembled(design, loads, {"gauge": gauges} | points),
+        design_hash=structure_hash(design, file.parent),
+        material_of=material_of,
+        region_of=region_of,
+        gauges_moved=moved,
+    )
 
 
 def assemble_structure(file: Path | str, memory_limit: float | None = None) -> AffineStructure:
@@ -149,87 +174,18 @@ def assemble_structure(file: Path | str, memory_limit: float | None = None) -> A
     return load_and_assemble(file, memory_limit)
 
 
-def assemble(
-    design: MeshDesign, mesh: StructureMesh, design_hash: str, *, mass_as_stiffness: bool = False
-) -> Structure:
-    """Assemble the affine operators of a design on its mesh, see `load_and_assemble`."""
-    material_of = _owners(mesh, "material", design.material, "material")
-    bare = np.flatnonzero(material_of < 0)
-    if len(bare):
-        raise MeshError(
-            f"{mesh.source}: {len(bare)} of {len(mesh.cells)} elements have no material, among them "
-            f"{mesh.cell_numbers[bare[0]]} at {mesh.place(mesh.centres[bare[0]])}."
-        )
-    region_of = _owners(mesh, "damage", design.damage, "damage region")
-    held = supported(design, mesh)
-    shares = [
-        point_shares(mesh, part.point, f"mass[{number}]") for number, part in enumerate(design.mass, start=1)
-    ]
-    density = np.array([part.density for part in design.material])[material_of]
-    rule = mesh.kind.stiffness_rule if mass_as_stiffness else mesh.kind.mass_rule
-    mass, three = mesh.mass(np.arange(len(mesh.cells)), density, rule), sparse.eye_array(3)
-    gauges, moved = gauge_rows(mesh, design.gauge)
-    return Structure(
-        **designed(
-            design,
-            held.expansion,
-            sparse.kron(mass, three).tocsr(),
-            (own @ own.T for own in (sparse.kron(own[:, None], three, format="csr") for own in shares)),
-            (nodal_load(mesh, load, f"load[{n}]").ravel() for n, load in enumerate(design.load, start=1)),
-            {"gauge": gauges}
-            | {key: _point_rows(design, mesh, key) for key in ("displacement", "acceleration")},
-        ),
-        stiffness_terms=_stiffness_terms(design, mesh, material_of, region_of, held),
-        design_hash=design_hash,
-        mesh=mesh,
-        material_of=material_of,
-        region_of=region_of,
-        unknowns_held=held,
-        gauges_moved=moved,
-        nodal_mass=mass.sum(axis=1)
-        + sum(part.mass * own for part, own in zip(design.mass, shares, strict=True)),
-    )
-
-
-def _stiffness_terms(
-    design: MeshDesign,
-    mesh: StructureMesh,
-    material_of: IntArray,
-    region_of: IntArray,
-    held: SupportedUnknowns,
-) -> tuple[StiffnessTerm, ...]:
-    """Sum the cells by pairs of a parameter and a region, none last; the pair of none holds the springs."""
-    restriction, springs = held.expansion.T.tocsr(), held.stiffness
-    parameters = [*(part.name for part in design.parameter), None]
-    regions = [*(part.name for part in design.damage), None]
-    elasticity = np.array([part.elasticity for part in design.material])
-    scaled = np.array([parameters.index(part.scaled_by) for part in design.material])
-    pairs = scaled[material_of] * len(regions) + region_of % len(regions)
-    found: dict[int, sparse.csr_array] = {}
-    for pair in np.unique(pairs).tolist():
-        cells = np.flatnonzero(pairs == pair)
-        found[pair] = restriction @ mesh.stiffness(cells, elasticity[material_of[cells]]) @ held.expansion
-    if springs.nnz and springs.max() > 0.0:
-        last = len(parameters) * len(regions) - 1
-        found[last] = found[last] + springs if last in found else springs
-    return tuple(
-        StiffnessTerm(found[pair].tocsr(), parameters[pair // len(regions)], regions[pair % len(regions)])
-        for pair in sorted(found)
-    )
-
-
 def _point_rows(design: MeshDesign, mesh: StructureMesh, key: str) -> sparse.csr_array:
     """Rows (m, full) of the displacements of points along directions."""
-    rows = [sparse.csr_array((0, mesh.unknowns))]
-    for number, part in enumerate(getattr(design, key), start=1):
-        shares = point_shares(mesh, part.point, f"{key}[{number}]")
-        rows.append(sparse.csr_array(np.outer(shares, unit_vector(part.direction)).reshape(1, -1)))
-    return sparse.vstack(rows).tocsr()
+    rows = [
+        np.outer(point_shares(mesh, part.point, where), unit_vector(part.direction)).ravel()
+        for where, part in design.numbered(key)
+    ]
+    return sparse.csr_array(np.reshape(rows, (-1, mesh.unknowns)))
 
 
 def weighed(structure: Structure) -> tuple[float, FloatArray]:
     """Mass [kg] with the nominal point masses, and the centre of gravity (3,) [m]."""
-    shares, points = structure.nodal_mass, structure.mesh.points
+    shares, points = structure.body.nodal_mass, structure.mesh.points
     mass = float(shares.sum())
     return mass, shares @ points / mass if mass > 0.0 else points.mean(axis=0)
 

@@ -1,10 +1,12 @@
 """The tables that every structure file has, whether its structure comes from a mesh or from matrices."""
 
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
 from fe.runtime.state import MOST_REGIONS
+from fe.sentences import said
 from reporting.section import Section
 
 Vector = tuple[float, float, float]
@@ -92,9 +94,7 @@ class Ranged(Named):
     def _range_holds_the_nominal_value(self) -> "Ranged":
         low, high = self.range
         if not low <= self.middle <= high:
-            raise ValueError(
-                f"its nominal value {self.middle:g} must lie between minimum {low:g} and maximum {high:g}"
-            )
+            raise ValueError(said("design.range", middle=self.middle, low=low, high=high))
         return self
 
 
@@ -118,9 +118,7 @@ class Control(Ranged):
     @model_validator(mode="after")
     def _is_not_always_zero(self) -> "Control":
         if not any(self.range):
-            raise ValueError(
-                "with its nominal value 0 it would be 0 always; give the `minimum` and `maximum` it takes"
-            )
+            raise ValueError(said("design.always_zero"))
         return self
 
 
@@ -218,12 +216,9 @@ class StructureDesign(Part):
             *((key,) for key in self.own_names),
         ):
             first: dict[str, str] = {}
-            named = ((key, *item) for key in keys for item in enumerate(getattr(self, key), start=1))
-            for key, number, part in named:
-                place = f"{key}[{number}]"
-                if first.setdefault(part.name, place) != place:
-                    both = f"{first[part.name]} and {place} are both named {part.name!r}"
-                    raise ValueError(f"{both}; give each a name of its own")
+            for place, part in (item for key in keys for item in self.numbered(key)):
+                if (other := first.setdefault(part.name, place)) != place:
+                    raise ValueError(said("design.names", first=other, second=place, name=part.name))
         if table := self.scaled_table:
             self._check_ties(table, "scaled_by", "parameter", "is scaled by", f"scales no {table}")
         self._check_ties("load", "control", "control", "is tied to the control", "commands no load")
@@ -232,13 +227,18 @@ class StructureDesign(Part):
     def _check_ties(self, table: str, key: str, other: str, tied: str, untied: str) -> None:
         """Refuse what is tied to a name of another table that is not there, and names that tie nothing."""
         known = [part.name for part in getattr(self, other)]
-        came = [getattr(part, key) for part in getattr(self, table)]
-        for number, name in enumerate(came, start=1):
+        came = {getattr(part, key): place for place, part in self.numbered(table)}
+        for name, place in came.items():
             if name is not None and name not in known:
-                raise ValueError(f"{table}[{number}] {tied} {name!r}, but no [[{other}]] has that name")
+                raise ValueError(f"{place} {tied} {name!r}, but no [[{other}]] has that name")
         for name in known:
             if name not in came:
                 raise ValueError(f"the {other} {name!r} {untied}")
+
+    def numbered(self, key: str) -> Iterator[tuple[str, Any]]:
+        """Yield the parts of a table, each behind its place in the file, such as `load[1]`."""
+        for number, part in enumerate(getattr(self, key), start=1):
+            yield f"{key}[{number}]", part
 
     @property
     def unit(self) -> float:

@@ -1,1 +1,1 @@
-"""Known answers, and CalculiX."""
+"""Balances and convergence of a wing; models against CalculiX."""

@@ -7,20 +7,19 @@ import os
 import re
 import shutil
 import subprocess
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from fe.elements.kinds import gauss_points
+from fe.elements.kinds import HEXAHEDRA_20, gauss_points
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import CalculixError
-from fe.runtime.state import TIP_FORCE, DigitalState
+from fe.sentences import said
 from fe.structure.affine import natural_frequencies
-from fe.wing.operators import AffineOperators
 
-from .calculix_deck import TEST_FORCE, CalculixDeck, Step, number_line, wing_deck
+from .calculix_deck import PRINTED, CalculixDeck, Step
 
 PROGRAM = "ccx"
 _TIME_LIMIT = 3600.0
@@ -35,9 +34,7 @@ def required_calculix() -> str:
     """Return the path of CalculiX; raises `CalculixError` where it is not installed."""
     if program := calculix_program():
         return program
-    raise CalculixError(
-        f"CalculiX ('{PROGRAM}') is not installed; on Debian and Ubuntu: apt-get install calculix-ccx."
-    )
+    raise CalculixError(said("calculix.missing", program=PROGRAM))
 
 
 _HEADER = re.compile(r"^ *(\w[\w ]*?) \(.*\) for set (\w+) and time +\S+$", re.MULTILINE)
@@ -57,10 +54,7 @@ def read_tables(text: str) -> dict[str, list[FloatArray]]:
         try:
             rows = np.loadtxt(body.splitlines(), ndmin=2)
         except ValueError as error:
-            raise CalculixError(
-                f"The table of {what} that CalculiX printed holds what is not a row of numbers ({error}); "
-                "its version may print another format (2.20 is known)."
-            ) from None
+            raise CalculixError(said("calculix.table", what=what, error=error)) from None
         tables.setdefault(name, []).append(rows)
     return tables
 
@@ -125,29 +119,21 @@ def run_calculix(text: str, folder: Path, name: str) -> str:
 
 INTEGRATION_POINTS = gauss_points(3)[0][:, ::-1]
 """Local places (27, 3) in 0..1 of the integration points of a C3D20 element, in the order of its output."""
-# Places of our strains in the order in which CalculiX prints a strain tensor: xx, yy, zz, xy, xz, yz.
-_PRINTED = [0, 1, 2, 5, 4, 3]
 
 
 def _relative(theirs: FloatArray, ours: FloatArray) -> float:
     return float(np.abs(theirs - ours).max() / np.abs(ours).max())
 
 
-def _relative_each(theirs: FloatArray, ours: FloatArray) -> float:
-    return float(np.abs(theirs / ours - 1.0).max())
-
-
-@dataclass(frozen=True)
-class Agreement:
+class Agreement(NamedTuple):
     """A model and CalculiX.
 
     Attributes
     ----------
     loads : dict of str to dict of str to float
-        Of each load the relative differences: of `nodal displacements`, over the largest; of `gauge strains`
-        and `displacement outputs`, where there are some, over the largest of their kind, or of a wing each
-        over its own; of a wing also of `strains at integration points` in the cells with gauges, which
-        CalculiX evaluates itself, over the largest.
+        Of each load the relative differences, over the largest of their kind: of `nodal displacements`; of
+        `gauge strains` and `displacement outputs`, where there are some; of 20-node hexahedra also of
+        `strains at integration points`, which CalculiX evaluates itself.
     ours, calculix : (m,) Hz
         Lowest frequencies of both codes.
     """
@@ -159,7 +145,7 @@ class Agreement:
     @property
     def modal(self) -> float:
         """Largest relative difference of the frequencies."""
-        return _relative_each(self.calculix, self.ours)
+        return float(np.abs(self.calculix / self.ours - 1.0).max())
 
 
 def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
@@ -180,10 +166,10 @@ def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
     CalculixError
         If CalculiX is not there or fails.
     """
-    structure, cells = deck.structure, np.asarray(deck.gauge_cells, dtype=np.int64)
+    structure, strained = deck.structure, deck.body.mesh.kind is HEXAHEDRA_20
     prints = ["*NODE PRINT, NSET=NALL", "U"]
     prints += ["*NODE PRINT, NSET=NPROBES", "U"] if len(deck.probes) else []
-    prints += ["*EL PRINT, ELSET=EGAUGES, GLOBAL=YES", "E"] if len(cells) else []
+    prints += ["*EL PRINT, ELSET=EALL, GLOBAL=YES", "E"] if strained else []
     text = deck.text(*(step._replace(lines=[*step.lines, *prints]) for step in deck.loads.values()))
     printed = read_tables(run_calculix(text, folder, "static")) if deck.loads else {}
     if (count := len(printed.get("NALL", ()))) != len(deck.loads):
@@ -203,91 +189,9 @@ def agreement(deck: CalculixDeck, folder: Path, modes: int = 6) -> Agreement:
         found = differences[name] = {"nodal displacements": _relative(tables["NALL"][:, 1:], nodes)}
         for what, own in parts.items():
             if len(ours[own]):
-                relative = _relative_each if deck.each_alone else _relative
-                found[what] = relative(tables["NPROBES"][:, 1:].ravel()[own], ours[own])
-        if len(cells):
-            strains = deck.mesh.strains(nodes, cells, INTEGRATION_POINTS).reshape(-1, 6)
+                found[what] = _relative(tables["NPROBES"][:, 1:].ravel()[own], ours[own])
+        if strained:
+            strains = deck.body.mesh.strains(nodes, local=INTEGRATION_POINTS).reshape(-1, 6)
             strains[:, 3:] *= 0.5  # engineering to tensor shear
-            printed_here = tables["EGAUGES"][:, 2:]
-            found["strains at integration points"] = _relative(printed_here, strains[:, _PRINTED])
+            found["strains at integration points"] = _relative(tables["EALL"][:, 2:], strains[:, PRINTED])
     return Agreement(differences, frequencies, theirs[:modes])
-
-
-def ring_down_agreement(
-    operators: AffineOperators,
-    folder: Path,
-    state: DigitalState,
-    periods: float = 5.0,
-    steps_per_period: int = 80,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Release the tip from a static force: our modal integration against direct integration.
-
-    Ours is the reduced model with its few modes, exact in time; CalculiX integrates all unknowns by the
-    trapezoidal rule, whose period is too long by (omega dt)^2 / 12, so that part of the difference is its.
-
-    Parameters
-    ----------
-    operators : AffineOperators
-        The model; CalculiX takes about a second for each step at 8,000 unknowns.
-    folder : Path
-        Where CalculiX works.
-    state : DigitalState
-        Health, masses and damping.
-    periods : float
-        Length in periods of the first mode.
-    steps_per_period : int
-        Increments of the direct integration.
-
-    Returns
-    -------
-    ours, calculix, same_rule : (t,)
-        Upward displacement of the tip at equal steps of time after its release over that before it: modal
-        integration, exact in time; direct integration by CalculiX; modal integration by the trapezoidal rule
-        with the increment of CalculiX, which leaves out the error of that rule.
-
-    Raises
-    ------
-    CalculixError
-        If CalculiX is not there or fails.
-    """
-    from fe.reduction.reduced_basis import reduce_model
-    from fe.runtime.transient import ModalIntegrator
-
-    model = reduce_model(operators).model
-    vector = model.vector(state.values, state.stiffness_loss)
-    integrator = ModalIntegrator(model, vector, state.damping_alpha, state.damping_beta)
-    frequency, row = integrator.modes.frequency, integrator.modes.output[-1]
-    increment, steps = 1.0 / (steps_per_period * float(frequency[0])), round(periods * steps_per_period)
-    initial = integrator.outputs(integrator.at_rest((0.0, TEST_FORCE)))[-1]
-    current = integrator.released(initial, (0.0, 0.0), TIP_FORCE)
-    same_rule = _trapezoidal(2.0 * np.pi * frequency, integrator.damping_ratio, increment, steps)
-    same_rule = row @ (same_rule * current.displacement[:, None])
-    ours = np.empty(steps)
-    for step in range(steps):
-        current = integrator.advance(current, increment, (0.0, 0.0))
-        ours[step] = integrator.outputs(current)[-1]
-    load = operators.turn(0.0, TEST_FORCE)
-    text = wing_deck(operators, state).text(
-        # CalculiX balances energy in a dynamic step and wants it asked for from the first step on.
-        Step(load, ("*EL PRINT, ELSET=E0", "ENER")),
-        Step(
-            0.0 * load,
-            ("*NODE PRINT, NSET=NPROBES, FREQUENCY=1", "U"),
-            procedure=("*DYNAMIC, DIRECT, ALPHA=0.", number_line([increment, increment * steps])),
-            increments=steps + 10,
-        ),
-    )
-    tables, tip = read_tables(run_calculix(text, folder, "ring_down")), len(operators.gauges)
-    theirs = np.array([rows[:, 1:].ravel()[tip] for rows in tables.get("NPROBES", ())])
-    if len(theirs) != steps:
-        raise CalculixError(f"CalculiX printed {len(theirs)} increments of the ring-down instead of {steps}.")
-    return ours / initial, theirs / initial, same_rule / initial
-
-
-def _trapezoidal(omega: FloatArray, damping_ratio: FloatArray, increment: float, steps: int) -> FloatArray:
-    """Free response (m, steps) of modes (m,), released at rest at one, by the trapezoidal rule."""
-    half = np.zeros((len(omega), 2, 2))
-    half[:, 0, 1], half[:, 1, 0], half[:, 1, 1] = 1.0, -(omega**2), -2.0 * damping_ratio * omega
-    half *= 0.5 * increment
-    advance = np.linalg.solve(np.eye(2) - half, np.eye(2) + half)
-    return np.stack([np.linalg.matrix_power(advance, step)[:, 0, 0] for step in range(1, steps + 1)], axis=1)

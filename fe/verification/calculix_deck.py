@@ -9,65 +9,40 @@ strain or displacement, by an equation, because printed displacements hold seven
 
 import itertools
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import cache, cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib import resources
 from typing import NamedTuple
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from jinja2 import StrictUndefined, Template
 from numpy.typing import ArrayLike
+from scipy import sparse
 
-from fe.elements.cells import CellMesh, rotate_elasticity
+from fe.elements.cells import CellMesh
 from fe.elements.kinds import HEXAHEDRA_20, WEDGES_6
-from fe.runtime.arrays import FloatArray, IntArray
+from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
+from fe.sentences import said
 from fe.structure.affine import AffineStructure
+from fe.structure.body import Body
 from fe.structure.design import Load
-from fe.structure.location import point_shares
-from fe.structure.mesh import SupportedUnknowns
 from fe.structure.operators import Structure
-from fe.wing import operators as wing
+from fe.wing.operators import AffineOperators
 from fe.wing.responses import wing_values
 
-NOT_COMPARABLE = (WEDGES_6,)
-"""Kinds that CalculiX integrates otherwise (C3D6 at two points)."""
-ORTHOTROPIC = ([0, 0, 1, 0, 1, 2, 5, 4, 3], [0, 1, 1, 2, 2, 2, 5, 4, 3])
-"""Rows and columns of an elasticity in the order of CalculiX's nine orthotropic constants."""
+PRINTED = [0, 1, 2, 5, 4, 3]
+"""Places of our strains in the order of CalculiX: xx, yy, zz, xy, xz, yz."""
+ANISOTROPIC = tuple(
+    np.array([(PRINTED[row], PRINTED[column]) for column in range(6) for row in range(column + 1)]).T
+)
+"""Rows and columns of an elasticity in the order of CalculiX's 21 anisotropic constants."""
 TEST_FORCE = 10.0
 """Upward force of the static test of a wing, and before its ring-down [N]."""
 _BLOCK = 0.01  # side of the block that stands for a point mass [m]
 Term = tuple[int, int, float]
 """A node, its direction from 1, and what stands with it: a force or a factor."""
-
-
-class CellMaterial(NamedTuple):
-    """What some cells are made of.
-
-    Attributes
-    ----------
-    courses : list of (float, (9,) Pa)
-        CalculiX's nine orthotropic constants at each of some temperatures.
-    density : float
-        kg/m^3.
-    axes : (2, 3)
-        Two vectors of the material's axes.
-    cells : (m,)
-        The cells.
-    """
-
-    courses: list[tuple[float, FloatArray]]
-    density: float
-    axes: FloatArray
-    cells: Iterable[int]
-
-
-class PointBlock(NamedTuple):
-    """A point mass [kg], where it is drawn (3,) [m], and the shares (nodes,) in its displacement."""
-
-    mass: float
-    place: FloatArray
-    shares: FloatArray
 
 
 class Step(NamedTuple):
@@ -83,15 +58,30 @@ class Step(NamedTuple):
         Whether the load is given as forces of nodes, and not by lines.
     procedure : tuple of str
         Lines that say what is solved.
-    increments : int
-        At most so many.
     """
 
     load: FloatArray = np.empty(0)
     lines: Iterable[str] = ()
     nodal: bool = True
     procedure: tuple[str, ...] = ("*STATIC",)
-    increments: int = 100
+
+
+class Grading(NamedTuple):
+    """Elasticity that changes inside cells: its `course`, rows of a temperature and a factor.
+
+    Attributes
+    ----------
+    course : list of (float, float)
+        Factor on the elasticity at rising temperatures.
+    temperatures : (nodes,)
+        Of the nodes, along which it changes.
+    cells : (nc,) bool
+        Where it changes; elsewhere the factor is one.
+    """
+
+    course: list[tuple[float, float]]
+    temperatures: FloatArray
+    cells: BoolArray
 
 
 @dataclass(frozen=True)
@@ -104,115 +94,102 @@ class CalculixDeck:
         What it is.
     structure : AffineStructure
         The model.
+    body : Body
+        What it is made of; the n free unknowns are in the order of its supports.
     values : mapping of str to float
         Its state by name; what is left out is nominal, and healthy.
-    mesh : CellMesh
-        Its mesh.
-    supports : SupportedUnknowns
-        What is held, sprung and rigid; the n free unknowns are in its order.
-    materials : tuple of CellMaterial
-        What the cells are made of.
-    masses : tuple of PointBlock
-        Point masses.
     loads : mapping of str to Step
         Static steps of its loads, each alone.
-    probed : tuple of (n,)
-        Rows on the free unknowns that are read behind the gauges and the displacement outputs.
-    gauge_cells : (m,)
-        Cells that are the set EGAUGES.
-    temperatures : (nodes,), optional
-        Temperatures of the nodes, where constants of materials depend on them.
+    grading : Grading, optional
+        Where the elasticity changes inside cells.
     damping : (float, float)
         Rayleigh damping [1/s] and [s] of a step in time.
-    each_alone : bool
-        Whether strains and outputs are compared each over its own, and not over the largest of their kind.
     """
 
     title: str
     structure: AffineStructure
+    body: Body[CellMesh]
     values: Mapping[str, float]
-    mesh: CellMesh
-    supports: SupportedUnknowns
-    materials: tuple[CellMaterial, ...]
-    masses: tuple[PointBlock, ...]
     loads: Mapping[str, Step]
-    probed: tuple[FloatArray, ...] = ()
-    gauge_cells: IntArray | tuple[()] = ()
-    temperatures: FloatArray | None = None
+    grading: Grading | None = None
     damping: tuple[float, float] = (0.0, 0.0)
-    each_alone: bool = False
+
+    @property
+    def _materials(self) -> Iterator[tuple[list[tuple[float, FloatArray]], float, IntArray]]:
+        """Constants of CalculiX at temperatures, density and cells of each material in this state."""
+        parameters, losses, _ = self.structure.parted(self.values)
+        body, factor = self.body, self.structure.theta(parameters, losses)[self.body.part]
+        graded = np.zeros(len(factor)) if self.grading is None else self.grading.cells
+        constants = factor[:, None] * body.elasticity[:, *ANISOTROPIC]
+        whole = np.column_stack((constants, body.density, graded))
+        rows, owner = np.unique(whole, axis=0, return_inverse=True)
+        for number, (*own, density, changes) in enumerate(rows):
+            course = self.grading.course if self.grading is not None and changes else [(0.0, 1.0)]
+            courses = [(temperature, share * np.array(own)) for temperature, share in course]
+            yield courses, density, np.flatnonzero(owner == number)
 
     @cached_property
     def probes(self) -> FloatArray:
         """Rows (m, n) of what is read, on the free unknowns."""
-        own = (self.structure.gauge_output.toarray(), self.structure.displacement_output.toarray())
-        return np.vstack((*own, *self.probed))
+        rows = sparse.vstack((self.structure.gauge_output, self.structure.displacement_output))
+        return np.asarray(rows.toarray())
 
     def text(self, *steps: Step) -> str:
         """Input of a job: the model, then its steps."""
-        held, motions = self.supports, self._motions
-        springs = [(*_place(own), held.springs[own]) for own in np.flatnonzero(held.springs).tolist()]
-        fixed = [*map(_place, np.flatnonzero(held.held).tolist())]
-        for places, body in zip(motions, held.rigid, strict=True):
-            springs += [(*places[own], body.springs[own]) for own in np.flatnonzero(body.springs)]
-            fixed += [places[own] for own in np.flatnonzero(body.held)]
-        # Behind the nodes of the mesh: two of each rigid set, eight of each point mass, then the probes.
-        heavy = [block for block in self.masses if block.mass > 0.0]
-        first = len(self.mesh.points) + 2 * len(motions) + 1
-        corners = np.arange(first, first + 8 * len(heavy)).reshape(-1, 8).tolist()
+        held, points = self.body.supports, self.body.mesh.points
+        masses = ((self.values.get(own.name, own.mass), own.shares) for own in self.body.masses)
+        heavy = [(mass, shares) for mass, places in masses for shares in places if mass > 0.0]
+        # Behind the nodes of the mesh: those of rigid motions, eight of each point mass, then the probes.
+        motions = len(held.springs) - len(held.alone)
+        first = len(points) + 1 - (-motions // 3)
         first_probe = first + 8 * len(heavy)
-        blocks = [*zip(heavy, corners, strict=True)]
-        return _template().render(
-            deck=self,
-            cells=np.column_stack((np.arange(len(self.mesh.cells)), self.mesh.cells)) + 1,
-            rigid_nodes=[
-                (places[motion][0], body.point)
-                for places, body in zip(motions, held.rigid, strict=True)
-                for motion in (0, 3)
-            ],
-            held=fixed,
-            springs=springs,
-            blocks=[
-                (block.mass, [*zip(nodes, block.place + HEXAHEDRA_20.places[:8] * _BLOCK, strict=True)])
-                for block, nodes in blocks
-            ],
-            block_side=_BLOCK,
-            probe_nodes=range(first_probe, first_probe + -(-len(self.probes) // 3)),
-            equations=self._equations(blocks, first_probe),
-            steps=steps,
+        corners = np.arange(first, first_probe).reshape(-1, 8).tolist()
+        blocks = [(nodes, *block) for nodes, block in zip(corners, heavy, strict=True)]
+        side, still = HEXAHEDRA_20.places[:8] * _BLOCK, np.diff(held.expansion.indptr) == 0
+        file = resources.files("fe.verification").joinpath("templates/calculix.inp.jinja")
+        template = Template(
+            file.read_text(encoding="utf-8"), trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined
+        )
+        return str(
+            template.render(
+                deck=self,
+                numbers=number_line,
+                materials=self._materials,
+                cells=np.column_stack((np.arange(len(self.body.mesh.cells)), self.body.mesh.cells)) + 1,
+                motion_nodes=range(len(points) + 1, first),
+                held=map(_place, (*np.flatnonzero(still), *range(3 * len(points) + motions, 3 * first - 3))),
+                springs=[*self.terms(held.springs)],
+                blocks=[
+                    (mass, [*zip(nodes, shares @ points + side, strict=True)])
+                    for nodes, mass, shares in blocks
+                ],
+                block_side=_BLOCK,
+                probe_nodes=range(first_probe, first_probe - (-len(self.probes) // 3)),
+                equations=self._equations([(nodes, shares) for nodes, _, shares in blocks], first_probe),
+                steps=steps,
+            )
         )
 
     def _equations(
-        self, blocks: Iterable[tuple[PointBlock, list[int]]], first_probe: int
+        self, blocks: Iterable[tuple[list[int], FloatArray]], first_probe: int
     ) -> Iterator[list[Term]]:
         """Yield sums that are zero, of which the first term depends on the others."""
-        for places, body in zip(self._motions, self.supports.rigid, strict=True):
-            for row, shares in enumerate(body.motions.tolist()):
-                moved = [(*place, share) for place, share in zip(places, shares, strict=True) if share]
-                yield [(int(body.nodes[row // 3]) + 1, row % 3 + 1, -1.0), *moved]
-        for block, nodes in blocks:
-            shares = [(own + 1, float(block.shares[own])) for own in np.flatnonzero(block.shares).tolist()]
+        held = self.body.supports
+        for row in np.setdiff1d(np.flatnonzero(np.diff(held.expansion.indptr)), held.alone).tolist():
+            yield [(*_place(row), -1.0), *self.terms(held.expansion[[row]].toarray()[0])]
+        for nodes, shares in blocks:
+            moved = [(own + 1, float(shares[own])) for own in np.flatnonzero(shares).tolist()]
             for node, component in itertools.product(nodes, (1, 2, 3)):
-                yield [(node, component, -1.0), *((own, component, share) for own, share in shares)]
+                yield [(node, component, -1.0), *((own, component, share) for own, share in moved)]
         for number, row in enumerate(self.probes):
             yield [(first_probe + number // 3, number % 3 + 1, -1.0), *self.terms(row)]
 
     @cached_property
-    def _motions(self) -> list[list[tuple[int, int]]]:
-        """Node and direction of the six motions of each rigid set: shifts of one node, turns as another's."""
-        first = 3 * len(self.mesh.points)
-        return [
-            [_place(first + 6 * number + motion) for motion in range(6)]
-            for number in range(len(self.supports.rigid))
-        ]
-
-    @cached_property
     def places(self) -> list[tuple[int, int]]:
         """Node and direction of each free unknown."""
-        found = [*map(_place, self.supports.alone.tolist())]
-        for places, body in zip(self._motions, self.supports.rigid, strict=True):
-            found += [places[motion] for motion in np.flatnonzero(~body.held)]
-        return found
+        held, behind = self.body.supports, self.body.mesh.unknowns
+        motions = range(behind, behind + len(held.springs) - len(held.alone))
+        return [_place(unknown) for unknown in (*held.alone.tolist(), *motions)]
 
     def terms(self, values: FloatArray) -> Iterator[Term]:
         """Yield node, direction and value of the values (n,) that are not zero."""
@@ -223,19 +200,6 @@ class CalculixDeck:
 def _place(unknown: int) -> tuple[int, int]:
     """Return node and direction, both from 1, of an unknown."""
     return unknown // 3 + 1, unknown % 3 + 1
-
-
-@cache
-def _template() -> Template:
-    environment = Environment(
-        loader=PackageLoader("fe.verification"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters["numbers"] = number_line
-    return environment.get_template("calculix.inp.jinja")
 
 
 def number_line(values: ArrayLike) -> str:
@@ -252,25 +216,10 @@ def structure_deck(structure: Structure) -> CalculixDeck:
         If CalculiX has no element that is integrated in the same way.
     """
     mesh, design = structure.mesh, structure.design
-    if mesh.kind in NOT_COMPARABLE:
-        raise CalculixError(
-            f"CalculiX integrates {mesh.kind.name} ({mesh.kind.calculix}) in another way, so that nothing "
-            "can be compared; tetrahedra and hexahedra can."
-        )
-    masses = (
-        PointBlock(part.mass, mesh.unit * np.asarray(part.point), point_shares(mesh, part.point, part.name))
-        for part in design.mass
-    )
-    materials = []
-    for number, part in enumerate(design.material):
-        factor = structure.parameters.get(part.scaled_by or "", 1.0)
-        constants = np.asarray(factor * np.linalg.inv(part.compliance)[ORTHOTROPIC], dtype=np.float64)
-        cells, axes = np.flatnonzero(structure.material_of == number), np.array(part.axes or np.eye(3)[:2])
-        materials.append(CellMaterial([(0.0, constants)], part.density, axes, cells))
+    if mesh.kind is WEDGES_6:  # C3D6 at two points
+        raise CalculixError(said("calculix.wedges", kind=mesh.kind))
     loads = {load.name: _load_step(structure, load) for load in design.load}
-    return CalculixDeck(
-        "structure", structure, {}, mesh, structure.unknowns_held, tuple(materials), tuple(masses), loads
-    )
+    return CalculixDeck("structure", structure, structure.body, {}, loads)
 
 
 def _load_step(structure: Structure, load: Load) -> Step:
@@ -290,59 +239,22 @@ def _load_step(structure: Structure, load: Load) -> Step:
     return Step(structure.load(load.name), lines, load.force is not None)
 
 
-def wing_deck(operators: wing.AffineOperators, state: DigitalState) -> CalculixDeck:
-    """Return the wing in one state; it reads the gauges, the displacement at the tip, then at the test load.
-
-    The root is a rigid set about the straight chord line, which moves in heave, flap and yaw on its springs.
-    """
-    mesh, design = operators.wing_mesh, operators.wing_mesh.design
-    plan, lift = design.planform, design.lift
-    masses = (
-        PointBlock(
-            state.servo_mass if place.kind == "servo" else state.pitot_mass,
-            np.array([0.0, place.station * plan.semi_span, 0.0]),  # where it is drawn
-            wing.point_mass_weights(mesh, place),
-        )
-        for place in design.point_masses
-    )
-    # The station of a node stands as its temperature, on which the constants of a graded skin depend.
-    stations = mesh.points[:, 1] / plan.semi_span if design.skin.stations else None
-    cells = [  # that hold the middle of a gauge
-        mesh.skin_point(distance, chord * plan.chord(distance / plan.semi_span)).cell
-        for distance, chord in design.gauges.positions
-    ]
+def wing_deck(operators: AffineOperators, state: DigitalState) -> CalculixDeck:
+    """Return the wing in one state."""
+    mesh, design, body = operators.wing_mesh, operators.wing_mesh.design, operators.body
+    plan, lift, skin, grading = design.planform, design.lift, design.skin, None
+    if skin.stations:  # the station of a node stands as its temperature, on which the skin depends
+        graded = (mesh.web < 0) & (mesh.rib < 0)
+        centre = np.where(graded, skin.young_modulus(mesh.centres[:, 1] / plan.semi_span), 1.0)
+        body = replace(body, elasticity=body.elasticity / centre[:, None, None])
+        course = [(place.station, place.young_modulus) for place in skin.stations]
+        grading = Grading(course, mesh.points[:, 1] / plan.semi_span, graded)
     return CalculixDeck(
         "wing, design",
         operators,
+        body,
         wing_values(operators, stiffness_loss=state.stiffness_loss, **state.values),
-        mesh,
-        wing.root_support(mesh),
-        tuple(_wing_materials(operators, state)),
-        tuple(masses),
         {"tip force": Step(operators.turn(0.0, TEST_FORCE)), "lift": Step(operators.turn(lift.load_factor))},
-        (operators.load_tip,),
-        np.unique(cells),
-        stations,
+        grading,
         (state.damping_alpha, state.damping_beta),
-        each_alone=True,
     )
-
-
-def _wing_materials(operators: wing.AffineOperators, state: DigitalState) -> Iterator[CellMaterial]:
-    mesh, skin = operators.wing_mesh, operators.wing_mesh.design.skin
-    axes = wing.cell_axes(mesh)
-    # Constants in the cell's own axes; CalculiX turns them by the orientation.
-    local = rotate_elasticity(wing.cell_elasticity(mesh), np.swapaxes(axes, 1, 2))
-    parameters = {"young_modulus_factor": state.young_modulus_factor}
-    factor = operators.theta(parameters, state.stiffness_loss)[mesh.stiffness_term]
-    constants, density = factor[:, None] * local[:, *ORTHOTROPIC], wing.cell_density(mesh)
-    # Whether Young's modulus changes inside a cell.
-    graded = (mesh.web < 0) & (mesh.rib < 0) & bool(skin.stations)
-    if graded.any():
-        centre = skin.young_modulus(mesh.centres[graded, 1] / mesh.design.planform.semi_span)
-        constants[graded] /= centre[:, None]
-    course = [(place.station, place.young_modulus) for place in skin.stations]
-    for cell, own in enumerate(constants):
-        moduli = course if graded[cell] else [(0.0, 1.0)]
-        rows = [(temperature, modulus * own) for temperature, modulus in moduli]
-        yield CellMaterial(rows, float(density[cell]), axes[cell, :2], [cell])

@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from fe.runtime.errors import DesignFileError, InvalidDesignError
 from fe.runtime.state import MOST_REGIONS, Geometry, region_names, wing_names
+from fe.sentences import said
 from fe.structure.tables import Part, StructureDesign
 from reporting.section import checked
 from reporting.toml_file import read_toml
@@ -130,24 +131,16 @@ def _check_webs(design: WingDesign) -> None:
     for index, (before, after) in enumerate(itertools.pairwise(design.webs), start=1):
         room = (after.chord - before.chord) * smallest - before.thickness - after.thickness
         if room <= 0.0:
-            raise ValueError(
-                f"webs[{index}] at chord {after.chord:g} must lie behind webs[{index - 1}] at chord "
-                f"{before.chord:g} with room for the thickness of both"
-            )
+            raise ValueError(said("wing.webs", index=index, web=after, other=index - 1, before=before))
     if design.front_chord <= 0.0 or design.rear_chord >= 1.0:
         raise ValueError("webs[0] and the last web must lie inside the chord, between 0 and 1")
     for web in design.webs:
         half = float(parts.four_digit_half_thickness(web.chord, design.airfoil.thickness_ratio)) * smallest
         if half <= 1.5 * design.skin.thickness:
-            raise ValueError(
-                f"the skin of {design.skin.thickness:g} m does not fit into the section at chord "
-                f"{web.chord:g}, whose half height is {half:.2g} m at the smallest chord"
-            )
+            raise ValueError(said("wing.skin", skin=design.skin, web=web, half=half))
     for index, rod in enumerate(design.rods):
         if rod.web >= len(design.webs):
-            raise ValueError(
-                f"rods[{index}] lies in web {rod.web}, but there are only webs 0 to {len(design.webs) - 1}"
-            )
+            raise ValueError(said("wing.rods", index=index, rod=rod, last=len(design.webs) - 1))
 
 
 def _check_ribs(design: WingDesign) -> None:
@@ -159,10 +152,7 @@ def _check_ribs(design: WingDesign) -> None:
 
 def _require_on_box(design: WingDesign, what: str, front: float, rear: float) -> None:
     if not design.front_chord <= front <= rear <= design.rear_chord:
-        raise ValueError(
-            f"{what} lies outside the skin of the box from chord {design.front_chord:g} to "
-            f"{design.rear_chord:g}"
-        )
+        raise ValueError(said("wing.box", what=what, design=design))
 
 
 def _check_regions(design: WingDesign) -> None:
@@ -181,10 +171,8 @@ def _check_regions(design: WingDesign) -> None:
         ) > max(one.chord_start, two.chord_start):
             raise ValueError(f"defects[{first}] and defects[{second}] overlap")
         if design.regions[first] == design.regions[second]:
-            raise ValueError(
-                f"defects[{first}] and defects[{second}] are both named {design.regions[first]!r}; give each "
-                "a name of its own"
-            )
+            both = {"first": f"defects[{first}]", "second": f"defects[{second}]"}
+            raise ValueError(said("design.names", name=design.regions[first], **both))
     for index, name in enumerate(design.regions):
         if name in TAKEN_NAMES:
             raise ValueError(f"defects[{index}] is named {name!r}, which is taken; give it another name")
@@ -198,10 +186,7 @@ def _check_gauges(design: WingDesign) -> None:
     along, across = 0.5 * design.gauges.averaging_spanwise, 0.5 * design.gauges.averaging_chordwise
     for index, (distance, chord) in enumerate(design.gauges.positions):
         if not along <= distance <= span - along:
-            raise ValueError(
-                f"gauges.positions[{index}] is {distance:g} m from the root, with its averaging length off "
-                f"the wing of {span:g} m"
-            )
+            raise ValueError(said("wing.gauge", index=index, distance=distance, span=span))
         for end in (distance - along, distance + along):
             local = design.planform.chord(end / span)
             middle = chord * design.planform.chord(distance / span)

@@ -18,6 +18,7 @@ from fe.elements.cells import CellMesh, hexahedra_20
 from fe.elements.kinds import HEXAHEDRA_20
 from fe.runtime.arrays import BoolArray, FloatArray, IntArray
 from fe.runtime.errors import MeshError
+from fe.sentences import said
 
 from .design import WingDesign, rib_interval
 from .parts import four_digit_half_thickness, four_digit_slope
@@ -70,11 +71,8 @@ def _filled(
             if np.abs(gaps).max() <= _SAME:
                 continue
             if gaps.min() < SMALLEST_GAP:
-                raise MeshError(
-                    f"{line.label} and {lines[-1].label} come closer than {SMALLEST_GAP * 1e3:g} mm or cross "
-                    f"between root and tip, at {line.at(lengths)[0]:.5f} m; move one of them or put them on "
-                    "the same line."
-                )
+                place, gap = line.at(lengths)[0], SMALLEST_GAP * 1e3
+                raise MeshError(said("wing.lines", line=line, other=lines[-1], gap=gap, place=place))
         lines.append(line)
     for line, room in wished:
         gaps = line.at(lengths) - np.array([other.at(lengths) for other in lines])
@@ -258,7 +256,7 @@ class WingMesh(CellMesh):
         return np.array([line.at(chord) for line in self.chord_lines])
 
     def skin_point(self, distance: float, behind_leading_edge: float, *, upper: bool = True) -> SurfacePoint:
-        """Point on the outer surface of the skin.
+        """Point on the outer surface of the skin of the box, where a design has checked that it lies.
 
         Parameters
         ----------
@@ -268,24 +266,12 @@ class WingMesh(CellMesh):
             Distance from the leading edge [m].
         upper : bool
             On the upper skin, otherwise on the lower.
-
-        Raises
-        ------
-        MeshError
-            If the point does not lie on the skin of the box.
         """
-        lines = (self.chord_places(distance), self.span_lines)
         index, local = [], []
-        for places, place in zip(lines, (behind_leading_edge, distance), strict=True):
-            if not places[0] - 1e-9 <= place <= places[-1] + 1e-9:
-                raise MeshError(
-                    f"the point {distance:.4g} m from the root and {behind_leading_edge:.4g} m behind the "
-                    f"leading edge does not lie on the skin, which reaches from {lines[0][0]:.4g} m to "
-                    f"{lines[0][-1]:.4g} m there."
-                )
-            before = int(np.clip(np.searchsorted(places, place, side="right") - 1, 0, len(places) - 2))
+        for lines, place in ((self.chord_places(distance), behind_leading_edge), (self.span_lines, distance)):
+            before = int(np.clip(np.searchsorted(lines, place, side="right") - 1, 0, len(lines) - 2))
             index.append(before)
-            local.append((place - places[before]) / (places[before + 1] - places[before]))
+            local.append((place - lines[before]) / (lines[before + 1] - lines[before]))
         height = self.height_cells + 1 if upper else 0
         return SurfacePoint(int(self._cell_of[*index, height]), np.array([*local, float(upper)]))
 

@@ -7,9 +7,8 @@ free unknowns: those of the nodes outside the root section, then root heave [m],
 Gauge strains are weights of nodal displacements: Kapteyn et al. 2021, eq. (15).
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Self
 
 import numpy as np
 from scipy import sparse
@@ -17,12 +16,13 @@ from scipy import sparse
 from fe.elements import cells as elements
 from fe.elements.kinds import gauss_points
 from fe.runtime.arrays import FloatArray, IntArray
-from fe.structure.affine import AffineStructure, StiffnessTerm, designed
-from fe.structure.mesh import RigidSet, SupportedUnknowns, rigid_motions
+from fe.runtime.state import TIP_FORCE
+from fe.structure.affine import AffineStructure
+from fe.structure.body import Body, PointMass
+from fe.structure.mesh import RigidSet, Supports, supports
 
 from .design import WingDesign, wing_structure
 from .mesh import WingMesh, build_mesh
-from .parts import PointMassPlace
 from .turn_load import STANDARD_GRAVITY, lift_load
 
 
@@ -87,54 +87,7 @@ ROOT_UNKNOWNS = 3
 class AffineWing(AffineStructure):
     """A wing as a structure: a factor on its skin, two point masses, a turn and a force near its tip."""
 
-    @classmethod
-    def of(
-        cls,
-        regions: tuple[str, ...],
-        stiffness: Iterable[sparse.csr_array],
-        masses: Iterable[sparse.csr_array],
-        loads: Iterable[FloatArray],
-        gauge_output: sparse.csr_array,
-        tip: FloatArray,
-        expansion: sparse.csr_array,
-        **own: Any,
-    ) -> Self:
-        """Name what a wing is made of; all but its stiffness is given on all unknowns.
-
-        Parameters
-        ----------
-        regions : tuple of str
-            Names of the K damage regions.
-        stiffness : iterable of csr (n, n)
-            Skin without the damage regions, each of these, and the rest with the root springs [N/m].
-        masses : iterable of csr (full, full)
-            Structure [kg], and 1 kg in each servo and in the pitot [1].
-        loads : iterable of (full,)
-            A turn at load factor 1 [N], and 1 N upwards at the place of the static test [1].
-        gauge_output : csr (gauges, full) 1/m
-            Strain of each gauge, positive in compression (upper skin under positive lift), dimensionless.
-        tip : (full,) 1
-            Upward displacement at the tip, on the chord line of the static test.
-        expansion : csr (full, n)
-            Free unknowns to all unknowns.
-        **own
-            Hash, and what a subclass holds.
-        """
-        pairs = (("young_modulus_factor", None), *((None, name) for name in regions), (None, None))
-        outputs = {
-            "gauge": gauge_output,
-            "displacement": sparse.csr_array(tip[np.newaxis]),
-            "acceleration": sparse.csr_array((0, len(tip))),
-        }
-        structure, *point_masses = masses
-        design = wing_structure(regions, gauge_output.shape[0])
-        return cls(
-            **designed(design, expansion, structure, point_masses, loads, outputs),
-            stiffness_terms=tuple(
-                StiffnessTerm(term, *pair) for term, pair in zip(stiffness, pairs, strict=True)
-            ),
-            **own,
-        )
+    followed_load = TIP_FORCE
 
     @property
     def load_lift(self) -> FloatArray:
@@ -161,17 +114,33 @@ def point_masses(servo: float, pitot: float) -> dict[str, float]:
     return {"servo_mass": servo, "pitot_mass": pitot}
 
 
+def stiffness_parts(regions: Iterable[str]) -> tuple[tuple[str | None, str | None], ...]:
+    """Parameter and region of each part of the stiffness: skin without regions, each of these, the rest."""
+    return ("young_modulus_factor", None), *((None, name) for name in regions), (None, None)
+
+
+def outputs(gauges: sparse.csr_array, tip: FloatArray) -> dict[str, sparse.csr_array]:
+    """Name the rows of gauges, positive in compression, and of the upward displacement (full,) at the tip."""
+    nothing = sparse.csr_array((0, len(tip)))
+    return {"gauge": gauges, "displacement": sparse.csr_array(tip[np.newaxis]), "acceleration": nothing}
+
+
 @dataclass(frozen=True)
 class AffineOperators(AffineWing):
     """Affine finite element model of the wing on its n free unknowns (held motions are eliminated).
 
     Attributes
     ----------
-    wing_mesh : WingMesh
-        Nodes and cells with named regions; `expansion` gives the displacements of the nodes.
+    body : Body
+        Its mesh, and what it is made of; `expansion` gives the displacements of the nodes.
     """
 
-    wing_mesh: WingMesh
+    body: Body[WingMesh]
+
+    @property
+    def wing_mesh(self) -> WingMesh:
+        """Nodes and cells with named regions."""
+        return self.body.mesh
 
 
 def cell_elasticity(mesh: WingMesh) -> FloatArray:
@@ -191,9 +160,8 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
         compliance = elements.orthotropic_compliance(web.young_modulus, web.poisson_ratio, web.shear_modulus)
         local[mesh.web == index] = np.linalg.inv(compliance)
     for index, rib in enumerate(design.ribs):
-        local[mesh.rib == index] = np.linalg.inv(
-            elements.isotropic_compliance(rib.young_modulus, rib.poisson_ratio)
-        )
+        compliance = elements.isotropic_compliance(rib.young_modulus, rib.poisson_ratio)
+        local[mesh.rib == index] = np.linalg.inv(compliance)
     for rod in design.rods:
         inside = (mesh.web == rod.web) & (station < rod.reach)
         second_moment = design.webs[rod.web].thickness * _web_height(mesh)[inside] ** 3 / 12.0
@@ -249,18 +217,17 @@ def cell_density(mesh: WingMesh) -> FloatArray:
     return density
 
 
-def root_support(mesh: WingMesh) -> SupportedUnknowns:
+def root_support(mesh: WingMesh) -> Supports:
     """Hold the wing: the root section moves as a rigid rib on springs.
 
     The rib may heave along z, flap about x and yaw about z, both about the straight chord line; its three
     unknowns come last. Its other motions are held.
     """
-    root, nothing = mesh.design.root, np.zeros(mesh.unknowns)
+    root, nothing = mesh.design.root, np.zeros(mesh.points.shape)
     on_root = np.flatnonzero(np.abs(mesh.points[:, 1]) < 1e-9 * mesh.design.planform.semi_span)
-    motions = rigid_motions(mesh.points[on_root], np.zeros(3), 2.0)
     springs = np.array([0.0, 0.0, root.transverse_spring, root.flap_spring, 0.0, root.yaw_spring])
-    rib = RigidSet(on_root, np.zeros(3), motions, springs == 0.0, springs)
-    return SupportedUnknowns(nothing.astype(bool), nothing, (rib,))
+    rib = RigidSet(on_root, np.zeros(3), springs == 0.0, springs)
+    return supports(mesh.points, nothing.astype(bool), nothing, [rib])
 
 
 def section_displacement(mesh: WingMesh, distance: float, chord_fraction: float) -> FloatArray:
@@ -288,44 +255,32 @@ def upward(weights: FloatArray) -> FloatArray:
     return np.kron(weights, np.array([0.0, 0.0, 1.0]))
 
 
-def point_mass_weights(mesh: WingMesh, place: PointMassPlace) -> FloatArray:
-    """Weights (nodes,) of the displacement of a point mass: half on each skin."""
-    distance = place.station * mesh.design.planform.semi_span
-    return section_displacement(mesh, distance, place.chord)
-
-
-def all_point_mass_weights(mesh: WingMesh) -> tuple[tuple[FloatArray, ...], ...]:
-    """`point_mass_weights` of the servos, and of the pitots."""
-    places = mesh.design.point_masses
-    return tuple(
-        tuple(point_mass_weights(mesh, place) for place in places if place.kind == kind)
-        for kind in ("servo", "pitot")
+def wing_body(mesh: WingMesh) -> Body[WingMesh]:
+    """Return what the wing is made of; servos and pitot have the nominal masses of the design."""
+    nominal = mesh.design.masses.model_dump()
+    shares = {kind: [np.zeros((0, len(mesh.points)))] for kind in nominal}
+    for place in mesh.design.point_masses:
+        distance = place.station * mesh.design.planform.semi_span
+        shares[place.kind].append(section_displacement(mesh, distance, place.chord)[None])
+    return Body(
+        mesh,
+        root_support(mesh),
+        cell_elasticity(mesh),
+        cell_density(mesh),
+        mesh.stiffness_term,
+        stiffness_parts(mesh.design.regions),
+        tuple(PointMass(f"{kind}_mass", nominal[kind], np.vstack(own)) for kind, own in shares.items()),
+        modulus_variation(mesh),
     )
 
 
-def nodal_weight(mesh: WingMesh) -> FloatArray:
-    """Weight (nodes,) [N] of structure and nominal point masses."""
-    mass = np.asarray(mesh.mass(np.arange(len(mesh.cells)), cell_density(mesh)).sum(axis=1))
-    masses = mesh.design.masses
-    for own, places in zip((masses.servo, masses.pitot), all_point_mass_weights(mesh), strict=True):
-        mass = mass + own * sum(places, np.zeros(len(mass)))
-    return STANDARD_GRAVITY * mass
-
-
-def turn_load(mesh: WingMesh) -> FloatArray:
+def turn_load(body: Body[WingMesh]) -> FloatArray:
     """Load (full,) [N] of load factor 1: the design's lift, net of the weight where that relieves it."""
-    load = lift_load(mesh)
-    if mesh.design.lift.inertia_relief:  # the weight where it lies, and as much lift against it
-        weight, lift = nodal_weight(mesh), load[2::3].copy()
+    load = lift_load(body.mesh)
+    if body.mesh.design.lift.inertia_relief:  # the weight where it lies, and as much lift against it
+        weight, lift = STANDARD_GRAVITY * body.nodal_mass, load[2::3].copy()
         load[2::3] += lift * (weight.sum() / lift.sum()) - weight
     return load
-
-
-def stiffness_parts(mesh: WingMesh, parts: Iterable[IntArray]) -> Iterator[sparse.csr_array]:
-    """Yield the stiffness, csr (full, full) [N/m], of each part of the cells, at e = 1 and without damage."""
-    elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
-    for cells in parts:
-        yield mesh.stiffness(cells, elasticity[cells], variation[cells])
 
 
 def assemble(design: WingDesign) -> AffineOperators:
@@ -337,27 +292,13 @@ def assemble(design: WingDesign) -> AffineOperators:
         If the mesh cannot hold what the design asks for.
     """
     mesh = build_mesh(design)
-    held = root_support(mesh)
-    restriction, expansion = held.expansion.T.tocsr(), held.expansion
-    parts = [np.flatnonzero(mesh.stiffness_term == term) for term in range(len(design.regions) + 2)]
-    *skin, rest = ((restriction @ (part @ expansion)).tocsr() for part in stiffness_parts(mesh, parts))
-    masses = [mesh.mass(np.arange(len(mesh.cells)), cell_density(mesh))]
-    for places in all_point_mass_weights(mesh):
-        columns = sparse.csr_array(np.array(places).reshape(-1, len(mesh.points)).T)
-        masses.append(columns @ columns.T)
-    span, load = design.planform.semi_span, design.tip_load
+    body, span, load = wing_body(mesh), design.planform.semi_span, design.tip_load
     at_load, at_tip = (
         upward(section_displacement(mesh, place, load.chord))
         for place in (span - load.distance_from_tip, span)
     )
-    return AffineOperators.of(
-        design.regions,
-        (*skin, (rest + held.stiffness).tocsr()),
-        (sparse.kron(mass, sparse.eye_array(3), format="csr") for mass in masses),
-        (turn_load(mesh), at_load),
-        gauge_output(mesh),
-        at_tip,
-        expansion,
-        design_hash=design.hash,
-        wing_mesh=mesh,
+    named = wing_structure(design.regions, len(design.gauges.positions))
+    loads = (turn_load(body), at_load)
+    return AffineOperators(
+        **body.assembled(named, loads, outputs(gauge_output(mesh), at_tip)), design_hash=design.hash
     )

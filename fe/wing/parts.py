@@ -4,7 +4,6 @@ The shape of the section is of the symmetric four-digit family of NACA Report 46
 1933).
 """
 
-import itertools
 import math
 from typing import Annotated, Literal, TypeVar
 
@@ -109,16 +108,10 @@ class Skin(Part):
         if bool(self.bands) == bool(self.stations):
             raise ValueError("Young's modulus must be given either in bands or at stations")
         places = [place.station for place in self.stations]
-        if places and (
-            len(places) < 2
-            or any(after <= before for before, after in itertools.pairwise(places))
-            or (places[0], places[-1]) != (0.0, 1.0)
-        ):
+        if places and (places != sorted({*places}) or (places[0], places[-1]) != (0.0, 1.0)):
             raise ValueError(f"the stations must rise from 0 to 1, but are {places}")
         ends = [band.end for band in self.bands]
-        if ends and (
-            any(after <= before for before, after in itertools.pairwise([0.0, *ends])) or ends[-1] != 1.0
-        ):
+        if ends and ([0.0, *ends] != sorted({0.0, *ends}) or ends[-1] != 1.0):
             raise ValueError(f"the ends of the bands must rise from above 0 to 1, but are {ends}")
         return self
 

@@ -17,6 +17,7 @@ from fe.runtime.arrays import FloatArray
 
 from . import operators as full
 from .design import WingDesign
+from .turn_load import STANDARD_GRAVITY
 
 LEAST_LINE_DISTANCE = 0.1
 """Least distance between lines of a section, as a fraction of the chord."""
@@ -65,24 +66,13 @@ def section_lines(design: WingDesign) -> tuple[float, ...]:
     return elastic, *sorted(lines[1:])
 
 
-def strip_edges(lines: FloatArray, count: int) -> FloatArray:
-    """Return at most `count` + 1 of the mesh lines, ends included, that part the span most evenly."""
-    if count >= len(lines) - 1:
-        return np.array(lines)
-    wanted = np.linspace(lines[0], lines[-1], count + 1)
-    nearest = np.abs(lines[:, np.newaxis] - wanted).argmin(axis=0)
-    return np.asarray(lines[np.unique(nearest)])
-
-
-def assemble_patch_operators(operators: full.AffineOperators, strip_count: int = 64) -> PatchOperators:
+def assemble_patch_operators(operators: full.AffineOperators) -> PatchOperators:
     """Assemble the operators of the primitives for a wing.
 
     Parameters
     ----------
     operators : AffineOperators
         The wing.
-    strip_count : int
-        Largest number of strips of the skin.
     """
     mesh, design, expansion = operators.wing_mesh, operators.wing_mesh.design, operators.expansion
     restriction = expansion.T.tocsr()
@@ -94,8 +84,8 @@ def assemble_patch_operators(operators: full.AffineOperators, strip_count: int =
         nodal = np.array([full.section_displacement(mesh, place, chord) for place in stations])
         return sparse.csr_array(sparse.csr_array(nodal) @ expansion[component::3])
 
-    weight = -full.upward(full.nodal_weight(mesh))
-    lift = full.turn_load(mesh)
+    weight = -STANDARD_GRAVITY * full.upward(operators.body.nodal_mass)
+    lift = full.turn_load(operators.body)
     if design.lift.inertia_relief:  # the load holds the weight
         lift = lift - weight
     node_station = np.abs(mesh.points[:, 1:2] - stations).argmin(axis=1)
@@ -105,13 +95,11 @@ def assemble_patch_operators(operators: full.AffineOperators, strip_count: int =
 
     along = operators.gauge_output
     across, diagonal = (full.gauge_output(mesh, angle) @ expansion for angle in (0.5 * np.pi, 0.25 * np.pi))
-    edges = strip_edges(lines, strip_count)
-    strips = np.searchsorted(edges, mesh.centres[:, 1]) - 1
+    strips = np.searchsorted(lines, mesh.centres[:, 1]) - 1
     skin = np.flatnonzero(mesh.stiffness_term <= len(design.regions))
     found, part_of = np.unique(
         np.stack((strips, mesh.stiffness_term), axis=1)[skin], axis=0, return_inverse=True
     )
-    parts = full.stiffness_parts(mesh, (skin[part_of == number] for number in range(len(found))))
     flap = np.zeros(operators.unknowns)
     flap[-2] = 1.0
     return PatchOperators(
@@ -130,7 +118,7 @@ def assemble_patch_operators(operators: full.AffineOperators, strip_count: int =
             "tip_row": operators.tip_row,
         },
         plain={
-            "strip_lines": edges,
+            "strip_lines": np.array(lines),
             "strip_of": found[:, 0],
             "term_of": found[:, 1],
             "flap_spring": design.root.flap_spring,
@@ -142,5 +130,5 @@ def assemble_patch_operators(operators: full.AffineOperators, strip_count: int =
             "gauge_stations": np.array([place for place, _ in design.gauges.positions]),
             "gauge_length": design.gauges.averaging_spanwise,
         },
-        strips=tuple(sparse.csr_array(restriction @ (part @ expansion)) for part in parts),
+        strips=tuple(operators.body.stiffness(skin[part_of == number]) for number in range(len(found))),
     )

@@ -66,7 +66,7 @@ def lifting_line(planform: Planform, terms: int = 40, section_slope: float = 2.0
     """
     theta = (np.arange(terms) + 1.0) * np.pi / (2.0 * terms)  # half-wing, tip excluded, root included
     order = 2.0 * np.arange(terms) + 1.0
-    chord = planform.root_chord + (planform.tip_chord - planform.root_chord) * np.cos(theta)
+    chord = planform.chord(np.cos(theta))
     mu = (chord * section_slope / (8.0 * planform.semi_span))[:, None]
     sine = np.sin(np.outer(theta, order))
     amplitude = np.linalg.solve(sine * (order * mu + np.sin(theta)[:, None]), mu[:, 0] * np.sin(theta))
@@ -80,10 +80,7 @@ def lifting_line(planform: Planform, terms: int = 40, section_slope: float = 2.0
     return per_length
 
 
-DISTRIBUTIONS: dict[str, Callable[[Planform], Distribution]] = {
-    "schrenk": schrenk,
-    "lifting_line": lifting_line,
-}
+DISTRIBUTIONS = {"schrenk": schrenk, "lifting_line": lifting_line}
 """Lift distributions by their name in a design."""
 
 
@@ -107,11 +104,9 @@ def lift_load(mesh: WingMesh) -> FloatArray:
         values, _ = mesh.kind.shape_functions(local)
         place = mesh.positions(cells, local)
         jacobian = jacobians(mesh.kind, mesh.nodes[cells], local)
-        area = (
-            jacobian[..., 0, 0] * jacobian[..., 1, 1] - jacobian[..., 0, 1] * jacobian[..., 1, 0]
-        )  # in the plan view
+        area = np.linalg.det(jacobian[..., :2, :2])  # in the plan view
         station = np.clip(place[..., 1] / plan.semi_span, 0.0, 1.0)
-        chord = plan.root_chord + (plan.tip_chord - plan.root_chord) * station
+        chord = plan.chord(station)
         xi = place[..., 0] / chord + plan.straight_chord_line
         pressure = per_length(station) * (1.0 - xi) ** design.lift.chordwise_exponent / chord
         np.add.at(load, mesh.cells[cells], (pressure * area * weight) @ values)

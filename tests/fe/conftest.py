@@ -2,7 +2,7 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from fe.reduction.fields import WingFields, field_basis
-from fe.reduction.reduced_basis import Reduction, reduce_model
+from fe.reduction.reduced_basis import Reduction, reduce_structure
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
@@ -36,7 +36,7 @@ def shipped_operators(shipped_design: WingDesign) -> AffineOperators:
 @pytest.fixture(scope="session")
 def coarse_reduction(coarse_design: WingDesign, coarse_operators: AffineOperators) -> Reduction:
     with threadpool_limits(1):
-        return kept("coarse-reduction", lambda: reduce_model(coarse_operators), FE, coarse_design.hash)
+        return kept("coarse-reduction", lambda: reduce_structure(coarse_operators), FE, coarse_design.hash)
 
 
 @pytest.fixture(scope="session")

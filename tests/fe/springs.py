@@ -6,12 +6,16 @@ from functools import cache
 import numpy as np
 from scipy import sparse
 
-from fe.reduction.reduced_basis import Reduction, reduce_model
-from fe.reduction.settings import ModalSettings, StructureSettings
+from fe.reduction.reduced_basis import Reduction, reduce_structure
+from fe.reduction.settings import StructureSettings
 from fe.runtime.state import region_names
-from fe.wing.operators import AffineWing
+from fe.structure.affine import StiffnessTerm, designed
+from fe.wing.design import wing_structure
+from fe.wing.operators import AffineWing, outputs, stiffness_parts
 
-SETTINGS = StructureSettings(modal=ModalSettings(mode_count=4, frequency_tolerance=1e-5))
+SETTINGS = StructureSettings(mode_count=4)
+ROUGH = 0.1
+"""Tolerance of `rough_springs`."""
 PIECES = ((6, 20), (30, 48), (48, 56), (20, 24), (24, 28), (2, 6), (28, 30), (56, 60))
 """First and last spring, of sixty, of the damage regions of a chain; the first holds every other one."""
 
@@ -34,14 +38,16 @@ def springs(regions: int = 2, root: float = 1.0) -> AffineWing:
     tip = np.eye(count)[-1]
     # each gauge is a mean over a piece of the chain, so that no spring decides alone
     places = np.linspace(0, count - 9, 24).astype(int)
-    return AffineWing.of(
-        region_names(regions),
-        ((stretch.T @ sparse.diags_array(1e3 * row) @ stretch).tocsr() for row in kind),
-        (sparse.diags_array(row).tocsr() for row in masses),
-        (random.uniform(0.5, 1.5, count), tip),
-        sparse.csr_array((np.eye(count)[places + 8] - np.eye(count)[places]) / 8),
-        tip,
-        sparse.eye_array(count).tocsr(),
+    gauges = sparse.csr_array((np.eye(count)[places + 8] - np.eye(count)[places]) / 8)
+    names = region_names(regions)
+    terms = ((stretch.T @ sparse.diags_array(1e3 * row) @ stretch).tocsr() for row in kind)
+    structure, *points = (sparse.diags_array(row).tocsr() for row in masses)
+    loads = random.uniform(0.5, 1.5, count), tip
+    expansion = sparse.eye_array(count).tocsr()
+    design = wing_structure(names, len(places))
+    return AffineWing(
+        **designed(design, expansion, structure, points, loads, outputs(gauges, tip)),
+        stiffness_terms=tuple(map(StiffnessTerm, terms, *zip(*stiffness_parts(names), strict=True))),
         design_hash="a chain",
     )
 
@@ -50,4 +56,10 @@ def springs(regions: int = 2, root: float = 1.0) -> AffineWing:
 def reduced_springs(regions: int) -> Reduction:
     """Return the reduction, of two regions as good as usual and else to half a per cent."""
     rough = replace(SETTINGS, bound_tolerance=5e-3, most_snapshots=30)
-    return reduce_model(springs(regions), SETTINGS if regions == 2 else rough)
+    return reduce_structure(springs(regions), SETTINGS if regions == 2 else rough)
+
+
+@cache
+def rough_springs() -> Reduction:
+    """Return a reduction so small that its errors are far above rounding."""
+    return reduce_structure(springs(), replace(SETTINGS, bound_tolerance=ROUGH))

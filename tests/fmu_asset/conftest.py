@@ -6,15 +6,13 @@ from typing import Any
 
 import pytest
 
-from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.errors import FmuBuildError
 from scenarios import binding_files
 from tests.conftest import BEAM
-from tests.fmu_asset.making import with_dependencies
-from tests.fmu_asset.ours import OurFmus, chain_arrays, chain_model
+from tests.fmu_asset.ours import OurFmus, wing_model
 from tests.kept import FE, kept
 
 
@@ -45,12 +43,8 @@ def compiler() -> list[str]:
 
 @pytest.fixture(scope="session")
 def model() -> ReducedModel:
-    return chain_model()
-
-
-@pytest.fixture(scope="session")
-def arrays(model: ReducedModel) -> PatchArrays:
-    return chain_arrays(model)
+    """The wing of most FMUs."""
+    return wing_model()
 
 
 @pytest.fixture(scope="session")
@@ -62,7 +56,7 @@ def beam_model(request: pytest.FixtureRequest) -> ReducedModel:
 @pytest.fixture(scope="session")
 def ours(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> OurFmus:
     """Pack our own FMUs: `ours("compiled")` is a path."""
-    return OurFmus(tmp_path_factory.mktemp("ours"), lambda: request.getfixturevalue("beam_model"))
+    return OurFmus(tmp_path_factory.mktemp("ours"), request.getfixturevalue)
 
 
 def _packed(name: str) -> Any:
@@ -73,8 +67,6 @@ def _packed(name: str) -> Any:
 
 
 fmu, compiled_fmu, spring_mass = map(_packed, ("python", "compiled", "spring_mass"))
-linear_fmu = _packed("linear")
-"""The linear system as pythonfmu exports it: it declares no dependencies, so all outputs have all."""
 
 
 @pytest.fixture(scope="session")
@@ -87,13 +79,23 @@ def spring_binding() -> Binding:
     return load_binding(Path(__file__).parent / "door" / "bindings" / "spring_mass.toml")
 
 
-@pytest.fixture(scope="session")
-def state_fmu(linear_fmu: Path) -> Path:
-    """The same, declaring that no output depends on an input directly."""
-    return with_dependencies(linear_fmu, linear_fmu.with_name("state.fmu"), {"y1": [], "y2": []})
+OUTPUTS = '<Outputs><Unknown index="3"{}/><Unknown index="4"{}/>'
+
+
+def _linear(name: str, *dependencies: str) -> Any:
+    """Return a fixture of `linear2` that declares on which of its inputs, 1 and 2, its outputs depend."""
+
+    def made(foreign_fmu: Any) -> Path:
+        told = OUTPUTS.format(*(f' dependencies="{inputs}"' for inputs in dependencies))
+        return foreign_fmu.changed("linear2", name, (OUTPUTS.format("", ""), told))
+
+    return pytest.fixture(scope="session")(made)
+
+
+state_fmu, crossed_fmu = _linear("state", "", ""), _linear("crossed", "1", "2")
 
 
 @pytest.fixture(scope="session")
-def crossed_fmu(linear_fmu: Path) -> Path:
-    """The same, declaring that y1 depends on u1 and y2 on u2."""
-    return with_dependencies(linear_fmu, linear_fmu.with_name("crossed.fmu"), {"y1": ["u1"], "y2": ["u2"]})
+def linear_fmu(foreign_fmu: Any) -> Path:
+    """The same, which does not say it: each output depends on all inputs."""
+    return foreign_fmu("linear2")

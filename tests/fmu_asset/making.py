@@ -1,28 +1,24 @@
 """What these tests make things with: archives, changed FMUs, bindings, systems, other processes."""
 
-import re
 import subprocess
 import sys
+import tomllib
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.coupling.structure import (
-    Component,
-    Connection,
-    Connector,
-    Setting,
-    SystemStructure,
-    expand_connection,
-)
+from fmu_asset.coupling.structure import Component, Connection, Connector, SystemStructure, expand_connection
 from fmu_asset.door.binding import Binding, parse_binding
 
 ROOT = Path(__file__).parents[2]
 DESCRIPTION = "modelDescription.xml"
+
+
+def tables(test: str, name: str = "refused") -> dict[str, Any]:
+    """Return the tables of a TOML file beside a test, by the test's `__file__`."""
+    return tomllib.loads(Path(test).with_name(f"{name}.toml").read_text("utf-8"))
 
 
 def members(path: Path) -> dict[str, bytes]:
@@ -54,19 +50,6 @@ def parameters_of(fmu: Path) -> dict[str, float]:
     return {v.name: float(v.start or 0.0) for v in read_fmu(fmu).variables if v.causality == "parameter"}
 
 
-def with_dependencies(fmu: Path, target: Path, dependencies: Mapping[str, Sequence[str]]) -> Path:
-    """Copy an FMU and write which inputs each of its outputs depends on."""
-    text = members(fmu)[DESCRIPTION].decode()
-    names = re.findall(r'<ScalarVariable[^>]*?\bname="([^"]+)"', text)
-    outputs = text[text.index("<Outputs>") : text.index("</Outputs>")]
-    told = outputs
-    for output, inputs in dependencies.items():
-        index, value = names.index(output) + 1, " ".join(str(names.index(name) + 1) for name in inputs)
-        assert f'<Unknown index="{index}"' in told
-        told = told.replace(f'<Unknown index="{index}"', f'<Unknown index="{index}" dependencies="{value}"')
-    return edited(fmu, target, (outputs, told))
-
-
 def run_python(program: str, *arguments: object, **options: Any) -> str:
     """Return what a program, run in a process of its own, writes; it must end well."""
     words = [sys.executable, "-c", program, *map(str, arguments)]
@@ -78,35 +61,24 @@ def run_python(program: str, *arguments: object, **options: Any) -> str:
 Ends = Mapping[str, tuple[Any, Any]]
 
 
-def bound(step_size: float, observation: Ends, *, record: object = None, **roles: Any) -> Binding:
+def bound(step_size: float, observation: Ends, **roles: Any) -> Binding:
     """Return a binding: of each name in each role its variable and unit, and its range where there are more.
 
-    `header` has further keys; `limits` and `port` are tables as in the file.
+    `header` has further keys; `port` is a table as in the file.
     """
     header = {"name": "bound", "step_size": step_size, **roles.pop("header", {})}
-    tables: dict[str, Any] = {name: roles.pop(name) for name in ("limits", "port") if name in roles}
+    parts: dict[str, Any] = {"port": roles.pop("port")} if "port" in roles else {}
     keys = "variable", "unit", "minimum", "maximum"
     for role, ends in roles.items():
-        tables[role] = {name: dict(zip(keys, end, strict=False)) for name, end in ends.items()}
-    if record is not None:
-        tables["record"] = {"variables": record}
+        parts[role] = {name: dict(zip(keys, end, strict=False)) for name, end in ends.items()}
     observed = {name: {"variables": names, "unit": unit} for name, (names, unit) in observation.items()}
-    return parse_binding({"binding": header, "observation": observed, **tables})
+    return parse_binding({"binding": header, "observation": observed, **parts})
 
 
 def changed(binding: Binding, *, header: Mapping[str, object] | None = None, **tables: Any) -> Binding:
     """Return a binding with further keys of its header, and some tables replaced."""
     record = binding.model_dump(exclude_none=True, mode="json")
     return parse_binding(record | {"binding": record["binding"] | dict(header or {})} | tables)
-
-
-def linear(name: str, fmu: Path, substeps: int = 1, **values: Any) -> Component:
-    """Return a component of `linear_system.py`; matrices as nested lists, `initial` as a pair."""
-    settings = {}
-    for key, value in values.items():
-        for place, x in np.ndenumerate(np.array(value, dtype=float)):
-            settings[key + "".join(str(index + 1) for index in place)] = Setting(float(x))
-    return Component(name, fmu, settings, substeps)
 
 
 def system(

@@ -57,25 +57,23 @@ DEEDS = (
 """What it does by the number of its misbehaviour, before it moves; False refuses the step."""
 
 
+VARIABLES = {
+    "force": (Real, "input", 0.0), "stiffness": (Real, "input", 4.0),
+    "locked": (Boolean, "input", False), "misbehaviour": (Integer, "input", 0),
+    "position": (Real, "output", 0.0), "velocity": (Real, "output", 0.0), "steps": (Integer, "output", 0),
+}  # fmt: skip
+
+
 class SpringMass(Fmi2Slave):
     description = "A mass on a spring"
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
-        self.force, self.stiffness, self.locked, self.misbehaviour = 0.0, 4.0, False, 0
-        self.position, self.velocity, self.steps = 0.0, 0.0, 0
-        given, shown = {"causality": Fmi2Causality.input}, {"causality": Fmi2Causality.output}
-        discrete = {"variability": Fmi2Variability.discrete}
-        for variable in (
-            Real("force", **given),
-            Real("stiffness", **given),
-            Boolean("locked", **given, **discrete),
-            Integer("misbehaviour", **given, **discrete),
-            Real("position", **shown),
-            Real("velocity", **shown),
-            Integer("steps", **shown, **discrete),
-        ):
-            self.register_variable(variable)
+        for name, (kind, causality, start) in VARIABLES.items():
+            setattr(self, name, start)
+            varies = "continuous" if kind is Real else "discrete"
+            told = {"causality": Fmi2Causality[causality], "variability": Fmi2Variability[varies]}
+            self.register_variable(kind(name, **told))
 
     def do_step(self, current_time, step_size):
         if DEEDS[self.misbehaviour](self) is False:

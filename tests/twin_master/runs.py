@@ -2,7 +2,7 @@
 
 import json
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,7 @@ import pytest
 
 from scenarios import scenario_files
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
-from twin_master.mission.journal import JOURNAL_NAME, records
-from twin_master.mission.loop import CheckpointFile
+from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 
@@ -69,15 +68,15 @@ def journal(folder: Path) -> list[dict[str, Any]]:
 @contextmanager
 def cut_off_after(turns: int, *, ends: bool = True) -> Iterator[None]:
     """Let the run within die once so many turns are kept; it must, unless a command line tells it."""
-    keep = CheckpointFile.keep
+    append = JournalFile.append
 
-    def dying(self: CheckpointFile, *turn: Any) -> None:
-        keep(self, *turn)
-        if self.turns == turns:
+    def dying(self: JournalFile, record: Mapping[str, Any]) -> None:
+        append(self, record)
+        if record.get("turn") == turns - 1:
             raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(CheckpointFile, "keep", dying)
+        patch.setattr(JournalFile, "append", dying)
         with pytest.raises(KeyboardInterrupt) if ends else nullcontext():
             yield
 

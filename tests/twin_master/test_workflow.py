@@ -39,7 +39,7 @@ from twin_master.run_folder import (
     tidy,
 )
 from twin_master.scenario.reading import load_scenario
-from twin_master.store.writing import RunOutcome, finished_run, read_run
+from twin_master.store.writing import RunOutcome, finished_run, open_run
 from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
 
@@ -64,7 +64,7 @@ def fly(
 def flown(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> RunOutcome:
     """The mission of level turns; tests change copies of its folder."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(workflow, "_report", lambda folder: (folder / "report.html").touch())
+        patch.setattr(workflow, "_report", lambda folder, _tree: (folder / "report.html").touch())
         return fly(tmp_path_factory.mktemp("flown") / "run", library_file)
 
 
@@ -171,7 +171,7 @@ def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
 
 def test_what_a_run_folder_holds(tmp_path, library_file):
     folder = fly(tmp_path / "a" / "run", library_file, "failing_gauges").folder
-    tree = read_run(folder)
+    tree = open_run(folder)
     groups = {"observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth", "notice"}
     assert set(tree.children) == groups
     assert tree["predicted"]["quantity_mean"].shape == (50, 10, 24)
@@ -261,7 +261,7 @@ class Notes(SilentProgress):
 
 
 def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flown, whole, monkeypatch):
-    def report(folder: Path) -> Path:
+    def report(folder: Path, _tree: object = None) -> Path:
         (folder / "report.html").write_text("report", encoding="utf-8")
         return folder / "report.html"
 

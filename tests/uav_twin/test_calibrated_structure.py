@@ -1,6 +1,5 @@
 """From a structure file to a twin with calibrated parameters: model file, campaign, calibration, mission."""
 
-import os
 import shutil
 from pathlib import Path
 
@@ -18,9 +17,10 @@ from tests.command_line import said
 from tests.twin_master.runs import loaded_from, table_of
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
+from twin_master.mission.opening import file_record
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario
-from twin_master.watch.opening import begin_watch
+from twin_master.watch.opening import begun_watch
 from twin_master.workflow import fly as new_run
 
 TRUTH = {"e": 0.96}
@@ -105,8 +105,9 @@ def test_the_twin_flies_with_it(calibrated, tmp_path):
     np.testing.assert_allclose(tree["truth"]["strain"].values[0], wanted, rtol=5e-4)
 
     said.clear()
-    own = Overrides(calibration=calibrated)
-    os.close(begin_watch(mission(), tmp_path / "watch", own, _Noted(said), replace_run=False)[1])
+    own = resolve_scenario(mission(), Overrides(calibration=calibrated))
+    with begun_watch(own, file_record(mission()), tmp_path / "watch", _Noted(said)):
+        pass
     assert any("flown is the watched asset" in note and note.endswith(believed) for note in said)
 
     scenario = resolve_scenario(mission(draws=3), Overrides(calibration=calibrated))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
-from fe.reduction.settings import ModalSettings
+from fe.reduction.settings import StructureSettings
 from fmu_asset.door.binding import Binding
 from reporting.files import atomic_write_text
 from reporting.progress import Progress
@@ -159,7 +159,7 @@ class _Structure(AssetSource):
         """Return how many natural frequencies are observed; raises `MissionInputError` for too many."""
         if self._scenario.observation.role != "frequency":
             return 0
-        count, most = self._scenario.observation.count, ModalSettings().mode_count
+        count, most = self._scenario.observation.count, StructureSettings.mode_count
         if count > most:
             raise MissionInputError(
                 f"a structure tells its first {most} frequencies, and {count} are observed."
@@ -185,7 +185,7 @@ class _Structure(AssetSource):
             known[ROLE] = observation.count
             there = [part.name for part in design.acceleration]
             row, table = ("accelerometer", [*modes.accelerometers], there), "acceleration"
-            most = ModalSettings().mode_count
+            most = StructureSettings.mode_count
             if max(modes.places) >= most:
                 raise MissingObservationModelError(
                     f"a structure tells its first {most} modes, and mode {max(modes.places) + 1} is observed."

@@ -30,21 +30,24 @@ ROWS = 20
 TABLE_SECONDS = 1.0
 
 
+Out = Annotated[Path | None, typer.Option(help="The folder to make.", show_default="runs/NAME")]
+FleetSeed = Annotated[int | None, typer.Option(min=0, help="Seed, in the place of that of the file.")]
+Authority = Annotated[Path | None, typer.Option(help="Certificate of the authority of an mqtts:// broker.")]
+
+
 def watch(
     file: Annotated[
         Path, typer.Argument(help="The fleet file, its groups with `observations`.", show_default=False)
     ],
-    out: Annotated[Path | None, typer.Option(help="The folder to make.", show_default="runs/NAME")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed, in the place of that of the file.")] = None,
+    out: Out = None,
+    seed: FleetSeed = None,
     follow: Annotated[
         bool, typer.Option("--follow", help="Wait for more at the end of CSV files, and for new files.")
     ] = False,
     turns: Annotated[
         int | None, typer.Option(min=0, help="Leave an asset alone after so many turns.")
     ] = None,
-    ca_file: Annotated[
-        Path | None, typer.Option(help="Certificate of the authority of an mqtts:// broker.")
-    ] = None,
+    ca_file: Authority = None,
     view: View = False,
 ) -> None:
     """Watch many real assets: observations in, a decision for each turn of each asset out, as a line of JSON.
@@ -55,6 +58,7 @@ def watch(
     from twin_master.fleet.plan import load_fleet
     from twin_master.fleet.view import is_fleet, serve_fleet
     from twin_master.fleet.watching import FleetWatch
+    from twin_master.watch.intake import listening
 
     fleet = load_fleet(file, seed)
     folder = out if out is not None else Path("runs") / fleet.name
@@ -63,21 +67,15 @@ def watch(
         fleet, folder, console.tell, console.say, follow=follow, turns=turns, authority=ca_file
     )
 
-    def ask(_signal: int, _frame: object) -> None:
-        watched.asked = True
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    fleet_view = is_fleet, serve_fleet
     try:
-        with shown(view, (is_fleet, serve_fleet)) as begun, console.showing(watched):
+        with listening(watched.ask), shown(view, fleet_view) as begun, console.showing(watched):
             if begun is not None:
                 begun(folder)
             watched.run(console.refresh)
     except Exception as error:
         error.add_note("What was observed is kept: repeat the command to go on.")
         raise
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     console.say(_heading(watched) + f": {folder}.")
     if watched.failures and not watched.assets:
         raise typer.Exit(1)
@@ -154,27 +152,23 @@ def _watched_table(watched: "FleetWatch") -> "Table":
     from rich import box
     from rich.table import Table
 
-    from twin_master.scenario.section import printed_state
+    from twin_master.mission.replay import health_in_words
 
-    assets = list(watched.assets.values())
-    told = [asset for asset in worst_first(assets) if asset.decision is not None][:ROWS]
-    states = list(dict.fromkeys(name for asset in told for name in asset.decision["health"]))  # type: ignore[index]
+    told = [asset for asset in worst_first(list(watched.assets.values())) if asset.decision is not None]
+    rows = [(asset, asset.decision or {}) for asset in told[:ROWS]]
+    states = list(dict.fromkeys(name for _, decision in rows for name in decision["health"]))
     table = Table("asset", "turn", "control", *states, "next", "alarms", box=box.SIMPLE_HEAD)
     table.title = _heading(watched)
-    for asset in told:
-        decision = asset.decision
-        assert decision is not None
-        cells = []
-        for name in states:
-            known = decision["health"].get(name)
-            if known is None:
-                cells.append("")
-                continue
-            scale, unit = printed_state(known["unit"])
-            cells.append(f"{scale * known['mean']:.3g} ± {scale * known['standard_deviation']:.2g} {unit}")
-        alarms = str(asset.alarm_count or "")
+    for asset, decision in rows:
+        health = health_in_words(decision)
+        cells = [health.get(name, "") for name in states]
         table.add_row(
-            asset.name, str(decision["turn"]), decision["control"], *cells, decision["next_control"], alarms
+            asset.name,
+            str(decision["turn"]),
+            decision["control"],
+            *cells,
+            decision["next_control"],
+            str(asset.alarm_count or ""),
         )
     return table
 
@@ -205,8 +199,8 @@ def fleet() -> None:
 @fleet_app.command("run")
 def run(
     file: Annotated[Path, typer.Argument(help="The fleet file.", show_default=False)],
-    out: Annotated[Path | None, typer.Option(help="The folder to make.", show_default="runs/NAME")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed, in the place of that of the file.")] = None,
+    out: Out = None,
+    seed: FleetSeed = None,
     workers: Workers = None,
     cluster: Cluster = None,
     replace: Replace = False,

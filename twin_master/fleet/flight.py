@@ -1,14 +1,14 @@
 """A fleet from its plan to its store: checked whole, prepared, flown in shards, resumed where it stopped."""
 
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,20 +16,24 @@ from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.folders import lock_folder
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
-from reporting.provenance import collect_provenance
+from reporting.provenance import collect_provenance, hash_record
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine, Piece, flown
 from twin_master.fleet.plan import Fleet, Group, load_fleet
 from twin_master.fleet.shard import Kit, ShardResult, read_recording, with_parameters
-from twin_master.fleet.store import FAILED, FleetStore, check_installed, sizes_of, written
-from twin_master.mission.opening import released
+from twin_master.fleet.store import FAILED, STORE_NAME, check_installed, create_store, sizes_of, written
+from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
+from twin_master.mission.opening import held
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
+
+if TYPE_CHECKING:
+    import zarr
 
 KIND = "uav-twin fleet"
 RESULT_NAME = "fleet.json"
@@ -112,26 +116,22 @@ def fly_fleet(
     see_folder(folder, config, fleet.seed, replace_old=replace_old)
     _check(fleet)
     if replace_old and folder.is_dir():
-        lock = _locked(folder)
-        try:
+        with held(_locked(folder)):
             shutil.rmtree(folder)
-        finally:
-            os.close(lock)
-    lock = hold_folder(folder, config, fleet.seed)
-    try:
-        store = FleetStore(folder, fleet)
-        kept = len(store.done)
-        _fly(fleet, folder, engine, store, progress)
+    with hold_folder(folder, config, fleet.seed):
+        if not (folder / JOURNAL_NAME).is_file():
+            create_store(folder, fleet)
+        with JournalFile(folder, hash_record(config)) as journal:
+            kept = {record["shard"] for record, *_ in records(journal.path)}
+            shards = _fly(fleet, folder, engine, journal, kept, progress)
+            done = [record for record, *_ in records(journal.path)]
         failures, ended = (
-            dict(sorted(item for told in store.done.values() for item in told.get(key, {}).items()))
-            for key in ("failures", "ended")
+            dict(sorted(item for told in done for item in told[key].items())) for key in ("failures", "ended")
         )
         told = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "twins": fleet.size}
         atomic_write_text(folder / RESULT_NAME, to_json(told | {"failures": failures, "ended": ended}))
-    finally:
-        os.close(lock)
     seconds = time.perf_counter() - begin
-    return FleetOutcome(folder, fleet.size, failures, ended, seconds, len(store.done) - kept, kept)
+    return FleetOutcome(folder, fleet.size, failures, ended, seconds, shards - len(kept), len(kept))
 
 
 def see_folder(folder: Path, config: Mapping[str, Any], seed: int, *, replace_old: bool = False) -> None:
@@ -176,16 +176,16 @@ def fleet_config(folder: Path, kind: str = KIND) -> dict[str, Any]:
     return found
 
 
-def hold_folder(folder: Path, config: Mapping[str, Any], seed: int) -> int:
+@contextmanager
+def hold_folder(folder: Path, config: Mapping[str, Any], seed: int) -> Iterator[None]:
     """Make the folder with its configuration, if it is not there, and hold it for this process."""
     with written(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    lock = _locked(folder)
-    with released(lock):
+    with held(_locked(folder)):
         if not (folder / CONFIG_NAME).is_file():
             provenance = collect_provenance(seed).as_dict()
             atomic_write_text(folder / CONFIG_NAME, to_json({**config, "provenance": provenance}))
-    return lock
+        yield
 
 
 def _locked(folder: Path) -> int:
@@ -328,8 +328,16 @@ class _Left:
     seconds: float = 0.0
 
 
-def _fly(fleet: Fleet, folder: Path, engine: Engine, store: FleetStore, progress: Progress) -> None:
-    """Fly what is not in the store yet."""
+def _fly(
+    fleet: Fleet, folder: Path, engine: Engine, journal: JournalFile, done: set[int], progress: Progress
+) -> int:
+    """Fly what is not in the store yet; return how many shards there are."""
+    import zarr
+
+    @cache
+    def arrays(group: str) -> "dict[str, zarr.Array[Any]]":
+        opened = zarr.open_group(folder / STORE_NAME, mode="r+", path=group, use_consolidated=False)
+        return dict(opened.arrays())
 
     @lru_cache(maxsize=2)
     def kit(number: int, place: int) -> bytes:
@@ -340,7 +348,7 @@ def _fly(fleet: Fleet, folder: Path, engine: Engine, store: FleetStore, progress
 
     def pieces() -> Iterator[Piece]:
         for piece in whole:
-            if piece.shard in store.done:
+            if piece.shard in done:
                 continue
             group = fleet.groups[piece.group]
             try:
@@ -362,7 +370,9 @@ def _fly(fleet: Fleet, folder: Path, engine: Engine, store: FleetStore, progress
             result = ShardResult(
                 {"status": np.array([FAILED]), "seed": seed}, {rows.start: result}, {}, 0.0, ""
             )
-        store.write(group.name, rows, result.arrays)
+        with written(folder / STORE_NAME):
+            for name, values in result.arrays.items():
+                arrays(group.name)[name][rows] = values
         told = left[piece.shard]
         told.twins -= len(piece.members)
         told.seconds += result.seconds
@@ -370,15 +380,16 @@ def _fly(fleet: Fleet, folder: Path, engine: Engine, store: FleetStore, progress
             kept |= {f"{group.name}/{group.members[row].name}": text for row, text in texts.items()}
         if not told.twins:
             said = {"failures": told.failures, "ended": told.ended, "seconds": told.seconds}
-            store.finish(piece.shard, said)
+            journal.append({"shard": piece.shard, **said})
 
     whole = list(_shards(fleet, kit))
     left = {piece.shard: _Left(len(piece.members)) for piece in whole}
     with progress.stage("Flying", total=fleet.size, unit="twins") as stage:
-        stage.advance(sum(len(piece.members) for piece in whole if piece.shard in store.done))
+        stage.advance(sum(len(piece.members) for piece in whole if piece.shard in done))
         for piece, result in flown(engine, pieces(), progress):
             keep(piece, result)
             stage.advance(len(piece.members))
+    return len(whole)
 
 
 def _recorded(group: Group, piece: Piece) -> Piece:

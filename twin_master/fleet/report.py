@@ -23,11 +23,13 @@ from reporting.json_file import read_json
 from reporting.page import Column, Page, Words, numbers
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND as FLOWN_KIND
+from twin_master.fleet.flight import RESULT_NAME
 from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
 from twin_master.fleet.reading import WITHIN, figure_rows, group_figures, last_turns, leaving, noticed
-from twin_master.fleet.standing import STATE_NAME, FleetRecord
-from twin_master.fleet.store import DONE_NAME, ENDED, FAILED, has_flown, open_group
+from twin_master.fleet.standing import STATE_NAME, read_standing
+from twin_master.fleet.store import ENDED, FAILED, has_flown, open_group
 from twin_master.fleet.watching import KIND as WATCHED_KIND
+from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.report.view import printed_factors
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.schema import Scenario
@@ -99,7 +101,10 @@ def fleet_page(folder: Path, most: int) -> str:
         WORDS.say("subtitle", assets=members, groups=groups, seed=fleet["seed"], watched=watched),
     )
     page.add_section("The fleet")
-    (_add_watched if watched else _add_flown)(page, folder, fleet["groups"], most)
+    try:
+        (_add_watched if watched else _add_flown)(page, folder, fleet["groups"], most)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise FleetError(f"{folder} is damaged or of another version ({error}).") from error
     return page.render()
 
 
@@ -166,21 +171,22 @@ def _opening(records: list[dict[str, Any]], groups: "dict[str, xr.Dataset]") -> 
 
 
 def _failures(folder: Path) -> dict[str, str]:
-    """Return the failures of the shards that are done; the last line may still be written."""
+    """Return the failures of the shards that are done."""
     found: dict[str, str] = {}
-    path = folder / DONE_NAME
-    for line in path.read_bytes().splitlines(keepends=True) if path.is_file() else []:
-        if line.endswith(b"\n"):
-            found |= json.loads(line)["failures"]
+    if not (folder / JOURNAL_NAME).is_file() and (folder / RESULT_NAME).is_file():  # of a version before
+        found = read_json(folder / RESULT_NAME, FleetError)["failures"]
+    for record, *_ in records(folder / JOURNAL_NAME):
+        found |= record["failures"]
     return found
 
 
 def _add_watched(page: Page, folder: Path, groups: list[dict[str, Any]], most: int) -> None:
-    record = FleetRecord.read(folder)
-    known, failures = record.assets, record.failures
-    silent = sorted(name for name, told in known.items() if told.last is None and name not in failures)
-    turns = sum(told.last.turn + 1 for told in known.values() if told.last is not None)
-    alarms, refused = (sum(getattr(told, name) for told in known.values()) for name in ("alarms", "refused"))
+    record = read_standing(folder)
+    known, failures = record["assets"], record["failures"]
+    told = {name: asset for name, asset in known.items() if asset["last"] is not None}
+    silent = sorted(known.keys() - told.keys() - failures.keys())
+    turns = sum(asset["last"]["turn"] + 1 for asset in told.values())
+    alarms, refused = (sum(asset[name] for asset in known.values()) for name in ("alarms", "refused"))
     counts = [len(known), turns, alarms, refused, len(failures)]
     titles = ("assets", "turns", "alarms", "messages refused", "not watched")
     page.add_highlights([(str(count), title) for count, title in zip(counts, titles, strict=True)])
@@ -192,24 +198,19 @@ def _add_watched(page: Page, folder: Path, groups: list[dict[str, Any]], most: i
     _add_lessons(page, folder)
     for group in groups:
         scenario, prefix = Scenario.model_validate(group["scenarios"][0]), f"{group['name']}/"
-        own = [(name.removeprefix(prefix), told) for name, told in known.items() if name.startswith(prefix)]
-        own = [(name, told) for name, told in own if told.last is not None]
-        last = [told.last for _, told in own if told.last is not None]
-        if any(set(scenario.state_names) - told.health.keys() for told in last):
-            raise FleetError(
-                f"{folder / STATE_NAME}: the health of an asset of {group['name']} is that of "
-                f"{', '.join(scenario.state_names)}, and one of them is missing."
-            )
+        own = {name.removeprefix(prefix): told[name] for name in told if name.startswith(prefix)}
+        last = [asset["last"] for asset in own.values()]
         mean, deviation = (
-            np.array([[getattr(told.health[n], m) for n in scenario.state_names] for told in last])
-            for m in ("mean", "standard_deviation")
+            np.array([[one["health"][name][moment] for name in scenario.state_names] for one in last])
+            for moment in ("mean", "standard_deviation")
+        )
+        turn, control = np.array([one["turn"] for one in last]), [one["control"] for one in last]
+        alarmed, leaving = (
+            np.array([asset[name] for asset in own.values()], np.float64) for name in ("alarms", "leaving")
         )
         standing = Standing(
-            scenario, [name for name, _ in own], np.array([told.turn for told in last], dtype=np.int64), mean,
-            deviation, [told.control for told in last],
-            np.array([told.alarms for _, told in own], dtype=np.int64),
-            np.array([told.leaving for _, told in own], dtype=np.float64),
-        )  # fmt: skip
+            scenario, [*own], turn, mean, deviation, control, alarmed.astype(np.int64), leaving
+        )
         page.add_section(f"Group {group['name']}")
         _add_group(page, standing, most)
 

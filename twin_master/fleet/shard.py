@@ -29,8 +29,9 @@ from twin_master.fleet.plan import Member
 from twin_master.fleet.store import outcomes_of
 from twin_master.mission.loop import operate
 from twin_master.mission.preparation import Knowledge, kept_knowledge
+from twin_master.mission.replay import BelievedModel, filtered_again
 from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one, fly_side_by_side
-from twin_master.mission.turns import History, Reading, Turn
+from twin_master.mission.turns import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import Fed, file_feed
@@ -91,14 +92,11 @@ def _history(knowledge: Knowledge, messages: Sequence[Fed]) -> History:
     lost: list[tuple[int, Notice]] = []
     for turn in operate(twin, intake, history.add):
         at = intake.observation_turn
-        seen[at] = turn.reading.observed, twin.control_of(at)
+        seen[at] = Reading(turn.reading.observed, twin.control_of(at))
         late |= turn.reading.revises is not None
         lost += [(at, notice) for notice in intake.notices]
     if late:
-        twin = knowledge.twin()
-        history = History(twin, scenario.observation.count)
-        for at in sorted(seen):
-            history.add(Turn(Reading(*seen[at]), twin.turn(*seen[at])))
+        history = filtered_again(seen, [BelievedModel(0, knowledge)])
     history.notices += lost
     return history
 

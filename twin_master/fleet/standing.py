@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from reporting.json_file import read_json
-from reporting.section import Section, checked
 from twin_master.errors import FleetError
 from twin_master.fleet.reading import attention
 from twin_master.watch.folder import Watch
@@ -14,49 +13,18 @@ STATE_NAME = "watched.json"
 """In the folder of a fleet that is watched: its assets as they stood a moment ago, for its view."""
 
 
-class Moments(Section):
-    """What is believed of a factor of the state."""
-
-    mean: float
-    standard_deviation: float
-    unit: str
+_OF_A_DECISION = ("turn", "control", "next_control", "probability", "health")
+"""What of its last decision is kept of each asset."""
 
 
-class TurnRecord(Section):
-    """What a decision said."""
+def read_standing(folder: Path) -> dict[str, Any]:
+    """Return `assets` and `failures` of a watched fleet, both empty where nothing was watched.
 
-    turn: int
-    control: str
-    next_control: str
-    probability: float | None
-    health: dict[str, Moments]
-
-
-class AssetRecord(Section):
-    """How an asset stands: its last decision, None before the first, and what was told and refused.
-
-    `leaving` is the probability that its control is left within the steps that are predicted.
+    Of each asset `last` is what its last decision said, None before the first; `alarms` and `refused` are
+    numbers; `leaving` is the probability that its control is left within the steps that are predicted.
     """
-
-    last: TurnRecord | None
-    alarms: int
-    refused: int
-    leaving: float | None = None
-
-
-class FleetRecord(Section):
-    """How a fleet stands."""
-
-    assets: dict[str, AssetRecord]
-    failures: dict[str, str]
-
-    @classmethod
-    def read(cls, folder: Path) -> "FleetRecord":
-        """Return the record in a folder, an empty one where there is none; raises `FleetError`."""
-        path = folder / STATE_NAME
-        if not path.is_file():
-            return cls(assets={}, failures={})
-        return checked(cls, read_json(path, FleetError), str(path), FleetError, what="a watched fleet")
+    path = folder / STATE_NAME
+    return dict(read_json(path, FleetError)) if path.is_file() else {"assets": {}, "failures": {}}
 
 
 class WatchedAsset:
@@ -79,17 +47,20 @@ class WatchedAsset:
         The alarms that the operator was told since it was taken up, each sentence once.
     alarms_before : int
         How many there were before.
+    first_untold : int
+        The first turn that the operator was not told before.
     """
 
-    def __init__(self, name: str, watch: Watch, before: AssetRecord | None = None) -> None:
+    def __init__(self, name: str, watch: Watch, before: Mapping[str, Any] | None = None) -> None:
         self.name, self.watch, self.keep = name, watch, watch.keep
         self.tell: Callable[[Mapping[str, Any]], None] = lambda _decision: None
         self.close: Callable[[], None] = lambda: None
         self._knowledge = watch.models[-1].knowledge
         self.decision = watch.last_decision()
-        first = before.last.turn + 1 if before is not None and before.last is not None else 0
-        self.alarms_before = before.alarms if before is not None and first else 0
-        told = [notice for _, notice in watch.told(first)] if self.decision else []
+        known = before if before is not None and before["last"] is not None else None
+        self.first_untold = 0 if known is None else known["last"]["turn"] + 1
+        self.alarms_before = 0 if known is None else known["alarms"]
+        told = [notice for _, notice in watch.told(self.first_untold)] if self.decision else []
         self.alarms = {notice.sentence for notice in told if notice.kind == "alarm"}
         if self.decision is not None:
             twin = self.keep.twin
@@ -100,12 +71,12 @@ class WatchedAsset:
         """How many alarms the operator was told."""
         return self.alarms_before + len(self.alarms)
 
-    def record(self) -> AssetRecord:
+    def record(self) -> dict[str, Any]:
         """Return how it stands, for the view."""
         last = leaving = None
         if self.decision is not None and self.keep.filtered is not None:
-            last = TurnRecord.model_validate({key: self.decision.get(key) for key in TurnRecord.model_fields})
-            control = self.watch.scenario.control_names.index(last.control)
+            last = {key: self.decision[key] for key in _OF_A_DECISION}
+            control = self.watch.scenario.control_names.index(last["control"])
             leaving = float(attention(self._knowledge, self.keep.filtered, control))
         refused = self.keep.intake.counts.rejected
-        return AssetRecord(last=last, alarms=self.alarm_count, refused=refused, leaving=leaving)
+        return {"last": last, "alarms": self.alarm_count, "refused": refused, "leaving": leaving}

@@ -1,9 +1,6 @@
 """The store of a fleet: what is kept of each twin, chunk by chunk, and which shards are there."""
 
-import json
-import os
-import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import util
 from pathlib import Path
@@ -20,6 +17,7 @@ from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.schema import Scenario
+from twin_master.store.mission_result import SCHEMA
 from twin_master.store.summary import find_fallback
 
 if TYPE_CHECKING:
@@ -40,12 +38,6 @@ FLOWN, FAILED, ENDED = 1, 2, 3
 def has_flown(status: NDArray[Any]) -> NDArray[np.int64]:
     """Return the rows of the twins that flew, to the end of the mission or to that of their assets."""
     return np.flatnonzero((status == FLOWN) | (status == ENDED))
-
-
-SCHEMA: dict[str, tuple[str, str, str, str]] = tomllib.loads(
-    Path(__file__).with_name("store.toml").read_text(encoding="utf-8")
-)
-"""Axes behind `twin`, type, unit and meaning of every variable."""
 
 
 def sizes_of(scenario: Scenario) -> dict[str, int]:
@@ -96,7 +88,7 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
             failed | unknown, np.nan, inside.reshape(-1, steps).sum(axis=1) / np.maximum(turns, 1)
         ),
     }
-    found = {name: np.ascontiguousarray(values, SCHEMA[name][1]) for name, values in found.items()}
+    found = {name: np.ascontiguousarray(values, SCHEMA["fleet"][name][3]) for name, values in found.items()}
     for name in members[0].parameters:
         found[name] = np.array([member.parameters[name] for member in members])
     return found
@@ -151,7 +143,6 @@ def in_credible_set(
 
 
 STORE_NAME = "fleet.zarr"
-DONE_NAME = "done.jsonl"
 
 
 def check_installed(*packages: str) -> None:
@@ -165,50 +156,6 @@ def check_installed(*packages: str) -> None:
     missing = [name for name in packages if util.find_spec(name) is None]
     if missing:
         raise FleetError(f"a fleet needs {' and '.join(missing)}: pip install 'uav-twin[fleet]'.")
-
-
-class FleetStore:
-    """The store, open to be written by this process alone.
-
-    Attributes
-    ----------
-    done : dict of int to dict
-        What the journal says of each shard: failures and seconds.
-    """
-
-    def __init__(self, folder: Path, fleet: Fleet) -> None:
-        self._path, self._journal = folder / STORE_NAME, folder / DONE_NAME
-        with written(self._path):
-            if not self._journal.exists():
-                _create(self._path, fleet)
-                self._journal.touch()
-            self.done = _read_done(self._journal)
-        self._arrays: dict[str, dict[str, zarr.Array[Any]]] = {}
-
-    def write(self, group: str, rows: slice, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Write some twins of a group.
-
-        Raises
-        ------
-        FileNotWrittenError
-            The disk is full or the folder cannot be written; the shards before are still there.
-        """
-        import zarr
-
-        with written(self._path):
-            if group not in self._arrays:
-                opened = zarr.open_group(self._path, mode="r+", path=group, use_consolidated=False)
-                self._arrays[group] = dict(opened.arrays())
-            for name, values in arrays.items():
-                self._arrays[group][name][rows] = values
-
-    def finish(self, shard: int, told: Mapping[str, Any]) -> None:
-        """Note that a shard is in the store; see `write` for errors."""
-        with written(self._journal), self._journal.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"shard": shard, **told}, sort_keys=True) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        self.done[shard] = dict(told)
 
 
 @contextmanager
@@ -238,19 +185,21 @@ def open_group(folder: Path, group: str) -> "xr.Dataset":
         raise FleetError(f"{folder} holds no group {group} of a fleet ({error}).") from error
 
 
-def _create(path: Path, fleet: Fleet) -> None:
+def create_store(folder: Path, fleet: Fleet) -> None:
+    """Make the arrays of a fleet, in which nothing has flown."""
     import zarr
 
-    root = zarr.open_group(path, mode="a", zarr_format=3)
-    for group in fleet.groups:
-        _create_group(root.require_group(group.name), group, fleet)
+    with written(folder / STORE_NAME):
+        root = zarr.open_group(folder / STORE_NAME, mode="a", zarr_format=3)
+        for group in fleet.groups:
+            _create_group(root.require_group(group.name), group, fleet)
 
 
 def _create_group(made: "zarr.Group", group: Group, fleet: Fleet) -> None:
     scenario, count = group.scenarios[0], len(group.members)
     sizes = sizes_of(scenario)
-    variables = SCHEMA | dict.fromkeys(group.spreads, ("", "f8", "SI", "true parameter"))
-    for name, (axes, kind, unit, title) in variables.items():
+    true = {name: ["", "SI", "true parameter", "f8"] for name in group.spreads}
+    for name, (axes, unit, title, kind) in (SCHEMA["fleet"] | true).items():
         shape = (count, *(sizes[axis] for axis in axes.split()))
         made.create_array(
             name,
@@ -273,18 +222,3 @@ def _create_group(made: "zarr.Group", group: Group, fleet: Fleet) -> None:
             "gives_notice": scenario.notice is not None,
         }
     )
-
-
-def _read_done(path: Path) -> dict[int, dict[str, Any]]:
-    """Return the shards of a journal; a line that a kill cut off is dropped."""
-    if not path.exists():
-        return {}
-    content = path.read_bytes()
-    whole = content[: content.rfind(b"\n") + 1]
-    if len(whole) < len(content):
-        os.truncate(path, len(whole))
-    try:
-        records = [json.loads(line) for line in whole.splitlines()]
-        return {int(record.pop("shard")): record for record in records}
-    except (ValueError, KeyError, TypeError) as error:
-        raise FleetError(f"{path} is damaged ({error}): fly the fleet again with --replace.") from error

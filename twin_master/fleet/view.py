@@ -18,7 +18,7 @@ from twin_master.fleet.report import (
     fleet_record,
 )
 from twin_master.fleet.standing import STATE_NAME
-from twin_master.fleet.store import DONE_NAME
+from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.viewer.server import OWN_NAMES, handlers_of, serve_application, text_of
 
 WORST = 50
@@ -45,7 +45,7 @@ class _Fleet:
         self.version, self._seen, self.html = 0, self._stamp(), fleet_view(folder)
 
     def _stamp(self) -> str:
-        names = (DONE_NAME, STATE_NAME, LESSONS_NAME)
+        names = (JOURNAL_NAME, STATE_NAME, LESSONS_NAME)
         paths = [self._folder / name for name in names if (self._folder / name).is_file()]
         return str([(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in paths])
 

@@ -1,11 +1,11 @@
 """Real assets, many of them: each is watched as `uav-twin watch` watches one, and leaves the same folder."""
 
-import os
+import json
 import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from reporting.progress import SilentProgress
 from twin_master.errors import FleetError
 from twin_master.fleet.flight import hold_folder, see_folder
 from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
-from twin_master.fleet.standing import STATE_NAME, FleetRecord, WatchedAsset
+from twin_master.fleet.standing import STATE_NAME, WatchedAsset, read_standing
 from twin_master.fleet.store import written
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME
@@ -28,7 +28,7 @@ from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed, LiveFeed
 from twin_master.watch.message import MessageReader
 from twin_master.watch.mqtt import Outbox, Session, placed
-from twin_master.watch.opening import begin_resolved, resume_watch
+from twin_master.watch.opening import begun_watch, resumed_watch
 
 KIND = "uav-twin fleet watch"
 TURNS_AT_ONCE = 64
@@ -109,8 +109,8 @@ class FleetWatch:
                 self._sources.append(_Topics(self, group, authority))
             else:
                 self._sources.append(_Files(self, group, follow))
-        self.closing.callback(os.close, _held(fleet, folder))
-        self._told_before = FleetRecord.read(folder).assets
+        self.closing.enter_context(_held(fleet, folder))
+        self._told_before = read_standing(folder)["assets"]
         import resource
 
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -162,18 +162,15 @@ class FleetWatch:
                 if len(self.assets) == LARGEST_FLEET and key not in self.assets:
                     raise FleetError(f"a process watches {LARGEST_FLEET} assets at most.")
                 source, like = feed(group.scenarios[0]), self._like.get(group.name)
-                if (folder / CONFIG_NAME).is_file():
-                    watch, lock = resume_watch(folder, None, SilentProgress(), like)
-                else:
+                opened = resumed_watch(folder, None, SilentProgress(), like)
+                if not (folder / CONFIG_NAME).is_file():
                     with written(folder):
                         folder.parent.mkdir(exist_ok=True)
-                    watch, lock = begin_resolved(
-                        group.scenarios[0], group.file, folder, SilentProgress(), like=like
-                    )
-                closing.callback(os.close, lock)
+                    given = group.scenarios[0], group.file, folder, SilentProgress()
+                    opened = begun_watch(*given, like=like)
+                watch = closing.enter_context(opened)
                 closing.enter_context(watch.begun(source))
-                told = self._told_before.get(key)
-                asset = WatchedAsset(key, watch, told)
+                asset = WatchedAsset(key, watch, self._told_before.get(key))
                 begun(asset)
                 asset.close = closing.pop_all().close
             except Exception as error:  # noqa: BLE001 - whatever one asset comes to, the others go on
@@ -184,8 +181,7 @@ class FleetWatch:
         self._like.setdefault(group.name, watch)
         self.assets[key] = asset
         last = asset.decision
-        before = told.last.turn if told is not None and told.last is not None else -1
-        if last is not None and before < last["turn"]:  # a kill may have left it untold
+        if last is not None and last["turn"] >= asset.first_untold:  # a kill may have left it untold
             self._decided(asset, last)
         return asset
 
@@ -214,6 +210,10 @@ class FleetWatch:
         except Exception as error:  # noqa: BLE001 - likewise
             self.lost(asset.name, error)
         return count
+
+    def ask(self) -> None:
+        """Ask for an end between two turns."""
+        self.asked = True
 
     def done(self, asset: WatchedAsset) -> bool:
         """Return whether an asset is left alone: it is lost, or has the turns that were wanted."""
@@ -246,12 +246,12 @@ class FleetWatch:
 
     def _write_state(self) -> None:
         assets = {name: asset.record() for name, asset in sorted(self.assets.items())}
-        record = FleetRecord(assets={**self._told_before, **assets}, failures=self.failures)
-        atomic_write_text(self.folder / STATE_NAME, record.model_dump_json() + "\n")
+        record = {"assets": {**self._told_before, **assets}, "failures": self.failures}
+        atomic_write_text(self.folder / STATE_NAME, json.dumps(record) + "\n")
 
 
-def _held(fleet: Fleet, folder: Path) -> int:
-    """Make the folder of a fleet, or see that it holds the same; return what holds it for this process."""
+def _held(fleet: Fleet, folder: Path) -> AbstractContextManager[None]:
+    """Make the folder of a fleet, or see that it holds the same; return what holds it."""
     groups = [
         {"name": group.name, "scenarios": [group.scenarios[0].portable().to_dict()]} for group in fleet.groups
     ]

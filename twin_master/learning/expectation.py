@@ -16,6 +16,7 @@ from twin_master.learning.hypotheses import Hypotheses, quantiles_of, shown_by
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.network.estimator import Carried, Learnt
 from twin_master.network.rewards import RewardModel
+from twin_master.network.sensor_model import GaussianSensorModel
 
 _LEVELS = np.array([0.025, 0.975])
 _NEGLIGIBLE = 1e-9
@@ -45,6 +46,19 @@ class Expected:
     reward_standard_deviation: Float
 
 
+def expected_of(
+    sensor_model: GaussianSensorModel, rewards: RewardModel, joint: Float, observed: Float | None,
+    *, quantiles: bool = True,
+) -> Expected:  # fmt: skip
+    """Return what beliefs (..., S, U) say where nothing is learnt; without quantiles those are NaN."""
+    mean, deviation = sensor_model.moments(joint)
+    lower = upper = np.full_like(mean, np.nan)
+    if quantiles:
+        lower, upper = np.moveaxis(sensor_model.quantiles(joint, _LEVELS), -2, 0)
+    reward, noise = rewards.expectation(joint, observed), sensor_model.noise(joint)
+    return Expected(mean, deviation, lower, upper, noise, reward.mean, reward.standard_deviation)
+
+
 class LearntExpectation:
     """Expectations of a learning filter.
 
@@ -64,17 +78,17 @@ class LearntExpectation:
     def filtered(self, carried: Sequence[Carried], observed: Float) -> Expected:
         """Return what is expected of T turns given the observations up to each; observed is (T, G)."""
         rows = zip(carried, observed, strict=True)
-        return _stacked(self._known(self._counting(turn), turn, seen) for turn, seen in rows)
+        return stacked(self._known(self._counting(turn), turn, seen) for turn, seen in rows)
 
     def smoothed(self, carried: Sequence[Carried], observed: Float) -> Expected:
         """Return what is expected of T turns given all observations; observed is (T, G)."""
         last = self._learning.hypotheses(carried[-1])
         rows = zip(self._learning.smoothed_hypotheses(carried), carried, observed, strict=True)
-        return _stacked(self._known(last.counting(weight), turn, seen) for weight, turn, seen in rows)
+        return stacked(self._known(last.counting(weight), turn, seen) for weight, turn, seen in rows)
 
     def predicted(self, carried: Sequence[Carried], horizon: int) -> Expected:
         """Return what is expected after each of T turns of the H turns to come."""
-        return _stacked(self._ahead(turn, horizon) for turn in carried)
+        return stacked(self._ahead(turn, horizon) for turn in carried)
 
     def of_marginals(
         self, learnt: Mapping[str, Learnt], joint: Float, controls: slice, seen: Float | None
@@ -188,7 +202,7 @@ class LearntExpectation:
         )  # fmt: skip
 
 
-def _stacked(parts: Iterable[Expected]) -> Expected:
+def stacked(parts: Iterable[Expected]) -> Expected:
     """Return what is expected of several turns, which become the leading axis."""
     found = [vars(part) for part in parts]
     return Expected(**{name: np.array([part[name] for part in found]) for name in found[0]})

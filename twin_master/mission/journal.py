@@ -4,6 +4,7 @@ The file only grows. A line that was cut off by a kill ends without a line feed 
 that does not have its hash was changed. It is read line by line, however long it is.
 """
 
+import io
 import json
 import math
 import os
@@ -19,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from reporting.files import write_error
 from twin_master.errors import NotResumableError
-from twin_master.network.twin import TwinTurn
+from twin_master.mission.turns import Happened, Reading, Turn
 
 Float = NDArray[np.float64]
 
@@ -40,23 +41,42 @@ def array_of(values: Any) -> Float:
     return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
 
 
-def belief_record(turn: TwinTurn) -> dict[str, Any]:
-    """Return what a line says of the belief: for people and viewers, who need not filter again."""
+def turn_record(turn: Turn) -> dict[str, Any]:
+    """Return what a line says of a turn: what came, and the belief for viewers, who need not filter again."""
+    happened, concluded = turn.reading.happened, turn.concluded
     record: dict[str, Any] = {
-        "decision_probability": turn.decision_probability.tolist(),
-        "filtered": turn.filtered.tolist(),
-        "log_evidence": turn.log_evidence,
+        "turn": concluded.turn,
+        "observed": plain(turn.reading.observed),
+        "control_index": concluded.control_index,
+        "next_control": concluded.next_control,
+        "decision_probability": concluded.decision_probability.tolist(),
+        "filtered": concluded.filtered.tolist(),
+        "log_evidence": concluded.log_evidence,
     }
-    if turn.learnt:
-        record["learnt"] = {name: vars(learnt) for name, learnt in turn.learnt.items()}
-    if turn.notices:
-        record["notices"] = [notice.as_record() for notice in turn.notices]
-    if turn.suspicion is not None:
+    if happened is not None:
+        told = dict(zip(happened.monitors, plain([*happened.monitors.values()]), strict=True))
+        record |= {
+            "state": plain(happened.state), "observation": plain(happened.observation), "monitors": told
+        }  # fmt: skip
+    if concluded.learnt:
+        record["learnt"] = {name: vars(learnt) for name, learnt in concluded.learnt.items()}
+    if concluded.notices:
+        record["notices"] = [notice.as_record() for notice in concluded.notices]
+    if concluded.suspicion is not None:
         record["suspicion"] = {
             name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in vars(turn.suspicion).items()
+            for name, value in vars(concluded.suspicion).items()
         }
     return record
+
+
+def reading_of(record: Mapping[str, Any]) -> Reading:
+    """Return what came in a turn, from its line; raises `KeyError`, `TypeError` or `ValueError`."""
+    happened = None
+    if "monitors" in record:
+        told = dict(zip(record["monitors"], array_of(record["monitors"].values()).tolist(), strict=True))
+        happened = Happened(array_of(record["state"]), array_of(record["observation"]), told)
+    return Reading(array_of(record["observed"]), int(record["control_index"]), happened=happened)
 
 
 class JournalFile:
@@ -74,6 +94,7 @@ class JournalFile:
 
     Attributes
     ----------
+    path : Path
     size : int
         Bytes of its whole lines.
 
@@ -86,19 +107,19 @@ class JournalFile:
     """
 
     def __init__(self, folder: Path, config_hash: str, flush_seconds: float = 0.0) -> None:
-        self._path, self._flush_seconds = folder / JOURNAL_NAME, flush_seconds
+        self.path, self._flush_seconds = folder / JOURNAL_NAME, flush_seconds
         self._flushed = time.monotonic()
         try:
-            next(records(self._path, config_hash=config_hash), None)
-            self.size = next((end for _, _, end in records_backwards(self._path)), 0)
-            self._descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+            next(records(self.path, config_hash=config_hash), None)
+            self.size = next((end for _, _, end in records_backwards(self.path)), 0)
+            self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
             os.truncate(self._descriptor, self.size)
             if not self.size:
                 self.append({"config_hash": config_hash})
                 self.flush()
                 synchronise_folder(folder)
         except OSError as error:
-            raise write_error(error, self._path) from error
+            raise write_error(error, self.path) from error
 
     def __enter__(self) -> Self:
         return self
@@ -130,7 +151,7 @@ class JournalFile:
         except OSError as error:
             with suppress(OSError):
                 os.truncate(self._descriptor, self.size)
-            raise write_error(error, self._path) from error
+            raise write_error(error, self.path) from error
         self.size += len(line)
 
     def flush(self) -> None:
@@ -227,7 +248,7 @@ def records_backwards(path: Path, end: int | None = None) -> Iterator[tuple[dict
             piece = min(begin, _PIECE)
             begin -= piece
             file.seek(begin)
-            first, *lines = (file.read(piece) + rest).splitlines(keepends=True)
+            first, *lines = io.BytesIO(file.read(piece) + rest).readlines()
             rest, lines = (first, lines) if begin else (b"", [first, *lines])
             for line in reversed(lines):
                 after -= len(line)

@@ -15,8 +15,8 @@ from twin_master.run_folder import CONFIG_NAME, KIND, create_run_folder, lock_ru
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 
-Held = tuple[dict[str, Any], Scenario, int]
-"""Configuration of a folder, its scenario located in it, and the descriptor by which it is held."""
+Held = Iterator[tuple[dict[str, Any], Scenario]]
+"""Configuration of a folder that this process holds, and its scenario located in it."""
 
 
 def file_record(loaded: LoadedScenario) -> dict[str, str]:
@@ -24,7 +24,8 @@ def file_record(loaded: LoadedScenario) -> dict[str, str]:
     return {"name": loaded.path.name, "sha256": loaded.content_hash}
 
 
-def begin_folder(
+@contextmanager
+def begun_folder(
     resolved: Scenario,
     file: Mapping[str, str],
     folder: Path,
@@ -70,11 +71,12 @@ def begin_folder(
         "provenance": collect_provenance(resolved.mission.seed).as_dict(),
     }
     lock = create_run_folder(folder, config, {**source.files(), **files}, replace=replace)
-    with released(lock):
-        return config, resolved.portable().moved(folder), lock
+    with held(lock):
+        yield config, resolved.portable().moved(folder)
 
 
-def resume_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
+@contextmanager
+def resumed_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
     """Take up the folder of a run or a watch.
 
     Parameters
@@ -100,18 +102,17 @@ def resume_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
             f"than {loaded.path}: resume it without naming a scenario."
         )
     lock = lock_run_folder(folder)
-    with released(lock):
-        return config, scenario.moved(folder), lock
+    with held(lock):
+        yield config, scenario.moved(folder)
 
 
 @contextmanager
-def released(lock: int) -> Iterator[None]:
-    """Let go of a folder where an error ends what was to be done in it."""
+def held(lock: int) -> Iterator[None]:
+    """Let go of a folder at the end."""
     try:
         yield
-    except BaseException:
+    finally:
         os.close(lock)
-        raise
 
 
 def restore(folder: Path, progress: Progress) -> None:

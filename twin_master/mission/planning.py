@@ -20,18 +20,6 @@ from twin_master.network.simulated_return import Decide, simulated_returns
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
-__all__ = [
-    "ComparedPolicy",
-    "compared",
-    "decision_problem",
-    "expected_plan",
-    "planned",
-    "promised",
-    "read_policy",
-    "risk_of",
-    "write_policy",
-]
-
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 

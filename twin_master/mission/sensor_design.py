@@ -18,8 +18,6 @@ from twin_master.errors import MissionInputError
 from twin_master.mission.preparation import Knowledge
 from twin_master.seeds import generator
 
-__all__ = ["Readings", "SensorDesign", "chosen_sensors", "drawn_readings", "separations"]
-
 Float = NDArray[np.float64]
 Index = NDArray[np.int64]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fmu_asset.errors import FmuEndedError
 from twin_master.assets.asset_source import Asset, AssetReading
 from twin_master.errors import AssetOutputError, MissionError, TwinMasterError
-from twin_master.mission.turns import Happened, Reading
+from twin_master.mission.turns import Happened, History, Reading
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
@@ -280,8 +280,7 @@ class Plant:
         """Return the state of the asset as bytes."""
         return self._asset.save_state()
 
-    def restore(self, readings: Sequence[Reading], asset_state: bytes) -> None:
+    def restore(self, flown: History, asset_state: bytes) -> None:
         """Continue behind turns that were flown, and from a saved state of the asset."""
-        happened = readings[-1].happened
-        self.step, self._state = len(readings), None if happened is None else happened.state
+        self.step, self._state = len(flown.turns), flown.state[-1]
         self._asset.restore_state(asset_state)

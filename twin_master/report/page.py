@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,12 +38,17 @@ from twin_master.report.structure import design_of, mesh_figure, planform_figure
 from twin_master.store.summary import another_truth
 from twin_master.store.writing import REPORT_NAME
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 FIGURE_FOLDER = "figures"
 MAIN_FIGURE, NETWORK = "mission_now", "network"
 """The figure that is also written as PNG, and the one that is the same for all runs."""
 
 
-def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
+def write_report(
+    run_folder: Path | str, *, now: int | None = None, tree: "xr.DataTree | None" = None
+) -> Path:
     """Write ``report.html`` and ``figures/`` of a run; return the path of the page.
 
     Equal runs give equal bytes: wall-clock figures stay in ``timing.json``.
@@ -54,6 +59,8 @@ def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
         Holds ``run.nc`` and ``config.json`` and, where they exist, ``summary.json`` and ``calibration.json``.
     now
         The present turn of the first figure; by default shortly before the control first changes.
+    tree
+        What ``run.nc`` holds, where it need not be read.
 
     Raises
     ------
@@ -63,7 +70,7 @@ def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
         The disk is full or the folder cannot be written.
     """
     folder = Path(run_folder)
-    run = read_run(folder)
+    run = read_run(folder, tree)
     drawings, words = {}, {}
     for drawn in _figures(run, now, folder):  # one after the other: those of a long mission are large
         words[drawn.name], drawings[drawn.name] = (drawn.title, drawn.caption), to_svg(drawn.figure)

@@ -10,8 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
-from reporting.errors import DamagedFileError
-from reporting.folders import restore_folder
 from reporting.json_file import read_json
 from twin_master.errors import RunFolderError, TwinMasterError
 from twin_master.network.graphical_model import GraphicalModel
@@ -22,8 +20,7 @@ from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MOMENTS, SCHEMA, LearntQuantity, printed_learnt, titles_of
-from twin_master.store.writing import RUN_NAME, SUMMARY_NAME
-from twin_master.store.writing import read_run as read_tree
+from twin_master.store.writing import RUN_NAME, SUMMARY_NAME, open_run
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -32,7 +29,6 @@ if TYPE_CHECKING:
 _GROUPS = ("observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth")
 """Groups that are read; the last one not every run has."""
 _UNREAD = ("noise_standard_deviation", "residual", "sensors_received", "sensor_status")
-_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -159,15 +155,15 @@ class Run:
         return smooth(self.model, self.control_index[: now + 1], rows)
 
 
-def read_run(folder: Path) -> Run:
-    """Read a run folder.
+def read_run(folder: Path, tree: "xr.DataTree | None" = None) -> Run:
+    """Read a run folder, but for `run.nc` where what it holds is given.
 
     Raises
     ------
     RunFolderError
         There is no ``run.nc``, it is damaged, or it has another layout.
     """
-    tree = open_run(folder)
+    tree = open_run(folder) if tree is None else tree
     config, summary, calibration = (
         _read_json(folder / name) for name in (CONFIG_NAME, SUMMARY_NAME, "calibration.json")
     )
@@ -187,27 +183,8 @@ def read_run(folder: Path) -> Run:
     return run
 
 
-def open_run(folder: Path | str) -> "xr.DataTree":
-    """Return everything that a run has stored, `run.nc`; `watch.snapshot.open_run` also reads what goes on.
-
-    Raises
-    ------
-    RunFolderError
-        There is no ``run.nc``, or it is damaged.
-    """
-    restore_folder(Path(folder))
-    if not (Path(folder) / RUN_NAME).is_file():
-        raise RunFolderError(
-            f"{folder} holds no run.nc, so there is no run to report: fly or resume the run first."
-        )
-    try:
-        return read_tree(Path(folder))
-    except DamagedFileError as error:
-        raise RunFolderError(str(error)) from error
-
-
 def _check(run: Run) -> None:
-    """Refuse what no twin has ever stored; the figures rely on it."""
+    """Refuse another layout; the figures rely on it."""
     for group in _GROUPS if "truth" in run.tree.children else _GROUPS[:-1]:
         lead = "step horizon" if group == "predicted" else "step"
         own = SCHEMA["belief"] if group in ("filtered", "smoothed", "predicted") else {}
@@ -219,16 +196,6 @@ def _check(run: Run) -> None:
                 raise ValueError(f"the variable {group}/{name} is missing")
             if run.tree[group][name].dims != wanted:
                 raise ValueError(f"{name} has the axes {run.tree[group][name].dims} and not {wanted}")
-    for path in ("observed/control_index", "policy/control_index"):
-        if not (run[path].min() >= 0 and run[path].max() < len(run.controls)):
-            raise ValueError(f"{path} goes beyond its {len(run.controls)} controls")
-    for group in ("filtered", "smoothed", "predicted"):
-        belief = run[f"{group}/probability"]
-        if not (np.all(belief >= 0.0) and np.all(np.abs(belief.sum(axis=-1) - 1.0) < _ROUNDING)):
-            raise ValueError(f"a row of {group}/probability is no distribution")
-        for name in ("mean", "standard_deviation"):
-            if not np.all(np.isfinite(run[f"{group}/{name}"])):
-                raise ValueError(f"a moment of {group} is not finite")
 
 
 def _read_json(path: Path) -> dict[str, Any]:

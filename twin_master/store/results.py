@@ -3,13 +3,14 @@
 import csv
 import io
 from collections.abc import Iterable, Iterator, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reporting.groups import Group, Variable
-from twin_master.learning.expectation import Expected
+from twin_master.learning.expectation import expected_of
 from twin_master.mission.truth import SensorStatus, Truth
 from twin_master.network.inference import known_control
 from twin_master.scenario.schema import REWARD_NAMES
@@ -19,7 +20,9 @@ from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, Mis
 Float = NDArray[np.float64]
 
 
-Entry = tuple[str, NDArray[Any], Mapping[str, str]]
+Words = Mapping[str, str]
+_NONE: Words = MappingProxyType({})
+Entry = tuple[str, NDArray[Any], Words]
 """A name in the schema, the values, and the words that stand in its braces."""
 
 _DECIDED_ON = {
@@ -35,9 +38,7 @@ def groups_of(result: MissionResult) -> dict[str, Group]:
     policy = {"control_index": plan.control_index, "action_value": plan.action_value, "value": plan.value}
     groups = {
         "observed": made.group("observed", _observed(result)),
-        "filtered": _filtered(result, made),
-        "smoothed": _smoothed(result, made),
-        "predicted": _predicted(result, made),
+        **dict(_beliefs(result, made)),
         "policy": made.group("policy", _plain(policy)),
         "calibration": made.group(
             "calibration",
@@ -100,16 +101,14 @@ class _Groups:
             attrs = {"units": unit, "long_name": text} if unit else {"long_name": text}
             yield name.format(**told), Variable(tuple(axes.split()), values, attrs)
 
-    def group(
-        self, name: str, entries: Iterable[Entry], *, attrs: Mapping[str, str] | None = None, **words: str
-    ) -> Group:
+    def group(self, name: str, entries: Iterable[Entry], words: Words = _NONE, attrs: Words = _NONE) -> Group:
         """Return a group of the schema; `words` stand in braces of all its entries."""
         variables = dict(self._variables(name, entries, words))
         axes = {axis for variable in variables.values() for axis in variable.dims}
         coordinates = {
             name: label for name, label in self._coordinates.items() if axes.issuperset(label.dims)
         }
-        return Group(variables, coordinates, attrs or {})
+        return Group(variables, coordinates, attrs)
 
 
 def _observed(result: MissionResult) -> Iterator[Entry]:
@@ -124,30 +123,26 @@ def _observed(result: MissionResult) -> Iterator[Entry]:
         yield "{input}", values, {"input": name, "unit": result.units.get(name, "1")}
 
 
-def _expected(result: MissionResult, belief: Float, observed: Float | None, flown: bool = True) -> Expected:
-    """Return what beliefs (..., S) say of sensors and rewards where nothing is learnt."""
-    known = result.knowledge
-    if flown:
-        joint = known_control(belief, result.flight.control_index, len(known.model.controls))
-    else:
-        joint = belief[..., :, None] * known.plan.policy  # (T, H, S, U), eqs. (37)-(39)
-    mean, deviation = known.sensor_model.moments(joint)
-    quantiles = known.sensor_model.quantiles(joint, (0.025, 0.975))
-    rewards = known.rewards.expectation(joint, observed)
-    return Expected(
-        mean, deviation, quantiles[..., 0, :], quantiles[..., 1, :], known.sensor_model.noise(joint),
-        rewards.mean, rewards.standard_deviation,
-    )  # fmt: skip
-
-
-def _belief(result: MissionResult, probability: Float, expected: Expected) -> list[Entry]:
-    """Return belief, moments, quantities of interest and rewards."""
-    states = result.knowledge.model.states
-    return _plain(
-        {
-            "probability": probability,
-            "mean": states.mean(probability),
-            "standard_deviation": states.standard_deviation(probability),
+def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, Group]]:
+    """Yield the groups of the beliefs filtered, smoothed and predicted."""
+    flight, learns, known = result.flight, result.expectation, result.knowledge
+    states, observed, horizon = known.model.states, flight.observed, flight.predicted.shape[1]
+    ahead = flight.predicted[..., None] * known.plan.policy  # (T, H, S, U), eqs. (37)-(39)
+    flown_under, so_far = (flight.control_index, len(known.model.controls)), "observations up to the step"
+    for name, belief, joint, given in (
+        ("filtered", flight.filtered, known_control(flight.filtered, *flown_under), so_far),
+        ("smoothed", flight.smoothed, known_control(flight.smoothed, *flown_under), "all observations"),
+        ("predicted", flight.predicted, ahead, f"{so_far}, through the policy"),
+    ):
+        flown = name != "predicted"
+        if learns is None:
+            expected = expected_of(known.sensor_model, known.rewards, joint, observed if flown else None)
+        else:
+            expected = getattr(learns, name)(flight.carried, observed if flown else horizon)
+        values = {
+            "probability": belief,
+            "mean": states.mean(belief),
+            "standard_deviation": states.standard_deviation(belief),
             "quantity_mean": expected.mean,
             "quantity_standard_deviation": expected.standard_deviation,
             "quantity_lower": expected.lower,
@@ -155,58 +150,20 @@ def _belief(result: MissionResult, probability: Float, expected: Expected) -> li
             "reward_mean": expected.reward_mean,
             "reward_standard_deviation": expected.reward_standard_deviation,
         }
-    )
-
-
-def _filtered(result: MissionResult, made: _Groups) -> Group:
-    flight, learns = result.flight, result.expectation
-    observed, filtered = flight.observed, flight.filtered
-    if learns is None:
-        expected, how = _expected(result, filtered, observed), "that the twin assumes"
-    else:
-        expected, how = learns.filtered(flight.carried, observed), "that the twin has learnt"
-    beside = {
-        "decision_probability": flight.decision_probability,
-        "log_evidence": flight.log_evidence,
-        "residual": (observed - expected.mean) / expected.noise,
-        "sensors_received": np.isfinite(observed).sum(axis=1),
-    }
-    if learns is not None:
-        beside = {"noise_standard_deviation": expected.noise, **beside}
-    return made.group(
-        "filtered",
-        _belief(result, filtered, expected) + _plain(beside),
-        lead="step",
-        given="observations up to the step",
-        decided_on=_DECIDED_ON[result.scenario.planner.decide_on],
-        how=how,
-    )
-
-
-def _smoothed(result: MissionResult, made: _Groups) -> Group:
-    flight, learns = result.flight, result.expectation
-    if learns is None:
-        expected = _expected(result, flight.smoothed, flight.observed)
-    else:
-        expected = learns.smoothed(flight.carried, flight.observed)
-    entries = _belief(result, flight.smoothed, expected)
-    return made.group("smoothed", entries, lead="step", given="all observations")
-
-
-def _predicted(result: MissionResult, made: _Groups) -> Group:
-    flight, learns, predicted = result.flight, result.expectation, result.flight.predicted
-    if learns is None:
-        expected = _expected(result, predicted, None, flown=False)
-    else:
-        expected = learns.predicted(flight.carried, predicted.shape[1])
-    joint = predicted[..., None] * result.knowledge.plan.policy
-    controls = {"control_probability": joint.sum(axis=-2)}
-    return made.group(
-        "predicted",
-        _belief(result, predicted, expected) + _plain(controls),
-        lead="step horizon",
-        given="observations up to the step, through the policy",
-    )
+        words = {"lead": "step" if flown else "step horizon", "given": given}
+        if name == "filtered":
+            values |= {} if learns is None else {"noise_standard_deviation": expected.noise}
+            values |= {
+                "decision_probability": flight.decision_probability,
+                "log_evidence": flight.log_evidence,
+                "residual": (observed - expected.mean) / expected.noise,
+                "sensors_received": np.isfinite(observed).sum(axis=1),
+            }
+            words["decided_on"] = _DECIDED_ON[result.scenario.planner.decide_on]
+            words["how"] = "that the twin assumes" if learns is None else "that the twin has learnt"
+        elif name == "predicted":
+            values["control_probability"] = joint.sum(axis=-2)
+        yield name, made.group(name, _plain(values), words)
 
 
 def _learnt(result: MissionResult) -> Iterator[Entry]:

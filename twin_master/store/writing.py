@@ -3,18 +3,20 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_file, atomic_write_text
+from reporting.folders import restore_folder
 from reporting.groups import Group, write_groups
 from reporting.json_file import read_json
 from reporting.netcdf import read_groups
 from reporting.provenance import hash_record
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.assets.mismatch import Misfit
-from twin_master.errors import NotResumableError
+from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.run_folder import FIELD_NAME, read_config, to_json
 from twin_master.store.mission_result import MissionResult, learnt_record
 from twin_master.store.results import groups_of, tables_of
@@ -52,52 +54,44 @@ def write_run(folder: Path, groups: Mapping[str, Group], attributes: Mapping[str
     return folder / RUN_NAME
 
 
-def read_run(folder: Path) -> "DataTree":
-    """Return the groups of a run, loaded into memory.
+def open_run(folder: Path | str) -> "DataTree":
+    """Return everything that a run has stored, `run.nc`, loaded into memory.
 
     Raises
     ------
-    DamagedFileError
-        There is no whole `run.nc`.
+    RunFolderError
+        There is no ``run.nc``, or it is damaged.
     """
+    restore_folder(Path(folder))
+    path = Path(folder) / RUN_NAME
+    if not path.is_file():
+        raise RunFolderError(
+            f"{folder} holds no run.nc, so there is no run to report: fly or resume the run first."
+        )
     try:
-        return read_groups(folder / RUN_NAME)
+        return read_groups(path)
     except DamagedFileError as error:
-        raise DamagedFileError(f"{error}: it is not a whole run, resume the run or fly it again.") from error
+        raise RunFolderError(f"{error}: it is not a whole run, resume the run or fly it again.") from error
+
+
+def tree_of(groups: Mapping[str, Group], attributes: Mapping[str, Any]) -> "DataTree":
+    """Return groups as `open_run` returns them, without a file."""
+    import xarray as xr
+
+    sets = {"/": xr.Dataset(attrs=attributes)}
+    for name, group in groups.items():
+        variables, coordinates = (
+            {key: (one.dims, one.values, one.attrs) for key, one in own.items()}
+            for own in (group.variables, group.coords)
+        )
+        sets[name] = xr.Dataset(variables, coordinates, group.attrs)
+    return xr.DataTree.from_dict(sets)
 
 
 def write_summary(folder: Path, figures: Sequence[Figure], heading: Mapping[str, Any]) -> Path:
     """Write `summary.json`: the heading, and each figure beside its reference."""
     record = {**heading, "figures": [asdict(figure) for figure in figures]}
     return atomic_write_text(folder / SUMMARY_NAME, to_json(record))
-
-
-def store_mission(
-    folder: Path,
-    result: MissionResult,
-    attributes: Mapping[str, Any],
-    write_field: Callable[[Path], object] | None = None,
-) -> dict[str, Group]:
-    """Write `run.nc`, the CSV files and, where the asset has a mesh, `wing.vtu`; return the groups.
-
-    Parameters
-    ----------
-    folder
-        The run folder.
-    result
-        The mission.
-    attributes
-        Attributes of the root of `run.nc`.
-    write_field
-        Writes the VTU file to the path that it is given.
-    """
-    groups = groups_of(result)
-    write_run(folder, groups, attributes)
-    for name, text in tables_of(groups, result.scenario.observation.role).items():
-        atomic_write_text(folder / CSV_FOLDER / f"{name}.csv", text)
-    if write_field is not None:
-        write_field(folder / FIELD_NAME)
-    return groups
 
 
 def store_flight(
@@ -111,13 +105,15 @@ def store_flight(
     attributes: Mapping[str, Any] | None = None,
     misfit: Misfit | None = None,
     write_field: Callable[[Path], object] | None = None,
-) -> None:
-    """Write all that a run or a watch leaves beside its report.
+) -> Callable[[], "DataTree"]:
+    """Write all that a run or a watch leaves beside its report; return what gives its tree.
 
     Parameters
     ----------
-    folder, result, write_field
-        As of `store_mission`.
+    folder
+        The run folder.
+    result
+        The mission.
     config
         Content of `config.json`.
     origin
@@ -130,6 +126,8 @@ def store_flight(
         Further ones of the root of `run.nc`.
     misfit
         Of the twin's model, where the asset is known to be another one.
+    write_field
+        Writes the VTU file to the path that it is given.
     """
     provenance, mission, draws = config["provenance"], result.scenario.mission, result.knowledge.draws
     flown = {"asset": origin.asset, "twin_model": origin.model}
@@ -147,7 +145,12 @@ def store_flight(
         **flown,
         **(attributes or {}),
     }
-    groups = store_mission(folder, result, told, write_field)
+    groups = groups_of(result)
+    write_run(folder, groups, told)
+    for name, text in tables_of(groups, result.scenario.observation.role).items():
+        atomic_write_text(folder / CSV_FOLDER / f"{name}.csv", text)
+    if write_field is not None:
+        write_field(folder / FIELD_NAME)
     flown_controls = result.flight.control_index
     heading = {
         "scenario": mission.name,
@@ -162,6 +165,7 @@ def store_flight(
     }
     rewards = groups["filtered"]["reward_mean"].values
     write_summary(folder, [*figures, *summarise(result, rewards, misfit)], heading)
+    return partial(tree_of, groups, told)
 
 
 REPORT_NAME = "report.html"
@@ -200,10 +204,16 @@ class RunOutcome:
     step_name: str
     control: str
     notices: tuple[str, ...] = ()
+    stored: Callable[[], "DataTree"] | None = None
+
+    @cached_property
+    def tree(self) -> "DataTree":
+        """All that the run has stored, as of `open_run`; it is read where this process did not fly it."""
+        return open_run(self.folder) if self.stored is None else self.stored()
 
 
-def read_outcome(folder: Path) -> RunOutcome:
-    """Return what came of the run in a folder.
+def read_outcome(folder: Path, stored: Callable[[], "DataTree"] | None = None) -> RunOutcome:
+    """Return what came of the run in a folder; `stored` gives its `run.nc` without reading it.
 
     Raises
     ------
@@ -223,13 +233,14 @@ def read_outcome(folder: Path) -> RunOutcome:
         str(read_config(folder)["scenario"]["mission"]["step_name"]),
         str(summary["control"]),
         tuple(str(notice["sentence"]) for notice in summary.get("notices", ())),
+        stored,
     )
 
 
 def finished_run(folder: Path) -> RunOutcome | None:
     """Return the outcome of a run that is finished; None where its results are missing or damaged."""
     try:
-        read_run(folder)
+        open_run(folder)
         return read_outcome(folder)
-    except (KeyError, TypeError, DamagedFileError, NotResumableError):
+    except (KeyError, TypeError, DamagedFileError, NotResumableError, RunFolderError):
         return None

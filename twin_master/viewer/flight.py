@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from twin_master.errors import RunFolderError
-from twin_master.learning.expectation import Expected, LearntExpectation
+from twin_master.learning.expectation import Expected, LearntExpectation, expected_of
 from twin_master.learning.setup import learning_filter
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
@@ -158,28 +158,21 @@ class GrowingJournal:
         return None
 
 
-@dataclass(frozen=True)
-class Belief:
-    """Means and standard deviations under beliefs, SI; the leading axis is that of the turns.
+class Belief(NamedTuple):
+    """What is believed of n turns.
 
     Attributes
     ----------
-    state_mean, state_deviation : (n, K)
-        Of each factor of the state.
-    reward_mean, reward_deviation : (n, R)
-        Of each reward; that of the error is NaN where nothing was observed.
-    sensor_mean, sensor_deviation : (n, G)
-        Of what each sensor shows, its noise included.
+    probability : (n, S)
+        Of each state.
+    expected : Expected
+        Of sensors and rewards, without quantiles; the reward of the error is NaN where nothing was observed.
     control_probability : (n, U)
         Of a turn that was flown: what its next control was decided by. Of a predicted one: p(U).
     """
 
-    state_mean: Float
-    state_deviation: Float
-    reward_mean: Float
-    reward_deviation: Float
-    sensor_mean: Float
-    sensor_deviation: Float
+    probability: Float
+    expected: Expected
     control_probability: Float
 
 
@@ -368,14 +361,14 @@ class Flight:
         )
         decided = np.array([turn.decision_probability for turn in turns])
         observed = self.observed(first, end)
-        found = self._belief(joint, observed, decided)
         if self._expectation is None or not turns:
-            return found
+            return self._belief(joint, observed, decided)
         parts = []
         for turn, own, seen in zip(turns, joint, observed, strict=True):
             u = slice(turn.control_index, turn.control_index + 1)
             parts.append(self._expectation.of_marginals(turn.learnt, own[None, :, u], u, seen))
-        return _as_learnt(found, parts)
+        together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
+        return Belief(joint.sum(axis=-1), Expected(**together), decided)
 
     def predicted(self, turn: int) -> Belief:
         """Return what the twin expected after a turn of the H turns to come."""
@@ -384,40 +377,15 @@ class Flight:
         coming = predict(
             model, seen.filtered, seen.control_index, plan.policy, self.scenario.mission.prediction_steps
         )
-        found = self._belief(coming.joint, None, coming.control_probability)
         if self._expectation is None:
-            return found
-        return _as_learnt(
-            found, [self._expectation.of_marginals(seen.learnt, coming.joint, slice(None), None)]
-        )
+            return self._belief(coming.joint, None, coming.control_probability)
+        expected = self._expectation.of_marginals(seen.learnt, coming.joint, slice(None), None)
+        return Belief(coming.joint.sum(axis=-1), expected, coming.control_probability)
 
     def _belief(self, joint: Float, observed: Float | None, control_probability: Float) -> Belief:
-        knowledge = self.knowledge
-        states, sensors = knowledge.model.states, knowledge.sensor_model
-        belief = joint.sum(axis=-1)
-        rewards = knowledge.rewards.expectation(joint, observed)
-        mean, spread = sensors.moments(joint)
-        return Belief(
-            states.mean(belief),
-            states.standard_deviation(belief),
-            rewards.mean,
-            rewards.standard_deviation,
-            mean,
-            np.hypot(spread, sensors.noise(joint)),
-            control_probability,
-        )
-
-
-def _as_learnt(belief: Belief, expected: Sequence[Expected]) -> Belief:
-    """Return a belief with sensors and rewards as they are expected by what was learnt."""
-    mean, spread, noise, reward, reward_spread = (
-        np.concatenate([getattr(part, name) for part in expected])
-        for name in ("mean", "standard_deviation", "noise", "reward_mean", "reward_standard_deviation")
-    )
-    return replace(
-        belief, sensor_mean=mean, sensor_deviation=np.hypot(spread, noise), reward_mean=reward,
-        reward_deviation=reward_spread,
-    )  # fmt: skip
+        known = self.knowledge
+        expected = expected_of(known.sensor_model, known.rewards, joint, observed, quantiles=False)
+        return Belief(joint.sum(axis=-1), expected, control_probability)
 
 
 def is_prepared(folder: Path) -> bool:

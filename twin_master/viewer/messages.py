@@ -142,9 +142,11 @@ class Teller:
         scene = self._scene
         scales = np.array([factor.scale for factor in scene.factors])
         levels = np.array([(factor.levels[0], factor.levels[-1]) for factor in scene.factors]).T
-        mean, reach = scales * belief.state_mean, 2.0 * scales * belief.state_deviation
-        reward, reward_reach = belief.reward_mean, NORMAL_95 * belief.reward_deviation
-        center, spread = belief.sensor_mean, belief.sensor_deviation
+        states, expected = self._flight.knowledge.model.states, belief.expected
+        mean = scales * states.mean(belief.probability)
+        reach = 2.0 * scales * states.standard_deviation(belief.probability)
+        reward, reward_reach = expected.reward_mean, NORMAL_95 * expected.reward_standard_deviation
+        center, spread = expected.mean, np.hypot(expected.standard_deviation, expected.noise)
         if scene.standardised:
             observed = None if observed is None else (observed - center) / spread
             center, spread = np.zeros_like(center), np.ones_like(spread)

@@ -1,12 +1,14 @@
 """A watch: its folder, begun or taken up again, its loop, and what it leaves."""
 
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from threading import Thread
+from typing import TYPE_CHECKING, Any
 
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
@@ -23,16 +25,17 @@ from twin_master.mission.journal import (
 )
 from twin_master.mission.loop import Source, operate
 from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
+from twin_master.mission.replay import BelievedModel, journalled_decision, replay
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.run_folder import PATCH, PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
+from twin_master.store.results import groups_of
 from twin_master.store.summary import Figure
-from twin_master.store.writing import store_flight
-from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping
+from twin_master.store.writing import store_flight, tree_of
+from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping, listening
 from twin_master.watch.keeping import Keeper, Standing
-from twin_master.watch.replay import BelievedModel, journalled_decision, replay
 from twin_master.watch.teaching import (
     LEAST_GAIN,
     TRIAL_TURNS,
@@ -44,7 +47,10 @@ from twin_master.watch.teaching import (
     trial_sentence,
     verdict_of,
 )
-from twin_master.watch.trial import CANNOT, Judge, Outcome, Trial, judged, patched_model
+from twin_master.watch.trial import CANNOT, Outcome, judged, patched_model
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 STORED_TURNS = 1_000
 """The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
@@ -153,7 +159,7 @@ class Watch:
         with self.begun(feed, patched) as (journal, keep):
             source = Stopping(keep.intake, turns, lambda: self.quiet(decide))
             tutor = Tutor(self, journal, search, source, wait=feed.replayable) if search else None
-            with source.listening():
+            with listening(source.ask):
                 try:
                     if untold is not None:
                         decide(untold)
@@ -181,13 +187,13 @@ class Watch:
             if patched is not None:
                 self._patch(journal, patched)
             found, last = replay(self._path, self.models, self.scenario.watch.lag)
-            intake.restore(None if last is None else last["intake"])
-            if last is not None:
+            intake.restore(last.get("intake"))
+            if last:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
             self.keep = Keeper(journal, intake, found.twin, self.standing)
-            self.keep.quiet = "quiet" in (last or {})
+            self.keep.quiet = "quiet" in last
             yield journal, self.keep
 
     def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:
@@ -221,12 +227,11 @@ class Watch:
 
     def trial(
         self, journal: JournalFile, file: Path, from_turn: int, compared: tuple[int, int] = (0, 0)
-    ) -> Trial:
-        """Return the question what comes of a patch from a turn on, after all lines of the journal."""
+    ) -> Callable[..., Outcome]:
+        """Return what tells what comes of a patch from a turn on, after all lines of the journal so far."""
         believed = [m for m in range(len(self.models)) if self.models[m].from_turn <= from_turn]
-        patch = both_patches(self._patches[max(believed)], file)
-        models = tuple(self.models)
-        return Trial(self._path, journal.size, self.scenario, models, patch, from_turn, compared)
+        patch, models = both_patches(self._patches[max(believed)], file), tuple(self.models)
+        return partial(judged, self._path, journal.size, self.scenario, models, patch, from_turn, compared)
 
     def _patch(self, journal: JournalFile, patched: Patched) -> None:
         """Believe a patch that is given from a turn on."""
@@ -235,7 +240,7 @@ class Watch:
             raise MissionInputError(
                 f"--from-turn names one of the {turns} turns watched so far, or the next one."
             )
-        outcome = judged(self.trial(journal, patched.file, patched.from_turn), self._progress)
+        outcome = self.trial(journal, patched.file, patched.from_turn)(progress=self._progress)
         self.adopt(journal, outcome, None, self._kept_verdict(patched.file.parent))
 
     def _kept_verdict(self, found: Path) -> str:
@@ -252,8 +257,10 @@ class Watch:
     ) -> Twin:
         """Believe a patched model; return the twin that goes on."""
         name, first = f"asset/model_patch_{len(self.models)}.json", outcome.model.from_turn
-        atomic_write_bytes(self.folder / name, outcome.trial.patch)
-        twin, alarms = outcome.twin()
+        atomic_write_bytes(self.folder / name, outcome.patch)
+        again, _ = replay(self._path, self.models, self.scenario.watch.lag, question=outcome.model)
+        alarms = [n for turn, n in again.notices if turn >= first and n.kind == "alarm"]
+        twin = again.twin
         self.models.append(outcome.model)
         self._patches.append(self.folder / name)
         model: dict[str, Any] = {
@@ -288,10 +295,7 @@ class Watch:
         if not turns:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
-        first = max(0, turns - last)
-        found, _ = replay(self._path, self.models, None, first_turn=first)
-        flight = replace(found.behind(first - found.first_turn), notices=self.told(first))
-        result, attributes = MissionResult(self.scenario, self.models[-1].knowledge, flight), {}
+        result, attributes = self.result(turns, last), {}
         if self.standing.adopted:
             adopted = self.standing.adopted[-1]
             attributes = {
@@ -299,7 +303,7 @@ class Watch:
             }  # fmt: skip
         origin = FlownAndBelieved(WATCHED, self._source.origin.model)
         with self._progress.stage("Storing"):
-            store_flight(
+            stored = store_flight(
                 self.folder, self._config, result, origin, steps=turns,
                 figures=self._figures(counts, turns), attributes=attributes,
             )  # fmt: skip
@@ -307,7 +311,19 @@ class Watch:
             from twin_master.report.page import write_report
 
             with self._progress.stage("Writing the report"):
-                write_report(self.folder)
+                write_report(self.folder, tree=stored())
+
+    def result(self, turns: int, last: int) -> MissionResult:
+        """Return the last of so many turns, as a mission."""
+        first = max(0, turns - last)
+        found, _ = replay(self._path, self.models, None, first_turn=first)
+        flight = replace(found.behind(first - found.first_turn), notices=self.told(first))
+        return MissionResult(self.scenario, self.models[-1].knowledge, flight)
+
+    @property
+    def tree(self) -> "xr.DataTree":
+        """The last turns as `open_run` returns them, without a file."""
+        return tree_of(groups_of(self.result(last_turn(self._path)[0] + 1, STORED_TURNS)), {})
 
     def told(self, first: int) -> list[tuple[int, Notice]]:
         """Return what the operator was told in the turns from `first` on, each sentence once.
@@ -356,7 +372,8 @@ class Tutor:
     source : Stopping
         Says whether the watch was asked to end.
     wait : bool
-        Whether the next turn waits for an answer, as those of a recording do.
+        Whether the next turn waits for an answer, as those of a recording do. Those of a live watch go on
+        beside a process that searches and a thread that tries a patch.
 
     Raises
     ------
@@ -370,7 +387,8 @@ class Tutor:
         check_teachable(watch.scenario)
         watch.keep.taught = True
         self._watch, self._journal, self._search, self._source = watch, journal, search, source
-        self._teaching, self._judge, self._wait = watch.standing.teaching, Judge(wait=wait), wait
+        self._teaching, self._wait = watch.standing.teaching, wait
+        self.outcome: Future[Outcome] | None = None
 
     @property
     def _over(self) -> bool:
@@ -400,16 +418,19 @@ class Tutor:
         if (trial := teaching.trial) is None or not self._over:
             return
         file, compared = watch.folder / trial["folder"] / PATCH, (trial["turn"] + 1, TRIAL_TURNS)
+        if self.outcome is None:
+            ask = watch.trial(self._journal, file, trial["from_turn"], compared)
+            self.outcome = Future()
+            working = Thread(target=_work, args=(ask, self.outcome), daemon=True)
+            (working.run if self._wait else working.start)()
+        if not self.outcome.done():
+            return
+        asked, self.outcome, outcome = self.outcome, None, None
         try:
-            outcome = self._judge.outcome(
-                partial(watch.trial, self._journal, file, trial["from_turn"], compared)
-            )
-        except CANNOT as error:
-            outcome, sentence = None, f"The patch cannot be believed by this twin: {error}"
-        else:
-            if outcome is None:
-                return
+            outcome = asked.result()
             sentence = trial_sentence(trial, outcome, step)
+        except CANNOT as error:
+            sentence = f"The patch cannot be believed by this twin: {error}"
         notice = notice_of("trial", sentence)
         if outcome is not None and outcome.gained >= LEAST_GAIN:
             watch.keep.twin = watch.adopt(self._journal, outcome, notice)
@@ -418,5 +439,11 @@ class Tutor:
 
     def end(self) -> None:
         """End what is under way."""
-        self._search.errand.end()
-        self._judge.end()
+        self._search.end()
+
+
+def _work(ask: Callable[[], Outcome], told: "Future[Outcome]") -> None:
+    try:
+        told.set_result(ask())
+    except BaseException as error:  # noqa: BLE001 - it is raised where it is asked for
+        told.set_exception(error)

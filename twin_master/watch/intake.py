@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import FrameType
 from typing import Any, Protocol
 
 import numpy as np
@@ -400,24 +399,27 @@ class Stopping:
         """Return what is assimilated in the place of an observation that no state allows."""
         return self._intake.impossible(reading, error)
 
-    def _ask(self, _signal: int, _frame: FrameType | None) -> None:
+    def ask(self) -> None:
+        """Ask for the end."""
         self.asked = True
         if self._waiting:
             raise _Asked
 
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        """Listen to the signals."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        before = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
 
 class _Asked(BaseException):
     """Somebody asked the watch to end while it waited."""
+
+
+@contextmanager
+def listening(ask: Callable[[], None]) -> Iterator[None]:
+    """Call `ask` where SIGINT or SIGTERM ask for an end, in the main thread alone."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = signal.SIGINT, signal.SIGTERM
+    before = {number: signal.signal(number, lambda *_: ask()) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

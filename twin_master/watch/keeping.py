@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from twin_master.mission.journal import (
     JournalFile,
-    belief_record,
     damaged,
-    plain,
     records_backwards,
+    turn_record,
 )
 from twin_master.mission.turns import Turn
 from twin_master.network.twin import Twin
@@ -128,19 +127,15 @@ class Keeper:
         """Write down a reading and what became of it."""
         reading, concluded, at = turn.reading, turn.concluded, self.intake.observation_turn
         number, self.filtered = concluded.turn, concluded.filtered
-        record: dict[str, Any] = {
-            "turn": number,
+        record = turn_record(turn) | {
             "observation_turn": at,
-            "observed": plain(reading.observed),
             "control_index": self.twin.control_of(at),
-            "next_control": concluded.next_control,
             "intake": self.intake.state(),
         }
         if reading.revises is not None:
             record["control_in_force"] = concluded.control_index
         elif number % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1:
             record |= self._standing.snapshot(self.twin, self._journal.size)
-        record |= belief_record(concluded)
         known = {(notice.kind, notice.sensors) for notice in concluded.notices}
         told = [n.as_record() for n in self.intake.notices if (n.kind, n.sensors) not in known]
         told += self._standing.teaching.untold if self.taught else []

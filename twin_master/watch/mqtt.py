@@ -19,6 +19,7 @@ from typing import Any
 from reporting.files import atomic_write_text, write_error
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, records
+from twin_master.mission.replay import journalled_decision
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.broker import PASSWORD_VARIABLE, Broker
 from twin_master.watch.feeds import Fed, parsed, shown
@@ -26,7 +27,6 @@ from twin_master.watch.folder import Watch
 from twin_master.watch.growing import Place
 from twin_master.watch.intake import LiveFeed
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
-from twin_master.watch.replay import journalled_decision
 
 CLIENT_SUFFIX, PUBLISHED_NAME = ".mqtt", "published"
 """Of the file with the name of the client, and of that which says how far decisions were published."""

@@ -1,10 +1,9 @@
 """A watch from its sources to its report, begun or taken up again, and as it stood after a turn."""
 
 import math
-import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -20,12 +19,12 @@ from twin_master.assets.resolution import (
 )
 from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME, last_turn
-from twin_master.mission.opening import begin_folder, file_record, released, resume_folder
-from twin_master.report import reading
+from twin_master.mission.opening import begun_folder, file_record, resumed_folder
 from twin_master.run_folder import CONFIG_NAME, check_versions, read_config
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.writing import SUMMARY_NAME
+from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.broker import broker_of, is_broker
 from twin_master.watch.feeds import JsonLinesFeed, MappingFeed, check_file, file_feed
 from twin_master.watch.folder import STORED_TURNS, Patched, Watch
@@ -37,45 +36,28 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def begin_watch(
-    loaded: LoadedScenario, folder: Path, overrides: Overrides, progress: Progress, *, replace_run: bool
-) -> tuple[Watch, int]:
-    """Make the folder of a watch; return it and the file descriptor that holds the folder.
-
-    Raises
-    ------
-    RunFolderExistsError
-        The folder exists.
-    TwinMasterError, FiniteElementError, CalibrationError
-        With one clear sentence.
-    """
-    resolved = resolve_scenario(loaded, overrides)
-    if loaded.remark:
-        progress.note(loaded.remark)
-    return begin_resolved(resolved, file_record(loaded), folder, progress, replace_run=replace_run)
-
-
-def begin_resolved(
+@contextmanager
+def begun_watch(
     resolved: Scenario, file: Mapping[str, str], folder: Path, progress: Progress, *,
     replace_run: bool = False, like: Watch | None = None,
-) -> tuple[Watch, int]:  # fmt: skip
-    """Make the folder of a watch of a resolved scenario, see `begin_watch` and `Watch`."""
+) -> Iterator[Watch]:  # fmt: skip
+    """Make the folder of a watch of a resolved scenario, and hold it; see `begun_folder` and `Watch`."""
     # A watch that takes the place of another ends its session at the broker: it comes under the same name.
     files = {
         path.name: path.read_bytes().partition(b"\n")[0] + f"\n{BEGIN_ANEW}\n".encode()
         for path in folder.glob(f"*{CLIENT_SUFFIX}")
     }
-    config, located, lock = begin_folder(
-        resolved, file, folder, believed_source(resolved), files, replace=replace_run, watched=True
-    )
-    with released(lock):
-        return Watch(folder, config, located, progress, like), lock
+    source = believed_source(resolved)
+    opened = begun_folder(resolved, file, folder, source, files, replace=replace_run, watched=True)
+    with opened as (config, located):
+        yield Watch(folder, config, located, progress, like)
 
 
-def resume_watch(
+@contextmanager
+def resumed_watch(
     folder: Path, loaded: LoadedScenario | None, progress: Progress, like: Watch | None = None
-) -> tuple[Watch, int]:
-    """Take up the watch in a folder; return it and the file descriptor that holds the folder.
+) -> Iterator[Watch]:
+    """Take up the watch in a folder, and hold it.
 
     Raises
     ------
@@ -86,17 +68,17 @@ def resume_watch(
         raise NotResumableError(
             f"{folder} holds a run, no watch: continue it with `uav-twin run --resume {folder}`."
         )
-    config, scenario, lock = resume_folder(folder, loaded)
-    with released(lock):
+    with resumed_folder(folder, loaded) as (config, scenario):
         try:
             check_versions(folder, config, scenario.mission.seed)
-            return Watch(folder, config, scenario, progress, like), lock
+            watched = Watch(folder, config, scenario, progress, like)
         except NotResumableError as error:
             error.add_note(
                 "--replace would remove what was observed; another watch, in another folder, takes it in "
                 f"with `--observations {folder}`."
             )
             raise
+        yield watched
 
 
 @contextmanager
@@ -160,9 +142,9 @@ def open_run(folder: Path | str) -> "xr.DataTree":
         The journal of a watch was changed or is damaged.
     """
     if _config(Path(folder)) is None or stored(Path(folder)):
-        return reading.open_run(folder)
+        return stored_run(folder)
     with flown(Path(folder), None, None, SilentProgress()) as ended:
-        return reading.open_run(ended)
+        return stored_run(ended)
 
 
 def stored(folder: Path) -> bool:
@@ -276,32 +258,31 @@ def watch(
     if isinstance(observations, str | Path):
         own = None if loaded is None else _allowing(loaded.scenario, allow_unknown)
         _check_source(str(observations), own, follow, authority)
-    watched, lock = _opened(loaded, observations, folder, given, progress, resume=resume, replace=replace)
-    try:
-        begun(watched)
-        known = _allowing(watched.scenario, allow_unknown)
-        source = _source(observations, known, otherwise)
-        feed, publish, close = _feed(source, watched, known, follow, authority, progress)
-
-        def tell(decision: Mapping[str, Any]) -> None:
-            decide(decision)
-            publish(decision)
-
+    opened = _opened(loaded, observations, folder, given, progress, resume=resume, replace=replace)
+    with opened as watched:
         try:
-            # A kill may have left the last decision untold.
-            untold = None if stored(watched.folder) else watched.last_decision()
-            search = Search(watched.folder, watched.scenario.mission.seed) if teach else None
-            counts = watched.run(feed, tell, turns=turns, patched=patch, search=search, untold=untold)
-        finally:
-            close()
-        watched.store(counts, last=last, report=report)
-    except Exception as error:
-        error.add_note(
-            f"What was observed is kept: go on with `uav-twin watch --resume --out {watched.folder}`."
-        )
-        raise
-    finally:
-        os.close(lock)
+            begun(watched)
+            known = _allowing(watched.scenario, allow_unknown)
+            source = _source(observations, known, otherwise)
+            feed, publish, close = _feed(source, watched, known, follow, authority, progress)
+
+            def tell(decision: Mapping[str, Any]) -> None:
+                decide(decision)
+                publish(decision)
+
+            try:
+                # A kill may have left the last decision untold.
+                untold = None if stored(watched.folder) else watched.last_decision()
+                search = Search(watched.folder, watched.scenario.mission.seed) if teach else None
+                counts = watched.run(feed, tell, turns=turns, patched=patch, search=search, untold=untold)
+            finally:
+                close()
+            watched.store(counts, last=last, report=report)
+        except Exception as error:
+            error.add_note(
+                f"What was observed is kept: go on with `uav-twin watch --resume --out {watched.folder}`."
+            )
+            raise
     return watched.folder
 
 
@@ -336,7 +317,7 @@ def _check_source(observations: str, scenario: Scenario | None, follow: bool, au
 def _opened(
     loaded: LoadedScenario | None, observations: Observations | None, out: Path | str | None,
     overrides: Overrides, progress: Progress, *, resume: bool, replace: bool,
-) -> tuple[Watch, int]:  # fmt: skip
+) -> AbstractContextManager[Watch]:  # fmt: skip
     """Return the watch, begun or taken up, and what holds its folder."""
     if resume and (replace or overrides != Overrides()):
         raise MissionInputError(
@@ -348,14 +329,17 @@ def _opened(
         raise MissionInputError("a scenario is needed, or --resume with the folder of a watch.")
     folder = Path(out)
     if resume or loaded is None:
-        return resume_watch(folder, loaded, progress)
+        return resumed_watch(folder, loaded, progress)
     source = Path(observations).resolve() if isinstance(observations, str | Path) else None
     if replace and source is not None and folder.resolve() in (source, *source.parents):
         raise MissionInputError(
             f"--replace would remove the observations in {observations} before they are read: choose another "
             "--out."
         )
-    return begin_watch(loaded, folder, overrides, progress, replace_run=replace)
+    resolved = resolve_scenario(loaded, overrides)
+    if loaded.remark:
+        progress.note(loaded.remark)
+    return begun_watch(resolved, file_record(loaded), folder, progress, replace_run=replace)
 
 
 def _feed(

@@ -8,9 +8,12 @@ turn in which it came.
 
 import json
 import math
+import os
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +23,7 @@ from reporting.json_file import read_json
 from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.run_folder import PATCH, TEACHING, VERDICT
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.trial import Errand, Outcome
+from twin_master.watch.trial import Outcome
 
 SETTLE_TURNS = 10
 """Turns that an alarm must hold before its cause is looked for; they also show what it is."""
@@ -38,6 +41,8 @@ NO_WING = (
     "by a design or a calibration, are needed, and this scenario has {}: leave --teach out, alarms are given "
     "all the same."
 )
+COURTESY = 10
+"""Niceness of a search beside a live watch: the watch comes first."""
 _LOOK_AGAIN = 0.05
 
 
@@ -172,7 +177,7 @@ class Search:
     watch: Path
     seed: int
     command: Sequence[str] = (sys.executable, "-m", "uav_twin", "discrepancy", "run")
-    errand: Errand = field(default_factory=Errand)
+    _process: "subprocess.Popen[bytes] | None" = field(default=None, init=False)
 
     def words(self, question: Question) -> list[str]:
         """Return the options of the command that answers a question."""
@@ -183,19 +188,43 @@ class Search:
     def answer(self, question: Question, *, wait: bool, asked_to_end: Callable[[], bool]) -> Path | None:
         """Return the folder of the verdict; None while it is looked for.
 
+        No key of the terminal ends the process; where turns do not wait for it, it has a low priority.
+
         Raises
         ------
         TwinMasterError
             The search ended without a verdict; the sentence is the last one that it said.
         """
         folder = question.folder(self.watch)
-        log, words = folder.with_name(folder.name + ".log"), [*self.command, *self.words(question)]
+        log = folder.with_name(folder.name + ".log")
         log.parent.mkdir(exist_ok=True)
-        while not self.errand.answered(folder / VERDICT, log, words, waited_for=wait):
+        while not (folder / VERDICT).is_file():
+            if self._process is None:
+                words = [*self.command, *self.words(question)]
+                with log.open("wb") as file:
+                    self._process = subprocess.Popen(
+                        words, stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
+                    )
+                if not wait:
+                    with suppress(ProcessLookupError):
+                        os.setpriority(os.PRIO_PROCESS, self._process.pid, COURTESY)
+            elif (code := self._process.poll()) is not None and not (folder / VERDICT).is_file():
+                self._process = None
+                lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
+                said = (line.strip() for line in reversed(lines) if line.strip())
+                raise TwinMasterError(next(said, f"exit code {code}"))
             if not wait or asked_to_end():
                 return None
             time.sleep(_LOOK_AGAIN)
+        self.end()
         return folder
+
+    def end(self) -> None:
+        """End the process, if there is one; a watch that is taken up again begins it anew."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+            self._process.wait()
+        self._process = None
 
 
 def verdict_of(

@@ -1,120 +1,57 @@
 """A patch beside what a watch believes: the patched model, its turns filtered again, and what that gains.
 
-All of it follows from a journal up to one of its lines, so that it may be worked out in another process while
-the watch goes on: what came meanwhile is filtered behind it.
+All of it follows from a journal up to one of its lines, so that it may be worked out beside the watch,
+which goes on.
 """
 
-import os
-import pickle
-import shutil
-import subprocess
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory, mkdtemp
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from fe.runtime.errors import FiniteElementError
 from fmu_asset.errors import FmuError
-from reporting.files import atomic_write_bytes
 from reporting.progress import Progress, SilentProgress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DesignBelief
 from twin_master.errors import MissionInputError, TwinMasterError
-from twin_master.mission.journal import array_of, records
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.network.estimator import Notice
-from twin_master.network.twin import Twin
+from twin_master.mission.replay import BelievedModel, gap_of, replay
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
 from twin_master.store.summary import policy_switch
-from twin_master.watch.replay import BelievedModel, gap_of, replay
 
-COURTESY = 10
-"""Niceness of what is worked out beside a watch: the watch comes first."""
 CANNOT = (TwinMasterError, FmuError, FiniteElementError)
 """Why a twin cannot believe a patch."""
-_ASKED, _ANSWER, _LOG = "asked", "answer", "log"
-
-
-@dataclass(frozen=True)
-class Trial:
-    """What is asked.
-
-    Attributes
-    ----------
-    journal : Path
-    end : int
-        Bytes of it that are read.
-    scenario : Scenario
-    models : tuple of BelievedModel
-        What was believed so far.
-    patch : bytes
-        Content of the patch file that would be believed, with what is believed already.
-    from_turn : int
-        From which on.
-    compared : tuple of int
-        The first turn whose evidence is compared, and how many.
-    """
-
-    journal: Path
-    end: int
-    scenario: Scenario
-    models: tuple[BelievedModel, ...]
-    patch: bytes
-    from_turn: int
-    compared: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of it.
+    """What comes of a patch.
 
     Attributes
     ----------
-    trial : Trial
+    patch : bytes
+        Content of the patch file, with what was believed already.
     model : BelievedModel
         The patched one.
     gained : float
         Log evidence of the turns that were compared, with the patch less without [nats].
     before, after : mapping
-        The gap of the turns from `trial.from_turn` on, see `decision.gap_of`.
-    alarms : tuple of Notice
-        What the patched model does not explain of these.
+        The gap of the turns from that of the patch on, see `gap_of`.
     policy_change : str
         How the policy changes, in a sentence; empty where it stays.
-    state : bytes
-        Of the twin that believes it, after the last turn.
     """
 
-    trial: Trial
+    patch: bytes
     model: BelievedModel
     gained: float
     before: Mapping[str, Any]
     after: Mapping[str, Any]
-    alarms: tuple[Notice, ...]
     policy_change: str
-    state: bytes
-
-    def twin(self) -> tuple[Twin, tuple[Notice, ...]]:
-        """Return the twin that believes the patch, after all turns of the journal, and its alarms."""
-        twin = self.model.knowledge.twin(lag=self.trial.scenario.watch.lag)
-        twin.restore_state(self.state)
-        alarms = [*self.alarms]
-        for record, *_ in records(self.trial.journal, self.trial.end):
-            if "observed" not in record:
-                continue
-            at, observed = int(record["observation_turn"]), array_of(record["observed"])
-            if at < twin.turns:
-                twin.revise(at, observed, int(record["control_index"]))
-            else:
-                found = twin.turn(observed, int(record["control_index"]))
-                alarms += [notice for notice in found.notices if notice.kind == "alarm"]
-        return twin, tuple(alarms)
 
 
 def patched_model(
@@ -138,8 +75,27 @@ def patched_model(
         return BelievedModel(from_turn, prepare_knowledge(scenario, source, scenario.mission.seed))
 
 
-def judged(trial: Trial, progress: Progress | None = None) -> Outcome:
+def judged(
+    journal: Path, end: int, scenario: Scenario, models: Sequence[BelievedModel], patch: bytes,
+    from_turn: int, compared: tuple[int, int] = (0, 0), progress: Progress | None = None,
+) -> Outcome:  # fmt: skip
     """Return what comes of a patch.
+
+    Parameters
+    ----------
+    journal : Path
+    end : int
+        Bytes of it that are read.
+    scenario : Scenario
+    models : sequence of BelievedModel
+        What was believed so far.
+    patch : bytes
+        Content of the patch file that would be believed, with what is believed already.
+    from_turn : int
+        From which on.
+    compared : tuple of int
+        The first turn whose evidence is compared, and how many.
+    progress : Progress, optional
 
     Raises
     ------
@@ -148,31 +104,26 @@ def judged(trial: Trial, progress: Progress | None = None) -> Outcome:
     """
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         file = Path(folder) / "patch.json"
-        file.write_bytes(trial.patch)
-        model = patched_model(trial.scenario, file, trial.from_turn, progress)
-    first, (begin, count) = trial.from_turn, trial.compared
-    wanted = min(first, begin) if count else first
+        file.write_bytes(patch)
+        model = patched_model(scenario, file, from_turn, progress)
+    begin, count = compared
+    wanted = min(from_turn, begin) if count else from_turn
     before, after = (
-        replay(
-            trial.journal, trial.models, trial.scenario.watch.lag, first_turn=wanted, end=trial.end,
-            question=question,
-        )[0]
+        replay(journal, models, scenario.watch.lag, first_turn=wanted, end=end, question=question)[0]
         for question in (None, model)
-    )  # fmt: skip
-    known = trial.models[-1].knowledge
-    compared = [
+    )
+    known = models[-1].knowledge
+    evidence = [
         sum(turn.concluded.log_evidence for turn in found.turns[begin - found.first_turn :][:count])
         for found in (before, after)
     ]
     return Outcome(
-        trial=trial,
+        patch=patch,
         model=model,
-        gained=float(compared[1] - compared[0]),
-        before=gap_of(before, first - before.first_turn, known.sensor_model),
-        after=gap_of(after, first - after.first_turn, model.knowledge.sensor_model),
-        alarms=tuple(n for turn, n in after.notices if turn >= first and n.kind == "alarm"),
+        gained=float(evidence[1] - evidence[0]),
+        before=gap_of(before, from_turn - before.first_turn, known.sensor_model),
+        after=gap_of(after, from_turn - after.first_turn, model.knowledge.sensor_model),
         policy_change=policy_change(known, model.knowledge),
-        state=after.twin.save_state(),
     )
 
 
@@ -207,120 +158,3 @@ def policy_change(before: Knowledge, after: Knowledge) -> str:
         f"With it another control is chosen in {len(changed)} of {len(old)} states, first {chosen} in the "
         f"place of {instead} at {where}."
     )
-
-
-class Errand:
-    """A process beside a watch, that no key of its terminal ends, and that leaves a file as its answer."""
-
-    def __init__(self) -> None:
-        self._process: subprocess.Popen[bytes] | None = None
-
-    def answered(self, answer: Path, log: Path, command: Sequence[str], *, waited_for: bool = False) -> bool:
-        """Return whether the answer is there; begin the process where it is neither there nor under way.
-
-        Parameters
-        ----------
-        answer, log
-            The file that the process leaves, and where what it says goes.
-        command
-            Its words.
-        waited_for
-            Whether it has the priority of the watch.
-
-        Raises
-        ------
-        TwinMasterError
-            It ended without an answer: the last line that it said, or else its exit code.
-        """
-        if answer.is_file():
-            self.end()
-            return True
-        if self._process is None:
-            with log.open("wb") as file:
-                self._process = subprocess.Popen(
-                    [*command], stdin=subprocess.DEVNULL, stdout=file, stderr=file, start_new_session=True
-                )
-            if not waited_for:
-                with suppress(ProcessLookupError):
-                    os.setpriority(os.PRIO_PROCESS, self._process.pid, COURTESY)
-        elif (code := self._process.poll()) is not None and not answer.is_file():
-            self._process = None
-            lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
-            said = (line.strip() for line in reversed(lines) if line.strip())
-            raise TwinMasterError(next(said, f"exit code {code}"))
-        return False
-
-    @property
-    def over(self) -> bool:
-        """Whether no process is under way."""
-        return self._process is None
-
-    def end(self) -> None:
-        """End the process, if there is one; a watch that is taken up again begins it anew."""
-        if self._process is not None and self._process.poll() is None:
-            self._process.terminate()
-            self._process.wait()
-        self._process = None
-
-
-class Judge:
-    """Works out what comes of a patch: at once, or in a process of low priority beside a live watch.
-
-    Parameters
-    ----------
-    wait : bool
-        Whether turns wait for it, as those of a recording do.
-    """
-
-    def __init__(self, *, wait: bool) -> None:
-        self._wait, self._errand = wait, Errand()
-        self._folder: Path | None = None
-
-    def outcome(self, asked: Callable[[], Trial]) -> Outcome | None:
-        """Return what came of the patch; None while it is worked out, of what was asked first.
-
-        Raises
-        ------
-        TwinMasterError, FmuError, FiniteElementError
-            This twin cannot believe it, see `CANNOT`.
-        """
-        if self._wait:
-            return judged(asked())
-        if self._folder is None:
-            self._folder = Path(mkdtemp(prefix="uav_twin_"))
-            (self._folder / _ASKED).write_bytes(pickle.dumps(asked()))
-        folder = self._folder
-        command = [sys.executable, "-c", f"from {__name__} import work; work()", str(folder)]
-        try:
-            if not self._errand.answered(folder / _ANSWER, folder / _LOG, command):
-                return None
-            found: Outcome | str = pickle.loads((folder / _ANSWER).read_bytes())
-        finally:
-            if self._errand.over:
-                self.end()
-        if isinstance(found, str):
-            raise TwinMasterError(found)
-        return found
-
-    @property
-    def answered(self) -> bool:
-        """Whether the process has left its answer."""
-        return self._folder is not None and (self._folder / _ANSWER).is_file()
-
-    def end(self) -> None:
-        """End what is under way."""
-        self._errand.end()
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
-        self._folder = None
-
-
-def work() -> None:
-    """Answer what is asked in the folder that the command line names."""
-    folder = Path(sys.argv[-1])
-    found: Outcome | str
-    try:
-        found = judged(pickle.loads((folder / _ASKED).read_bytes()))
-    except CANNOT as error:
-        found = str(error)
-    atomic_write_bytes(folder / _ANSWER, pickle.dumps(found))

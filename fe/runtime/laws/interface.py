@@ -1,27 +1,26 @@
 """What a law of a port is: a force F(x, x', memory) that acts against the motion x of a port, -F on x.
 
-A law is one file of this folder: its primitive, a subclass of `PortForce`, and those functions of this file
-that it answers otherwise. They stand below as a law of nothing answers them. A law of position has the first
-part; a law of speed sets `PortForce.of_speed` and has `pull` and the second part.
+A law is a subclass of `PortForce` in a file of this folder, with its numbers and their units. A law of
+position answers `pull`, and `advance` if it is hysteretic; a law of speed is one of the power laws of
+`fe.runtime.laws.speed`.
 
-They are called at every step, in the subset of Python that numba compiles too. What they are given:
+`advance` and `pull` are called at every step, in the subset of Python that numba compiles too, with:
 
 law : (`PARAMETERS` + E,) ndarray
     The law's parameters, then those of its hysteretic elements, `PortForce.row`.
 memory : (`HEAD` + E,) ndarray
-    1 if friction holds the port; its last position; the law's force after the lag of omitted modes; what
-    loads that are gone still add to the position; the last force of damping on a flexible port; then the
-    states of the elements.
+    1 if friction holds the port (`HELD`); its last position (`PLACE`); the law's force after the lag of
+    omitted modes (`LAGGED`); what loads that are gone still add to the position (`FADING`); the law's force
+    (`FORCE`); then the states of the elements.
 x : float
     Position of the port [m or rad].
-h, least : float, int
-    Duration of the way to x [s], and the least number of parts in which it is followed.
-strength : float
-    What a law of speed takes from the port's speed in a unit of time at unit speed.
+h : float
+    Duration of the way from the last position to x [s].
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
+from inspect import get_annotations
 from typing import ClassVar
 
 import numpy as np
@@ -32,8 +31,8 @@ from ..primitive import Primitive
 
 PARAMETERS = 5
 """Most parameters of a law."""
-HEAD = 5
-"""Columns of a memory before its hysteretic elements."""
+POSITIVE, NOT_NEGATIVE = "be positive", "not be negative"
+"""What a number must, said after its unit."""
 
 
 class PortForce(Primitive):
@@ -44,14 +43,13 @@ class PortForce(Primitive):
     """Whether the force is one of speed, which is zero at rest."""
     hysteretic: ClassVar[bool] = False
     """Whether the force depends on what happened before."""
-    proportional: ClassVar[tuple[str, ...]] = ()
-    """The numbers that the force is in proportion to; without the first there is none."""
-    positive: ClassVar[tuple[str, ...]] = ()
-    """The numbers that must be above zero."""
-    not_negative: ClassVar[tuple[str, ...]] = ()
-    """The numbers that must be zero or above."""
 
     port: str
+
+    @property
+    def proportional(self) -> tuple[str, ...]:
+        """The numbers that the force is in proportion to; without the first there is none."""
+        return (next(iter(self.units)),)
 
     @property
     def row(self) -> FloatArray:
@@ -66,16 +64,26 @@ class PortForce(Primitive):
 
     def check(self) -> None:
         """Raise `InvalidPatchError` where a number cannot be."""
-        for name in self.positive:
-            self.require(name, getattr(self, name), positive=True)
-        for name in self.not_negative:
-            self.require(name, getattr(self, name), positive=False)
+        for name, hint in get_annotations(type(self)).items():
+            for must in getattr(hint, "__metadata__", ())[1:]:
+                self.require(name, getattr(self, name), must)
 
-    def require(self, name: str, value: float, *, positive: bool) -> None:
-        """Raise `InvalidPatchError` for a number that is not positive, or at least zero."""
-        if value < 0.0 or (positive and not value > 0.0):
-            wanted = "be positive" if positive else "not be negative"
-            raise InvalidPatchError(f"{name} of {self.kind!r} must {wanted}, but is {value:g}.")
+    def require(self, name: str, value: float, must: str) -> None:
+        """Raise `InvalidPatchError` for a number that is not `POSITIVE` or `NOT_NEGATIVE`, as it must."""
+        if value < 0.0 or (must == POSITIVE and value == 0.0):
+            raise InvalidPatchError(f"{name} of {self.kind!r} must {must}, but is {value:g}.")
+
+    @staticmethod
+    def advance(law: FloatArray, memory: FloatArray, x: float) -> None:
+        """Carry the states of the elements from the last position to `x`."""
+
+    @staticmethod
+    def pull(law: FloatArray, memory: FloatArray, x: float, h: float) -> tuple[float, float]:
+        """Return force and slope at `x`; the memory, of where the way begins, is left as it is.
+
+        Of dry friction the largest force, as if it moved forwards.
+        """
+        return 0.0, 0.0
 
 
 def power(base: float, exponent: float) -> float:
@@ -89,112 +97,3 @@ def power(base: float, exponent: float) -> float:
     if exponent == 3.0:
         return base * base * base
     return float(base**exponent)
-
-
-def decayed(size: float, exponent: float, strength: float, duration: float) -> float:
-    """Return a positive s after s' = -strength s^exponent alone, zero where it is spent."""
-    if exponent == 1.0:
-        return float(size * np.exp(-strength * duration))
-    if exponent == 2.0:
-        return size / (1.0 + strength * duration * size)
-    if exponent == 0.0:
-        return max(size - strength * duration, 0.0)
-    root = size ** (1.0 - exponent) - (1.0 - exponent) * strength * duration
-    return float(root ** (1.0 / (1.0 - exponent))) if root > 0.0 else 0.0
-
-
-# ---------------------------------------------------------------- a law of position
-
-
-def advance(law: FloatArray, memory: FloatArray, x: float, least: int) -> None:
-    """Carry the memory from its last position to `x`."""
-
-
-def parts(law: FloatArray, way: float) -> int:
-    """Return the least number of parts in which a way to a position at rest is followed."""
-    return 1
-
-
-def pull(law: FloatArray, memory: FloatArray, x: float, h: float, least: int) -> tuple[float, float]:
-    """Return force and slope at `x`; the memory, of where the way begins, is left as it is.
-
-    Of dry friction the largest force, as if it moved forwards.
-    """
-    return 0.0, 0.0
-
-
-# ---------------------------------------------------------------- a law of speed
-
-
-def dry(law: FloatArray) -> bool:
-    """Return whether the force does not depend on the size of the speed."""
-    return False
-
-
-def holds(law: FloatArray) -> bool:
-    """Return whether the force can bring a port to rest in finite time, and hold it there."""
-    return False
-
-
-def strength(law: FloatArray, weight: float) -> float:
-    """Return the strength, but for `share`, for a port whose speed a unit impulse changes by `weight`."""
-    return 0.0
-
-
-def share(law: FloatArray, x: float) -> float:
-    """Return the factor of `strength` at a position."""
-    return 1.0
-
-
-def steady(law: FloatArray, x: float, speed: float) -> float:
-    """Return the force at a position and a speed."""
-    return 0.0
-
-
-def kick(law: FloatArray, speed: float, strength: float, duration: float, through: bool) -> float:
-    """Return the speed after the law alone has acted; with `through`, dry friction does not stop at zero."""
-    return speed
-
-
-def holding_limit(law: FloatArray, strength: float, duration: float) -> float:
-    """Return the largest speed that a law which `holds` brings to rest within `duration`."""
-    return 0.0
-
-
-def crossing(
-    law: FloatArray, begin: float, end: float, slopes: tuple[float, float], lost: float, strength: float,
-    h: float,
-) -> tuple[float, float, float]:  # fmt: skip
-    """Return what must be added where the speed of a port changes sign within a step.
-
-    Parameters
-    ----------
-    law : ndarray
-        A law that `holds`.
-    begin, end : float
-        Speed at both ends as friction of the first sign would have it.
-    slopes : tuple of float
-        Its derivatives there.
-    lost : float
-        What the first half kick took from the speed.
-    strength, h : float
-        Of the law at its position; duration of the step.
-
-    Returns
-    -------
-    speed : float
-        To be added to the speed at the end.
-    position : float
-        To be added to the position at the end; or, if friction holds, the way from the step's begin to the
-        turn.
-    held : float
-        1 if friction holds from the turn on.
-    """
-    return 0.0, 0.0, 0.0
-
-
-FUNCTIONS = (
-    "advance", "parts", "pull",
-    "dry", "holds", "strength", "share", "steady", "kick", "holding_limit", "crossing",
-)  # fmt: skip
-"""Functions of a law."""

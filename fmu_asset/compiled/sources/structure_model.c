@@ -49,7 +49,7 @@ static void lay_out(structure_model *model, size_t anchors, structure_arena *are
     model->cross_mass = structure_take(arena, (model->masses + 1) * n * model->modal_size);
     model->load_residual = structure_take(arena, model->loads * r);
     model->stiffness_residual = structure_take(arena, (model->terms - 1) * n * r);
-    model->correction_columns = structure_take(arena, (model->functions ? model->functions : anchors) * r * outputs);
+    model->correction_columns = structure_take(arena, anchors * r * model->functions * outputs);
     model->dual_factor = structure_take(arena, anchors * outputs * model->dual_rows * model->dual_columns);
 }
 
@@ -81,7 +81,7 @@ static bool take_chosen(structure_model *model, structure_problem *problem) {
     return true;
 }
 
-/* Read how many approximate dual solutions lie along each loss, and where the next one takes over. */
+/* Read how many anchors of dual functions lie along each loss, and where the next one takes over. */
 static bool take_anchors(structure_model *model, structure_problem *problem) {
     const structure_data *data = &model->data;
     const double *counts = shaped(data, "dual_counts", 1, &model->regions, problem);
@@ -91,7 +91,7 @@ static bool take_anchors(structure_model *model, structure_problem *problem) {
     size_t splits = 0;
     for (size_t k = 0; k < model->regions; ++k) {
         if (!(counts[k] >= 1.0 && counts[k] <= LARGEST_SIZE)) {
-            return structure_fail(problem, "the data file announces %g dual solutions along a loss", counts[k]);
+            return structure_fail(problem, "the data file announces %g anchors along a loss", counts[k]);
         }
         model->anchors[k] = (size_t)counts[k];
         splits += model->anchors[k] - 1;
@@ -207,7 +207,7 @@ static bool find_begins(structure_model *model, structure_problem *problem) {
 static bool take_arrays(structure_model *model, structure_problem *problem) {
     const structure_data *data = &model->data;
     const size_t n = extent(data, "static_load", 1), outputs = extent(data, "static_output", 0),
-                 all = extent(data, "residual_load", 0), nm = extent(data, "modal_load", 1),
+                 r = extent(data, "residual_load", 0), nm = extent(data, "modal_load", 1),
                  modal_outputs = extent(data, "modal_output", 0);
     model->terms = extent(data, "static_stiffness", 0);
     model->loads = extent(data, "static_load", 0);
@@ -225,25 +225,13 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
     model->modal_size = nm;
     model->output_count = outputs;
     model->modal_outputs = modal_outputs;
-    if (n > all) {
-        return structure_fail(problem, "the data file has residuals in fewer directions than the static basis");
-    }
-    const size_t r = all - n; /* along the basis a solution leaves nothing */
     model->residual_size = r;
-    const size_t functions = extent(data, "dual_output", 1); /* arrays without values are not in the file */
+    const size_t functions = extent(data, "dual_output", 2);
     model->functions = functions;
-    model->dual_rows = functions ? extent(data, "dual_residual", 2) : terms;
-    model->dual_columns = functions ? 1 + terms * functions : terms;
-    if (functions > 0) {
-        const size_t of_stiffness[4] = {outputs, terms, functions, functions}, of_output[2] = {outputs, functions};
-        model->dual_stiffness = shaped(data, "dual_stiffness", 4, of_stiffness, problem);
-        model->dual_output = shaped(data, "dual_output", 2, of_output, problem);
-        if (model->dual_stiffness == NULL || model->dual_output == NULL) {
-            return false;
-        }
-        if (anchors != 1 || (double)functions > LARGEST_SIZE || (double)model->dual_rows > LARGEST_SIZE) {
-            return structure_fail(problem, "the data file combines dual functions at %lu anchors", (unsigned long)anchors);
-        }
+    model->dual_rows = extent(data, "dual_residual", 2);
+    model->dual_columns = 1 + terms * functions;
+    if (functions < 1 || (double)functions > LARGEST_SIZE || (double)model->dual_rows > LARGEST_SIZE) {
+        return structure_fail(problem, "the data file combines %lu dual functions", (unsigned long)functions);
     }
     const double *static_stiffness = NULL, *static_output = NULL, *load_residual = NULL,
                  *stiffness_residual = NULL, *correction = NULL, *modes = NULL, *gauges = NULL,
@@ -253,18 +241,20 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
         const char *name;
         const double **values;
         size_t dimensions;
-        size_t shape[4];
+        size_t shape[5];
     } wanted[] = {
         {"static_stiffness", &static_stiffness, 3, {terms, n, n}},
         {"static_load", &model->static_load, 2, {loads, n}},
         {"static_output", &static_output, 2, {outputs, n}},
         {"bound_reference", &model->bound_reference, 1, {terms - 1}},
-        {"residual_load", &load_residual, 2, {all, loads}},
-        {"residual_stiffness", &stiffness_residual, 3, {all, terms - 1, n}},
+        {"residual_load", &load_residual, 2, {r, loads}},
+        {"residual_stiffness", &stiffness_residual, 3, {r, terms - 1, n}},
         {"residual_allowance", &residual_allowance, 0, {0}},
         {"rounding_allowance", &rounding_allowance, 0, {0}},
-        {"dual_correction", &correction, 3, {functions ? functions : anchors, outputs, all}},
+        {"dual_correction", &correction, 4, {anchors, functions, outputs, r}},
         {"dual_residual", &dual_residual, 4, {anchors, outputs, model->dual_rows, model->dual_columns}},
+        {"dual_stiffness", &model->dual_stiffness, 5, {anchors, outputs, terms, functions, functions}},
+        {"dual_output", &model->dual_output, 3, {anchors, outputs, functions}},
         {"modal_stiffness", &model->modal_stiffness, 3, {terms, nm, nm}},
         {"modal_mass", &model->modal_mass, 3, {mass_terms, nm, nm}},
         {"modal_load", &model->modal_load, 2, {loads, nm}},
@@ -305,7 +295,7 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
     for (size_t i = 0; i < mass_terms; ++i) {
         transpose(model->cross_mass + i * nm * n, cross_mass + i * nm * n, nm, n, n, 1.0);
     }
-    transpose(model->load_residual, load_residual + n * loads, r, loads, loads, 1.0);
+    transpose(model->load_residual, load_residual, r, loads, loads, 1.0);
     for (size_t i = 0; i < terms; ++i) {
         const size_t t = model->order[i];
         double *term = model->stiffness_terms + i * model->padded_size * model->stride;
@@ -320,15 +310,13 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
             }
         }
         if (i > 0) { /* The residual is the load minus the changes of the stiffness times the coordinates. */
-            transpose(model->stiffness_residual + (i - 1) * n * r, stiffness_residual + (n * (terms - 1) + t) * n, r, n,
-                      (terms - 1) * n, -1.0);
+            transpose(model->stiffness_residual + (i - 1) * n * r, stiffness_residual + t * n, r, n, (terms - 1) * n,
+                      -1.0);
         }
     }
-    for (size_t i = 0; i < functions * outputs; ++i) {
-        memcpy(model->correction_columns + i * r, correction + i * all + n, r * sizeof *correction);
-    }
-    for (size_t a = 0; a < anchors && functions == 0; ++a) {
-        transpose(model->correction_columns + a * outputs * r, correction + a * outputs * all + n, outputs, r, all, 1.0);
+    for (size_t a = 0; a < anchors; ++a) {
+        const size_t all = functions * outputs;
+        transpose(model->correction_columns + a * all * r, correction + a * all * r, all, r, r, 1.0);
     }
     for (size_t a = 0; a < anchors; ++a) {
         const size_t values = outputs * model->dual_rows * model->dual_columns;

@@ -29,7 +29,7 @@ typedef struct {
     size_t gauges;        /* G, strains, the first outputs */
     size_t output_count;  /* O: strains, then displacements */
     size_t modal_outputs; /* O and the accelerations */
-    size_t residual_size; /* R, basis of the residuals, without its part along the static basis */
+    size_t residual_size; /* R, basis of the residuals */
     size_t health_residual; /* the first of them, in which residuals are where only losses differ from the reference */
     size_t terms;         /* T, terms of the stiffness, of which the last is times one */
     size_t loads;         /* L */
@@ -40,7 +40,7 @@ typedef struct {
     size_t chosen;        /* V, all that can be chosen */
     size_t health;        /* parameters and losses, the first of what can be chosen: the stiffness */
     size_t key;           /* these and the masses: the modes */
-    size_t anchors[STRUCTURE_MOST_REGIONS]; /* approximate dual solutions along each loss, A in all */
+    size_t anchors[STRUCTURE_MOST_REGIONS]; /* of dual functions along each loss, A in all */
     size_t lasting;                 /* terms whose coefficient no loss changes; the first of `order` */
     size_t *order;                  /* (T) terms in the order of `stiffness_terms`: the last one, others, damage */
     structure_factors *stiffness_factors; /* (T) parameter and loss of each term */
@@ -48,10 +48,10 @@ typedef struct {
     const double *static_load;      /* (L, N) */
     const double *bound_reference;  /* (T - 1) */
     const double *dual_split[STRUCTURE_MOST_REGIONS]; /* (anchors less one) of each region, ascending */
-    size_t functions;               /* M, dual functions of an output that are combined, or 0: the nearest counts */
-    size_t dual_rows, dual_columns; /* of a factor of a dual residual: (T, T), or (F, 1 + T M) */
-    const double *dual_stiffness;   /* (O, T, M, M) */
-    const double *dual_output;      /* (O, M) */
+    size_t functions;               /* M, dual functions of an output that are combined */
+    size_t dual_rows, dual_columns; /* F and 1 + T M, of a factor of a dual residual */
+    const double *dual_stiffness;   /* (A, O, T, M, M) */
+    const double *dual_output;      /* (A, O, M) */
     const double *modal_stiffness;  /* (T, Nm, Nm) */
     const double *modal_mass;       /* (1 + P, Nm, Nm) */
     const double *modal_load;       /* (L, Nm) */
@@ -66,7 +66,7 @@ typedef struct {
     double *load_residual;      /* (L, R) */
     double *stiffness_residual; /* (T - 1, N, R) in the order of `order`, without the first of it */
     size_t *residual_begins;    /* (damaged terms, tiles of R) columns before which a tile has only zeros */
-    double *correction_columns; /* (A, R, O) or, as they are in the file, (M, O, R) */
+    double *correction_columns; /* (A, R, M O) */
     double *dual_factor;        /* (A, dual columns, dual rows, O) */
     structure_data data;        /* owns the arrays */
     double *memory;             /* owns what was laid out anew */

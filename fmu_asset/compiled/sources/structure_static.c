@@ -24,12 +24,11 @@ void structure_static_lay_out(structure_static *steady, const structure_model *m
     steady->lasting_residual = structure_take(arena, n * r);
     steady->factor = structure_take(arena, model->padded_size * model->stride);
     steady->dual_norm = structure_take(arena, outputs);
-    const size_t functions = model->functions;
-    steady->dual_weights = structure_take(arena, outputs * functions);
-    steady->dual_correction = structure_take(arena, functions ? r * outputs : 0);
-    const size_t padded = structure_padded(functions);
-    steady->dual_work = structure_take(arena, functions * functions + larger(padded * padded, model->dual_rows * outputs +
-                                                  larger(model->dual_columns, outputs)));
+    const size_t functions = model->functions, padded = structure_padded(functions);
+    steady->dual_weights = structure_take(arena, functions * outputs);
+    steady->dual_products = structure_take(arena, functions * outputs);
+    steady->dual_work = structure_take(
+        arena, larger(functions * (functions + 1) + padded * padded, (model->dual_rows + 1) * outputs));
     /* Flags in the room of doubles, of which every byte is zero at first. */
     steady->solved = (bool *)(void *)structure_take(arena, model->loads);
     steady->bounded = (bool *)(void *)structure_take(arena, model->loads);
@@ -191,25 +190,22 @@ static size_t anchor_of(const structure_static *steady) {
 }
 
 /* Combine the dual functions of each output: their Galerkin solution at the present stiffness. */
-static void combine_duals(structure_static *steady) {
+static void combine_duals(structure_static *steady, size_t anchor) {
     const structure_model *model = steady->model;
-    const size_t outputs = model->output_count, r = model->residual_size, m = model->functions;
-    const size_t stride = structure_padded(m);
-    double *stiffness = steady->dual_work, *factor = stiffness + m * m;
-    memset(steady->dual_correction, 0, r * outputs * sizeof *steady->dual_correction);
+    const size_t outputs = model->output_count, m = model->functions, stride = structure_padded(m);
+    double *stiffness = steady->dual_work, *weights = stiffness + m * m, *factor = weights + m;
     for (size_t o = 0; o < outputs; ++o) {
-        double *weights = steady->dual_weights + o * m;
-        structure_sum_terms(stiffness, m, model->dual_stiffness + o * model->terms * m * m, model->terms, steady->theta);
+        const size_t place = anchor * outputs + o;
+        structure_sum_terms(stiffness, m, model->dual_stiffness + place * model->terms * m * m, model->terms,
+                            steady->theta);
+        memcpy(weights, model->dual_output + place * m, m * sizeof *weights);
         structure_pad(factor, stiffness, m);
-        (void)structure_cholesky(factor, m, stride, factor, NULL, 0, NULL); /* positive definite where the stiffness is */
-        memcpy(weights, model->dual_output + o * m, m * sizeof *weights);
+        /* positive definite where the stiffness is */
+        (void)structure_cholesky(factor, m, stride, factor, NULL, 0, NULL);
         structure_solve_lower(factor, m, stride, weights);
         structure_solve_upper(factor, m, stride, weights);
         for (size_t j = 0; j < m; ++j) {
-            const double *function = model->correction_columns + (j * outputs + o) * r;
-            for (size_t i = 0; i < r; ++i) {
-                steady->dual_correction[i * outputs + o] += weights[j] * function[i];
-            }
+            steady->dual_weights[j * outputs + o] = weights[j];
         }
     }
 }
@@ -237,10 +233,16 @@ static void take_residual(structure_static *steady, const double *coordinates, d
             structure_add_columns(residual + i, size, steady->lasting_residual + i, r, n, coordinates);
         }
     }
+    const size_t functions = model->functions, all = functions * outputs;
+    memset(steady->dual_products, 0, all * sizeof *correction);
+    const double *columns = model->correction_columns + anchor_of(steady) * r * all;
+    structure_add_columns(steady->dual_products, all, columns, all, rows, residual);
     memset(correction, 0, outputs * sizeof *correction);
-    const double *columns =
-        model->functions ? steady->dual_correction : model->correction_columns + anchor_of(steady) * r * outputs;
-    structure_add_columns(correction, outputs, columns, outputs, rows, residual);
+    for (size_t j = 0; j < functions; ++j) {
+        for (size_t o = 0; o < outputs; ++o) {
+            correction[o] += steady->dual_weights[j * outputs + o] * steady->dual_products[j * outputs + o];
+        }
+    }
 }
 
 /* The same of one unit response, which is kept. */
@@ -254,29 +256,21 @@ static void bound_unit(structure_static *steady, size_t load) {
     steady->bounded[load] = true;
 }
 
-/* Norms of the dual residuals: of the factors times (1, -theta_1, -theta_2, ...), or of combined functions times
-   (1, -theta_1 c, -theta_2 c, ...). */
-static void find_dual_norms(structure_static *steady) {
+/* Norms of the dual residuals: of the factors times (1, -theta_1 c, -theta_2 c, ...). */
+static void find_dual_norms(structure_static *steady, size_t anchor) {
     const structure_model *model = steady->model;
     const size_t rows = model->dual_rows, columns = model->dual_columns, m = model->functions;
     const size_t outputs = model->output_count, values = rows * outputs;
-    const double *factor = model->dual_factor + (m ? 0 : anchor_of(steady) * columns * values);
-    double *residual = steady->dual_work + m * m, *coefficients = residual + values;
-    if (m == 0) {
-        coefficients[0] = 1.0;
-        for (size_t k = 1; k < columns; ++k) {
-            coefficients[k] = -steady->theta[k - 1];
+    const double *factor = model->dual_factor + anchor * columns * values;
+    double *residual = steady->dual_work, *coefficients = residual + values;
+    memcpy(residual, factor, values * sizeof *residual);
+    for (size_t k = 1; k < columns; ++k) {
+        for (size_t o = 0; o < outputs; ++o) {
+            coefficients[o] = -steady->theta[(k - 1) / m] * steady->dual_weights[(k - 1) % m * outputs + o];
         }
-        memset(residual, 0, values * sizeof *residual);
-        structure_add_columns(residual, values, factor, values, columns, coefficients);
-    } else {
-        memcpy(residual, factor, values * sizeof *residual);
-        for (size_t k = 1; k < columns; ++k) {
+        for (size_t row = 0; row < rows; ++row) {
             for (size_t o = 0; o < outputs; ++o) {
-                coefficients[o] = -steady->theta[(k - 1) / m] * steady->dual_weights[o * m + (k - 1) % m];
-            }
-            for (size_t i = 0; i < values; ++i) {
-                residual[i] += factor[k * values + i] * coefficients[i % outputs];
+                residual[row * outputs + o] += factor[k * values + row * outputs + o] * coefficients[o];
             }
         }
     }
@@ -310,10 +304,9 @@ structure_bounds structure_static_error_bounds(structure_static *steady, const d
     solve_needed(steady, load);
     superpose(steady->whole_coordinates, n, model, load, steady->coordinates);
     if (!steady->dual_known) {
-        if (model->functions > 0) {
-            combine_duals(steady);
-        }
-        find_dual_norms(steady);
+        const size_t anchor = anchor_of(steady);
+        combine_duals(steady, anchor);
+        find_dual_norms(steady, anchor);
         steady->dual_known = true;
     }
     size_t acting = 0;

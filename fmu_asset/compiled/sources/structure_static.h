@@ -1,6 +1,6 @@
 /* Equilibrium: static response to the loads, with its certified error bounds.
 
-   Kapteyn et al. 2021, eqs. (13), (15); the bounds are those of fe/runtime/online.py. The response is linear in the loads,
+   Kapteyn et al. 2021, eqs. (13), (15); the bounds are those of fe/runtime/reduced_arrays.py. The response is linear in the loads,
    so that the solutions under one unit of each load are kept as long as the stiffness stays. What is kept never
    changes a result: it is a function of the stiffness alone. */
 #ifndef STRUCTURE_STATIC_H
@@ -28,10 +28,9 @@ typedef struct {
     size_t residual_size;             /* how many directions of residuals may not be zero */
     double *factor;                   /* (N, N) */
     double *dual_norm;                /* (O) */
-    /* Where dual functions are combined: their coefficients in the solutions, and the solutions. */
-    double *dual_weights;             /* (O, M) */
-    double *dual_correction;          /* (R, O) */
-    double *dual_work;                /* (M, M) and 1 + T M */
+    double *dual_weights;             /* (M, O) coefficients of the dual functions in the approximate solutions */
+    double *dual_products;            /* (M, O) what the functions give, applied to a residual */
+    double *dual_work;                /* a dual problem, or all dual residuals */
     /* Response to one unit of each load; computed when it is first needed. */
     bool *solved, *bounded;           /* (L) */
     double *coordinates;              /* (L, N) */

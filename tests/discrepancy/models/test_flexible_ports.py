@@ -13,8 +13,9 @@ from scipy.optimize import brentq
 
 from discrepancy.campaign.records import Release
 from discrepancy.models.acting import Acting, Course, Shown
-from discrepancy.models.compiled_motion import compiled_kernel
-from discrepancy.models.second_order import Motion, SecondOrderSystem
+from discrepancy.models.linear_system import LinearSystem
+from discrepancy.models.motion import Motion, motion_of
+from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import laws_of
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
@@ -36,21 +37,21 @@ A = 0.02 * 0.135
 """About the motion of the joint [m]."""
 
 
-def chain(modes: int, beta: float) -> SecondOrderSystem:
+def chain(modes: int, beta: float) -> LinearSystem:
     """Three masses of 1 kg in a row on a joint whose node weighs next to nothing."""
     springs = np.array([ROOT, 2000.0, 4000.0, 5000.0])
     stretch = np.eye(4) - np.eye(4, k=-1)
     stiffness = stretch.T @ np.diag(springs) @ stretch
     mass = np.diag([LIGHT, 1.0, 1.0, 1.0])
     ports = {"joint": np.array([1.0, 0.0, 0.0, 0.0]), "tip": TIP}
-    return SecondOrderSystem(mass, 0.3 * mass + beta * stiffness, stiffness, ports, modes, beta)
+    return LinearSystem(mass, 0.3 * mass + beta * stiffness, stiffness, ports, modes, beta)
 
 
 def ringdown(beta: float, *items: Primitive, refinement: int = 1) -> Motion:
     system = chain(3, beta)
     laws = laws_of(ModelPatch(items), list(system.ports))
-    acting = Acting(TIME, np.zeros(len(TIP)), initial=np.zeros((0, 2)), release=(TIP, RELEASE))
-    return system.motion(acting, laws, refinement)
+    acting = Acting(TIME, TIME, initial=np.zeros((0, 2)), release=(TIP, RELEASE))
+    return motion_of(system, acting, laws, refinement)
 
 
 def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
@@ -91,7 +92,7 @@ LAWS = {
 def test_the_modes_leave_out_nearly_all_of_the_joint() -> None:
     system = chain(3, 0.0)
     row = system.ports["joint"]
-    assert float(row @ system.residual @ row) > 0.7 * float(row @ system.flexibility(row))
+    assert float(row @ system.residual(row)) > 0.7 * float(row @ system.flexibility(row))
 
 
 slips = cache(MicroSlip.elements)
@@ -281,8 +282,8 @@ def test_a_slow_force_leads_through_the_static_states(name: str) -> None:
     laws = laws_of(ModelPatch(LAWS[name]), list(system.ports))
     time = np.linspace(0.0, 90.0, 3001)
     force = np.asarray(15.0 * np.sin(2.0 * np.pi * time / 90.0))
-    acting = Acting(time, np.zeros(len(TIP)), [(TIP, Course.of(time, force))])
-    moved = values(system.motion(acting, laws), ROWS)
+    acting = Acting(time, time, [(TIP, Course.of(time, force))])
+    moved = values(motion_of(system, acting, laws), ROWS)
     still = system.static(np.outer(force, TIP), laws)[0] @ ROWS.T
     assert np.abs(moved - still).max(axis=0) == pytest.approx(np.zeros(2), abs=7e-3 * np.abs(still).max())
 

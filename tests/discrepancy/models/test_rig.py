@@ -15,7 +15,7 @@ from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.second_order import FORCES
+from discrepancy.models.port_scales import FORCES
 from fe.runtime.patch import ModulusTemperature, Overflow, PowerDamping, PowerStiffness
 from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
 from tests.discrepancy.asking import trial as asked
@@ -230,20 +230,6 @@ def test_straight_lines_have_the_mean_effect_of_a_spline() -> None:
     np.testing.assert_allclose(found, (steps[:-1] ** 2 - lower, steps[1:] ** 2 - lower), atol=1e-12)
 
 
-def test_the_same_record_is_one_course_to_the_last_bit() -> None:
-    time = np.sort(np.random.default_rng(5).uniform(0.0, 3.0, 40))
-    between = np.linspace(time[0], time[-1], 91)
-    for values in (np.sin(time), np.cos(time), np.sin(time)):  # computed, then kept
-        for order in range(3):
-            kept = Course.of(time.copy(), values.copy(), Hold.SMOOTH, 1)
-            fresh = Course(time, values, Hold.SMOOTH, 1)
-            assert np.array_equal(kept.at(between, order), fresh.at(between, order))
-        for hold in (Hold.LINEAR, Hold.SMOOTH):
-            course, fresh = Course.of(time.copy(), values.copy(), hold), Course(time, values, hold)
-            assert np.array_equal(course.at(between), fresh.at(between))
-            assert np.array_equal(course.ends(between), fresh.ends(between))
-
-
 # ---------------------------------------------------------------- controllers and own laws
 
 
@@ -337,13 +323,8 @@ def test_a_port_whose_motion_goes_one_way_shows_no_memory() -> None:
     given = campaign(falls, height=Channel("height", Quantity.DISPLACEMENT, "height", None))
     setting = Setting(given, model, model.scales(given))
     assert not setting.scales.ports["air"].turns
-    for name in [
-        "joint_micro_slip",
-        "bouc_wen_hysteresis",
-        "cubic_stiffness",
-        "free_play",
-        "breathing_crack",
-    ]:
+    remember = "joint_micro_slip", "bouc_wen_hysteresis", "cubic_stiffness", "free_play", "breathing_crack"
+    for name in remember:
         assert "motion that turns" in (effect_by_identifier(name, library()).unavailable(setting) or "")
     assert effect_by_identifier("quadratic_damping", library()).unavailable(setting) is None
     still = replace(given, trials=(falls, replace(falls, name="load", kind=TrialKind.STATIC)))
@@ -351,17 +332,6 @@ def test_a_port_whose_motion_goes_one_way_shows_no_memory() -> None:
 
 
 # ---------------------------------------------------------------- refusals
-
-
-def test_states_may_be_given_by_parts_alone() -> None:
-    whole = "conductance = [[0.1, 0.0], [-0.1, 0.08]]\n"
-    given = (("first", [[0.1, 0.0], [-0.1, 0.0]]), ("second", [[0.0, 0.0], [0.0, 0.08]]))
-    parts = "".join(f'[[conductance_part]]\nname = "{name}"\nmatrix = {rows}\n' for name, rows in given)
-    other = model_of(INPUTS.text("tanks.toml", (whole, "")) + parts)
-    one, other = (item.description.terms()["conductance"] for item in (rig("tanks"), other))
-    np.testing.assert_array_equal(one, other)
-    with pytest.raises(ModelError, match="conductance must be a 2 x 2 matrix"):
-        rig("tanks", (whole, ""))
 
 
 @pytest.mark.parametrize(

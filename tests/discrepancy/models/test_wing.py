@@ -128,13 +128,6 @@ def test_a_cubic_spring_over_the_planform_solves_the_equations_of_all_unknowns(w
     assert np.abs(values - plain).max() > 0.05 * np.abs(plain).max()
 
 
-def test_a_law_elsewhere_leaves_no_trace(wing: Wing) -> None:
-    fresh = Wing(wing.arrays)
-    span, planform = (PowerDamping(p, 3.0, 2.0, 0.0, 1.0, 1.0) for p in ("span", "planform"))
-    wing.seen(RING, planform)
-    assert np.array_equal(wing.seen(RING, span), fresh.seen(RING, span))
-
-
 def test_hysteresis_remembers_the_path_also_while_the_structure_warms(wing: Wing) -> None:
     slip = patch.MicroSlip("root", 8.0, 3e4, -0.3)
     values = wing.seen(STATIC, slip)
@@ -209,12 +202,8 @@ def test_a_harmonic_force_reaches_the_frequency_response(wing: Wing) -> None:
 def test_scales(wing: Wing) -> None:
     scales = wing.model.scales(campaign(STATIC, replace(RING, start=10.0)))
     square, shapes, _ = wing.modes(count=1)
-    wanted = {
-        "tip_stiffness": 1.0 / float(wing.tip @ wing.static(wing.tip)), "force": 20.0,
-        "duration": RING.time[-1], "campaign_time": 10.0 + RING.time[-1],
-        "angular_frequency": float(square[0]) ** 0.5,
-    }  # fmt: skip
-    assert {name: getattr(scales, name) for name in wanted} == pytest.approx(wanted)
+    assert scales.tip_stiffness == pytest.approx(1.0 / float(wing.tip @ wing.static(wing.tip)))
+    assert scales.angular_frequency == pytest.approx(float(square[0]) ** 0.5)
     assert scales.modal_mass == pytest.approx(float(wing.tip @ shapes[:, 0]) ** -2, rel=1e-5)
     tip, planform = scales.ports["tip"], scales.ports["planform"]
     assert tip.displacement == pytest.approx(max(0.03, 20.0 / scales.tip_stiffness))

@@ -169,7 +169,7 @@ port = [
   {{ name = "between", vector = [1.0, -1.0] }},
 ]
 """)
-    assert [model.port_unit(name) for name in ("one", "other", "between")] == units
+    assert [model.port_units(name)[0] for name in ("one", "other", "between")] == units
 
 
 def test_a_name_that_holds_its_identifier_is_said_once(drag):

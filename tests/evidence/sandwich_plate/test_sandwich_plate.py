@@ -13,7 +13,7 @@ from evidence.sandwich_plate.plate_comparison import (
 from evidence.sandwich_plate.plate_layout import PlateLayout
 from evidence.sandwich_plate.sandwich_plate import assemble_plate
 from fe.full.factorisation import Factorisation
-from fe.verification.known_answers import wing_balance
+from fe.verification.wing_checks import wing_balance
 from fe.wing.operators import assemble, point_masses
 from fe.wing.turn_load import STANDARD_GRAVITY
 from tests import command_line

@@ -14,9 +14,9 @@ from threadpoolctl import threadpool_limits
 from fe.full import factorisation, subspace
 from fe.full.dissection import best_cut, elimination_blocks
 from fe.full.factorisation import Factorisation, analyse, lowest_eigenpairs
-from fe.full.subspace import FunctionalBasis, Norm, ProjectedBasis, conjugate_gradients
+from fe.full.subspace import OrthonormalBasis, ProjectedBasis, affine_product, solved_near
 from fe.runtime.errors import SolutionError
-from fe.structure.affine import AffineSum, affine_sum
+from fe.structure.affine import affine_sum
 
 seeds = st.integers(0, 999)
 
@@ -204,22 +204,28 @@ TERMS = _terms()
 WHOLE = affine_sum((1.0, 1.0, 1.0), TERMS)
 
 
-@pytest.mark.parametrize("coefficients", [(1.0, 2.0, 3.0), (0.0, -1.0, 0.5)])
-def test_a_sum_is_the_sum(coefficients) -> None:
-    wanted = sum(c * term.toarray() for c, term in zip(coefficients, TERMS, strict=True))
-    for found in (AffineSum(TERMS).matrix(coefficients), affine_sum(coefficients, TERMS)):
-        np.testing.assert_allclose(found.toarray(), wanted, rtol=0.0, atol=1e-13)
+def test_sums_are_the_sums() -> None:
+    coefficients, vectors = np.array([(1.0, 0.0), (2.0, -1.0), (3.0, 0.5)]), np.eye(SIZE)[:, :2]
+    wanted = [sum(c * term.toarray() for c, term in zip(own, TERMS, strict=True)) for own in coefficients.T]
+    found = affine_product(TERMS, coefficients, vectors)
+    for number, whole in enumerate(wanted):
+        np.testing.assert_allclose(found[:, number], whole[:, number], rtol=0.0, atol=1e-13)
+        np.testing.assert_allclose(affine_sum(coefficients[:, number], TERMS).toarray(), whole, atol=1e-13)
 
 
-def test_conjugate_gradients_solve_with_several_matrices_at_once_and_give_up(monkeypatch) -> None:
-    matrices, norm = [WHOLE, affine_sum((0.3, 2.0, 1.0), TERMS)], Norm(WHOLE)
-    right = np.random.default_rng(4).normal(size=(SIZE, 4)) * [1.0, 1.0, 1.0, 0.0]
-    found = conjugate_gradients(matrices, norm, right, np.zeros_like(right), tolerance=1e-12)
-    wanted = [np.linalg.solve(m.toarray(), right[:, 2 * k : 2 * k + 2]) for k, m in enumerate(matrices)]
-    np.testing.assert_allclose(found, np.concatenate(wanted, axis=1), rtol=1e-9, atol=1e-15)
+def test_several_systems_are_solved_at_once_near_a_factorised_one_or_given_up(monkeypatch) -> None:
+    factors, coefficients = (
+        Factorisation(WHOLE),
+        np.array([(1.0, 1.0, 0.3), (1.0, 1.0, 2.0), (1.0, 1.0, 1.0)]),
+    )
+    right = np.random.default_rng(4).normal(size=(SIZE, 3)) * [1.0, 0.0, 1e3]
+    given = (factors, TERMS, coefficients, factors.whitened(right), np.zeros_like(right))
+    found = factors.unwhitened(solved_near(*given, tolerance=1e-12))
+    for column, own, wanted in zip(found.T, coefficients.T, right.T, strict=True):
+        np.testing.assert_allclose(affine_sum(own, TERMS) @ column, wanted, rtol=1e-9, atol=1e-9)
     monkeypatch.setattr(subspace, "MOST_ITERATIONS", 2)
-    with pytest.raises(SolutionError, match="Conjugate gradients reached"):
-        conjugate_gradients(matrices, norm, right, np.zeros_like(right), tolerance=1e-12)
+    with pytest.raises(SolutionError, match="Conjugate gradients did not reach"):
+        solved_near(*given, tolerance=1e-12)
 
 
 def test_eigenpairs_equal_the_dense_ones_and_a_structure_that_is_not_held_has_none() -> None:
@@ -233,36 +239,43 @@ def test_eigenpairs_equal_the_dense_ones_and_a_structure_that_is_not_held_has_no
         lowest_eigenpairs(loose, sparse.eye_array(20).tocsr(), 3)
 
 
-def test_a_basis_of_functionals_holds_what_it_was_given_and_says_what_it_dropped() -> None:
+def test_a_basis_holds_what_it_was_given_and_says_what_it_dropped() -> None:
     """Blocks with copies, zeros and directions of all sizes: orthonormal, and the rest is below the bound."""
-    rng, norm = np.random.default_rng(5), Norm(WHOLE)
-    basis, own = FunctionalBasis(SIZE, norm, drop=1e-8), rng.normal(size=(SIZE, 12))
+    rng = np.random.default_rng(5)
+    basis, own = OrthonormalBasis(SIZE, drop=1e-8), rng.normal(size=(SIZE, 12))
     blocks = [
         own[:, :4],
         np.column_stack((own[:, :4] @ rng.normal(size=(4, 3)), own[:, 4:8], np.zeros(SIZE))),
         own[:, :8] @ rng.normal(size=(8, 5)) + 10.0 ** -np.arange(1.0, 14.0, 2.6) * own[:, 7:12],
     ]
     coordinates = [basis.extend(block) for block in blocks]
-    vectors, given = basis.vectors, np.concatenate(blocks, axis=1)
+    vectors = basis.vectors
     np.testing.assert_allclose(vectors.T @ vectors, np.eye(vectors.shape[1]), atol=1e-7)
-    lengths = np.linalg.norm(norm.whitened(given), axis=0)
-    np.testing.assert_allclose(lengths**2, np.einsum("ik,ik->k", given, norm.riesz(given)), rtol=1e-11)
-    left = [norm.whitened(b) - vectors[:, : len(c)] @ c for b, c in zip(blocks, coordinates, strict=True)]
+    left = [b - vectors[:, : len(c)] @ c for b, c in zip(blocks, coordinates, strict=True)]
     missing = np.linalg.norm(np.concatenate(left, axis=1), axis=0)
     assert 8 < vectors.shape[1] < 12
     assert 0.0 < missing.max() <= np.sqrt(basis.dropped_square) * (1.0 + 1e-6) + 1e-12
     assert np.sqrt(basis.dropped_square) < 1e-6
-    nothing = FunctionalBasis(SIZE, norm, drop=1e-8)
+    nothing = OrthonormalBasis(SIZE, drop=1e-8)
     assert nothing.extend(np.zeros((SIZE, 3))).shape == (0, 3)
     assert (nothing.vectors.shape, nothing.dropped_square) == ((SIZE, 0), 0.0)
 
 
-def test_a_basis_stays_orthonormal_with_nearly_dependent_vectors() -> None:
-    random = np.random.default_rng(5)
-    basis, first = ProjectedBasis(Norm(WHOLE), [(WHOLE,)], drop=1e-9), random.normal(size=(SIZE, 5))
-    basis.extend(first)
-    assert basis.vectors.shape[1] == 5
-    near = first + 1e-6 * random.normal(size=first.shape)
-    basis.extend(np.concatenate((near, first @ random.normal(size=(5, 3)), np.zeros((SIZE, 1))), axis=1))
-    np.testing.assert_allclose(basis.vectors.T @ WHOLE @ basis.vectors, np.eye(10), atol=1e-9)
-    np.testing.assert_allclose(basis.inner[0][0], np.eye(10), atol=1e-9)
+def test_a_basis_of_displacements_is_orthonormal_in_energy_with_its_terms_projected() -> None:
+    """Also with nearly dependent vectors; a load and its answer are whitened alike."""
+    random, factors = np.random.default_rng(5), Factorisation(WHOLE)
+    basis, first = ProjectedBasis(factors, TERMS, (WHOLE,), drop=1e-9), random.normal(size=(SIZE, 5))
+    loads = WHOLE @ first
+    np.testing.assert_allclose(factors.unwhitened(factors.whitened(loads)), first, rtol=1e-9, atol=1e-9)
+    near = loads + 1e-6 * random.normal(size=first.shape)
+    for block in (
+        loads,
+        np.concatenate((near, loads @ random.normal(size=(5, 3)), np.zeros((SIZE, 1))), axis=1),
+    ):
+        images, _ = basis.add(factors.whitened(block))
+        np.testing.assert_array_equal(images[0], TERMS[0] @ basis.displacements[:, -5:])
+    vectors, (inner, whole) = basis.displacements, basis.inner
+    np.testing.assert_allclose(vectors.T @ WHOLE @ vectors, np.eye(10), atol=1e-9)
+    np.testing.assert_allclose(whole[0], np.eye(10), atol=1e-9)
+    for term, own in zip(TERMS, inner, strict=True):
+        np.testing.assert_allclose(own, vectors.T @ term @ vectors, atol=1e-9)

@@ -10,14 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fe.reduction.certified_basis import compressed
 from fe.reduction.reduced_basis import measured_errors, reduce_structure
 from fe.runtime.errors import OutsideModelError
 from fe.runtime.reduced import ReducedModel
 from fe.structure.affine import AffineStructure, natural_frequencies, static_response
 from fe.structure.operators import load_and_assemble
 from fe.wing.responses import eigenmodes
-from tests.fe.springs import SETTINGS, reduced_springs, springs
+from tests.fe.springs import ROUGH, SETTINGS, reduced_springs, rough_springs, springs
 from tests.wings import tip_stiffness
 
 HURT = {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 3.0, "push": -120.0}
@@ -46,7 +45,7 @@ def pair(request: pytest.FixtureRequest) -> Pair:
     if kind == "springs":
         return Pair(full, model, 2.0 * SETTINGS.bound_tolerance, 1e-4, 100)
     # so small that its errors are far above rounding
-    return Pair(full, compressed(model, np.eye(len(model.static_load.T))[:, :4]), np.inf, 1e-4, 200)
+    return Pair(full, rough_springs().model, 2.0 * ROUGH, 1e-4, 200)
 
 
 def named(model: ReducedModel, vector: np.ndarray) -> dict[str, float]:
@@ -89,7 +88,7 @@ def test_frequencies_are_those_of_the_full_model(pair: Pair) -> None:
     for vector in states(model, 3):
         wanted, _ = natural_frequencies(pair.full, model.mode_count, named(model, vector))
         relative = model.modes(vector).frequency / wanted - 1.0
-        assert np.all(relative > -1e-6)  # a projection can only be stiffer
+        assert np.all(relative > -3e-6)  # a projection can only be stiffer, but for rounding
         assert np.all(relative < pair.frequency)
 
 

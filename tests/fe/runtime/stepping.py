@@ -8,7 +8,8 @@ from scipy.linalg import expm
 
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, PLAIN, Kernel, Laws
-from fe.runtime.stepwise import Begin, ModalMotion, advance, steps_under
+from fe.runtime.motion_arrays import ModalMotion
+from fe.runtime.stepwise import Begin, advance, steps_under
 from fe.runtime.stepwise import substeps as divided
 
 FloatArray = NDArray[np.float64]

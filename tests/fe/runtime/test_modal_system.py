@@ -55,17 +55,6 @@ def test_steps_of_any_length_are_matrix_exponentials(coupled: bool) -> None:
 
 
 @given(
-    omega=st.floats(0.1, 1e4),
-    zeta=st.floats(0.0, 0.99) | st.floats(0.99, 1.01) | st.floats(1.01, 1e3),
-    duration=st.floats(1e-6, 10.0),
-)
-def test_two_half_steps_are_one_step(omega: float, zeta: float, duration: float) -> None:
-    half, whole = (transition(omega, 2.0 * zeta * omega, part * duration, omega) for part in (0.5, 1.0))
-    np.testing.assert_allclose(half @ half, whole, atol=1e-9 * (1 + zeta))
-    assert np.abs(whole).max() <= 1.0 + 1e-9 + 2 * zeta  # and so finite
-
-
-@given(
     alpha=st.floats(0.0, 100.0),
     beta=st.floats(0.0, 1.0),
     first=st.floats(0.1, 10.0),

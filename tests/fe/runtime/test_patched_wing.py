@@ -16,13 +16,11 @@ from fe.runtime.patched_wing import PatchedWing
 from fe.wing.operators import (
     AffineOperators,
     assemble,
-    cell_elasticity,
     gauge_output,
-    modulus_variation,
     point_masses,
     section_displacement,
 )  # fmt: skip
-from fe.wing.patch_operators import area_shares, strip_edges
+from fe.wing.patch_operators import area_shares
 from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY, lift_load
 
 FloatArray = np.ndarray[Any, np.dtype[np.float64]]
@@ -84,12 +82,10 @@ class Compared:
         sound = operators is not self.operators
         factors = np.ones(3) if sound else operators.theta(FACTOR, STATE[1])[:3]
         whole = operators.stiffness() if sound else operators.stiffness(FACTOR, STATE[1])
-        elasticity, variation = cell_elasticity(mesh), modulus_variation(mesh)
         for region, factor in enumerate(factors):
             cells = np.flatnonzero((mesh.stiffness_term == region) & inside)
             if cells.size:
-                part = mesh.stiffness(cells, elasticity[cells], variation[cells])
-                whole = whole - loss * factor * (operators.expansion.T @ (part @ operators.expansion))
+                whole = whole - loss * factor * operators.body.stiffness(cells)
         return whole.tocsr()
 
     @property
@@ -381,10 +377,7 @@ def test_what_cannot_be_is_refused(both: Compared, ask: Any, message: str) -> No
         _ = ask(both) if callable(ask) else both.structure(ask, temperature=10.0).mass
 
 
-def test_strips_end_at_mesh_lines_and_shares_of_the_area_integrate_a_parabola_on_each_cell() -> None:
-    lines = np.array([0.0, 0.003, 0.1, 0.25, 0.5, 0.52, 0.8, 1.0])
-    assert strip_edges(lines, 4).tolist() == [0.0, 0.25, 0.5, 0.8, 1.0]
-    assert strip_edges(lines, 100).tolist() == lines.tolist()
+def test_shares_of_the_area_integrate_a_parabola_on_each_cell() -> None:
     stations = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
     # mean of y^2 with chord 2 - y: (2/3 - 1/4) / 1.5
     mean = area_shares(stations, 2.0, 1.0) @ stations**2

@@ -109,14 +109,14 @@ def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction) -> None:
     """Once the high modes have died away, strain, position and acceleration agree."""
     model, values = beam_reduction.model, {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 0.0}
     vector, let_go = (model.vector({**values, "push": push}) for push in (100.0, 0.0))
-    motion = ModalIntegrator(model, vector, beam.damping_alpha, beam.damping_beta)
+    motion = ModalIntegrator(model, vector, *model.damping)
     state = motion.at_rest(model.load_coefficients(vector))
     for _ in range(3):
         state = motion.advance(state, 2e-3, model.load_coefficients(let_go))
     stiffness, mass, load = beam.at({**values, "push": 100.0})
     stiffness, inverse, n = stiffness.toarray(), np.linalg.inv(mass.toarray()), len(load)
     start = np.linalg.solve(stiffness, load)
-    damping = beam.damping_alpha * np.eye(n) + beam.damping_beta * inverse @ stiffness
+    damping = model.damping[0] * np.eye(n) + model.damping[1] * inverse @ stiffness
     generator = second_order(inverse @ stiffness, damping)
     moved = expm(generator * 6e-3) @ np.concatenate((start, np.zeros(n)))
     rows = np.vstack((beam.gauge_output.toarray(), beam.displacement_output.toarray()))
@@ -124,7 +124,7 @@ def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction) -> None:
     wanted = np.concatenate((rows @ moved[:n], acceleration))
     size = np.concatenate((np.abs(rows @ start), np.abs(acceleration)))
     assert np.all(np.abs(motion.outputs(state) - wanted) < 5e-3 * size)
-    same = ModalIntegrator(model, vector, beam.damping_alpha, beam.damping_beta)
+    same = ModalIntegrator(model, vector, *model.damping)
     taken = motion.outputs(same.take_over(state, motion))
     np.testing.assert_allclose(taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max()))
 

@@ -44,13 +44,11 @@ def box() -> Callable[[str, Divisions], tuple[FloatArray, NDArray[np.int64]]]:
 def write(tmp_path: Path) -> Callable[..., Path]:
     """A writer of a structure file and its mesh; returns the structure file."""
 
-    def make(
-        points: FloatArray, kind: str, cells: Any, text: str, mesh: str = "mesh.vtu", **sets: Any
-    ) -> Path:
+    def make(points: FloatArray, kind: str, cells: Any, text: str, **sets: Any) -> Path:
         meshio = meshio_with_wedges()
-        meshio.write(tmp_path / mesh, meshio.Mesh(points, [(kind, cells)], **sets))
+        meshio.write(tmp_path / "mesh.vtu", meshio.Mesh(points, [(kind, cells)], **sets))
         file = tmp_path / "structure.toml"
-        file.write_text(f'name = "test"\nmesh = "{mesh}"\n{text}', encoding="utf-8")
+        file.write_text(text, encoding="utf-8")
         return file
 
     return make

@@ -15,7 +15,7 @@ from fe.structure.design import load_structure
 from fe.structure.operators import assemble_structure, load_and_assemble
 from tests import calculix_decks as decks
 from tests.calculix_decks import Point, needs_calculix
-from tests.refusals import Inputs
+from tests.refusals import Inputs, refused
 
 FloatArray = NDArray[np.float64]
 
@@ -201,7 +201,7 @@ def test_a_support_holds_what_the_matrices_leave_free(chain) -> None:
     """A free chain is told which motion is free; held at its first node it is a spring and a mass."""
     free: dict[str, FloatArray | str] = {"k.mtx": STIFFNESS - np.diag([200.0, 0.0, 0.0])}
     words = r"leaves free, or nearly: 1; in one node \d, component 1 moves most\. Hold"
-    with pytest.raises(FiniteElementError, match=words):
+    with refused(FiniteElementError, words):
         chain(free)
     held = free | {"[[mass]]": '[[support]]\nnodes = [4]\nhold = ["x"]\n[[mass]]'}
     found = static_responses(chain(held))["push"]
@@ -212,45 +212,26 @@ def test_a_support_holds_what_the_matrices_leave_free(chain) -> None:
     assert static_responses(wide)["push"].output == pytest.approx(found.output, rel=1e-12)
 
 
-def changed(matrix: FloatArray, **entries: float) -> FloatArray:
-    """A matrix with entries such as a12 replaced."""
-    new = matrix.copy()
-    for name, value in entries.items():
-        new[int(name[1]) - 1, int(name[2]) - 1] = value
-    return new
+NOTHING = "1 1 0\n3 3 0\n"
+AGAIN = {"nodes = [4, 7]": "nodes = [9, 7]", "rows.dof": "9.1\n7.1\n9.1\n"}
 
 
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"k.mtx": changed(STIFFNESS, a12=-90.0)}, r"not symmetric: .* node (4|7), component 1 .* 10; f"),
-        ({"k.mtx": changed(STIFFNESS, a33=np.nan)}, "holds a number that is not finite"),
-        ({"k.mtx": changed(STIFFNESS, a33=-1.0)}, "node 9, component 1 has a negative stiffness"),
-        ({"k.mtx": changed(STIFFNESS, a33=10.0)}, "the stiffness is indefinite"),
-        ({"k.mtx": STIFFNESS * [[1, 1, 0], [1, 1, 0], [0, 0, 0]]}, "node 9, component 1 has mass but no st"),
-        ({"k.mtx": 1j * STIFFNESS}, "of real numbers is expected, but complex128"),
-        ({"k.mtx": 0.0 * STIFFNESS, "m.mtx": 0.0 * MASS}, "no row that is free and has stiffness or mass"),
-        ({"k.mtx": STIFFNESS[:2]}, r"of real numbers is expected, but float64 of shape \(2, 3\)"),
-        ({"m.mtx": MASS[:2, :2]}, r"m\.mtx has 2 rows, but there are 3 unknowns; .* same run"),
-        ({"m.mtx": changed(MASS, a22=-1e-3)}, "node 7, component 1 has a negative mass"),
-        ({"m.mtx": changed(MASS, a12=9e-3, a21=9e-3)}, "mass matrix is indefinite"),
-        ({"middle.mtx": 2.0 * STIFFNESS}, "the parts are together stiffer than the whole; two parts must"),
-        ({"middle.mtx": -MIDDLE}, r"part\[1\] takes stiffness away somewhere"),
-        ({"middle.mtx": 0.0 * MIDDLE}, r"part\[1\] has no stiffness"),
-        # Rows that turn look like rows that shift there; nor is it known how five rows share a force.
-        ({"nodes = [4, 7]": "nodes = [9, 7]", "rows.dof": "9.1\n7.1\n9.1\n"},
-         r"load\[2\]: several rows of the matrices carry one name.* as a vector"),
         *(({old: new}, sentence) for old, new, sentence in INPUTS.refused("chain")),
+        ({"k.mtx": NOTHING, "m.mtx": NOTHING}, "no row that is free and has stiffness or mass"),
+        # Rows that turn look like rows that shift there; nor is it known how five rows share a force.
+        (AGAIN, r"load\[2\]: several rows of the matrices carry one name.* as a vector"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_structure_is_refused_in_a_sentence(changes, sentence: str, chain) -> None:
-    with pytest.raises(FiniteElementError, match=sentence) as found:
+    with refused(FiniteElementError, sentence):
         chain(changes)
-    assert "\n" not in str(found.value)
 
 
 def test_a_mesh_is_asked_for_where_one_is_needed(tmp_path: Path) -> None:
-    with pytest.raises(FiniteElementError, match="is a structure from matrices: without a mesh"):
+    with refused(FiniteElementError, "is a structure from matrices: without a mesh"):
         load_and_assemble(write_chain(tmp_path))
 
 

@@ -1,6 +1,5 @@
 """Mesh files of all programs: the same cells and sets, coordinates of any kind, faults in a sentence."""
 
-import gzip
 from pathlib import Path
 from typing import Any
 
@@ -12,28 +11,17 @@ from scipy.spatial.transform import Rotation
 from fe.elements.cells import jacobians
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.runtime.errors import MeshError
-from fe.structure.affine import static_responses
 from fe.structure.deck import words_of
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_by_meshio, read_mesh
-from fe.structure.operators import load_and_assemble
 from tests.refusals import Inputs
 
 INPUTS = Inputs(__file__)
 CUBES, TETRAHEDRON = INPUTS.text("cubes.inp"), INPUTS.text("tetrahedron.bdf").splitlines()
-SOLID = [
-    "*NODE",
-    "1, 0, 0, 0",
-    "2, 1, 0, 0",
-    "3, 0, 1, 0",
-    "4, 0, 0, 1",
-    "*ELEMENT, TYPE=C3D4",
-    "8, 1, 2, 3, 4",
-]
+SOLID = INPUTS.text("tetrahedron.inp").splitlines()
 DIALECTS = {"abaqus": ("m.inp", SOLID), "nastran": ("m.bdf", TETRAHEDRON)}
 ORIGIN = np.array([0.3, -1.2, 0.7])
 TURN = Rotation.from_rotvec([0.4, -0.9, 1.3])
-DECKS = Path("/usr/share/doc/calculix-ccx-test/examples/test")
 
 
 def coordinates(points: Any, kind: str) -> Any:
@@ -68,35 +56,32 @@ def refuses(path: Path, sentence: str) -> None:
 # ---------------------------------------------------------------- formats
 
 
-@pytest.mark.parametrize("kind", ["tetra", "tetra10", "hexahedron", "hexahedron20", "wedge", "wedge15"])
-@pytest.mark.parametrize("file_format", ["vtu", "gmsh", "gmsh22", "abaqus", "nastran"])
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("file_format", ["vtu", "gmsh", "gmsh22", "abaqus", "nastran", "med"])
 def test_formats_agree(kind: str, file_format: str, box, tmp_path: Path) -> None:
+    """MED counts the nodes of a cell as seen in a mirror; its families are of several groups."""
     points, cells = box(kind, (2, 1, 1))
-    points = points * (20.0, 10.0, 5.0)
-    ending = {"gmsh": "msh", "gmsh22": "msh", "abaqus": "inp", "nastran": "bdf"}.get(file_format, "vtu")
-    path, tags = tmp_path / f"m.{ending}", [np.zeros(len(cells), dtype=np.int32)]
+    ending = {"gmsh": "msh", "gmsh22": "msh", "abaqus": "inp", "nastran": "bdf"}.get(file_format, file_format)
+    tags, half = [np.zeros(len(cells), dtype=np.int32)], points[cells].mean(axis=1)[:, 0] < 0.5
     data = {"gmsh:physical": tags, "gmsh:geometrical": tags} if ending == "msh" else {}
-    mesh = meshio.Mesh(points, [(kind, cells)], cell_data=data)
-    meshio_with_wedges().write(path, mesh, file_format=file_format)
-    found = read_mesh(path, 1e-3, "mm")
+    data |= {"cell_tags": [np.where(half, -1, -2)]} if ending == "med" else {}
+    mesh = meshio_with_wedges().Mesh(
+        points * (-1 if ending == "med" else 1, 1, 1), [(kind, cells)], cell_data=data
+    )
+    if ending == "med":
+        mesh.point_data["point_tags"] = np.where(points[:, 0] == 0.0, 1, 0)
+        mesh.point_tags, mesh.cell_tags = {1: ["root"]}, {-1: ["left", "body"], -2: ["body"]}
+    meshio.write(tmp_path / f"m.{ending}", mesh, file_format=file_format)
+    found = read_mesh(tmp_path / f"m.{ending}", 1e-3, "mm")
     assert found.kind is KINDS[kind]
-    np.testing.assert_allclose(found.nodes, 1e-3 * points[cells], atol=1e-9)
+    assert volume(found) == pytest.approx(1e-9)
     assert len(found.boundary) == {4: 20, 6: 14, 8: 10}[len(found.kind.corners)]
-
-
-@pytest.mark.parametrize("kind", ["tetra", "tetra10", "hexahedron", "hexahedron20", "wedge", "wedge15"])
-def test_cells_and_groups_of_med(kind: str, box, tmp_path: Path) -> None:
-    """MED counts the nodes of a cell as seen in a mirror; families are of several groups."""
-    points, cells = box(kind, (2, 1, 1))
-    half = np.where(points[cells].mean(axis=1)[:, 0] < 0.5, -1, -2)
-    mirrored = meshio.Mesh(points * (-1, 1, 1), [(kind, cells)], cell_data={"cell_tags": [half]})
-    mirrored.point_data["point_tags"] = np.where(points[:, 0] == 0.0, 1, 0)
-    mirrored.point_tags, mirrored.cell_tags = {1: ["root"]}, {-1: ["left", "body"], -2: ["body"]}
-    meshio_with_wedges().write(tmp_path / "m.med", mirrored)
-    mesh = read_mesh(tmp_path / "m.med", 1.0, "m")
-    assert volume(mesh) == pytest.approx(1.0)
-    assert 2 * len(mesh.cells_of("left", "here")) == len(mesh.cells_of("body", "here")) == len(cells)
-    np.testing.assert_array_equal(mesh.points[mesh.nodes_of("root", "here"), 0], 0.0)
+    if ending == "med":
+        assert sorted(found.cells_of("left", "here")) == np.flatnonzero(half).tolist()
+        assert len(found.cells_of("body", "here")) == len(cells)
+        np.testing.assert_array_equal(found.points[found.nodes_of("root", "here"), 0], 0.0)
+    else:
+        np.testing.assert_allclose(found.nodes, 1e-3 * points[cells], atol=1e-12)
 
 
 def test_physical_groups_of_gmsh_are_sets(box, tmp_path: Path) -> None:
@@ -150,14 +135,7 @@ def test_arrays_of_a_vtu_that_are_sets(box, tmp_path: Path) -> None:
 def test_other_files_that_cannot_be_read_are_refused(box, tmp_path: Path, capsys) -> None:
     refuses(tmp_path / "none.msh", "is not there")
     refuses(tmp_path, "is a folder; `mesh` must name it as seen")
-    for name, content, words in (
-        ("e.msh", "", "e.msh is empty"),
-        ("e.inp", "", "e.inp is empty"),
-        ("c.inp", "*NODE\n1, 0, 0, 0\n", "but none that is solid came"),
-        ("m.msh", "nonsense", "cannot be read"),
-        ("m.xyz", "nonsense", "cannot be read"),
-        ("m.vtu", "<nonsense/>", "m.vtu cannot be read as .vtu: Couldn't read file"),
-    ):
+    for name, content, words in INPUTS.refused("files"):
         (tmp_path / name).write_text(content)
         refuses(tmp_path / name, words)
     assert capsys.readouterr() == ("", "")
@@ -179,7 +157,7 @@ def test_other_files_that_cannot_be_read_are_refused(box, tmp_path: Path, capsys
 
 
 def test_a_deck_is_read_with_its_sets(tmp_path: Path) -> None:
-    mesh = written(tmp_path / "m.inp", CUBES)
+    mesh = written(tmp_path / "m.inp", CUBES, "*SURFACE, NAME=sides", "10, S1", "10, S2")
     assert mesh.cell_numbers.tolist() == [10, 20]
     assert mesh.cells_of("BODY", "here").tolist() == [0, 1]
     assert mesh.cells_of("left", "here").tolist() == [0]
@@ -188,6 +166,7 @@ def test_a_deck_is_read_with_its_sets(tmp_path: Path) -> None:
     top = mesh.faces_of("top", "here")
     assert (top.cell.tolist(), top.face.tolist()) == ([0, 1], [1, 1])
     assert (len(mesh.nodes_of("TOP", "here")), len(mesh.faces_of("END", "here"))) == (6, 1)
+    assert len(mesh.faces_of("sides", "here")) == 2  # whose nodes are those of all faces of the cube
     assert mesh.loose.tolist() == [99]
     with pytest.raises(MeshError, match=r"1 of the nodes of the set 'Nall' .* touch no cell"):
         mesh.nodes_of("Nall", "support[1]")
@@ -294,35 +273,3 @@ def test_nodes_of_abaqus_in_a_system_of_their_own(kind: str, box, tmp_path: Path
     # A point on x alone turns x about z, after its height is left out.
     turned = written(tmp_path / "m.inp", "*SYSTEM", ",, 0, , 3, 4,", *SOLID)
     np.testing.assert_allclose(turned.nodes[0], [[0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-15)
-
-
-# ---------------------------------------------------------------- CalculiX
-
-
-@pytest.mark.skipif(not DECKS.is_dir(), reason="Debian's calculix-ccx-test is not installed")
-@pytest.mark.parametrize("name", ["beam10p", "beam20p", "beam8p"])
-def test_decks_of_calculix_give_its_published_results(name: str, tmp_path: Path) -> None:
-    """The same load along y at each node of a set; results are printed with seven digits."""
-    deck, results = (
-        gzip.decompress((DECKS / f"{name}{end}").read_bytes()).decode() for end in (".inp.gz", ".dat.ref.gz")
-    )
-    extra = "".join(f"*NSET, NSET=NODE{n}\n{n}\n" for n in (1, 3))
-    mesh = written(tmp_path / "m.inp", deck.rstrip(), extra)
-    part, direction, force = deck.split("*CLOAD")[1].splitlines()[1].split(",")
-    assert direction == "2"
-    text = INPUTS.text("deck.toml")
-    for block in deck.split("*BOUNDARY")[1:]:
-        for line in block.split("*")[0].splitlines()[1:]:
-            place, first, *last = (part.strip() for part in line.split(",") if part.strip())
-            axes = [*"xyz"[int(first) - 1 : int((last or [first])[0])]]
-            text += f'[[support]]\nset = "{"NODE" * place.isdigit()}{place}"\nhold = {axes}\n'
-    for number, point in enumerate(mesh.points[mesh.nodes_of(part, "here")].tolist()):
-        text += f'[[load]]\nname = "n{number}"\npoint = {point}\nforce = [0, {float(force)}, 0]\n'
-    (tmp_path / "s.toml").write_text(text)
-    structure = load_and_assemble(tmp_path / "s.toml")
-    total = sum(found.displacement for found in static_responses(structure).values())
-    field = 1e3 * structure.full_displacement(np.asarray(total))
-    printed = [line.split() for line in results.split("displacements")[1].splitlines()[2:]]
-    rows = np.array([line for line in printed if len(line) == 4][: len(mesh.points)], dtype=float)
-    assert rows[:, 0].tolist() == mesh.node_numbers.tolist()
-    assert np.abs(rows[:, 1:] - field).max() < 1e-6 * np.abs(field).max()

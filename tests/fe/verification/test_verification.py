@@ -1,4 +1,4 @@
-"""Known answers, and the wing against CalculiX on a coarse mesh; its input and parsers without it."""
+"""Balances of the wing, and the wing against CalculiX on a coarse mesh; its input and parsers without it."""
 
 import math
 from pathlib import Path
@@ -9,50 +9,11 @@ import pytest
 from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
 from fe.verification import calculix_comparison as comparison
-from fe.verification import known_answers as answers
+from fe.verification import wing_checks as answers
 from fe.verification.calculix_deck import wing_deck
-from fe.wing.operators import AffineOperators, assemble
+from fe.wing.operators import assemble
 from tests.calculix_decks import needs_calculix
 from tests.refusals import Inputs
-
-
-def test_a_constant_strain_passes_through_distorted_cells():
-    assert max(answers.patch_test()) < 1e-12
-
-
-def test_an_unsupported_body_has_six_rigid_motions():
-    values = answers.rigid_body_values()
-    assert (values < 1e-12).sum() == 6
-    assert values[6] > 1e-6
-
-
-def test_a_cantilever_bends_as_timoshenko_says():
-    assert abs(answers.cantilever_check()) < 1e-3
-    # It converges to the beam, and a coarse one is already near.
-    coarse, fine = (abs(answers.cantilever_check(cells)) for cells in (5, 10))
-    assert abs(answers.cantilever_check(20)) < fine < coarse < 0.01
-    assert 2.5 < np.log2(coarse / fine) < 4.5  # the tip of a quadratic element: third to fourth order
-
-
-# R. H. MacNeal and R. L. Harder (1985), table 3, column HEX20: the same element in another code.
-@pytest.mark.parametrize(
-    ("shape", "in_plane", "out_of_plane"),
-    [("regular", 0.970, 0.961), ("trapezoid", 0.886, 0.920), ("parallelogram", 0.967, 0.941)],
-)
-def test_the_slender_beam_of_macneal_and_harder_is_reproduced(shape, in_plane, out_of_plane):
-    assert answers.macneal_harder_beam(shape, across_depth=True) == pytest.approx(in_plane, abs=6e-4)
-    assert answers.macneal_harder_beam(shape, across_depth=False) == pytest.approx(out_of_plane, abs=6e-4)
-
-
-def test_the_wing_resists_no_rigid_motion(coarse_operators):
-    assert answers.rigid_body_residual(coarse_operators) < 1e-12
-
-
-def test_mass_reactions_and_energy_balance(coarse_operators):
-    balance = answers.wing_balance(coarse_operators)
-    assert list(balance) == ["mass", "reaction", "root moment", "energy and work"]
-    for name, (found, expected, _) in balance.items():
-        assert found == pytest.approx(expected, rel=1e-10 if name == "mass" else 1e-5)
 
 
 def test_the_structure_weighs_what_it_should(shipped_operators):
@@ -112,20 +73,9 @@ def test_statics_and_frequencies_agree(
     assert list(found.loads) == ["tip force", "lift"]
     for differences in found.loads.values():
         assert all(differences[name] < most for name, most in PLACES.items())
-        assert changes or differences["gauge strains"] < 2e-5
+        assert changes or differences["gauge strains"] < 1e-5
     assert len(found.ours) == count
     assert found.modal < 1e-5
-
-
-@pytest.mark.long
-@needs_calculix
-def test_a_ring_down_agrees(coarse_operators: AffineOperators, tmp_path: Path) -> None:
-    ours, calculix, same_rule = comparison.ring_down_agreement(
-        coarse_operators, tmp_path, DigitalState(), periods=0.125, steps_per_period=80
-    )
-    assert np.abs(calculix - ours).max() < 0.01
-    assert np.abs(calculix - same_rule).max() < 3e-4  # what is left is not the time integration
-    assert np.all(calculix < 1.0)
 
 
 @needs_calculix
@@ -138,14 +88,6 @@ def test_calculix_that_is_not_there_is_one_sentence(monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(CalculixError, match="apt-get install calculix-ccx"):
         comparison.run_calculix("", tmp_path, "job")
-
-
-def test_every_cell_has_its_nodes_material_and_axes(coarse_operators: AffineOperators) -> None:
-    lines = wing_deck(coarse_operators, DigitalState(stiffness_loss=DAMAGED)).text().splitlines()
-    cells = len(coarse_operators.wing_mesh.cells)
-    assert sum(line.startswith("*SOLID SECTION, ELSET=E") for line in lines) == cells
-    assert sum(line.startswith("*ORIENTATION") for line in lines) == cells
-    assert all(len(number) <= 20 for line in lines if line[0] != "*" for number in line.split(","))
 
 
 TABLES, EIGENVALUES = (Inputs(__file__).text(f"{name}.dat") for name in ("tables", "eigenvalues"))

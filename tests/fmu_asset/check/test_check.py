@@ -1,16 +1,13 @@
 """What the checks say of sound FMUs and of FMUs with one fault each."""
 
-import tomllib
-from pathlib import Path
-from typing import Any
-
 import pytest
 
 from fmu_asset.check import FmuCheck, check_fmu
+from tests.fmu_asset.door.kinds import BINDINGS
 from tests.fmu_asset.foreign.workshop import MODELS
-from tests.fmu_asset.making import bound
+from tests.fmu_asset.making import bound, changed, tables
 
-FAULTS = tomllib.loads(Path(__file__).with_name("faults.toml").read_text("utf-8"))
+FAULTS = tables(__file__, "faults")
 QUICK = ("array3", "ball2", "hostile2")
 
 
@@ -69,19 +66,16 @@ def test_step_sizes_and_units_that_contradict(foreign_fmu) -> None:
 
 
 def test_a_binding_of_ones_own(foreign_fmu) -> None:
-    def own(unit: str) -> Any:
-        load = {"outside": ("ambient.T", "degC", -40.0, 50.0), "power": ("heater.u[1].P", "kW", 0.0, 3.0)}
-        return bound(30.0, {"room": ("room.T", unit)}, load=load, header={"name": "own"})
-
-    check = check_fmu(foreign_fmu("room2"), own("degC"))
+    check = check_fmu(foreign_fmu("room2"), BINDINGS["room2"])
     assert check.passed
-    assert texts(check, "binding") == "own fits."
-    assert texts(check, "range edges") == "4 ends of ranges give finite outputs."
+    assert texts(check, "binding") == "room2 fits."
+    assert texts(check, "range edges") == "6 ends of ranges give finite outputs."
+    wrong = changed(BINDINGS["room2"], observation={"room": {"variables": ["room.T"], "unit": "m"}})
     sentence = (
         "observation.room is in 'm', but the FMU has 'room.T' in 'K', and there is no conversion between "
         "the two; state the value in 'K'."
     )
-    assert check_fmu(foreign_fmu("room2"), own("m")).problems == (sentence,)
+    assert check_fmu(foreign_fmu("room2"), wrong).problems == (sentence,)
 
 
 def test_a_range_that_the_fmu_does_not_keep(foreign_fmu) -> None:

@@ -1,9 +1,8 @@
-"""The companions of the wing: what they do by their own formulas, and what they refuse as FMUs."""
+"""The companions of the wing: what they do by their own formulas."""
 
 import math
 import random
 from collections.abc import Callable
-from contextlib import closing
 
 import numpy as np
 import pytest
@@ -12,11 +11,8 @@ from hypothesis import strategies as st
 
 from fmu_asset.companions.damage_growth import DamageGrowth
 from fmu_asset.companions.strain_gauges import StrainGauges, normal
-from fmu_asset.door.session import FmiAsset
-from fmu_asset.errors import FmuInputError
-from tests.fmu_asset.making import bound, parameters_of
+from tests.fmu_asset.making import parameters_of
 from tests.fmu_asset.ours import OurFmus
-from tests.fmu_asset.slaves.slave import DISCARD, OK, Slave
 
 # ---------------------------------------------------------------------- damage growth
 
@@ -94,27 +90,6 @@ def test_regions_and_marks_are_independent(damage) -> None:
     assert np.abs(correlation - np.eye(3)).max() < 4.0 / math.sqrt(3000)
 
 
-def test_refusals_leave_the_state(ours) -> None:
-    """Values and steps that a master should not send: refused by the FMU itself, which goes on from there."""
-    with closing(Slave(ours("damage_growth"))) as slave:
-        fmu, rate = slave.fmu, slave.reference["rate.z1"]
-        fmu.setReal([rate], [0.01])
-        fmu.setupExperiment(startTime=0.0)
-        fmu.enterInitializationMode()
-        fmu.exitInitializationMode()
-        assert slave.step([3.0], 0.0, 1.0) == OK
-        for value, time, size, status in (
-            (math.nan, 1.0, 1.0, 2), (99.0, 1.0, 1.0, 1), (3.0, 1.0, -1.0, 3), (3.0, 5.0, 1.0, 3),
-        ):  # fmt: skip
-            assert slave.step([value], time, size) == DISCARD
-            assert slave.status == status
-        assert slave.step([3.0], 1.0, 1.0) == OK
-        assert slave.of("z1") == pytest.approx(0.02)
-        assert slave.status == 0
-        fmu.setReal([rate], [0.5])  # a fixed parameter, too late
-        assert slave.status == 4
-
-
 # ---------------------------------------------------------------------- gauges
 
 
@@ -174,12 +149,3 @@ def test_lost_by_chance(gauges) -> None:
     at = gauges([1e-3] * 24, dropout_probability=0.1, seed=3.0)
     received = [at(step)[24:] for step in range(400)]
     assert abs(np.mean(received) - 0.9) < 4.0 * math.sqrt(0.09 / (400 * 24))
-
-
-def test_the_gauges_take_their_parameters(ours) -> None:
-    noise = {"noise": ("noise", "microstrain")}
-    binding = bound(1.0, {"r": ("reading[{1..24}]", "microstrain")}, parameter=noise)
-    with FmiAsset(ours("strain_gauges"), binding, isolated=False, parameters={"noise": 1.0}) as asset:
-        assert 0.0 < np.abs(asset.step().values).max() < 10.0
-        with pytest.raises(FmuInputError, match="outside the range"):
-            asset.reset({"noise": 2e5})

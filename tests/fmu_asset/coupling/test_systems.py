@@ -1,153 +1,82 @@
-"""Coupled systems against closed forms, and what cannot be joined in one sentence each.
+"""Coupled systems against their recursion, and what cannot be joined in one sentence each."""
 
-The contract of all assets has their recursion written by hand.
-"""
-
-import itertools
-import tomllib
 from dataclasses import replace
-from pathlib import Path
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from fmu_asset import errors
 from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.coupling.structure import Component, Connection, Connector, Setting, SystemStructure
+from fmu_asset.coupling.structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure
 from fmu_asset.coupling.structure import expand_connection as expand
 from fmu_asset.coupling.wiring import Wiring
-from tests.fmu_asset.door import kinds
-from tests.fmu_asset.door.kinds import OSCILLATOR, SYSTEM_OF_THREE, held, oscillator, three
-from tests.fmu_asset.making import bound, changed, linear, system, watch
+from tests.fmu_asset.coupling.reference import PARTS, SYSTEMS, coupled, linear, of_ours, recursion
+from tests.fmu_asset.door.kinds import BINDINGS
+from tests.fmu_asset.making import bound, changed, system, tables, watch
 from tests.fmu_asset.ours import OurFmus
 
 NAN, DIE = 1.0, 3.0
 
 
-def flown(
-    structure: SystemStructure, *ends: str, steps: int = 1, step_size: float = 1.0, **options: Any
-) -> Any:
-    """Return what ends of a system without inputs show at the start and after each step."""
-    with CoupledAsset(structure, watch(*ends, step_size=step_size), isolated=False, **options) as asset:
-        return np.array([asset.observe().values, *(asset.step().values for _ in range(steps))])
+JACOBI = {"algorithm": "jacobi"}
 
 
-def test_the_order_follows_from_the_dependencies(state_fmu, linear_fmu) -> None:
-    asset = CoupledAsset(oscillator(state_fmu, linear_fmu), watch("first.y1"), isolated=False)
-    assert asset.schedule.order == ("first", "second")
-    assert asset.schedule.loops == ()
-    # With inputs held, an exact component comes to the same place in one step and in four.
-    one, four = (
-        flown(oscillator(state_fmu, linear_fmu, substeps), "first.y1", steps=10, step_size=0.1)
-        for substeps in (1, 4)
+@pytest.mark.parametrize(("name", "order", "delayed", "options"), SYSTEMS["flights"])
+def test_a_system_does_what_its_recursion_says(request, name, order, delayed, options) -> None:
+    """In the order that follows from dependencies; settled, each has the others' values of the step's end.
+
+    With inputs held, an exact component comes to the same place in one step and in four.
+    """
+    given, parts, pushes = dict(options), order.split(), [0.7, -1.0, 0.0, 2.0, 0.5]
+    structure = coupled(name, request.getfixturevalue, given.pop("substeps", 1)).delayed(delayed)
+    inputs = ["push"] if any(connector.kind == "input" for connector in structure.connectors) else []
+    ends = [f"{part}.y{number}" for part in parts for number in (1, 2)]
+    binding = watch(*ends, inputs=inputs, step_size=0.1)
+    with CoupledAsset(structure, binding, isolated=False, **given) as asset:
+        assert asset.describe()["order"] == parts
+        begin = asset.observe().values
+        steps = [asset.step(dict.fromkeys(inputs, push)).values for push in pushes]
+    wanted = recursion(
+        name, parts, 0.1, pushes,
+        jacobi="algorithm" in options, delayed=delayed, sweeps=options.get("iterations", 1),
+    )  # fmt: skip
+    np.testing.assert_allclose(
+        [begin, *steps], np.hstack([wanted[part] for part in parts]), rtol=1e-9, atol=1e-12
     )
-    np.testing.assert_allclose(one, four, rtol=1e-12)
 
 
-def test_the_face_is_that_of_one_fmu(linear_fmu) -> None:
-    one = system([linear("one", linear_fmu, d=[[2.0, 0.0], [0.0, 1.0]])], [("push", "one.u1")])
-    with CoupledAsset(one, watch("one.y1", inputs=["push"], step_size=0.1), isolated=False) as asset:
-        assert asset.describe()["order"] == ["one"]
-        for steps in (0, -1):
-            with pytest.raises(errors.FmuInputError, match=f"steps must be at least 1, but is {steps}"):
-                asset.simulate(steps=steps)
-        assert asset.simulate({"push": 3.0}, steps=1).values.tolist() == [[6.0]]
-        with pytest.raises(TypeError, match="Inputs are control, health, load, port, and 'contrl' came"):
-            asset.reset(contrl={})
-        assert asset.step_index == 1
-        asset.reset(control={"push": 1.0})
-        assert asset.observe().values.tolist() == [2.0]
-
-
-def test_a_chain_gives_in_one_step_what_one_system_would(linear_fmu) -> None:
-    """Direct feedthrough through three FMUs, written backwards, arrives in the same step."""
-    gains = {"third": 5.0, "second": 3.0, "first": 2.0}
-    parts = [linear(name, linear_fmu, d=np.diag([gain, 1.0])) for name, gain in gains.items()]
-    ends = [("push", "first.u1"), ("first.y1", "second.u1"), ("second.y1", "third.u1"), ("third.y1", "out")]
-    chain, binding = system(parts, ends), watch("out", inputs=["push"])
-    with CoupledAsset(chain, binding, isolated=False) as asset:
-        assert asset.schedule.order == ("first", "second", "third")
-        assert asset.step({"push": 0.7}).values[0] == 2.0 * 0.7 * 3.0 * 5.0
-    with CoupledAsset(chain, binding, algorithm="jacobi", isolated=False) as asset:
-        seen = [asset.step({"push": 0.7}).values[0] for _ in range(3)]
-    np.testing.assert_allclose(seen, [0.0, 0.0, 21.0])  # one FMU further in each step
-    delayed = system(parts[::-1], ends).delayed(["second.u1"])  # though the first one stands before it
-    with CoupledAsset(delayed, binding, isolated=False) as asset:
-        np.testing.assert_allclose([asset.step({"push": 0.7}).values[0] for _ in range(2)], [0.0, 21.0])
-
-
-def loop_of(linear_fmu: Path, gain: float) -> SystemStructure:
-    """y = gain u' + 1 and u' = -0.3 y + 2: the constants are states that do not move."""
-    first = np.diag([1.0, 0.0])
-    left = linear("left", linear_fmu, c=first, d=gain * first, initial=(1.0, 0.0))
-    right = linear("right", linear_fmu, c=first, d=-0.3 * first, initial=(2.0, 0.0))
-    return system([left, right], [("left.y1", "right.u1"), ("right.y1", "left.u1")])
-
-
-def test_an_algebraic_loop_is_reported_and_broken_by_a_delay_or_by_jacobi(linear_fmu) -> None:
-    """y = 0.5 u + 1, u of the last step; u = 2 - 0.3 y, y of this step, but of the last one by Jacobi."""
-    loop = loop_of(linear_fmu, 0.5)
+def test_an_algebraic_loop_is_reported(request) -> None:
+    loop = coupled("loop", request.getfixturevalue)
     with pytest.raises(errors.AlgebraicLoopError) as caught:
         CoupledAsset(loop, watch("left.y1"))
     assert "left.y1 -> right.u1 -> right.y1 -> left.u1" in str(caught.value)
     words = "delay one of its connections, allow iterations, or take the algorithm jacobi"
     assert words in str(caught.value)
-    for structure, algorithm, lag in ((loop.delayed(["left.u1"]), "gauss_seidel", 0), (loop, "jacobi", 1)):
-        seen = flown(structure, "left.y1", "right.y1", steps=5, algorithm=algorithm)
-        for (before_y, before_u), (y, u) in itertools.pairwise(seen):
-            np.testing.assert_allclose([y, u], [1.0 + 0.5 * before_u, 2.0 - 0.3 * (before_y if lag else y)])
     words = r"ends at left\.u2.*connections end at right\.u1, left\.u1"
     with pytest.raises(errors.CouplingError, match=words):
         loop.delayed(["left.u2"])
+    with CoupledAsset(coupled("circle", request.getfixturevalue), watch("left.y2"), isolated=False) as asset:
+        assert asset.schedule.loops == ()
+        assert [str(link.source) for link in asset.schedule.held] == ["right.y1"]
 
 
-@pytest.mark.parametrize("algorithm", ["gauss_seidel", "jacobi"])
-def test_iterations_solve_an_algebraic_loop_and_make_the_coupling_implicit(
-    state_fmu, linear_fmu, algorithm
-) -> None:
-    """Settled, each FMU has the other's values of the end of the step, whichever algorithm led there."""
-    settled = {"algorithm": algorithm, "iterations": 80, "tolerance": 1e-13}
-    y = (1.0 + 0.5 * 2.0) / (1.0 + 0.5 * 0.3)
-    seen = flown(loop_of(linear_fmu, 0.5), "left.y1", "right.y1", **settled)[1]
-    np.testing.assert_allclose(seen, [y, 2.0 - 0.3 * y], rtol=1e-11)
-    pair, ends = oscillator(state_fmu, linear_fmu), ("first.y1", "first.y2", "second.y1")
-    (p1, q1), (p2, q2) = held(kinds.A1, kinds.B1, 0.1), held(kinds.A2, kinds.B2, 0.1)
-    c, d = kinds.C2[0], kinds.D2[0]
-    x, z = OSCILLATOR[:2], OSCILLATOR[2:]
-    for row in flown(pair, *ends, steps=5, step_size=0.1, **settled)[1:]:
-        # x' = P1 x + q F', z' = P2 z + Q2 x', F' = C z' + D x': a linear system for F'.
-        free = c @ (p2 @ z + q2 @ p1 @ x) + d @ p1 @ x
-        force = free / (1.0 - (c @ q2 + d) @ q1[:, 0])
-        x = p1 @ x + q1[:, 0] * force
-        z = p2 @ z + q2 @ x
-        np.testing.assert_allclose(row, [*x, force], rtol=1e-9)
-
-
-def test_iterations_that_do_not_settle_or_cannot_be_made(spring_mass, linear_fmu) -> None:
+def test_iterations_that_do_not_settle_or_cannot_be_made(request, spring_mass, linear_fmu) -> None:
     words = r"left, right did not settle in 8 iterations.*still changes by"
-    with pytest.raises(errors.IterationError, match=words):
-        flown(loop_of(linear_fmu, -7.0), "left.y1", iterations=8)
+    stiff = coupled("stiff", request.getfixturevalue)
+    asset = CoupledAsset(stiff, watch("left.y1"), iterations=8, isolated=False)
+    with asset, pytest.raises(errors.IterationError, match=words):
+        asset.step()
     parts = [Component("spring", spring_mass), linear("law", linear_fmu, d=np.eye(2))]
     joined = system(parts, [("spring.position", "law.u1"), ("law.y1", "spring.force")])
     with pytest.raises(errors.CouplingError, match="component 'spring' cannot save and restore its state"):
         CoupledAsset(joined, watch("law.y1"), iterations=3)
 
 
-def test_components_in_a_circle_without_a_loop_of_variables(crossed_fmu) -> None:
-    """Two FMUs that feed each other through different variables: no loop, but one value is a step old."""
-    parts = [linear("left", crossed_fmu, d=np.diag([2, 3])), linear("right", crossed_fmu, d=np.diag([5, 1]))]
-    joined = system(parts, [("push", "left.u1"), ("left.y1", "right.u1"), ("right.y1", "left.u2")])
-    with CoupledAsset(joined, watch("left.y2", inputs=["push"]), isolated=False) as asset:
-        assert asset.schedule.loops == ()
-        assert [str(link.source) for link in asset.schedule.held] == ["right.y1"]
-        assert [asset.step({"push": 1.0}).values[0] for _ in range(2)] == [0.0, 30.0]
-    with CoupledAsset(joined, watch("left.y2", inputs=["push"]), iterations=5, isolated=False) as asset:
-        assert asset.step({"push": 1.0}).values[0] == 30.0
-
-
-def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(state_fmu, linear_fmu) -> None:
-    structure, push = oscillator(state_fmu, linear_fmu, pushed=True), {"push": ("push", "1", -1.0, 2.0)}
+def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(request) -> None:
+    structure, push = coupled("oscillator", request.getfixturevalue), {"push": ("push", "1", -1.0, 2.0)}
     ranged = bound(1.0, {"y": ("first.y1", "1")}, control=push)
     with CoupledAsset(structure, ranged, isolated=False) as asset:
         before = asset.step({"push": 2.0}).values
@@ -160,10 +89,10 @@ def test_a_binding_of_several_fmus_keeps_its_ranges_and_has_no_decimation(state_
 
 
 def test_parameters_and_refusals_are_those_of_the_components(ours) -> None:
-    structure, seen = three(ours), []
+    structure, seen = of_ours(ours), []
     for seed in (5.0, 6.0):
         options = {"isolated": False, "parameters": {"seed": seed}}
-        with CoupledAsset(structure, SYSTEM_OF_THREE, **options) as asset:
+        with CoupledAsset(structure, BINDINGS["three"], **options) as asset:
             assert asset.schedule.order == ("damage", "wing", "gauges")
             seen.append(asset.simulate({"load_factor": 2.0}, steps=3).values)
             state = asset.save_state()
@@ -175,7 +104,7 @@ def test_parameters_and_refusals_are_those_of_the_components(ours) -> None:
             asset.step({"load_factor": 2.0})
     assert not np.array_equal(*seen)
     delayed = tuple(replace(c, delayed=bool(c.source.component)) for c in structure.connections)
-    other = CoupledAsset(replace(structure, connections=delayed), SYSTEM_OF_THREE, isolated=False)
+    other = CoupledAsset(replace(structure, connections=delayed), BINDINGS["three"], isolated=False)
     with other, pytest.raises(errors.FmuStateError, match="another FMU than the system test"):
         other.restore_state(state)
 
@@ -205,28 +134,93 @@ def test_fmus_of_model_exchange_are_solved_by_us_and_coupled_as_any(foreign_fmu)
             x *= np.exp(-step)
             y = y * np.exp(-slow * step) + x * (1.0 - np.exp(-slow * step)) / slow
             np.testing.assert_allclose(asset.step().values, [x, y], rtol=1e-8)
-    only = Component("ball", foreign_fmu("ball2"), interface="co-simulation")
-    words = r"offers model-exchange only, but .* for co-simulation"
-    with pytest.raises(errors.FmuUnsupportedError, match=words):
-        CoupledAsset(system([only], []), watch("ball.h"))
+
+
+# ---------------------------------------------------------------------- inputs in straight lines
+
+END = 2.0
+# x1' = -x1 - 2 x2, x2' = 1.5 x1 - x2: a circle.
+EXACT = expm(np.array([[-1.0, -2.0], [1.5, -1.0]]) * END) @ [1.0, 0.0]
+
+
+def circle(fmu: Any, *, exchange: bool = False, delayed: bool = False, substeps: int = 1) -> SystemStructure:
+    """Return two followers x' = u - x that feed each other."""
+    joined = (
+        Connection(Endpoint("first", "x"), Endpoint("second", "u"), factor=1.5),
+        Connection(Endpoint("second", "x"), Endpoint("first", "u"), factor=-2.0, delayed=delayed),
+    )
+    second = Component("second", fmu, {}, substeps, "model-exchange" if exchange else "co-simulation")
+    first = Component("first", fmu, {"start": Setting(1.0)}, interface="co-simulation")
+    return SystemStructure("circle", (first, second), (), joined)
+
+
+def watched(step: float, kind: str) -> Any:
+    """Return a binding of both states."""
+    return watch("first.x", "second.x", step_size=step, interpolation=kind, tolerance=1e-10)
+
+
+COUPLED = [({}, {}), ({"exchange": True}, {}), ({"substeps": 3}, {}), ({"delayed": True}, {}), ({}, JACOBI),
+           ({"exchange": True, "substeps": 3}, JACOBI)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("system_options", "asset_options"), COUPLED)
+def test_the_error_of_a_system_falls_with_the_square_of_the_step(
+    foreign_fmu, system_options, asset_options
+) -> None:
+    structure, apart = circle(foreign_fmu("follow2"), **system_options), {}
+    for kind in ("zero-order", "linear"):
+        for steps in (20, 40):
+            binding = watched(END / steps, kind)
+            with CoupledAsset(structure, binding, isolated=False, **asset_options) as asset:
+                seen = asset.simulate(steps=steps).values[-1]
+            apart[kind, steps] = np.abs(seen - EXACT).max()
+    assert 1.7 < apart["zero-order", 20] / apart["zero-order", 40] < 2.4
+    assert 3.3 < apart["linear", 20] / apart["linear", 40] < 4.8
+    assert apart["linear", 40] < 0.3 * apart["zero-order", 40]
+
+
+def test_iterations_make_lines_between_both_ends(foreign_fmu) -> None:
+    """Settled, each input is the line between the other's states: no extrapolation is left in it."""
+    options = {"isolated": False, "iterations": 50, "tolerance": 1e-13}
+    with CoupledAsset(circle(foreign_fmu("follow2")), watched(0.1, "linear"), **options) as asset:
+        seen = [asset.observe().values, *(asset.step().values for _ in range(3))]
+    lost = 1.0 - np.exp(-0.1)
+    for before, after in pairwise(seen):
+        for own, factor in ((0, -2.0), (1, 1.5)):
+            u, slope = factor * before[1 - own], factor * (after - before)[1 - own] / 0.1
+            expected = before[own] + lost * (u - before[own]) + slope * (0.1 - lost)
+            assert abs(after[own] - expected) < 1e-11
+
+
+def test_a_system_with_lines_is_restored_or_refused(foreign_fmu, request) -> None:
+    structure = circle(foreign_fmu("follow2"), exchange=True)
+    with CoupledAsset(structure, watched(0.1, "linear"), isolated=False) as asset:
+        asset.simulate(steps=3)
+        kept = asset.save_state()
+        there = [asset.step().values.tobytes() for _ in range(3)]
+        asset.restore_state(kept)
+        assert [asset.step().values.tobytes() for _ in range(3)] == there
+        assert asset.describe()["linear"] == ["first", "second"]
+    with pytest.raises(
+        errors.BindingError, match=r"no component of the system test has a continuous input and"
+    ):
+        CoupledAsset(coupled("pair", request.getfixturevalue), watch("b.y1", interpolation="linear"))
 
 
 # ---------------------------------------------------------------------- wiring
-
-FILES = {"damage": "damage_growth", "wing": "python", "gauges": "strain_gauges", "spring": "spring_mass"}
 
 
 @pytest.fixture(scope="module")
 def base(ours: OurFmus) -> SystemStructure:
     ends = Connector("push", "input"), Connector("seen", "output"), Connector("percent", "output", "%")
-    return SystemStructure("base", tuple(Component(name, ours(file)) for name, file in FILES.items()), ends)
+    return SystemStructure("base", tuple(Component(name, ours(file)) for name, file in PARTS.items()), ends)
 
 
 def link(source: str, target: str, **options: Any) -> Connection:
-    return replace(expand(source, target, tuple(FILES))[0], **options)
+    return replace(expand(source, target, tuple(PARTS))[0], **options)
 
 
-REFUSED = tomllib.loads(Path(__file__).with_name("refused.toml").read_text("utf-8"))
+REFUSED = tables(__file__)
 
 
 def test_what_does_not_fit_is_one_sentence(base, tmp_path) -> None:
@@ -245,11 +239,7 @@ def test_what_does_not_fit_is_one_sentence(base, tmp_path) -> None:
         with pytest.raises((errors.CouplingError, errors.FmuFileError), match=words) as caught:
             Wiring(replace(base, **{name: tuple(items) for name, items in changes.items()}))
         assert "\n" not in str(caught.value)
-    for source, target, sentence in (
-        ("wnig.strain", "a.x", r"'wnig\.strain' begins with no component; the components are a, b"),
-        ("a.x[{1..3}]", "b.y[{1..2}]", "joins 3 ends to 2"),
-        ("a.x[{3..1}]", "b.y[{1..2}]", "is empty or longer"),
-    ):
+    for source, target, sentence in REFUSED["unexpanded"]:
         with pytest.raises(errors.CouplingError, match=sentence):
             expand(source, target, ["a", "b"])
 
@@ -284,7 +274,7 @@ def test_an_input_that_is_only_set_keeps_its_value(base) -> None:
         with CoupledAsset(structure, binding, isolated=False) as asset:
             shown.append((asset.observe().values[0], asset.step().values[0]))
     assert shown[0][0] == shown[0][1]
-    assert shown[0][1] > 1.05 * shown[1][1]
+    assert shown[0][1] > 1.03 * shown[1][1]
 
 
 def test_bindings_that_do_not_fit(base) -> None:
@@ -296,10 +286,5 @@ def test_bindings_that_do_not_fit(base) -> None:
         with pytest.raises(ValueError, match=words):
             CoupledAsset(wiring, bound(1.0, **given))
     right = bound(1.0, observed, control={"x": ("push", "1")})
-    with pytest.raises(ValueError, match="has no parameter 'q'"):
-        CoupledAsset(wiring, right, parameters={"q": 1.0})
     with pytest.raises(ValueError, match="algorithm must be one of gauss_seidel, jacobi"):
         CoupledAsset(wiring, right, algorithm="newton")  # type: ignore[arg-type]
-    asset = CoupledAsset(wiring, right, isolated=False)
-    with asset, pytest.raises(ValueError, match="has no control 'pull'; it has x"):
-        asset.step({"pull": 1.0})

@@ -9,23 +9,16 @@ import numpy as np
 import pytest
 
 from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.coupling.structure import SystemStructure
 from fmu_asset.door.layout import Observation
 from fmu_asset.door.saved_state import SavedState
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError, FmuStateError
-from tests.fmu_asset.door.kinds import INPUTS, KINDS, Kind, oscillator, three
+from tests.fmu_asset.coupling.reference import coupled, of_ours
+from tests.fmu_asset.door.kinds import INPUTS, KINDS, STEPS, Kind
 from tests.fmu_asset.ours import NAMES, OurFmus
 
 Open = Callable[..., FmiAsset]
-Systems = Callable[[str], SystemStructure]
 Bits = list[tuple[bytes, bytes, float]]
-
-
-@pytest.fixture
-def systems(ours: OurFmus, state_fmu: Path, linear_fmu: Path) -> Systems:
-    """Systems of FMUs by name."""
-    return lambda name: three(ours) if name == "three" else oscillator(state_fmu, linear_fmu, pushed=True)
 
 
 @pytest.fixture
@@ -36,18 +29,18 @@ def open_asset(
 
     def opened(kind: Kind, **options: Any) -> FmiAsset:
         given = {"parameters": kind.parameters, **options}
-        if kind.file.startswith(("oscillator", "three")):
+        if kind.file == "three":
+            return CoupledAsset(of_ours(ours), kind.binding, **given)
+        if kind.file.startswith("oscillator"):
             algorithm = {"algorithm": "jacobi"} if kind.file.endswith("jacobi") else {}
-            structure = request.getfixturevalue("systems")(kind.file)
-            return CoupledAsset(structure, kind.binding, **algorithm, **given)
-        return FmiAsset(
-            ours(kind.file) if kind.file in NAMES else foreign_fmu(kind.file), kind.binding, **given
-        )
+            return CoupledAsset(
+                coupled("oscillator", request.getfixturevalue), kind.binding, **algorithm, **given
+            )
+        file = ours(kind.file) if kind.file in NAMES else foreign_fmu(kind.file)
+        return FmiAsset(file, kind.binding, **given)
 
     def there() -> tuple[list[str], int, set[str]]:
-        modules = {
-            name for name in sys.modules if name.startswith(("uav_wing_", "SpringMass", "LinearSystem"))
-        }
+        modules = {name for name in sys.modules if name.startswith(("uav_wing_", "SpringMass"))}
         return list(sys.path), len(list(Path("/proc/self/fd").iterdir())), modules
 
     before = there()
@@ -66,7 +59,7 @@ def flown(asset: FmiAsset, kind: Kind, steps: range) -> Bits:
 
 def onwards(asset: FmiAsset, kind: Kind) -> Bits:
     """Fly the second half, after a step that keeps the inputs of the last one."""
-    return [bits(asset.step()), *flown(asset, kind, range(kind.steps // 2, kind.steps))]
+    return [bits(asset.step()), *flown(asset, kind, range(STEPS // 2, STEPS))]
 
 
 every_kind = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
@@ -80,12 +73,12 @@ def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(open_asset
         open_asset(kind, isolated=True) as there,
     ):
         one.reset(**kind.start)
-        single = flown(one, kind, range(kind.steps))
+        single = flown(one, kind, range(STEPS))
         now, following = SavedState.from_bytes(one.save_state()), bits(one.step())
         for whole in (here, there):
             whole.reset(**kind.start)
-            history = whole.simulate(**kind.course, steps=kind.steps)
-            extra = np.array(list(history.extra.values())).reshape(-1, kind.steps).T
+            history = whole.simulate(**kind.course, steps=STEPS)
+            extra = np.array(list(history.extra.values())).reshape(-1, STEPS).T
             rows = zip(history.values, extra, history.time, strict=True)
             assert [(row.tobytes(), more.tobytes(), time) for row, more, time in rows] == single
             # All are in the same state, and the inputs are held. An FMU may write addresses into its own.
@@ -94,11 +87,11 @@ def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(open_asset
             assert kind.state == "serialised" or saved.body == now.body
             assert bits(whole.step()) == following
         header = kind.binding.binding
-        moments = [header.start_time + k * kind.binding.interval for k in range(1, kind.steps + 1)]
+        moments = [header.start_time + k * kind.binding.interval for k in range(1, STEPS + 1)]
         assert history.time.tolist() == moments  # never accumulated
-    if kind.expected is None:
+    if kind.oracle is None:
         return
-    values, more = kind.expected(kind, ours)
+    values, more = kind.oracle(kind, ours)
     within = {"rtol": kind.rtol, "atol": kind.atol + kind.largest * np.abs(values).max()}
     np.testing.assert_allclose(history.values, values, **within)
     for name, expected in more.items():
@@ -107,7 +100,7 @@ def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(open_asset
 
 @every_kind
 def test_a_state_goes_on_to_the_bit_and_copies_go_their_own_way(open_asset, kind, isolated) -> None:
-    half = range(kind.steps // 2)
+    half = range(STEPS // 2)
     with (
         open_asset(kind, isolated=isolated) as asset,
         open_asset(kind, parameters={}, isolated=not isolated) as other,

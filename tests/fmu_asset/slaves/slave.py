@@ -150,15 +150,16 @@ class Slave:
             self.fmu.freeFMUState(state)
 
     def restore(self, content: bytes) -> int:
-        """Restore a serialised state and return the worst status."""
-        try:
+        """Restore a serialised state and return the status."""
+
+        def restored() -> None:
             state = self.fmu.deserializeFMUState(content)
-        except FMICallException as error:
-            return int(error.status)
-        try:
-            return self.status_of(self.fmu.setFMUState, state)
-        finally:
-            self.fmu.freeFMUState(state)
+            try:
+                self.fmu.setFMUState(state)
+            finally:
+                self.fmu.freeFMUState(state)
+
+        return self.status_of(restored)
 
     def close(self) -> None:
         """Free the instance."""

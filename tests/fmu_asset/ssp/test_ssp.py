@@ -2,7 +2,6 @@
 
 import itertools
 import re
-import tomllib
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,42 +32,26 @@ from fmu_asset.errors import CouplingError, SspError
 from fmu_asset.ssp.check import check_ssp, join_ssp, left_out_sentence
 from fmu_asset.ssp.reader import read_ssp
 from fmu_asset.ssp.writer import write_ssp
-from tests.fmu_asset.making import archive_of, bound, system
+from tests.fmu_asset.coupling.reference import PARTS, of_ours
+from tests.fmu_asset.door.kinds import BINDINGS
+from tests.fmu_asset.making import archive_of, bound, tables, watch
 from tests.fmu_asset.ours import OurFmus
 
 HERE = Path(__file__).parent
+CASES = tables(__file__, "cases")
 NAMES = ("damage", "wing", "gauges")
 NOISE = {Endpoint("gauges", "noise"): "noise"}
-BINDING = bound(
-    1.0, {"strain": ("reading[{1..24}]", "1")},
-    control={"load_factor": ("load_factor", "1")}, monitor={"z1": ("z1", "1")},
-)  # fmt: skip
+BINDING = BINDINGS["three_sent"]
 
 
 @pytest.fixture(scope="module")
 def fmus(ours: OurFmus) -> dict[str, Path]:
-    return {"damage": ours("damage_growth"), "wing": ours("python"), "gauges": ours("strain_gauges")}
+    return {name: ours(PARTS[name]) for name in NAMES}
 
 
 @pytest.fixture(scope="module")
-def structure(fmus: dict[str, Path]) -> SystemStructure:
-    script = {"script[1].first": 1.0, "script[1].last": 3.0, "script[1].z1": 0.1}
-    given = {
-        "damage": {name: Setting(value) for name, value in script.items()},
-        "wing": {"response": Setting("quasi_static"), "mass.servo": Setting(150.0, "g")},
-        "gauges": {"noise": Setting(120.0, "microstrain"), "seed": Setting(9)},
-    }
-    joined = [
-        ("load_factor", "damage.load_factor"),
-        ("load_factor", "wing.load_factor"),
-        ("damage.z1", "wing.health.z1"),
-        ("damage.z2", "wing.health.z2"),
-        ("wing.strain[{1..24}]", "gauges.strain[{1..24}]"),
-        ("gauges.reading[{1..24}]", "reading[{1..24}]"),
-        ("gauges.received[1]", "received"),
-        ("damage.z1", "z1"),
-    ]
-    return system([Component(name, fmus[name], given[name]) for name in NAMES], joined, "three")
+def structure(ours: OurFmus) -> SystemStructure:
+    return of_ours(ours, CASES["ours"], "three")
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +154,6 @@ FILES = {
     name: (HERE / "theirs" / name).read_text("utf-8")
     for name in ("SystemStructure.ssd", "top.ssv", "top.ssm")
 }
-CASES = tomllib.loads((HERE / "cases.toml").read_text("utf-8"))
 Pack = Callable[..., Path]
 
 
@@ -206,37 +188,26 @@ def joined(theirs: Pack, tmp_path: Path) -> Callable[..., Wiring]:
     )
 
 
-DELAYED = (
-    '<ssd:Annotations><ssc:Annotation type="uav-twin"><own:Coupling xmlns:own="urn:uav-twin:coupling" '
-    'delayed="true"/></ssc:Annotation></ssd:Annotations>'
-)
+def conversions(wiring: Wiring, end: str) -> dict[str, tuple[float, float]]:
+    return {str(port.end): port.conversion for port in wiring.ends[end]}
 
 
 def test_nested_systems_parameters_and_mappings(theirs, joined) -> None:
     wiring = joined()
     assert [c.name for c in wiring.structure.components] == ["structure.wing", "damage"]
     # The outer system's set goes before the component's; a value is converted in unit, then scaled.
-    assert wiring.settings["structure.wing"] == {
-        "young_modulus_factor": pytest.approx(0.96), "mass.servo": 0.2,
-    }  # fmt: skip
-    assert wiring.settings["damage"] == {
-        "initial.z1": pytest.approx(0.4), "initial.z2": pytest.approx(0.04), "seed": 17.0,
-    }  # fmt: skip
+    for name, settings_of in CASES["settings"].items():
+        assert wiring.settings[name] == pytest.approx(settings_of)
     ((target, feed),) = wiring.feeds.items()
     assert (str(feed.end), str(target)) == ("damage.z1", "structure.wing.health.z1")
     assert (feed.conversion, feed.delayed) == ((0.5, 0.0), False)
     inner = 'startConnector="z" endElement="wing" endConnector="health.z1"'
-    late = joined((f"{inner}/>", f"{inner}>{DELAYED}</ssd:Connection>"))
+    late = joined((f"{inner}/>", f"{inner}>{CASES['delayed']}</ssd:Connection>"))
     assert [feed.delayed for feed in late.feeds.values()] == [True]
-    assert wiring.ends["loss"][0].conversion == (pytest.approx(100.0), 0.0)
-    assert {str(port.end): port.conversion for port in wiring.ends["n"]} == {
-        "structure.wing.load_factor": (1.0, 0.0), "damage.load_factor": (0.5, 0.25),
-    }  # fmt: skip
-    binding = bound(
-        1.0, {"tip": ("tip", "mm"), "loss": ("loss", "1"), "z": ("damage.z1", "%")},
-        control={"n": ("n", "1")}, parameter={"e": ("structure.wing.young_modulus_factor", "1")},
-    )  # fmt: skip
-    with CoupledAsset(wiring, binding, isolated=False) as asset:
+    assert conversions(wiring, "loss") == {"damage.z1": pytest.approx((100.0, 0.0))}
+    n = {"structure.wing.load_factor": (1.0, 0.0), "damage.load_factor": (0.5, 0.25)}
+    assert conversions(wiring, "n") == n
+    with CoupledAsset(wiring, BINDINGS["theirs"], isolated=False) as asset:
         tip, loss, z = asset.step({"n": 2.0}).values
         assert (loss, z) == (pytest.approx(0.4), pytest.approx(40.0))
         asset.reset({"e": 1.0})
@@ -270,16 +241,10 @@ def test_what_means_the_same_is_read_alike(joined, case) -> None:
     assert read.settings == plain.settings
 
 
-MORE = """<ssd:ParameterBinding><ssd:ParameterValues><ssv:ParameterSet version="1.0" name="more">
-<ssv:Parameters>%s</ssv:Parameters>
-<ssv:Units><ssc:Unit name="%%"><ssc:BaseUnit factor="0.1"/></ssc:Unit></ssv:Units>
-</ssv:ParameterSet></ssd:ParameterValues></ssd:ParameterBinding></ssd:ParameterBindings><ssd:Elements>"""
-
-
 def further(*parameters: tuple[str, str]) -> tuple[str, str]:
     """Return the change that gives the system a second parameter binding, with another `%` than its first."""
     more = "".join(f'<ssv:Parameter name="{name}">{value}</ssv:Parameter>' for name, value in parameters)
-    return "</ssd:ParameterBindings>\n  <ssd:Elements>", MORE % more
+    return "</ssd:ParameterBindings>\n  <ssd:Elements>", CASES["more"] % more
 
 
 def test_values_go_where_the_standard_says(joined) -> None:
@@ -320,11 +285,11 @@ def test_fmus_of_other_versions_are_joined(foreign_fmu, tmp_path) -> None:
         "resources/lag.fmu": foreign_fmu("lag1").read_bytes(),
     }
     wiring = join_ssp(read_ssp(archive_of(tmp_path / "mixed.ssp", contents), tmp_path / "fmus"))
-    with CoupledAsset(wiring, bound(0.1, {"seen": ("lag.Out1", "1")}), isolated=False) as asset:
+    with CoupledAsset(wiring, watch("lag.Out1", step_size=0.1), isolated=False) as asset:
         values = [asset.step().values[0] for _ in range(4)]
-    alone = bound(0.1, {"x": ("Out1", "1")}, load={"u": ("In1 (rad/s)", "rad/s")})
+    alone = BINDINGS["lag1"].with_header(step_size=0.1, decimation=1)
     with FmiAsset(foreign_fmu("lag1"), alone, isolated=False) as lag:
-        assert [lag.step(load={"u": float(n)}).values[0] for n in range(1, 5)] == values
+        assert [lag.step({"speed": float(n)}).values[0] for n in range(1, 5)] == values
     assert values[-1] > 0.0
     array = Connection(Endpoint("counter", "y"), Endpoint("lag", "In1 (rad/s)"))
     words = r"counter\.y cannot be the source .* of the type Float64, and an output of a single"
@@ -332,16 +297,8 @@ def test_fmus_of_other_versions_are_joined(foreign_fmu, tmp_path) -> None:
         Wiring(replace(wiring.structure, connections=(array,)))
 
 
-NOT_SET = {
-    ("array3", "u"): "it is an array; only single numbers",
-    ("array3", "ticked"): "it changes with a clock; only single numbers",
-    ("array3", "blob"): "it is of the type Binary; only single numbers",
-    ("ball2", "der(h)"): "it is declared as local",
-}
-
-
 def test_what_is_no_single_number_or_no_start_is_not_set(foreign_fmu) -> None:
-    for (model, name), words in NOT_SET.items():
+    for model, name, words in CASES["unset"]:
         wrong = Component("a", foreign_fmu(model), {name: Setting(1.0)})
         with pytest.raises(CouplingError, match=re.escape(f"a.{name} cannot be set: {words}")):
             Wiring(SystemStructure("one", (wrong,)))

@@ -4,7 +4,6 @@ import ctypes
 import logging
 import os
 import pickle
-import resource
 import socket
 import subprocess
 import sys
@@ -31,10 +30,6 @@ from twin_master.library.sampling import sample_library
 
 pytestmark = pytest.mark.skipif(landlock_version() < 6, reason="the kernel is older than Linux 6.12")
 
-Attempted = Callable[[], bool]
-"""Whether what was attempted has happened."""
-STREAM = "call(SOCK_STREAM,0,TARGET)"
-
 
 @pytest.fixture
 def key(tmp_path: Path) -> Path:
@@ -60,21 +55,12 @@ def attempting(foreign_fmu: Any, monkeypatch: pytest.MonkeyPatch) -> Attempting:
     return make
 
 
-def listening(cleaner: ExitStack, family: int, kind: int, address: Any) -> tuple[object, Attempted]:
+def listening(cleaner: ExitStack, family: int, kind: int, address: Any = ("127.0.0.1", 0)) -> object:
     line = cleaner.enter_context(socket.socket(family, kind))
     line.bind(address)
     if kind == socket.SOCK_STREAM:
         line.listen()
-    line.setblocking(False)
-
-    def reached() -> bool:
-        try:
-            line.accept()[0].close() if kind == socket.SOCK_STREAM else line.recv(8)
-        except BlockingIOError:
-            return False
-        return True
-
-    return line.getsockname()[1] if family == socket.AF_INET else address, reached
+    return line.getsockname()[1] if family == socket.AF_INET else address
 
 
 def shared(cleaner: ExitStack, kind: str, *size: int) -> int:
@@ -85,72 +71,38 @@ def shared(cleaner: ExitStack, kind: str, *size: int) -> int:
     return int(number)
 
 
-def measured(process: int) -> tuple[object, ...]:
-    limits = resource.prlimit(process, resource.RLIMIT_NOFILE)
-    way = os.sched_getscheduler(process), os.sched_getaffinity(process)
-    return limits, os.getpriority(os.PRIO_PROCESS, process), way
+def process(cleaner: ExitStack) -> int:
+    running = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    cleaner.callback(running.communicate)
+    return running.pid
 
 
-Targets = Callable[[str], tuple[str, Attempted]]
+Target = Callable[[str], str]
 
 
 @pytest.fixture
-def targets(tmp_path: Path, key: Path) -> Iterator[Targets]:
-    """Return what is attempted, by name: the target that the FMU is told, and whether it was reached."""
-    place, inet, unix = ("127.0.0.1", 0), socket.AF_INET, socket.AF_UNIX
-    made, queue = tmp_path / "made", f"uav-twin-{os.getpid()}"
-
-    def told_by_fmu() -> bool:
-        return True
-
-    def process() -> subprocess.Popen[bytes]:
-        running = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-        cleaner.callback(running.communicate)
-        return running
-
-    def kill() -> tuple[object, Attempted]:
-        running = process()
-
-        def killed() -> bool:
-            try:
-                return running.wait(0.0) != 0
-            except subprocess.TimeoutExpired:
-                return False
-
-        return running.pid, killed
-
-    def hamper() -> tuple[object, Attempted]:
-        number = process().pid
-        before = measured(number)
-        return number, lambda: measured(number) != before
-
-    ways: dict[str, Callable[[], tuple[object, Attempted]]] = {
-        "delete": lambda: (key, lambda: not key.exists()),
-        "overwrite": lambda: (key, lambda: key.read_text() == ""),
-        "read": lambda: (key, told_by_fmu),
-        "project": lambda: (ROOT / "pyproject.toml", told_by_fmu),  # beside the packages of a checkout
-        "spy": lambda: (f"/proc/{os.getpid()}/environ", told_by_fmu),
-        "make": lambda: (made, made.exists),
-        "call": lambda: listening(cleaner, inet, socket.SOCK_STREAM, place),
-        "datagram": lambda: listening(cleaner, inet, socket.SOCK_DGRAM, place),
-        "service": lambda: listening(cleaner, unix, socket.SOCK_STREAM, str(tmp_path / "service")),
-        "mailbox": lambda: listening(cleaner, unix, socket.SOCK_DGRAM, str(tmp_path / "mailbox")),
-        "watch": lambda: (tmp_path, told_by_fmu),
-        "share": lambda: (shared(cleaner, "shm", 4096), told_by_fmu),
-        "semaphore": lambda: (shared(cleaner, "sem", 1), told_by_fmu),
-        "message": lambda: (shared(cleaner, "msg"), told_by_fmu),
-        "queue": lambda: (queue, lambda: ctypes.CDLL(None).mq_unlink(f"/{queue}".encode()) == 0),
-        "disturb": lambda: (process().pid, told_by_fmu),
-        "hamper": hamper,
-        "kill": kill,
+def target(tmp_path: Path, key: Path) -> Iterator[Target]:
+    """Return what is attempted upon, by name, as the FMU is told it; it says whether it reached it."""
+    inet, unix, stream, datagram = socket.AF_INET, socket.AF_UNIX, socket.SOCK_STREAM, socket.SOCK_DGRAM
+    queue = f"uav-twin-{os.getpid()}"
+    ways: dict[str, Callable[[], object]] = {
+        "file": lambda: key,
+        "project": lambda: ROOT / "pyproject.toml",  # beside the packages of a checkout
+        "spy": lambda: f"/proc/{os.getpid()}/environ",
+        "make": lambda: tmp_path / "made",
+        "call": lambda: listening(cleaner, inet, stream),
+        "datagram": lambda: listening(cleaner, inet, datagram),
+        "service": lambda: listening(cleaner, unix, stream, str(tmp_path / "service")),
+        "mailbox": lambda: listening(cleaner, unix, datagram, str(tmp_path / "mailbox")),
+        "watch": lambda: tmp_path,
+        "share": lambda: shared(cleaner, "shm", 4096),
+        "semaphore": lambda: shared(cleaner, "sem", 1),
+        "message": lambda: shared(cleaner, "msg"),
+        "queue": lambda: cleaner.callback(ctypes.CDLL(None).mq_unlink, f"/{queue}".encode()) and queue,
+        "process": lambda: process(cleaner),
     }
-
-    def target(what: str) -> tuple[str, Attempted]:
-        told, happened = ways[what]()
-        return str(told), happened
-
     with ExitStack() as cleaner:
-        yield target
+        yield lambda what: str(ways[what]())
 
 
 def granted(asset: FmiAsset) -> None:
@@ -168,20 +120,15 @@ def refused(asset: FmiAsset, sentence: str, kind: type[Exception] = errors.FmuCa
     return caught.value
 
 
-WITHOUT_TRACE = ("read", "project", "spy", "watch", "share", "semaphore", "message", "disturb")
-
-
 @pytest.mark.parametrize("row", MISBEHAVIOURS["attempt"], ids=lambda row: row["call"])
-def test_what_is_not_its_own_is_out_of_reach(attempting, targets, row) -> None:
+def test_what_is_not_its_own_is_out_of_reach(attempting, target, key, row) -> None:
     """And the same FMU reaches it where the sandbox is off: it is the sandbox that holds."""
-    reason = row.get("reason", "Permission denied")
-    target, happened = targets(row["what"])
-    error = refused(attempting(row["call"], target), rf"(?s)step 2 .*it cannot have {target}: {reason}")
+    reason, told = row.get("reason", "Permission denied"), target(row["what"])
+    error = refused(attempting(row["call"], told), rf"(?s)step 2 .*it cannot have {told}: {reason}")
     assert ("granted by `read`, `write`, `ports`" in str(error)) == (reason == "Permission denied")
-    assert row["what"] in WITHOUT_TRACE or not happened()
-    with attempting(row["call"], target, sandbox=False) as asset:
-        asset.simulate(steps=3)
-    assert happened()
+    assert key.read_text() == "the private key"
+    assert not (key.parent / "made").exists()
+    granted(attempting(row["call"], told, sandbox=False))
 
 
 def test_what_was_refused_is_named_also_where_the_fmu_does_not_say_it(
@@ -205,35 +152,18 @@ def test_rights_of_files_stay_as_they_are(attempting, key) -> None:
             assert key.stat() != before
 
 
-GRANTED = [
-    ("read", "look_into(TARGET)", "read"),
-    ("overwrite", "overwrite(TARGET)", "write"),
-    ("call", STREAM, "ports"),
-    ("datagram", "call(SOCK_DGRAM,0,TARGET)", "ports"),  # by which the names of hosts are looked up
-]
+@pytest.mark.parametrize(("what", "attempt", "limit"), MISBEHAVIOURS["granted"])
+def test_what_is_granted_can_be_had(attempting, target, what, attempt, limit) -> None:
+    told = target(what)
+    granted(attempting(attempt, told, **{limit: [int(told) if limit == "ports" else told]}))
 
 
-@pytest.mark.parametrize(("what", "attempt", "limit"), GRANTED, ids=[case[1] for case in GRANTED])
-def test_what_is_granted_can_be_had(attempting, targets, what, attempt, limit) -> None:
-    target, happened = targets(what)
-    granted(attempting(attempt, target, **{limit: [int(target) if limit == "ports" else target]}))
-    assert happened()
-
-
-CLOSED = [
-    ("call", STREAM, 9),
-    ("call", "call(SOCK_STREAM,262,TARGET)", 0),
-    ("service", "call_service(TARGET)", 9),
-]
-
-
-@pytest.mark.parametrize(("what", "attempt", "port"), CLOSED)
+@pytest.mark.parametrize(("what", "attempt", "port"), MISBEHAVIOURS["closed"])
 def test_a_port_beside_the_granted_one_and_another_protocol_stay_closed(
-    attempting, targets, what, attempt, port
+    attempting, target, what, attempt, port
 ) -> None:
-    target, happened = targets(what)
-    refused(attempting(attempt, target, ports=[port or int(target)]), "Permission denied")
-    assert not happened()
+    told = target(what)
+    refused(attempting(attempt, told, ports=[port or int(told)]), "Permission denied")
 
 
 def test_a_program_that_is_granted_is_as_confined_as_the_fmu(attempting, tmp_path) -> None:
@@ -253,22 +183,9 @@ def test_its_own_folder_is_its_own(attempting) -> None:
     refused(attempting("create(beside_binary())"), "Permission denied")
 
 
-REFUSED = [
-    (
-        {"read": ["/there/is/no/such"]},
-        errors.FmuInputError,
-        r"grants '/there/is/no/such', which does not exist",
-    ),
-    ({"ports": [0]}, errors.BindingError, r"limits\.ports.*1"),
-    ({"ports": ["27000"]}, errors.BindingError, r"limits\.ports.*an integer"),
-    ({"read": "/opt"}, errors.BindingError, r"limits\.read.*a list"),
-    ({"sandbox": "no"}, errors.BindingError, r"limits\.sandbox.*true or false"),
-]
-
-
 def test_keys_that_are_wrong_are_one_sentence(foreign_fmu) -> None:
-    for limits, kind, sentence in REFUSED:
-        with pytest.raises(kind, match=sentence):
+    for limits, kind, sentence in MISBEHAVIOURS["limits"]:
+        with pytest.raises(getattr(errors, kind), match=sentence):
             FmiAsset(foreign_fmu("hostile2"), changed(HOSTILE, limits=limits)).reset()
 
 

@@ -24,7 +24,7 @@ from twin_master.errors import InvalidObservationLibraryError, ScenarioError, Tw
 from twin_master.library.request import grid_of_scenario
 from twin_master.library.sampling import sample_library
 from twin_master.scenario.reading import LoadedScenario, load_scenario
-from twin_master.store.writing import read_run
+from twin_master.store.writing import open_run
 from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
 
@@ -272,7 +272,7 @@ def move(control: str, before: int, after: int) -> float:
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("pump")
     overrides = Overrides(library=sampled(folder) if request.param == "library" else None)
-    return read_run(new_run(small_pump(), folder / "run", overrides, report=False).folder)
+    return open_run(new_run(small_pump(), folder / "run", overrides, report=False).folder)
 
 
 @pytest.fixture(scope="module")

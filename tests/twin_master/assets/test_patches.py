@@ -26,7 +26,7 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.assets.system_export import export_scenario
 from twin_master.errors import MissionInputError, ScenarioError
 from twin_master.scenario.reading import load_scenario
-from twin_master.store.writing import read_run
+from twin_master.store.writing import open_run
 from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
 
@@ -122,7 +122,7 @@ def test_a_mission_with_a_hidden_drift(mission, tmp_path):
     write_patch(tmp_path, *DRIFT)
     folder = mission("hidden", PATCH)
     folders = mission("plain"), folder, mission("off", PATCH, '"effect.hidden.active" = 0')
-    plain, hidden, off = (read_run(place)["observed"]["strain"].values for place in folders)
+    plain, hidden, off = (open_run(place)["observed"]["strain"].values for place in folders)
     np.testing.assert_array_equal(off, plain)
     # the control of later turns may differ, since the twin is misled; that of the first ones does not
     np.testing.assert_allclose(hidden[:2, 4] - plain[:2, 4], [3e-5, 6e-5], rtol=1e-6)

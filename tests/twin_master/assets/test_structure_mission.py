@@ -23,7 +23,7 @@ from twin_master.errors import MissionInputError, TwinMasterError
 from twin_master.network.identified import packed_row
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.store.writing import read_run
+from twin_master.store.writing import open_run
 from twin_master.watch.message import MessageReader, Refused
 from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
@@ -55,7 +55,7 @@ def short(**changes: Any) -> LoadedScenario:
 
 def fly(loaded: LoadedScenario, folder: Path) -> Any:
     """Return the tree of the run."""
-    return read_run(new_run(loaded, folder, report=False).folder)
+    return open_run(new_run(loaded, folder, report=False).folder)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_twin_finds_the_damage_of_the_full_model(flown):
     """The strains flown are those of the full model within their bound; the heel is accused, not the arm."""
-    tree, structure = read_run(flown), load_and_assemble(FILE)
+    tree, structure = open_run(flown), load_and_assemble(FILE)
     unit = structure.load("weight", 1.0)
     truth, observed = tree["truth"], tree["observed"]
     for step in (0, 9):
@@ -252,7 +252,7 @@ def features(tree: Any, titles: list[str]) -> tuple[np.ndarray, np.ndarray, np.n
 
 def test_the_twin_finds_the_loss_from_records_of_accelerations(decays):
     """Features lie within their errors of those of the model that flies; the inner region is accused."""
-    tree = read_run(decays)
+    tree = open_run(decays)
     true, seen, errors = features(tree, TITLES)
     assert list(tree["observed"]["sensor_unit"].values) == ["Hz", "1", "1"] * 2
     # mode 5, at 8 kHz and strongly damped, is in the record and told by none of the bands: a small bias

@@ -19,10 +19,10 @@ from twin_master.fleet.flight import fly_fleet, group_folder
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet, seed_range
 from twin_master.fleet.reading import Estimated, group_figures
 from twin_master.fleet.reading import open_fleet as fleet_groups
-from twin_master.fleet.store import FleetStore
+from twin_master.mission.journal import JournalFile
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import kept_knowledge
-from twin_master.store.writing import read_run
+from twin_master.store.writing import open_run
 from twin_master.workflow import fly as new_run
 
 
@@ -40,7 +40,7 @@ def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, tmp_path):
     given = Overrides(strain_library=library_file)
     outcome = fly_fleet(ensemble("level_turns", range(2020, 2023), given), tmp_path / "many")
     group = fleet_groups(outcome.folder)["level_turns"]
-    tree = read_run(new_run("level_turns", tmp_path / "one", given, report=False).folder)
+    tree = open_run(new_run("level_turns", tmp_path / "one", given, report=False).folder)
     row = group["seed"].values.tolist().index(int(tree.attrs["seed"]))
     for ours, (part, name) in {
         "observed": ("observed", "strain"),
@@ -64,20 +64,20 @@ def test_shards_and_workers_change_nothing(library_file, whole, tmp_path):
 
 
 def test_a_fleet_goes_on_where_it_was_killed(library_file, whole, tmp_path, monkeypatch):
-    fleet, cut, finish = growing(library_file), tmp_path / "cut", FleetStore.finish
+    fleet, cut, append = growing(library_file), tmp_path / "cut", JournalFile.append
 
-    def dying(self: FleetStore, shard: int, told: Any) -> None:
-        if shard == 1:  # its chunk is written, and the journal does not know
+    def dying(self: JournalFile, record: Any) -> None:
+        if record.get("shard") == 1:  # its chunk is written, and the journal does not know
             raise KeyboardInterrupt
-        finish(self, shard, told)
+        append(self, record)
 
     with monkeypatch.context() as patch:
-        patch.setattr(FleetStore, "finish", dying)
+        patch.setattr(JournalFile, "append", dying)
         with pytest.raises(KeyboardInterrupt):
             fly_fleet(fleet, cut)
     assert fleet_groups(cut)["growing_damage"]["status"].values.tolist() == [1] * 8 + [0] * 2
-    with (cut / "done.jsonl").open("a") as file:
-        file.write('{"shard": 2, "fail')  # a line that the kill cut off
+    with (cut / "journal.jsonl").open("a") as file:
+        file.write(64 * "0" + ' {"shard": 2, "fail')  # a line that the kill cut off
     outcome = fly_fleet(fleet, cut)
     assert (outcome.shards_kept, outcome.shards_flown) == (1, 2)
     kept = [  # the journal keeps times and is no result

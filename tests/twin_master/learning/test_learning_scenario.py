@@ -16,9 +16,10 @@ from twin_master.mission.preparation import Knowledge, prepare_twin
 from twin_master.network.estimator import ExactFilter
 from twin_master.network.twin import build_graphical_model
 from twin_master.report.page import render_page
-from twin_master.report.reading import open_run, read_run
+from twin_master.report.reading import read_run
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.tables import Noticing
+from twin_master.store.writing import open_run
 from twin_master.workflow import resume as resume_run
 
 TEXT = text_of("level_turns_learning")

@@ -14,13 +14,14 @@ from scipy.stats import invgamma
 from tests.command_line import said
 from tests.twin_master.runs import journal, text_of, written
 from twin_master.mission.preparation import prepare_twin
+from twin_master.mission.replay import gap_of
 from twin_master.mission.turns import History, Reading, Turn
 from twin_master.report.learnt import asset_rows, learnt_figure, sensor_rows
 from twin_master.report.page import render_page
-from twin_master.report.reading import open_run, read_run
+from twin_master.report.reading import read_run
 from twin_master.scenario.reading import load_scenario
+from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Flight
-from twin_master.watch.replay import gap_of
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 TURNS = 9
@@ -161,15 +162,15 @@ def test_the_view_shows_what_was_learnt(folder, run):
     """From the posterior of each quantity alone, which the journal tells."""
     flight, filtered = Flight(folder), run["filtered"].to_dataset()
     flight.update()
-    shown, noise = flight.believed(0, TURNS), filtered["noise_standard_deviation"].values
+    shown, noise = flight.believed(0, TURNS).expected, filtered["noise_standard_deviation"].values
     wide = np.hypot(noise, filtered["quantity_standard_deviation"].values)
-    np.testing.assert_allclose(shown.sensor_deviation, wide, rtol=0.1)
+    np.testing.assert_allclose(np.hypot(shown.standard_deviation, shown.noise), wide, rtol=0.1)
     np.testing.assert_allclose(shown.reward_mean, filtered["reward_mean"].values, atol=0.03)
-    ahead = flight.predicted(TURNS - 1).sensor_mean - run["predicted"]["quantity_mean"].values[-1]
+    ahead = flight.predicted(TURNS - 1).expected.mean - run["predicted"]["quantity_mean"].values[-1]
     assert np.abs(ahead / noise[-1]).max() < 0.06
 
     def off() -> float:
-        error = (flight.believed(0, TURNS).sensor_mean - filtered["quantity_mean"].values) / noise
+        error = (flight.believed(0, TURNS).expected.mean - filtered["quantity_mean"].values) / noise
         return float(np.abs(error).max())
 
     learnt = off()

@@ -17,8 +17,9 @@ from twin_master.learning.learning_filter import LearningFilter, LearntPriors
 from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.learning.switching import at_first, one_turn_later
 from twin_master.learning.words import Words
-from twin_master.mission.journal import belief_record, line_of
+from twin_master.mission.journal import line_of, turn_record
 from twin_master.mission.preparation import Knowledge, prepare_twin
+from twin_master.mission.turns import Reading, Turn
 from twin_master.network.estimator import Carried, Estimate, ExactFilter
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.sensor_model import GaussianSensorModel
@@ -252,7 +253,9 @@ def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, la
                 assert twin.save_state() == before
                 turn = twin.turn(np.full(2, np.nan))
             assert turn.filtered.sum() == pytest.approx(1.0)
-            line_of(belief_record(turn))  # which holds no NaN and no infinity
+            line_of(
+                turn_record(Turn(Reading(np.full(2, np.nan)), turn))
+            )  # which holds no NaN and no infinity
 
 
 def test_a_turn_without_readings_changes_no_evidence():

@@ -41,10 +41,10 @@ from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.estimator import Carried, Estimator, ExactFilter
 from twin_master.network.planner import BeliefPolicy, rationed
 from twin_master.network.transition import TransitionModel
-from twin_master.report.reading import open_run
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import Noticing
+from twin_master.store.writing import open_run
 
 TEXT = text_of("inspected_wing", ("notice = false", ""))
 INSPECT, REPAIR_1 = 2, 3

@@ -17,7 +17,7 @@ from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.store import ENDED
 from twin_master.scenario.reading import load_scenario
-from twin_master.store.writing import read_run
+from twin_master.store.writing import open_run
 from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
 
@@ -141,7 +141,7 @@ def test_an_fmi_3_asset_with_an_array_is_watched(foreign_fmu, tmp_path):
         scenario(tmp_path, fmu, *changes, ("count = 1", f"count = {count}"), binding=ARRAY)
         for count in (2, 3)
     )
-    truth = read_run(new_run(two, tmp_path / "run").folder)["truth"]
+    truth = open_run(new_run(two, tmp_path / "run").folder)["truth"]
     assert truth["state_calls"].values.tolist() == [1.0, 2.0, 3.0]
     assert truth["y[1]"].attrs["units"] == "mm"
     assert truth["y"].attrs["units"] == "m"

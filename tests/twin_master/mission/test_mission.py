@@ -1,17 +1,18 @@
 """The mission loop and its truth: timing, history, growth, faults, resuming at every turn, what stops it."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.seeds import fly_seeds
-from tests.twin_master.runs import of_library, table_of
+from tests.twin_master.runs import journal, of_library, table_of
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import AssetOutputError, NotResumableError
-from twin_master.mission.loop import Checkpoint, fly
+from twin_master.mission.journal import JOURNAL_NAME, JournalFile, line_of
+from twin_master.mission.loop import fly, kept_in, taken_up
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import SensorStatus, Truth
 from twin_master.mission.turns import History, Turn
@@ -21,7 +22,6 @@ from twin_master.scenario.schema import Scenario
 from twin_master.seeds import PURPOSES, generator
 
 Known = tuple[Knowledge, StrainLibrarySource]
-Kept = list[tuple[Turn, bytes]]
 ARRAYS = (
     "observed", "control_index", "filtered", "log_evidence", "smoothed", "predicted", "decision_probability",
     "state",
@@ -33,33 +33,41 @@ def paper(library_file: Path) -> Known:
     return of_library("paper_level_turns", library_file, 1)
 
 
-def flown(known: Known, seed: int = 3, asset: StatelessAsset | None = None, **options: object) -> History:
+def flown(
+    known: Known, seed: int = 3, asset: StatelessAsset | None = None, *sinks: Callable[[Turn], None]
+) -> History:
     knowledge, source = known
     plant = knowledge.plant(knowledge.truth(seed), asset or source.open())
-    return fly(knowledge.scenario, knowledge.twin(), plant, **options)  # type: ignore[arg-type]
-
-
-def stopped(kept: Kept) -> Checkpoint:
-    turns = [turn for turn, _ in kept]
-    decided = [turn.concluded.next_control for turn in turns]
-    return Checkpoint([turn.reading for turn in turns], decided, kept[-1][1])
+    return fly(knowledge.scenario, knowledge.twin(), plant, *sinks)
 
 
 @pytest.mark.parametrize("name", ["level_turns", "growing_damage", "failing_gauges"])
-def test_resuming_after_any_turn_is_bit_identical(name, library_file):
-    known, kept = of_library(name, library_file), Kept()
-    whole = flown(known, keep=lambda *told: kept.append(told))
-    assert len(kept) == 50
+def test_resuming_after_any_turn_is_bit_identical(name, library_file, tmp_path):
+    knowledge, source = of_library(name, library_file)
+
+    def part() -> History:
+        plant = knowledge.plant(knowledge.truth(3), source.open())
+        with JournalFile(tmp_path, "abc") as file:
+            before = taken_up(file, knowledge, plant)
+            return fly(knowledge.scenario, before.twin, plant, kept_in(file, plant), history=before)
+
+    whole, lines = part(), journal(tmp_path)
+    assert len(lines) == 50
+    content = (tmp_path / JOURNAL_NAME).read_bytes()
     for turns in (1, 2, 17, 49, 50):
-        rest = flown(known, checkpoint=stopped(kept[:turns]))
+        kept = content.splitlines(keepends=True)[: turns + 1]
+        (tmp_path / JOURNAL_NAME).write_bytes(b"".join(kept))
+        rest = part()
         assert rest.resumed_at == turns
+        assert (tmp_path / JOURNAL_NAME).read_bytes() == content
         assert np.all((rest.seconds > 0.0).any(axis=1) == (np.arange(50) >= turns))
         for array in ARRAYS:
             np.testing.assert_array_equal(getattr(rest, array), getattr(whole, array))
-    altered = stopped(kept[:10])
-    altered.decided[4] = 1 - altered.decided[4]
+    altered = lines[4] | {"next_control": 1 - lines[4]["next_control"]}
+    kept = [*content.splitlines(keepends=True)[:5], line_of(altered)]
+    (tmp_path / JOURNAL_NAME).write_bytes(b"".join(kept))
     with pytest.raises(NotResumableError, match="after turn 4"):
-        flown(known, checkpoint=altered)
+        part()
 
 
 def test_timing_of_a_turn(paper):
@@ -88,7 +96,7 @@ def test_timing_of_a_turn(paper):
 
 
 def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(paper):
-    inner, kept = paper[1].open(), Kept()
+    inner, kept = paper[1].open(), list[Turn]()
 
     def broken(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         values = inner.step(control, health).values
@@ -99,7 +107,7 @@ def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(paper):
         return AssetReading(np.zeros(3))
 
     with pytest.raises(AssetOutputError, match=r"step 3: .*NaN.*`strain` 8 under the control `3g`"):
-        flown(paper, 1, StatelessAsset(broken), keep=lambda *told: kept.append(told))
+        flown(paper, 1, StatelessAsset(broken), kept.append)
     with pytest.raises(AssetOutputError, match="expects 24 values"):
         flown(paper, 1, StatelessAsset(short))
 

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 
-from reporting.errors import DamagedFileError, FileNotWrittenError
+from reporting.errors import FileNotWrittenError
 from tests.twin_master.runs import of_library
+from twin_master.errors import RunFolderError
 from twin_master.mission.loop import fly
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
@@ -17,7 +19,7 @@ from twin_master.scenario.schema import Reference
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.results import groups_of, tables_of
 from twin_master.store.summary import Figure, control_changes, filtered_rms_error, find_fallback, summarise
-from twin_master.store.writing import read_run, write_run, write_summary
+from twin_master.store.writing import open_run, tree_of, write_run, write_summary
 
 
 @pytest.fixture(scope="module")
@@ -37,18 +39,21 @@ def test_the_file_reads_back_and_its_bytes_depend_on_the_tree_alone(result, tmp_
     first = write_run(tmp_path / "a", groups, {"seed": 3}).read_bytes()
     assert write_run(tmp_path / "b", groups_of(result), {"seed": 3}).read_bytes() == first
     assert write_run(tmp_path / "c", groups_of(result), {"seed": 4}).read_bytes() != first
-    read, predicted = read_run(tmp_path / "a"), groups["predicted"]
+    read, predicted = open_run(tmp_path / "a"), groups["predicted"]
     assert {*predicted.variables, *predicted.coords} == set(read["predicted"].to_dataset().variables)
     for name, variable in {**predicted.variables, **predicted.coords}.items():
         found = read["predicted"][name]
         np.testing.assert_array_equal(found, variable.values)
         assert (found.dims, found.attrs) == (variable.dims, variable.attrs)
     np.testing.assert_array_equal(read["observed"]["strain"], result.flight.observed)
+    made = tree_of(groups, {"seed": 3})
+    xr.testing.assert_equal(made, read)
+    assert [node.attrs for node in made.subtree] == [node.attrs for node in read.subtree]
 
 
 def test_what_is_stored_agrees_with_itself(result, tmp_path):
     write_run(tmp_path, groups_of(result), {})
-    tree = read_run(tmp_path)
+    tree = open_run(tmp_path)
     filtered, predicted = tree["filtered"].to_dataset(), tree["predicted"].to_dataset()
     levels = result.knowledge.model.states.coordinates
     np.testing.assert_allclose(filtered["mean"], filtered["probability"].values @ levels)
@@ -103,8 +108,8 @@ def test_damaged_and_unwritable(result, tmp_path):
     write_run(tmp_path, groups_of(result), {})
     content = (tmp_path / "run.nc").read_bytes()
     (tmp_path / "run.nc").write_bytes(content[:1000])
-    with pytest.raises(DamagedFileError, match="not a whole run"):
-        read_run(tmp_path)
+    with pytest.raises(RunFolderError, match="not a whole run"):
+        open_run(tmp_path)
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(FileNotWrittenError):
         write_run(tmp_path / "file", groups_of(result), {})

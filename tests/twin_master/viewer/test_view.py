@@ -30,9 +30,9 @@ from twin_master.assets.resolution import Overrides
 from twin_master.errors import RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME
-from twin_master.report.reading import open_run
 from twin_master.scenario.reading import load_scenario
-from twin_master.viewer.flight import Flight
+from twin_master.store.writing import open_run
+from twin_master.viewer.flight import Belief, Flight
 from twin_master.viewer.messages import Request, Teller, parse_request
 from twin_master.viewer.scene import LATEST, scene_of
 from twin_master.workflow import fly as new_run
@@ -86,6 +86,11 @@ def whole(folder: Path) -> Flight:
     return flight
 
 
+def wide(belief: Belief) -> np.ndarray:
+    """Return the standard deviation of what each sensor shows, its noise included."""
+    return np.hypot(belief.expected.standard_deviation, belief.expected.noise)
+
+
 def teller_of(flight: Flight) -> Teller:
     return Teller(flight, scene_of(flight.folder, flight.knowledge))
 
@@ -101,17 +106,19 @@ def test_every_number_is_that_of_the_run(run):
     believed, expected = flight.believed(0, TURNS), flight.predicted(28)
     for belief, group, part in ((believed, "filtered", slice(None)), (expected, "predicted", 28)):
         values = {name: stored[group][name].values[part] for name in stored[group].data_vars}
-        np.testing.assert_array_equal(belief.state_mean, values["mean"])
-        np.testing.assert_array_equal(belief.state_deviation, values["standard_deviation"])
-        np.testing.assert_array_equal(belief.reward_mean, values["reward_mean"])
-        np.testing.assert_array_equal(belief.reward_deviation, values["reward_standard_deviation"])
-        np.testing.assert_array_equal(belief.sensor_mean, values["quantity_mean"])
+        np.testing.assert_array_equal(belief.probability, values["probability"])
+        np.testing.assert_array_equal(belief.expected.reward_mean, values["reward_mean"])
+        deviation = values["reward_standard_deviation"]
+        np.testing.assert_array_equal(belief.expected.reward_standard_deviation, deviation)
+        np.testing.assert_array_equal(belief.expected.mean, values["quantity_mean"])
     filtered = stored["filtered"].to_dataset()
     total = flight.knowledge.sensor_model.total_standard_deviation[:, stored["observed"]["control_index"]]
     noise2 = np.einsum("ts,stg->tg", filtered["probability"].values, total**2)
     assert np.all(noise2 > 125e-6**2)
     spread = np.hypot(filtered["quantity_standard_deviation"].values, np.sqrt(noise2))
-    np.testing.assert_allclose(believed.sensor_deviation, spread, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.hypot(believed.expected.standard_deviation, believed.expected.noise), spread, rtol=1e-9
+    )
     decided = filtered["decision_probability"].values
     np.testing.assert_array_equal(believed.control_probability, decided)
     np.testing.assert_array_equal(
@@ -131,7 +138,7 @@ def test_turns_are_seen_as_soon_as_their_lines_are_whole(run, begun, lines):
     assert flight.update()
     assert flight.turns == TURNS
     np.testing.assert_array_equal(
-        flight.believed(0, TURNS).state_mean, whole(run).believed(0, TURNS).state_mean
+        flight.believed(0, TURNS).probability, whole(run).believed(0, TURNS).probability
     )
 
 
@@ -175,8 +182,10 @@ def test_an_observation_that_came_late_stands_in_its_turn(begun, lines, monkeypa
     few = whole(begun)
     assert few.turns == flight.turns == 20
     for part, belief in zip(parts, believed, strict=True):
-        for name, values in vars(few.believed(*part)).items():
-            np.testing.assert_array_equal(values, getattr(belief, name))
+        again = few.believed(*part)
+        np.testing.assert_array_equal(again.probability, belief.probability)
+        np.testing.assert_array_equal(again.control_probability, belief.control_probability)
+        np.testing.assert_array_equal(again.expected.reward_mean, belief.expected.reward_mean)
     assert [turn.notices for turn in few.seen(0, 20)] == [turn.notices for turn in seen]
     assert len(few._kept) == 3
     add(begun, line_of(turns[30]))
@@ -193,7 +202,7 @@ def test_an_observation_that_came_late_stands_in_its_turn(begun, lines, monkeypa
 def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown(begun, lines):
     add(begun, *lines)
     flight = whole(begun)
-    before, number = flight.believed(0, 5).sensor_mean, flight.number
+    before, number = flight.believed(0, 5).expected.mean, flight.number
     with np.load(begun / KNOWLEDGE_NAME) as kept:
         arrays = dict(kept)
     content = io.BytesIO()
@@ -201,7 +210,7 @@ def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown
     atomic_write_bytes(begun / KNOWLEDGE_NAME, content.getvalue())
     assert flight.update()
     assert flight.number > number
-    np.testing.assert_allclose(flight.believed(0, 5).sensor_mean, 1.1 * before)
+    np.testing.assert_allclose(flight.believed(0, 5).expected.mean, 1.1 * before)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PK\x05\x06" + bytes(18), b"no archive"])
@@ -234,10 +243,15 @@ def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
     # In printed units, with their bands.
     answer = told(teller, turn=28)
     past, believed = answer["past"], flight.believed(0, 29)
-    np.testing.assert_allclose(past["state"], 100.0 * believed.state_mean)
+    np.testing.assert_allclose(
+        past["state"], 100.0 * flight.knowledge.model.states.mean(believed.probability)
+    )
     np.testing.assert_allclose(past["observed"], 1e6 * flight.observed(0, 29))
     width = np.subtract(past["sensor_upper"], past["sensor_lower"])
-    np.testing.assert_allclose(width, 2 * 1.959963984540054e6 * believed.sensor_deviation)
+    np.testing.assert_allclose(
+        width,
+        2 * 1.959963984540054e6 * np.hypot(believed.expected.standard_deviation, believed.expected.noise),
+    )
     assert np.min(past["state_lower"]) >= 0.0
     assert np.max(past["state_upper"]) <= 80.0
     assert answer["ahead"]["reward"][0][2] is None  # no error reward of a turn to come
@@ -344,7 +358,8 @@ def test_the_page_in_a_browser(begun, lines, tmp_path):
         assert first.value("state.shown") == 10
         tabs[2].value("connect()")
         tabs[2].wait("window.painted.at(-1)[0] === 49 && held.rows.length === 50")
-        expected = 100.0 * whole(begun).believed(0, TURNS).state_mean
+        flown = whole(begun)
+        expected = 100.0 * flown.knowledge.model.states.mean(flown.believed(0, TURNS).probability)
         for tab in tabs[1:]:
             np.testing.assert_allclose(tab.value("held.rows.map((row) => row.state)"), expected)
         assert first.value("element('told').hidden && element('learning').hidden")

@@ -1,7 +1,6 @@
 """A wing and its watches, made once."""
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,13 +8,13 @@ import pytest
 
 from reporting.progress import SilentProgress
 from tests.twin_master.watch.watches import begun, write_csv
-from twin_master.assets.resolution import Overrides
 from twin_master.mission.loop import fly
+from twin_master.mission.opening import file_record
 from twin_master.mission.turns import History
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Watch
-from twin_master.watch.opening import begin_watch
+from twin_master.watch.opening import begun_watch
 
 
 @pytest.fixture(scope="session")
@@ -51,9 +50,8 @@ def recorded(mission: History, tmp_path_factory: pytest.TempPathFactory) -> Path
 def base(scenario: LoadedScenario, tmp_path_factory: pytest.TempPathFactory) -> Watch:
     """A watch that has seen nothing."""
     folder = tmp_path_factory.mktemp("base") / "watch"
-    watch, lock = begin_watch(scenario, folder, Overrides(), SilentProgress(), replace_run=False)
-    os.close(lock)
-    return watch
+    with begun_watch(scenario.scenario, file_record(scenario), folder, SilentProgress()) as watch:
+        return watch
 
 
 @pytest.fixture(scope="session")

@@ -27,14 +27,14 @@ from tests.twin_master.runs import check_same, journal, text_of, written
 from tests.twin_master.watch.watches import of_gauge, patch_of, ran, viewed, watchful
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
+from twin_master.mission.replay import replay
 from twin_master.network.inference import known_control
 from twin_master.viewer.messages import Request, Teller
 from twin_master.viewer.scene import scene_of
 from twin_master.watch.feeds import CsvFeed
-from twin_master.watch.folder import Patched, Watch
-from twin_master.watch.replay import replay
+from twin_master.watch.folder import Patched, Tutor, Watch
 from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence
-from twin_master.watch.trial import Judge, Outcome, patched_model, policy_change
+from twin_master.watch.trial import Outcome, patched_model, policy_change
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
 
@@ -178,15 +178,15 @@ def test_live_turns_do_not_wait_for_the_search(base, loose, tmp_path):
 
 def test_live_turns_do_not_wait_for_the_patched_model(base, mission, loose, tmp_path, monkeypatch):
     """It is built beside them, and believed behind the turn that the journal says, to the bit."""
-    judges: list[Judge] = []
+    tutors: list[Tutor] = []
 
-    class Kept(Judge):
-        def __init__(self, *, wait: bool) -> None:
-            super().__init__(wait=wait)
-            judges.append(self)
+    class Kept(Tutor):
+        def __init__(self, *words: Any, wait: bool) -> None:
+            super().__init__(*words, wait=wait)
+            tutors.append(self)
 
-    monkeypatch.setattr("twin_master.watch.folder.Judge", Kept)
-    monkeypatch.setattr("twin_master.watch.trial.COURTESY", 0)
+    monkeypatch.setattr("twin_master.watch.folder.Tutor", Kept)
+    monkeypatch.setattr("twin_master.watch.teaching.COURTESY", 0)
     watch = watchful(base, tmp_path / "watch")
     feed = CsvFeed(loose, watch.scenario)
     feed.replayable = False  # as a broker
@@ -201,7 +201,8 @@ def test_live_turns_do_not_wait_for_the_patched_model(base, mission, loose, tmp_
             time.sleep(0.02)
         trial_end = verdict["turn"] + 10 if verdict else 0
         if trial_end and decision["turn"] == trial_end + 3:
-            while not judges[0].answered:  # the turns between were decided while it was built
+            # The turns between were decided while it was built.
+            while tutors[0].outcome is None or not tutors[0].outcome.done():
                 time.sleep(0.02)
 
     watch.run(feed, decide, search=finder)
@@ -239,7 +240,7 @@ def test_a_policy_that_changes_is_told(base):
     ):  # fmt: skip
         plan = replace(known.plan, control_index=np.where(gentle, 1 - sharp, sharp))
         assert policy_change(known, replace(known, plan=plan)) == sentence
-    outcome = Outcome(None, None, 3.5, {}, {}, (), sentence, b"")  # type: ignore[arg-type]
+    outcome = Outcome(b"", None, 3.5, {}, {}, sentence)  # type: ignore[arg-type]
     for kind in TRIED:
         assert trial_sentence({"kind": kind, "from_turn": 3}, outcome, "turn").endswith(f". {sentence}")
 

@@ -33,16 +33,16 @@ from tests.twin_master.watch.watches import (
 )  # fmt: skip
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of, whole_record
+from twin_master.mission.replay import BelievedModel, journalled_decision
 from twin_master.mission.turns import History
 from twin_master.network.estimator import ExactFilter
-from twin_master.report.reading import open_run as stored_run
 from twin_master.scenario.reading import load_scenario
+from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.feeds import CsvFeed, FolderFeed, JsonLinesFeed, file_feed
 from twin_master.watch.folder import Patched, Watch
 from twin_master.watch.intake import Feed
 from twin_master.watch.message import Message
-from twin_master.watch.opening import flown, resume_watch
-from twin_master.watch.replay import BelievedModel, journalled_decision
+from twin_master.watch.opening import flown, resumed_watch
 
 pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
 
@@ -374,7 +374,7 @@ def test_a_changed_journal_and_other_folders_are_refused(scenario, whole, tmp_pa
     file.write_bytes(file.read_bytes().replace(b'"turn": 9}', b'"turn": 8}', 1))
     sentence = r"line 11 .*damaged.*; 10 before it are whole, and 40 behind it"
     with pytest.raises(NotResumableError, match=sentence) as caught:
-        resume_watch(copy, None, SilentProgress())
+        resumed_watch(copy, None, SilentProgress()).__enter__()
     # Another watch takes in all but what the line said, and refuses that by name.
     assert f"--observations {copy}" in caught.value.__notes__[-1]
     fed = [list(FolderFeed(folder, scenario.scenario).messages(None)) for folder in (whole, copy)]

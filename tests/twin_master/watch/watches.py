@@ -19,11 +19,11 @@ from paho.mqtt import client as paho
 from fe.runtime.patch import ModelPatch, SensorGain
 from fmu_asset.packing.patch_file import SCHEMA
 from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.replay import BelievedModel
 from twin_master.scenario.tables import Noticing
 from twin_master.viewer.flight import Flight
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts, Feed
-from twin_master.watch.replay import BelievedModel
 
 
 def write_csv(path: Path, observed: np.ndarray, controls: np.ndarray, garbage: bool = False) -> Path:

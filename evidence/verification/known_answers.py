@@ -1,26 +1,16 @@
-"""Verification of the finite element model: checks with known answers, each returned as a record.
-
-The patch test, the rigid-body modes and the cantilever check the element and the assembly on bodies of
-their own; the balance and the mesh convergence check the wing itself.
-"""
-
-import math
-from collections.abc import Sequence
-from typing import Any
+"""The element and the assembly against known answers, on bodies of their own."""
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
-from fe.elements.cells import CellMesh, gradients, hexahedra_20, isotropic_compliance
-from fe.elements.kinds import HEXAHEDRA_20, gauss_points
+from fe.elements.cells import CellMesh, hexahedra_20, isotropic_compliance
+from fe.elements.kinds import HEXAHEDRA_20
 from fe.full.factorisation import Factorisation
-from fe.runtime.arrays import FloatArray
-from fe.structure.affine import static_response
 from fe.structure.location import face_areas
-from fe.structure.mesh import Surface, rigid_motions
-from fe.wing.design import WingDesign
-from fe.wing.operators import AffineOperators, assemble, cell_density, root_support
-from fe.wing.responses import eigenmodes
+from fe.structure.mesh import Surface
+
+FloatArray = NDArray[np.float64]
 
 _PATCH_GRADIENT = np.array([[1.0, -0.4, 0.3], [0.2, -0.7, 0.5], [-0.6, 0.1, 0.8]]) * 1e-3
 
@@ -86,28 +76,6 @@ def rigid_body_values() -> FloatArray:
     return np.asarray(values / values[-1])
 
 
-def _rigid_motions(operators: AffineOperators) -> FloatArray:
-    """Free unknowns (n, 3) of the rigid motions that the root allows: heave, flap and yaw."""
-    expansion = operators.expansion
-    full = rigid_motions(operators.wing_mesh.points, np.zeros(3), 2.0)[:, [2, 3, 5]]
-    scale = np.asarray((expansion.T @ expansion).diagonal())
-    free = (expansion.T @ full) / scale[:, None]
-    free[-3:] = np.eye(3)
-    return np.asarray(free)
-
-
-def rigid_body_residual(operators: AffineOperators) -> float:
-    """Largest force that a rigid motion of the wing calls forth, over the sum of its terms.
-
-    The motions are those that the root allows, heave, flap and yaw; the forces of the springs are left out.
-    """
-    free = _rigid_motions(operators)
-    stiffness = operators.stiffness()
-    force = (stiffness - root_support(operators.wing_mesh).stiffness) @ free
-    bound = np.asarray(abs(stiffness) @ np.abs(free))
-    return float(np.abs(force).max() / bound.max())
-
-
 def cantilever_check(cells_along: int = 10) -> float:
     """Bend a clamped beam of square section by a shear force: deflection over Timoshenko's, less one.
 
@@ -166,70 +134,3 @@ def macneal_harder_beam(shape: str, *, across_depth: bool) -> float:
     body = hexahedra_20(points, regular.cells[:, :8])
     component, exact = (0, 0.1081) if across_depth else (2, 0.4321)
     return _end_deflection(body, 1e7, 0.3, length, component) / exact
-
-
-def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[str, tuple[float, float, str]]:
-    """Return sums that must agree for the wing at a load factor, each with the other and their unit.
-
-    The mass of the matrix and of the volumes; the force of the root spring and the net load; the moment of
-    the flap spring and that of the load about the root; the elastic energy and half the work of the load.
-    """
-    mesh, design = operators.wing_mesh, operators.wing_mesh.design
-    heave, flap, _ = _rigid_motions(operators).T
-    local, weight = gauss_points(2)
-    volume = gradients(mesh.kind, mesh.nodes, local)[1] @ weight
-    u = static_response(operators, {"load_factor": load_factor}).displacement
-    load = operators.turn(load_factor)
-    lift = design.lift.force * load_factor / design.lift.load_factor
-    energy = 0.5 * u @ (operators.stiffness() @ u)
-    return {
-        "mass": (float(heave @ (operators.mass_terms[0] @ heave)), float(volume @ cell_density(mesh)), "kg"),
-        "reaction": (float(design.root.transverse_spring * u[-3]), lift, "N"),
-        "root moment": (float(design.root.flap_spring * u[-2]), float(flap @ load), "N m"),
-        "energy and work": (float(energy), float(0.5 * load @ u), "J"),
-    }
-
-
-def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> dict[str, FloatArray]:
-    """Results of the healthy wing at e = 1 on a sequence of meshes; nothing is refitted.
-
-    Returns
-    -------
-    dict of str to (meshes, ...)
-        Free `unknowns`; `tip stiffness` [N/m]; frequencies of `first bending` and `second bending` at the
-        design's nominal masses [Hz]; `strain` (meshes, gauges) at the load factor of the design's lift.
-
-    Raises
-    ------
-    InvalidDesignError
-        If a refinement lies outside the range of the design.
-    """
-    found: dict[str, list[Any]] = {}
-    for refinement in refinements:
-        operators = assemble(design.changed(mesh={"refinement": refinement}))
-        loads = np.column_stack((operators.turn(design.lift.load_factor), operators.load_tip))
-        turn, bent = Factorisation(operators.stiffness()).solve(loads).T
-        modes = eigenmodes(operators, 1.0, (), design.masses.servo, design.masses.pitot, 4)
-        first, second = modes.frequency[modes.flapwise_bending].tolist()
-        for name, value in (
-            ("unknowns", operators.unknowns),
-            ("tip stiffness", 1.0 / float(operators.load_tip @ bent)),
-            ("first bending", first),
-            ("second bending", second),
-            ("strain", operators.gauge_output @ turn),
-        ):
-            found.setdefault(name, []).append(value)
-    return {name: np.array(values) for name, values in found.items()}
-
-
-def observed_order(ratio: float, values: Sequence[float]) -> float:
-    """Order p of v = v_0 + c h^p through the last three of values on meshes, h each `ratio` times less.
-
-    Returns
-    -------
-    float
-        The order; NaN where the values do not approach a limit from one side with an order of 0.05 to 12.
-    """
-    first, second = values[-2] - values[-3], values[-1] - values[-2]
-    order = math.log(first / second) / math.log(ratio) if first * second > 0.0 else math.nan
-    return order if 0.05 < order < 12.0 else math.nan

@@ -1,4 +1,4 @@
-"""The journal of a watch, read back: what was told, the twin as it was, the turns that are stored."""
+"""The journal of a run or a watch, read back: what was told, the twin as it was, turns to be stored."""
 
 import base64
 import zlib
@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin_master.errors import NotResumableError
-from twin_master.mission.journal import array_of, damaged, records_backwards
+from twin_master.mission.journal import array_of, damaged, reading_of, records_backwards
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.turns import History, Reading, Turn
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import known_control
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import printed_state
 
 Float = NDArray[np.float64]
 
@@ -60,6 +61,17 @@ def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: Grap
     return record
 
 
+def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
+    """Return mean and standard deviation of each factor of the state, as a decision tells them."""
+    said = {}
+    for name, known in decision["health"].items():
+        scale, unit = printed_state(known["unit"])
+        digits = ".0f" if unit == "%" else ".3g"
+        mean, deviation = (f"{scale * known[moment]:{digits}}" for moment in ("mean", "standard_deviation"))
+        said[name] = f"{mean} ± {deviation} {unit}"
+    return said
+
+
 def gap_of(history: History, skipped: int, sensors: GaussianSensorModel) -> dict[str, Any]:
     """Return root mean square residual and log evidence of the turns behind `skipped`; None without any.
 
@@ -94,15 +106,11 @@ class BelievedModel:
     knowledge: Knowledge
 
 
-Seen = Mapping[int, tuple[Float, int]]
-"""What was observed in a turn, and the control in force."""
-
-
 def replay(
     path: Path, models: Sequence[BelievedModel], lag: int | None, *, first_turn: int | None = None,
     end: int | None = None, question: BelievedModel | None = None,
-) -> tuple[History, dict[str, Any] | None]:  # fmt: skip
-    """Filter the end of a watch again, what came late in its place.
+) -> tuple[History, dict[str, Any]]:  # fmt: skip
+    """Filter the turns of a journal again, what came late in its place.
 
     The journal is read from its end to the last state of the twin that lies before what is wanted.
 
@@ -121,6 +129,13 @@ def replay(
     question : BelievedModel, optional
         What would be believed with one model more, from its turn on.
 
+    Returns
+    -------
+    History
+        The turns behind that state, with the twin behind the last one.
+    dict
+        The last line; empty where there is none.
+
     Raises
     ------
     NotResumableError
@@ -128,39 +143,43 @@ def replay(
     """
     wanted = [] if first_turn is None else [first_turn]
     wanted += [] if question is None else [question.from_turn]
-    seen: dict[int, tuple[Float, int]] = {}
-    settled, last = (-1, b""), None
+    seen: dict[int, Reading] = {}
+    settled, last = (-1, b""), dict[str, Any]()
+    behind, place = -1, 0  # the turn of the line behind, and where it begins
     for record, begin, _ in records_backwards(path, end):
         try:
-            if not begin:
+            turn = int(record["turn"]) if begin else -1
+            if last and behind - turn not in (0, 1):
+                raise damaged(path, place if turn < behind else begin, f"turn {behind} is out of place")
+            if not begin or turn <= settled[0]:
                 break
-            last = last or record
-            if int(record["turn"]) <= settled[0]:
-                break
+            last, behind, place = last or record, turn, begin
             if settled[0] < 0 and "settled" in record:
-                turn, state = int(record["settled"]["turn"]), record["settled"]["state"]
+                kept, state = int(record["settled"]["turn"]), record["settled"]["state"]
                 # Only one before what is wanted, and before all models that are adopted behind it.
-                if all(turn < other for other in wanted):
-                    settled = turn, zlib.decompress(base64.b64decode(state))
+                if all(kept < other for other in wanted):
+                    settled = kept, zlib.decompress(base64.b64decode(state))
             if "model" in record:
                 wanted.append(int(record["model"]["from_turn"]))
             elif "observed" in record:
-                observed = array_of(record["observed"]), int(record["control_index"])
-                seen.setdefault(int(record["observation_turn"]), observed)
-        except (KeyError, TypeError, ValueError, zlib.error) as error:
+                seen.setdefault(int(record.get("observation_turn", turn)), reading_of(record))
+        except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
             raise damaged(path, begin, f"it has another layout, {error}") from error
-    found = _filtered(settled, seen, [*models, *([question] if question else [])], lag)
-    if last is not None and question is None and last["next_control"] != found.twin.proposed_control:
+    found = filtered_again(seen, [*models, *([question] if question else [])], lag, settled)
+    if last and question is None and last["next_control"] != found.twin.proposed_control:
+        begin_again = f"begin another watch, in another folder, with `--observations {path.parent}`"
         raise NotResumableError(
-            f"the journal decided otherwise after turn {last['turn']} than this version does: begin "
-            f"another watch, in another folder, with `--observations {path.parent}`."
+            f"the journal decided otherwise after turn {last['turn']} than this version does: "
+            f"{begin_again if 'intake' in last else 'fly the mission again with --replace'}."
         )
     return found, last
 
 
-def _filtered(
-    settled: tuple[int, bytes], seen: Seen, given: Sequence[BelievedModel], lag: int | None
-) -> History:
+def filtered_again(
+    seen: Mapping[int, Reading], given: Sequence[BelievedModel], lag: int | None = None,
+    settled: tuple[int, bytes] = (-1, b""),
+) -> History:  # fmt: skip
+    """Return the turns that a twin filters of what was seen in each, from a settled state on."""
     # A model that was adopted from an earlier turn on than one before it takes its place altogether.
     models = [
         model
@@ -180,6 +199,6 @@ def _filtered(
             state, twin = twin.save_state(), models[at].knowledge.twin(lag=lag)
             twin.restore_state(state)
             found.twin = twin
-        reading = Reading(*seen[twin.turns])
+        reading = seen[twin.turns]
         found.add(Turn(reading, twin.turn(reading.observed, reading.control)))
     return found

@@ -1,0 +1,1 @@
+"""The finite elements against known answers, and a ring-down against CalculiX."""
