@@ -48,7 +48,7 @@ def _destination(path: Path) -> Path:
     return target
 
 
-def _synchronise(path: Path) -> None:
+def synchronise(path: Path) -> None:
     """Flush a file or a folder to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
@@ -113,9 +113,9 @@ def atomic_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         # Created here, with the permissions of the user's umask and not those of a private temporary file.
         os.close(os.open(temporary, os.O_CREAT | os.O_WRONLY | os.O_TRUNC, 0o666))
         yield temporary
-        _synchronise(temporary)
+        synchronise(temporary)
         temporary.replace(target)
-        _synchronise(target.parent)
+        synchronise(target.parent)
     except OSError as error:
         raise write_error(error, requested) from error
     finally:

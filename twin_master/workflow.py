@@ -168,15 +168,15 @@ def _run(
         stages[name] = time.perf_counter() - begin
 
     source = asset_source(scenario)
-    with _unflown(folder), timed("asset"):
+    with _noted(folder), timed("asset"):
         hashes = dict(source.prepare(folder, progress))
         policy = _given_policy(folder, hashes)
     config = with_inputs(folder, config, hashes)
-    with _unflown(folder), timed("calibration"), progress.stage("Calibrating and planning"):
+    with _noted(folder), timed("calibration"), progress.stage("Calibrating and planning"):
         knowledge = _known(folder, config, scenario, source, policy, progress)
-    with timed("mission"), _kept(folder):
+    with timed("mission"), _noted(folder):
         result = _fly(folder, config, knowledge, source, progress)
-    with timed("store"), progress.stage("Storing"), _kept(folder):
+    with timed("store"), progress.stage("Storing"), _noted(folder):
         write_field = _field_writer(source, result)
         misfit = _misfit(knowledge, source)
         stored = store_flight(
@@ -186,7 +186,7 @@ def _run(
     timing = _timing(result.flight)
     del knowledge, result, write_field  # before the report is drawn
     if report:
-        with timed("report"), progress.stage("Writing the report"), _kept(folder):
+        with timed("report"), progress.stage("Writing the report"), _noted(folder):
             _report(folder, stored())
     timing |= {"stages_seconds": stages, "total_seconds": time.perf_counter() - start}
     atomic_write_text(folder / TIMING_NAME, to_json(timing))  # the only file with figures of a clock
@@ -247,8 +247,8 @@ def _tell_of_another_truth(knowledge: Knowledge, progress: Progress) -> None:
 
 
 @contextmanager
-def _kept(folder: Path) -> Iterator[None]:
-    """Add to any error how the run can be continued."""
+def _noted(folder: Path) -> Iterator[None]:
+    """Add to any error how the run can be continued, or begun anew before its first turn."""
     try:
         yield
     except NotResumableError:
@@ -257,18 +257,9 @@ def _kept(folder: Path) -> Iterator[None]:
         error.add_note(
             f"What was flown is kept: continue with `uav-twin run --resume {folder}`, or, where the scenario "
             "itself is to be changed, fly the changed one with --replace."
+            if (folder / JOURNAL_NAME).exists()
+            else "Nothing was flown yet: once this is mended, fly again with --replace."
         )
-        raise
-
-
-@contextmanager
-def _unflown(folder: Path) -> Iterator[None]:
-    """Add to any error before the first turn how to begin anew."""
-    try:
-        yield
-    except Exception as error:
-        if not (folder / JOURNAL_NAME).exists():
-            error.add_note("Nothing was flown yet: once this is mended, fly again with --replace.")
         raise
 
 

@@ -161,15 +161,9 @@ def _watched_table(watched: "FleetWatch") -> "Table":
     table.title = _heading(watched)
     for asset, decision in rows:
         health = health_in_words(decision)
-        cells = [health.get(name, "") for name in states]
-        table.add_row(
-            asset.name,
-            str(decision["turn"]),
-            decision["control"],
-            *cells,
-            decision["next_control"],
-            str(asset.alarm_count or ""),
-        )
+        cells, alarms = [health.get(name, "") for name in states], str(asset.alarm_count or "")
+        turn, control, coming = (str(decision[name]) for name in ("turn", "control", "next_control"))
+        table.add_row(asset.name, turn, control, *cells, coming, alarms)
     return table
 
 

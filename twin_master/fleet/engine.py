@@ -51,17 +51,14 @@ class Piece:
 
     Attributes
     ----------
-    shard : int
-        Number of the shard.
     group : int
-        Number of its group.
+        Number of its group in the fleet.
     kit : callable
         Returns the packed `Kit` of its twins.
     members : tuple of Member
         Its twins.
     """
 
-    shard: int
     group: int
     kit: Callable[[], bytes]
     members: tuple[Member, ...]

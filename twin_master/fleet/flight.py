@@ -5,7 +5,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -122,8 +122,7 @@ def fly_fleet(
         if not (folder / JOURNAL_NAME).is_file():
             create_store(folder, fleet)
         with JournalFile(folder, hash_record(config)) as journal:
-            kept = {record["shard"] for record, *_ in records(journal.path)}
-            shards = _fly(fleet, folder, engine, journal, kept, progress)
+            shards, flown = _fly(fleet, folder, engine, journal, progress)
             done = [record for record, *_ in records(journal.path)]
         failures, ended = (
             dict(sorted(item for told in done for item in told[key].items())) for key in ("failures", "ended")
@@ -131,7 +130,7 @@ def fly_fleet(
         told = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "twins": fleet.size}
         atomic_write_text(folder / RESULT_NAME, to_json(told | {"failures": failures, "ended": ended}))
     seconds = time.perf_counter() - begin
-    return FleetOutcome(folder, fleet.size, failures, ended, seconds, shards - len(kept), len(kept))
+    return FleetOutcome(folder, fleet.size, failures, ended, seconds, flown, shards - flown)
 
 
 def see_folder(folder: Path, config: Mapping[str, Any], seed: int, *, replace_old: bool = False) -> None:
@@ -318,20 +317,10 @@ def group_folder(folder: Path, group: Group, place: int) -> Path:
     return own / str(place) if group.files else own
 
 
-@dataclass
-class _Left:
-    """What is to come of a shard, and what came: workers may cut it."""
-
-    twins: int
-    failures: dict[str, str] = field(default_factory=dict)
-    ended: dict[str, str] = field(default_factory=dict)
-    seconds: float = 0.0
-
-
 def _fly(
-    fleet: Fleet, folder: Path, engine: Engine, journal: JournalFile, done: set[int], progress: Progress
-) -> int:
-    """Fly what is not in the store yet; return how many shards there are."""
+    fleet: Fleet, folder: Path, engine: Engine, journal: JournalFile, progress: Progress
+) -> tuple[int, int]:
+    """Fly what is not in the store yet; return how many shards there are, and how many of them it flew."""
     import zarr
 
     @cache
@@ -347,9 +336,7 @@ def _fly(
         return prepared(group.scenarios[place], own, SilentProgress(), real=real)
 
     def pieces() -> Iterator[Piece]:
-        for piece in whole:
-            if piece.shard in done:
-                continue
+        for piece in left:
             group = fleet.groups[piece.group]
             try:
                 if group.files:
@@ -367,29 +354,30 @@ def _fly(
         rows = slice(piece.members[0].row, piece.members[-1].row + 1)
         if isinstance(result, str):
             seed = np.array([piece.members[0].seed])
-            result = ShardResult(
-                {"status": np.array([FAILED]), "seed": seed}, {rows.start: result}, {}, 0.0, ""
-            )
+            result = ShardResult({"status": np.array([FAILED]), "seed": seed}, {rows.start: result}, {}, "")
         with written(folder / STORE_NAME):
             for name, values in result.arrays.items():
                 arrays(group.name)[name][rows] = values
-        told = left[piece.shard]
-        told.twins -= len(piece.members)
-        told.seconds += result.seconds
-        for kept, texts in ((told.failures, result.failures), (told.ended, result.ended)):
-            kept |= {f"{group.name}/{group.members[row].name}": text for row, text in texts.items()}
-        if not told.twins:
-            said = {"failures": told.failures, "ended": told.ended, "seconds": told.seconds}
-            journal.append({"shard": piece.shard, **said})
+        failures, ended = (
+            {f"{group.name}/{group.members[row].name}": text for row, text in texts.items()}
+            for texts in (result.failures, result.ended)
+        )
+        place = {"group": piece.group, "rows": [rows.start, rows.stop]}
+        journal.append({**place, "failures": failures, "ended": ended})
 
+    there = {
+        (record["group"], row)
+        for record, *_ in records(journal.path)
+        for row in range(*record["rows"])  # workers may cut a shard
+    }
     whole = list(_shards(fleet, kit))
-    left = {piece.shard: _Left(len(piece.members)) for piece in whole}
+    left = [piece for piece in whole if not there.issuperset((piece.group, one.row) for one in piece.members)]
     with progress.stage("Flying", total=fleet.size, unit="twins") as stage:
-        stage.advance(sum(len(piece.members) for piece in whole if piece.shard in done))
+        stage.advance(fleet.size - sum(len(piece.members) for piece in left))
         for piece, result in flown(engine, pieces(), progress):
             keep(piece, result)
             stage.advance(len(piece.members))
-    return len(whole)
+    return len(whole), len(left)
 
 
 def _recorded(group: Group, piece: Piece) -> Piece:
@@ -406,10 +394,8 @@ def _recorded(group: Group, piece: Piece) -> Piece:
 
 def _shards(fleet: Fleet, kit: Callable[[int, int], bytes]) -> Iterator[Piece]:
     """Yield all shards in their order: twins that share all files, no more of them than a shard holds."""
-    shard = 0
     for number, group in enumerate(fleet.groups):
         size = 1 if group.files else fleet.shard
         for first in range(0, len(group.members), size):
             place = first if group.files else 0
-            yield Piece(shard, number, partial(kit, number, place), group.members[first : first + size])
-            shard += 1
+            yield Piece(number, partial(kit, number, place), group.members[first : first + size])

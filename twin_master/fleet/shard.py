@@ -7,7 +7,6 @@ of times: the result is the same to the last bit.
 import pickle
 import shutil
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -136,8 +135,6 @@ class ShardResult:
         What ended flights, by the number in the group.
     ended : dict of int to str
         How assets ended their simulations early, likewise.
-    seconds : float
-        Processor time.
     version : str
         Of the program that flew.
     """
@@ -145,7 +142,6 @@ class ShardResult:
     arrays: Mapping[str, NDArray[Any]]
     failures: Mapping[int, str]
     ended: Mapping[int, str]
-    seconds: float
     version: str
 
 
@@ -230,7 +226,6 @@ def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
     members : sequence of Member
         B of them.
     """
-    begin = time.process_time()
     if packed not in _kept:
         _kept.clear()
         _kept[packed] = _Unpacked(packed)
@@ -242,7 +237,7 @@ def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
         for texts in (flights.failure, flights.ended)
     )
     arrays = outcomes_of(kit.knowledge, flights, members)
-    return ShardResult(arrays, failures, ended, time.process_time() - begin, program_version())
+    return ShardResult(arrays, failures, ended, program_version())
 
 
 def _flown(kit: _Unpacked, members: Sequence[Member]) -> Flights:

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reporting.files import write_error
+from reporting.files import synchronise, write_error
 from twin_master.errors import NotResumableError
 from twin_master.mission.turns import Happened, Reading, Turn
 
@@ -117,7 +117,7 @@ class JournalFile:
             if not self.size:
                 self.append({"config_hash": config_hash})
                 self.flush()
-                synchronise_folder(folder)
+                synchronise(folder)
         except OSError as error:
             raise write_error(error, self.path) from error
 
@@ -283,13 +283,3 @@ def damaged(path: Path, begin: int, why: str) -> NotResumableError:
         f"line {number} of the journal {path} was changed or is damaged ({why}); {whole[True]} before it are "
         f"whole, and {whole[False]} behind it: begin again with --replace."
     )
-
-
-def synchronise_folder(folder: Path) -> None:
-    """Flush a folder to the disk, so that a file that is new in it is found again."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # some file systems cannot
-            os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

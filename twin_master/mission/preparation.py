@@ -21,7 +21,9 @@ from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.errors import RunFolderError
-from twin_master.learning.setup import scenario_estimator
+from twin_master.learning.expectation import LearntExpectation
+from twin_master.learning.learning_filter import LearningFilter
+from twin_master.learning.setup import learning_filter, scenario_estimator
 from twin_master.mission.planning import planned
 from twin_master.mission.truth import Plant, Truth
 from twin_master.network.estimator import Estimator
@@ -75,6 +77,18 @@ class Knowledge:
         """Expected reward of each state and control (S, U) that is planned with, eqs. (9)-(11)."""
         weights = self.scenario.rewards
         return self.rewards.planning_reward(weights.health_weight, weights.control_weight)
+
+    @cached_property
+    def learning(self) -> LearningFilter | None:
+        """What learns, without notices; None where nothing is learnt."""
+        return learning_filter(self.scenario, self.model, self.sensor_model, self.draws.values)
+
+    @cached_property
+    def expectation(self) -> LearntExpectation | None:
+        """What is expected of sensors and rewards by what is learnt; None where nothing is."""
+        if self.learning is None:
+            return None
+        return LearntExpectation(self.learning, self.rewards, self.plan.policy)
 
     def twin(
         self,
@@ -266,11 +280,15 @@ def prepare_twin(
     """
     loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
     resolved = resolve_scenario(loaded, given_overrides(overrides))
-    source = asset_source(resolved)
+    return prepared_alone(resolved, asset_source(resolved), progress)
+
+
+def prepared_alone(scenario: Scenario, source: AssetSource, progress: Progress | None = None) -> Knowledge:
+    """Return what a twin knows that flies in no folder."""
     source.check()
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         source.prepare(Path(folder), progress or SilentProgress())
-        return prepare_knowledge(resolved, source, resolved.mission.seed)
+        return prepare_knowledge(scenario, source, scenario.mission.seed)
 
 
 def reward_settings(scenario: Scenario) -> RewardSettings:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fmu_asset.errors import FmuEndedError
 from twin_master.assets.asset_source import Asset, AssetReading
-from twin_master.errors import AssetOutputError, MissionError, TwinMasterError
+from twin_master.errors import AssetOutputError, TwinMasterError
 from twin_master.mission.turns import Happened, History, Reading
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.twin import Twin
@@ -104,10 +104,6 @@ class Truth:
         previous_state, previous_control
             State and control index of the step before; None at step 0.
         """
-        if self.in_asset:
-            raise MissionError(
-                "the damage of this asset is its own: it is read from the asset, not given to it."
-            )
         if self._scripted is not None:
             return np.array(self._scripted[step])
         before = None if previous_state is None else np.array([self._states.index(tuple(previous_state))])

@@ -12,9 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.words import capital, parameter_title
-from twin_master.learning.expectation import LearntExpectation
-from twin_master.learning.learning_filter import LearningFilter
-from twin_master.learning.setup import learning_filter
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import Truth
 from twin_master.mission.turns import History
@@ -206,21 +203,7 @@ class MissionResult:
         return self.units.get(self.scenario.calibration.parameter, "1")
 
     @cached_property
-    def learning(self) -> LearningFilter | None:
-        """What learnt; None where nothing is."""
-        if not self.flight.learnt_names:
-            return None
-        known = self.knowledge
-        return learning_filter(self.scenario, known.model, known.sensor_model, known.draws.values)
-
-    @cached_property
-    def expectation(self) -> LearntExpectation | None:
-        """What is expected of sensors and rewards by what was learnt; None where nothing is."""
-        if self.learning is None:
-            return None
-        return LearntExpectation(self.learning, self.knowledge.rewards, self.knowledge.plan.policy)
-
-    @cached_property
     def learnt(self) -> tuple[LearntQuantity, ...]:
         """What was learnt; empty where nothing is."""
-        return () if self.learning is None else _learnt(self, self.learning.prior)
+        learning = self.knowledge.learning
+        return () if learning is None or not self.flight.turns else _learnt(self, learning.prior)

@@ -125,7 +125,7 @@ def _observed(result: MissionResult) -> Iterator[Entry]:
 
 def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, Group]]:
     """Yield the groups of the beliefs filtered, smoothed and predicted."""
-    flight, learns, known = result.flight, result.expectation, result.knowledge
+    flight, learns, known = result.flight, result.knowledge.expectation, result.knowledge
     states, observed, horizon = known.model.states, flight.observed, flight.predicted.shape[1]
     ahead = flight.predicted[..., None] * known.plan.policy  # (T, H, S, U), eqs. (37)-(39)
     flown_under, so_far = (flight.control_index, len(known.model.controls)), "observations up to the step"

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -88,12 +88,6 @@ def tree_of(groups: Mapping[str, Group], attributes: Mapping[str, Any]) -> "Data
     return xr.DataTree.from_dict(sets)
 
 
-def write_summary(folder: Path, figures: Sequence[Figure], heading: Mapping[str, Any]) -> Path:
-    """Write `summary.json`: the heading, and each figure beside its reference."""
-    record = {**heading, "figures": [asdict(figure) for figure in figures]}
-    return atomic_write_text(folder / SUMMARY_NAME, to_json(record))
-
-
 def store_flight(
     folder: Path,
     config: Mapping[str, Any],
@@ -164,7 +158,8 @@ def store_flight(
         **noticed(result),
     }
     rewards = groups["filtered"]["reward_mean"].values
-    write_summary(folder, [*figures, *summarise(result, rewards, misfit)], heading)
+    shown = [asdict(figure) for figure in (*figures, *summarise(result, rewards, misfit))]
+    atomic_write_text(folder / SUMMARY_NAME, to_json({**heading, "figures": shown}))
     return partial(tree_of, groups, told)
 
 
@@ -194,6 +189,8 @@ class RunOutcome:
         When which control was left for which, in words.
     notices : tuple of str
         What the operator should know, a sentence each.
+    stored : callable or None
+        Gives `tree` where this process flew the run.
     """
 
     folder: Path
@@ -204,7 +201,7 @@ class RunOutcome:
     step_name: str
     control: str
     notices: tuple[str, ...] = ()
-    stored: Callable[[], "DataTree"] | None = None
+    stored: Callable[[], "DataTree"] | None = field(default=None, repr=False, compare=False)
 
     @cached_property
     def tree(self) -> "DataTree":

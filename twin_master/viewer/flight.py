@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from twin_master.errors import RunFolderError
-from twin_master.learning.expectation import Expected, LearntExpectation, expected_of
-from twin_master.learning.setup import learning_filter
+from twin_master.learning.expectation import Expected, expected_of
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
 from twin_master.network.estimator import Learnt, Notice
@@ -224,7 +223,7 @@ class Flight:
         config = read_config(folder)
         self.scenario: Scenario = parse_scenario(config["scenario"], str(folder))
         self._knowledge_of = self._kept_at()
-        self._know()
+        self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
         self._journal = GrowingJournal(folder)
         # Where in the journal stand belief and observation of each turn; in memory are those last read.
         self._believed, self._observed = array("q"), array("q")
@@ -232,15 +231,6 @@ class Flight:
         self._told: dict[int, tuple[Notice, ...]] = {}  # behind a turn, where none came
         self.pictures: list[Picture] = []
         self.number = 0
-
-    def _know(self) -> None:
-        """Read what the twin knows, and what it expects of sensors and rewards where it learns."""
-        self.knowledge: Knowledge = kept_knowledge(self.folder, self.scenario)
-        known = self.knowledge
-        learning = learning_filter(self.scenario, known.model, known.sensor_model, known.draws.values)
-        self._expectation = (
-            None if learning is None else LearntExpectation(learning, known.rewards, known.plan.policy)
-        )
 
     @property
     def turns(self) -> int:
@@ -264,7 +254,7 @@ class Flight:
             self.number += 1
         if (kept := self._kept_at()) != self._knowledge_of:  # a patched model was adopted
             self._knowledge_of = kept
-            self._know()
+            self.knowledge = kept_knowledge(self.folder, self.scenario)
             self.number += 1
             changed = True
         news = self._journal.news(TURNS_AT_ONCE)
@@ -361,12 +351,12 @@ class Flight:
         )
         decided = np.array([turn.decision_probability for turn in turns])
         observed = self.observed(first, end)
-        if self._expectation is None or not turns:
+        if self.knowledge.expectation is None or not turns:
             return self._belief(joint, observed, decided)
         parts = []
         for turn, own, seen in zip(turns, joint, observed, strict=True):
             u = slice(turn.control_index, turn.control_index + 1)
-            parts.append(self._expectation.of_marginals(turn.learnt, own[None, :, u], u, seen))
+            parts.append(self.knowledge.expectation.of_marginals(turn.learnt, own[None, :, u], u, seen))
         together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
         return Belief(joint.sum(axis=-1), Expected(**together), decided)
 
@@ -377,9 +367,9 @@ class Flight:
         coming = predict(
             model, seen.filtered, seen.control_index, plan.policy, self.scenario.mission.prediction_steps
         )
-        if self._expectation is None:
+        if self.knowledge.expectation is None:
             return self._belief(coming.joint, None, coming.control_probability)
-        expected = self._expectation.of_marginals(seen.learnt, coming.joint, slice(None), None)
+        expected = self.knowledge.expectation.of_marginals(seen.learnt, coming.joint, slice(None), None)
         return Belief(coming.joint.sum(axis=-1), expected, coming.control_probability)
 
     def _belief(self, joint: Float, observed: Float | None, control_probability: Float) -> Belief:

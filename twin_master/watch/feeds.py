@@ -328,26 +328,15 @@ def file_feed(path: Path, scenario: Scenario, *, follow: bool = False) -> CsvFee
     MissionInputError
         It cannot be read, or a recorded one is to be followed.
     """
-    check_file(path, follow=follow)
+    if not path.exists():
+        raise MissionInputError(f"there is no file {path} to read observations from.")
+    if follow and (path.is_dir() or _is_netcdf(path)):
+        raise MissionInputError(f"{path} is recorded: only a CSV file can be followed.")
     if path.is_dir():
         return FolderFeed(path, scenario)
     if _is_netcdf(path):
         return RunFeed(path, scenario)
     return CsvFeed(path, scenario, follow=follow)
-
-
-def check_file(path: Path, *, follow: bool = False) -> None:
-    """Check what can be known of a source before a watch is prepared.
-
-    Raises
-    ------
-    MissionInputError
-        It is not there, or a recorded one is to be followed.
-    """
-    if not path.exists():
-        raise MissionInputError(f"there is no file {path} to read observations from.")
-    if follow and (path.is_dir() or _is_netcdf(path)):
-        raise MissionInputError(f"{path} is recorded: only a CSV file can be followed.")
 
 
 def _is_netcdf(path: Path) -> bool:

@@ -156,9 +156,9 @@ class Watch:
         untold : dict, optional
             The last decision, to be told again first.
         """
-        with self.begun(feed, patched) as (journal, keep):
+        with self.begun(feed, patched) as keep:
             source = Stopping(keep.intake, turns, lambda: self.quiet(decide))
-            tutor = Tutor(self, journal, search, source, wait=feed.replayable) if search else None
+            tutor = Tutor(self, search, source, wait=feed.replayable) if search else None
             with listening(source.ask):
                 try:
                     if untold is not None:
@@ -178,23 +178,24 @@ class Watch:
         return keep.intake.counts
 
     @contextmanager
-    def begun(self, feed: Feed, patched: Patched | None = None) -> Iterator[tuple[JournalFile, Keeper]]:
-        """Give the open journal, and what keeps the turns of the twin as it stands after it; see `run`."""
+    def begun(self, feed: Feed, patched: Patched | None = None) -> Iterator[Keeper]:
+        """Open the journal, and give what keeps the turns of the twin as it stands after it; see `run`."""
         rejected = RejectedFile(self.folder / REJECTED_NAME)
         intake = Intake(self.scenario, feed, rejected)
-        with JournalFile(self.folder, self._hash, FLUSH_SECONDS if feed.replayable else 0.0) as journal:
+        seconds = FLUSH_SECONDS if feed.replayable else 0.0
+        with JournalFile(self.folder, self._hash, seconds) as self._journal:
             self._take_up()
             if patched is not None:
-                self._patch(journal, patched)
+                self._patch(patched)
             found, last = replay(self._path, self.models, self.scenario.watch.lag)
             intake.restore(last.get("intake"))
             if last:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
-            self.keep = Keeper(journal, intake, found.twin, self.standing)
+            self.keep = Keeper(self._journal, intake, found.twin, self.standing)
             self.keep.quiet = "quiet" in last
-            yield journal, self.keep
+            yield self.keep
 
     def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:
         """Yield what the operator is told of each turn, once it is written down, until the source ends."""
@@ -225,23 +226,23 @@ class Watch:
         keep.quiet = True
         decide(decision)
 
-    def trial(
-        self, journal: JournalFile, file: Path, from_turn: int, compared: tuple[int, int] = (0, 0)
-    ) -> Callable[..., Outcome]:
+    def trial(self, file: Path, from_turn: int, compared: tuple[int, int] = (0, 0)) -> Callable[..., Outcome]:
         """Return what tells what comes of a patch from a turn on, after all lines of the journal so far."""
         believed = [m for m in range(len(self.models)) if self.models[m].from_turn <= from_turn]
         patch, models = both_patches(self._patches[max(believed)], file), tuple(self.models)
-        return partial(judged, self._path, journal.size, self.scenario, models, patch, from_turn, compared)
+        return partial(
+            judged, self._path, self._journal.size, self.scenario, models, patch, from_turn, compared
+        )
 
-    def _patch(self, journal: JournalFile, patched: Patched) -> None:
+    def _patch(self, patched: Patched) -> None:
         """Believe a patch that is given from a turn on."""
         turns = last_turn(self._path)[0] + 1
         if not turns or not 0 <= patched.from_turn <= turns:
             raise MissionInputError(
                 f"--from-turn names one of the {turns} turns watched so far, or the next one."
             )
-        outcome = self.trial(journal, patched.file, patched.from_turn)(progress=self._progress)
-        self.adopt(journal, outcome, None, self._kept_verdict(patched.file.parent))
+        outcome = self.trial(patched.file, patched.from_turn)(progress=self._progress)
+        self.adopt(outcome, None, self._kept_verdict(patched.file.parent))
 
     def _kept_verdict(self, found: Path) -> str:
         """Keep the missing force that a verdict shows, for viewers; return where, empty without one."""
@@ -252,9 +253,7 @@ class Watch:
             atomic_write_bytes(self.folder / kept / name, (found / name).read_bytes())
         return kept
 
-    def adopt(
-        self, journal: JournalFile, outcome: Outcome, notice: Mapping[str, Any] | None, verdict: str = ""
-    ) -> Twin:
+    def adopt(self, outcome: Outcome, notice: Mapping[str, Any] | None, verdict: str = "") -> Twin:
         """Believe a patched model; return the twin that goes on."""
         name, first = f"asset/model_patch_{len(self.models)}.json", outcome.model.from_turn
         atomic_write_bytes(self.folder / name, outcome.patch)
@@ -275,7 +274,7 @@ class Watch:
             "intake": next(records_backwards(self._path))[0]["intake"],
             "model": model,
         }
-        journal.append(line | self.standing.snapshot(twin, journal.size))
+        self._journal.append(line | self.standing.snapshot(twin, self._journal.size))
         self.standing.take(line)
         keep_knowledge(self.folder, outcome.model.knowledge)
         self._progress.note(
@@ -365,8 +364,6 @@ class Tutor:
     ----------
     watch : Watch
         With its turns kept, see `Watch.begun`.
-    journal : JournalFile
-        Of the watch.
     search : Search
         Looks for causes.
     source : Stopping
@@ -381,12 +378,10 @@ class Tutor:
         Nothing could look into the alarms of the scenario.
     """
 
-    def __init__(
-        self, watch: Watch, journal: JournalFile, search: Search, source: Stopping, *, wait: bool
-    ) -> None:
+    def __init__(self, watch: Watch, search: Search, source: Stopping, *, wait: bool) -> None:
         check_teachable(watch.scenario)
         watch.keep.taught = True
-        self._watch, self._journal, self._search, self._source = watch, journal, search, source
+        self._watch, self._search, self._source = watch, search, source
         self._teaching, self._wait = watch.standing.teaching, wait
         self.outcome: Future[Outcome] | None = None
 
@@ -419,7 +414,7 @@ class Tutor:
             return
         file, compared = watch.folder / trial["folder"] / PATCH, (trial["turn"] + 1, TRIAL_TURNS)
         if self.outcome is None:
-            ask = watch.trial(self._journal, file, trial["from_turn"], compared)
+            ask = watch.trial(file, trial["from_turn"], compared)
             self.outcome = Future()
             working = Thread(target=_work, args=(ask, self.outcome), daemon=True)
             (working.run if self._wait else working.start)()
@@ -433,7 +428,7 @@ class Tutor:
             sentence = f"The patch cannot be believed by this twin: {error}"
         notice = notice_of("trial", sentence)
         if outcome is not None and outcome.gained >= LEAST_GAIN:
-            watch.keep.twin = watch.adopt(self._journal, outcome, notice)
+            watch.keep.twin = watch.adopt(outcome, notice)
         else:
             watch.keep.write({"verdict": {**trial, "tried": False, "notice": notice}})
 

@@ -25,8 +25,8 @@ from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_sc
 from twin_master.scenario.schema import Scenario
 from twin_master.store.writing import SUMMARY_NAME
 from twin_master.store.writing import open_run as stored_run
-from twin_master.watch.broker import broker_of, is_broker
-from twin_master.watch.feeds import JsonLinesFeed, MappingFeed, check_file, file_feed
+from twin_master.watch.broker import Broker, broker_of, is_broker
+from twin_master.watch.feeds import JsonLinesFeed, MappingFeed, file_feed
 from twin_master.watch.folder import STORED_TURNS, Patched, Watch
 from twin_master.watch.intake import Counts, Feed
 from twin_master.watch.mqtt import BEGIN_ANEW, CLIENT_SUFFIX, MqttFeed
@@ -255,20 +255,21 @@ def watch(
         if teach:
             check_teachable(loaded.scenario)
         observations = _source(observations, loaded.scenario.moved(loaded.path.parent), otherwise)
-    if isinstance(observations, str | Path):
-        own = None if loaded is None else _allowing(loaded.scenario, allow_unknown)
-        _check_source(str(observations), own, follow, authority)
+        # Slips of the pen are found before a model is built and a folder made.
+        _feed(observations, _allowing(loaded.scenario, allow_unknown), follow, authority)
     opened = _opened(loaded, observations, folder, given, progress, resume=resume, replace=replace)
     with opened as watched:
         try:
             begun(watched)
             known = _allowing(watched.scenario, allow_unknown)
-            source = _source(observations, known, otherwise)
-            feed, publish, close = _feed(source, watched, known, follow, authority, progress)
+            feed = _feed(_source(observations, known, otherwise), known, follow, authority)
+            if isinstance(feed, Broker):
+                feed = MqttFeed(feed, watched, progress.note, known)
 
             def tell(decision: Mapping[str, Any]) -> None:
                 decide(decision)
-                publish(decision)
+                if isinstance(feed, MqttFeed):
+                    feed.decide(decision)
 
             try:
                 # A kill may have left the last decision untold.
@@ -276,7 +277,8 @@ def watch(
                 search = Search(watched.folder, watched.scenario.mission.seed) if teach else None
                 counts = watched.run(feed, tell, turns=turns, patched=patch, search=search, untold=untold)
             finally:
-                close()
+                if isinstance(feed, MqttFeed):
+                    feed.close()
             watched.store(counts, last=last, report=report)
         except Exception as error:
             error.add_note(
@@ -300,18 +302,6 @@ def _allowing(scenario: Scenario, unknown: bool) -> Scenario:
     """Return a scenario that passes over keys and columns that are no sensor, if that is asked."""
     section = scenario.watch.model_copy(update={"allow_unknown": scenario.watch.allow_unknown or unknown})
     return scenario.model_copy(update={"watch": section})
-
-
-def _check_source(observations: str, scenario: Scenario | None, follow: bool, authority: Path | None) -> None:
-    """Find slips of the pen before a model is built and a folder made."""
-    if is_broker(observations):
-        broker_of(observations, authority)
-    elif observations != STANDARD_INPUT and scenario is not None:
-        file_feed(Path(observations), scenario, follow=follow)
-    elif observations != STANDARD_INPUT:
-        check_file(Path(observations), follow=follow)
-    elif follow:
-        raise MissionInputError("--follow belongs to a CSV file; standard input is read to its end anyway.")
 
 
 def _opened(
@@ -343,18 +333,15 @@ def _opened(
 
 
 def _feed(
-    observations: Observations, watched: Watch, scenario: Scenario, follow: bool, authority: Path | None,
-    progress: Progress,
-) -> tuple[Feed, Decide, Callable[[], None]]:  # fmt: skip
-    """Return where observations come from, who else is told the decisions, and what ends both."""
-    if isinstance(observations, str) and is_broker(observations):
-        mqtt = MqttFeed(broker_of(observations, authority), watched, progress.note, scenario)
-        return mqtt, mqtt.decide, mqtt.close
-    feed: Feed
+    observations: Observations, scenario: Scenario, follow: bool, authority: Path | None
+) -> Feed | Broker:
+    """Return what gives the observations, or the broker that does."""
     if not isinstance(observations, str | Path):
-        feed = MappingFeed(observations, scenario)
-    elif str(observations) == STANDARD_INPUT:
-        feed = JsonLinesFeed(scenario)
-    else:
-        feed = file_feed(Path(observations), scenario, follow=follow)
-    return feed, lambda _decision: None, lambda: None
+        return MappingFeed(observations, scenario)
+    if is_broker(str(observations)):
+        return broker_of(str(observations), authority)
+    if str(observations) != STANDARD_INPUT:
+        return file_feed(Path(observations), scenario, follow=follow)
+    if follow:
+        raise MissionInputError("--follow belongs to a CSV file; standard input is read to its end anyway.")
+    return JsonLinesFeed(scenario)

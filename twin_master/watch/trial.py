@@ -14,11 +14,11 @@ import numpy as np
 
 from fe.runtime.errors import FiniteElementError
 from fmu_asset.errors import FmuError
-from reporting.progress import Progress, SilentProgress
+from reporting.progress import Progress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DesignBelief
 from twin_master.errors import MissionInputError, TwinMasterError
-from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.preparation import Knowledge, prepared_alone
 from twin_master.mission.replay import BelievedModel, gap_of, replay
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
@@ -69,10 +69,7 @@ def patched_model(
         raise MissionInputError("only a twin that believes a design can be given a patch of its model.")
     scenario = scenario.model_copy(update={"belief": belief.model_copy(update={"patch": str(file)})})
     source: AssetSource = scenario.belief.source(scenario, None)
-    source.check()
-    with TemporaryDirectory(prefix="uav_twin_") as folder:
-        source.prepare(Path(folder), progress or SilentProgress())
-        return BelievedModel(from_turn, prepare_knowledge(scenario, source, scenario.mission.seed))
+    return BelievedModel(from_turn, prepared_alone(scenario, source, progress))
 
 
 def judged(

@@ -174,7 +174,7 @@ def test_the_view_shows_what_was_learnt(folder, run):
         return float(np.abs(error).max())
 
     learnt = off()
-    flight._expectation = None
+    flight.knowledge.__dict__["expectation"] = None
     assert learnt < 0.06 < 0.3 < off()  # as calibrated
 
 
