@@ -442,6 +442,8 @@ class FmuMotion(FmuRuns):
 
     def flexibility(self, state: State, ports: Sequence[int]) -> FloatArray:
         """Return the displacements (P, P) of ports at rest under unit forces at each."""
+        if not ports:  # loads of zero may be outside of what the FMU takes
+            return np.zeros((0, 0))
         loads = [{}, *({self.forces[port]: self.size(self.forces[port])} for port in ports)]
         columns = [self.x[port] for port in ports]
         found = np.array([self.rest([state], [load])[0, columns] for load in loads])
@@ -476,7 +478,17 @@ class FmuMotion(FmuRuns):
         ModelError
             If the law has no solution, or the FMU does not confirm it.
         """
-        values = self.rest(states, loads)
+        try:
+            values = self.rest(states, loads)
+        except ModelError as cause:
+            if len(loads) == 1:
+                raise
+            for row, (state, load) in enumerate(zip(states, loads, strict=True), start=1):
+                try:
+                    self.rest([state], [load])
+                except ModelError as own:
+                    raise ModelError(f"The trial {trial!r}, row {row} of its table: {own}") from own
+            raise cause
         if not len(laws):
             return values
         at = [self.ports.index(name) for name in laws.ports]
