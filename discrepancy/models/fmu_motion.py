@@ -483,11 +483,11 @@ class FmuMotion(FmuRuns):
         except ModelError as cause:
             if len(loads) == 1:
                 raise
-            for row, (state, load) in enumerate(zip(states, loads, strict=True), start=1):
+            for number, (state, load) in enumerate(zip(states, loads, strict=True), start=1):
                 try:
                     self.rest([state], [load])
                 except ModelError as own:
-                    raise ModelError(f"The trial {trial!r}, row {row} of its table: {own}") from own
+                    raise ModelError(f"The trial {trial!r}, row {number} of its table: {own}") from own
             raise cause
         if not len(laws):
             return values

@@ -1,4 +1,4 @@
-"""Our own wing FMU as a model, against the wing model of the same chain of springs; its effects used."""
+"""Our own wing FMU as a model, against the wing model of the same design; its effects used."""
 
 import json
 import tomllib
@@ -38,7 +38,7 @@ RINGDOWN = record(TrialKind.RINGDOWN, 400, release=Release(0.01))
 
 
 class Pair(NamedTuple):
-    """One chain of springs as an FMU with two effects, and as a wing model."""
+    """A wing on a coarse mesh as an FMU with two effects, and as a wing model."""
 
     fmu: FmuModel
     wing: WingModel
