@@ -99,7 +99,7 @@ if numba is not None:
 def _kept_by_sources(files: list[str]) -> Iterator[None]:
     """Have numba keep what is declared meanwhile by the content of files, the function's own first."""
     digest = hashlib.sha256()
-    for file in sorted(set(files)):
+    for file in sorted({*files, __file__}):  # what makes a choice among laws, too
         digest.update(Path(file).read_bytes())
     given = numba.config.CACHE_DIR
     beside = Path(files[0]).parent

@@ -140,9 +140,7 @@ def _analysed(size: int, starts: bytes, columns: bytes) -> Elimination:
     return analyse(sparse.csr_array((np.ones(len(places[0]), dtype=np.int8), *places), shape=(size, size)))
 
 
-@cache
-def _threads() -> ThreadpoolController:
-    return ThreadpoolController()
+_threads = cache(ThreadpoolController)
 
 
 class Factorisation:

@@ -150,11 +150,10 @@ class StaticReduction:
         added = self.duals @ self.residuals.vectors[:, known:]
         self.correction = np.concatenate((self.correction, added), axis=3)
         # what was there lies in the basis that was there
-        self.residual_load = _with_rows(self.residual_load, len(found))
-        stiffness = _with_rows(self.residual_stiffness, len(found))
-        self.residual_stiffness = np.concatenate(
-            (stiffness, found.reshape(len(found), len(images), -1)), axis=2
-        )
+        rows = (0, len(found) - known)
+        self.residual_load = np.pad(self.residual_load, (rows, (0, 0)))
+        before, new = np.pad(self.residual_stiffness, (rows, (0, 0), (0, 0))), (len(found), len(images), -1)
+        self.residual_stiffness = np.concatenate((before, found.reshape(new)), axis=2)
         if not self.snapshots:
             self.rounding = self._rounding(self._galerkin(thetas[0]), solutions)
         self.snapshots.extend(states)
@@ -289,11 +288,6 @@ class StaticReduction:
             return all(self.bound(smaller, state) <= tolerance for state in states)
 
         return fewest_directions(np.array(solutions).T, 2, good)
-
-
-def _with_rows(array: FloatArray, count: int) -> FloatArray:
-    """Return an array with zeros below, so that it has so many rows."""
-    return np.concatenate((array, np.zeros((count - len(array), *array.shape[1:]))))
 
 
 def _spread(states: FloatArray, bounds: FloatArray, count: int, least: float) -> list[State]:

@@ -51,11 +51,6 @@ class WingFields(ReducedModel):
     static_displacement: Annotated[FloatArray, "points", 3, "static"]
     modal_displacement: Annotated[FloatArray, "points", 3, "modal"]
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.cells.min() < 0 or self.cells.max() >= len(self.points):
-            self.refuse("has cells with nodes that are not there")
-
     @property
     def model(self) -> ReducedModel:
         """The reduced model alone."""
@@ -64,7 +59,7 @@ class WingFields(ReducedModel):
 
 def _content(model: ReducedModel) -> dict[str, Any]:
     """Return what a reduced model holds, by the names of its fields."""
-    return {item.name: getattr(model, item.name) for item in fields(ReducedModel) if item.init}
+    return {item.name: getattr(model, item.name) for item in fields(ReducedModel)}
 
 
 def field_basis(operators: "AffineOperators", reduction: "Reduction") -> WingFields:

@@ -23,7 +23,7 @@ from reporting.progress import Progress, SilentProgress, Stage
 
 from .certified_basis import TOGETHER, StaticReduction, fewest_directions
 from .settings import StructureSettings
-from .terms import ModalState, ReductionTerms, State, loss_at
+from .terms import ModalState, ReductionTerms, State
 
 START_ITERATIONS = 4
 FURTHER_MODES = 2
@@ -241,13 +241,7 @@ def _named(terms: ReductionTerms) -> dict[str, Any]:
         "damping": np.array((structure.design.damping.alpha, structure.design.damping.beta)),
         "stiffness_factors": terms.stiffness_factors,
         "load_factors": terms.load_factors,
-        "dual_counts": terms.counts,
-        "dual_split": np.concatenate(
-            [
-                loss_at(ends, np.arange(1, count) / count)
-                for ends, count in zip(terms.losses, terms.counts, strict=True)
-            ]
-        ),
+        "dual_split": terms.splits,
     }
 
 
@@ -306,15 +300,17 @@ def measured_errors(
     for number, vector in enumerate(vectors):
         values = dict(zip(model.chosen, vector.tolist(), strict=True))
         full, found = static_response(structure, values), model.static_response(vector)
-        if full.strain.size:
-            missed = np.abs(found.strain - full.strain).max(), found.strain_error_bound
-            errors[:, number, 0] = missed / np.abs(full.strain).max()
-        if full.output.size:
-            missed = np.abs(found.displacement - full.output).max(), found.displacement_error_bound
-            errors[:, number, 1] = missed / np.abs(full.output).max()
+        kinds = (
+            (full.strain, found.strain, found.strain_error_bound),
+            (full.output, found.displacement, found.displacement_error_bound),
+        )
+        for kind, (wanted, came, bound) in enumerate(kinds):
+            if wanted.size:
+                size = np.abs(wanted).max()
+                errors[:, number, kind] = np.abs(came - wanted).max() / size, bound / size
         if number in (0, states - 1):
             wanted = natural_frequencies(structure, model.mode_count, values)[0]
             frequency = max(frequency, float(np.abs(model.modes(vector).frequency / wanted - 1.0).max()))
-    (strain, displacement), bound = np.fmax.reduce(errors[0]), np.nanmax(errors[1])
+    (strain, displacement), largest = np.fmax.reduce(errors[0]), np.nanmax(errors[1])
     broken = int((errors[0] > errors[1]).any(axis=1).sum())
-    return MeasuredErrors(float(strain), float(displacement), float(bound), frequency, states, broken)
+    return MeasuredErrors(float(strain), float(displacement), float(largest), frequency, states, broken)

@@ -87,10 +87,12 @@ class ReductionTerms:
             np.array([structure.ranges[name] for name in names], dtype=np.float64).reshape(-1, 2)
             for names in (parameters, regions, masses)
         )
+        self.varied = len(parameters) + len(regions)
         self.middle = [float(np.mean(ends)) for ends in self.parameters]
-        # anchors along each loss, in equal ratios; with many regions there is but one
-        self.counts = np.full(len(regions), 2 if len(regions) <= MOST_GRID_REGIONS else 1)
-        self.reference = self.theta((*self.middle, *self.levels(0.5)[0]))
+        (halves,) = self.levels(0.5)
+        self.reference = self.theta((*self.middle, *halves))
+        # between two anchors along each loss; with many regions there is but one
+        self.splits = halves[: len(regions) if len(regions) <= MOST_GRID_REGIONS else 0]
 
     @cached_property
     def factors(self) -> Factorisation:
@@ -110,18 +112,12 @@ class ReductionTerms:
     def anchors(self) -> list[list[FloatArray]]:
         """Coefficients (T,) where dual solutions are wanted, at each anchor; the last loss changes first.
 
-        At a single anchor for many regions what is varied is moved to each end by itself, too.
+        Around a single anchor for many regions they are the corners.
         """
-        if self.counts.max() > 1:
-            return [
-                [self.theta((*self.middle, *losses))]
-                for losses in itertools.product(*self.levels(0.25, 0.75).T)
-            ]
-        middle = np.array([*self.middle, *self.levels(0.5)[0]])
-        ends = np.array([*self.parameters, *self.losses])
-        one_by_one = zip(np.eye(len(ends)), ends, strict=True)
-        alone = [np.where(row, end, middle) for row, span in one_by_one for end in span]
-        return [[self.theta(tuple(state)) for state in (middle, *alone)]]
+        if not self.splits.size:
+            return [[self.theta(state) for state in self.states(corners(self.varied))]]
+        losses = itertools.product(*self.levels(0.25, 0.75).T)
+        return [[self.theta((*self.middle, *own))] for own in losses]
 
     def states(self, shares: FloatArray) -> list[State]:
         """States at shares (B, P + K) of the ranges; a loss goes by equal ratios of what is kept."""
@@ -132,30 +128,29 @@ class ReductionTerms:
 
     def training(self) -> list[State]:
         """States on which the greedy search looks for the largest bound: corners, and points between them."""
-        varied = len(self.parameters) + len(self.losses)
         count = CHOSEN_STATES if len(self.losses) <= MOST_GRID_REGIONS else CHOSEN_OF_MANY
-        return self.states(np.concatenate((corners(varied), halton(varied, count))))
+        return self.states(np.concatenate((corners(self.varied), halton(self.varied, count))))
 
     def sampled_modes(self) -> list[ModalState]:
         """Corners under least and largest masses in turns, and a few states inside."""
-        ends = corners(len(self.parameters) + len(self.losses))
+        ends = corners(self.varied)
         turns = np.add.outer(np.arange(len(ends)), np.arange(len(self.masses))) % 2
         return self._modal_states(np.concatenate((ends, turns), axis=1), SAMPLED_INSIDE)
 
     def compressed_modes(self) -> list[ModalState]:
         """Corners under all least and largest masses, at most 64 of them, and states inside."""
         masses = list(itertools.product((0.0, 1.0), repeat=len(self.masses)))[:64]
-        ends = itertools.product(corners(len(self.parameters) + len(self.losses)), masses)
+        ends = itertools.product(corners(self.varied), masses)
         return self._modal_states(np.array([np.append(*pair) for pair in ends]), 4 * SAMPLED_INSIDE)
 
     def _modal_states(self, ends: FloatArray, count: int) -> list[ModalState]:
         """Return states at shares of all ranges and masses, and after them `count` inside."""
         shares = np.concatenate((ends, halton(ends.shape[1], 1 + count)[1:]))
-        varied, (low, high) = len(self.parameters) + len(self.losses), self.masses.T
-        masses = low + (high - low) * shares[:, varied:]
+        low, high = self.masses.T
+        masses = low + (high - low) * shares[:, self.varied :]
         return [
             (self.theta(state), np.append(1.0, chosen))
-            for state, chosen in zip(self.states(shares[:, :varied]), masses, strict=True)
+            for state, chosen in zip(self.states(shares[:, : self.varied]), masses, strict=True)
         ]
 
     def least(self, loads: FloatArray, outputs: FloatArray) -> FloatArray:

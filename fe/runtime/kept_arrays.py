@@ -7,7 +7,7 @@ NumPy and relative imports only: this file is copied into the FMU.
 
 import io
 import zipfile
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields
 from math import isfinite
 from pathlib import Path
@@ -99,15 +99,10 @@ def arrays_from_bytes(
         raise ReducedModelFileError(
             f"{where} is not a sound archive of plain arrays ({reason}); delete it and build it anew."
         ) from cause
-    require_arrays(arrays, where, wanted)
-    return arrays
-
-
-def require_arrays(arrays: Mapping[str, npt.NDArray[Any]], where: str, wanted: Iterable[str]) -> None:
-    """Raise `ReducedModelFileError` if one of the `wanted` names is not among the arrays of `where`."""
     missing = [name for name in wanted if name not in arrays]
     if missing:
         raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it anew.")
+    return arrays
 
 
 @dataclass(frozen=True, repr=False)
@@ -211,7 +206,6 @@ class KeptArrays:
                 f"{where} has the format {arrays['format']}, but this version reads {cls.version}; build it "
                 "anew."
             )
-        require_arrays(arrays, where, (item.name for item in fields(cls)))
         try:
             values: dict[str, Any] = {
                 item.name: KINDS[kind](arrays[item.name]) if kind in KINDS else arrays[item.name]
@@ -219,6 +213,8 @@ class KeptArrays:
                 for kind in (getattr(item.type, "__origin__", item.type),)
             }
             return cls(**values)
+        except KeyError as missing:
+            raise ReducedModelFileError(f"{where} lacks {missing.args[0]}; build it anew.") from missing
         except (TypeError, ValueError, IndexError) as cause:
             raise ReducedModelFileError(
                 f"{where} does not hold the arrays of {cls.what} ({cause}); build it anew."

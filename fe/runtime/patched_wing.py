@@ -243,12 +243,5 @@ class PatchedState:
         """The modes that move."""
         return self.lowest(MODE_COUNT, self._held)
 
-    @property
-    def shapes(self) -> FloatArray:
-        """Their shapes (n, M)."""
-        return self.modes.shapes
-
-    @property
-    def to_modes(self) -> FloatArray:
-        """Modal coordinates (M, n) of a displacement."""
-        return self.modes.to_modes
+    shapes = property(lambda self: self.modes.shapes, doc="Their shapes (n, M).")
+    to_modes = property(lambda self: self.modes.to_modes, doc="Modal coordinates (M, n) of a displacement.")

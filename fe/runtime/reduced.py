@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.linalg import solve
 
-from .arrays import FloatArray
+from .arrays import FloatArray, IntArray
 from .errors import OutsideModelError
 from .reduced_arrays import OnlineArrays, ReducedArrays
 from .state import GivenLosses
@@ -131,17 +131,12 @@ class ReducedModel(ReducedArrays):
         return OnlineArrays(self)
 
     @cached_property
-    def _pairs(self) -> tuple[list[list[int]], list[list[int]]]:
-        """Places of the two factors of each stiffness term and load among those of `_coefficients`."""
-        parameters, regions, masses = len(self.parameters), len(self.regions), len(self.masses)
-        # a factor that is counted from one, and after which others it comes; none is the one in front
-        losses, controls = parameters + regions, parameters + regions + masses
-        of_stiffness, of_load = (0, len(self.chosen)), (controls, losses)
-        stiffness, load = (
-            np.where(factors > 0, factors + np.array(offsets), 0).tolist()
-            for factors, offsets in ((self.stiffness_factors, of_stiffness), (self.load_factors, of_load))
-        )
-        return stiffness, load
+    def _places(self) -> list[IntArray]:
+        """Places (2, T) and (2, L) of the factors of stiffness terms and loads: one, values, what is kept."""
+        controls = len(self.chosen) - len(self.controls)
+        of_load, of_stiffness = (controls, controls - len(self.masses)), (0, len(self.chosen))
+        tables = ((self.stiffness_factors, of_stiffness), (self.load_factors, of_load))
+        return [np.where(factors > 0, factors + offsets, 0).T for factors, offsets in tables]
 
     @property
     def gauge_count(self) -> int:
@@ -221,19 +216,11 @@ class ReducedModel(ReducedArrays):
                 )
 
     def _coefficients(self, vectors: FloatArray, number: int) -> FloatArray:
-        if vectors.ndim == 1:
-            return self._of_one(vectors.tolist(), number)
         first = len(self.parameters)
-        unit = np.ones((*vectors.shape[:-1], 1))
-        left = 1.0 - vectors[..., first : first + len(self.regions)]
-        known = np.concatenate((unit, vectors, left), axis=-1)
-        return np.asarray(known[..., np.array(self._pairs[number]).reshape(-1, 2)].prod(axis=-1))
-
-    def _of_one(self, values: list[float], number: int) -> FloatArray:
-        # plain floats: arrays of so few numbers cost more than all sums over them
-        first = len(self.parameters)
-        known = [1.0, *values, *[1.0 - value for value in values[first : first + len(self.regions)]]]
-        return np.array([known[one] * known[other] for one, other in self._pairs[number]])
+        kept = 1.0 - vectors[..., first : first + len(self.regions)]
+        known = np.concatenate((np.ones_like(vectors[..., :1]), vectors, kept), axis=-1)
+        one, other = self._places[number]
+        return np.asarray(known[..., one] * known[..., other])
 
     @cached_property
     def rows(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -293,15 +280,14 @@ class ReducedModel(ReducedArrays):
         self.check_validity(chosen)
         first, gauges = len(self.parameters), len(self.gauges)
         loss = tuple(chosen[first : first + len(self.regions)])
-        acting = self._of_one(chosen, 1) if load is None else load
-        theta, rounding = self._of_one(chosen, 0), self.rounding_allowance
-        coordinates, output, errors = self._online.solution(theta, acting, loss)
+        acting = self.load_coefficients(vector) if load is None else load
+        coordinates, output, errors = self._online.solution(self.stiffness_coefficients(vector), acting, loss)
         strain, displacement, bound = output[:gauges], output[gauges:], errors.tolist()
         return StaticResponse(
             strain,
             displacement,
-            max(bound[:gauges], default=0.0) + rounding * sqrt(strain @ strain),
-            max(bound[gauges:], default=0.0) + rounding * sqrt(displacement @ displacement),
+            max(bound[:gauges], default=0.0) + self.rounding_allowance * sqrt(strain @ strain),
+            max(bound[gauges:], default=0.0) + self.rounding_allowance * sqrt(displacement @ displacement),
             coordinates,
         )
 

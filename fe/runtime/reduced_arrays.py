@@ -4,7 +4,6 @@ Last the certified static solution online, of arrays laid out for the fewest ope
 equations are in `docs/reduced_model.md`. NumPy and relative imports only: this file is copied into the FMU.
 """
 
-from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, sqrt
@@ -17,9 +16,6 @@ from numpy.linalg import solve
 from .arrays import FloatArray, IntArray
 from .kept_arrays import KeptArrays
 from .state import Losses
-
-MOST_ANCHORS = 16
-"""Largest number of approximate dual solutions of a reduced model."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -76,11 +72,9 @@ class ReducedArrays(KeptArrays):
     rounding_allowance : float
         Part of the norm of the strains, and of displacements, added to the bounds for rounding: a
         multiple of the difference seen where the reduced model holds the full solution itself.
-    dual_counts : (K,) ndarray of int64
-        Number of anchors along each loss; their product is A, at most 16. At each, M dual functions of an
-        output are combined to its approximate dual solution.
-    dual_split : (sum of dual_counts less K,) ndarray
-        Values of the losses at which the next anchor takes over, region by region.
+    dual_split : (K,) or (0,) ndarray
+        Value of each loss at which the second of two anchors along it takes over; A = 2^K, or one. At each, M
+        dual functions of an output are combined to its approximate dual solution.
     dual_correction : (A, M, O', R) ndarray
         Dual functions, applied to the basis of the residuals; the anchors of the last region change first.
     dual_residual : (A, O', F, 1 + T M) ndarray
@@ -128,7 +122,6 @@ class ReducedArrays(KeptArrays):
     residual_stiffness: Annotated[FloatArray, "residual", "varied terms", "static"]
     residual_allowance: Annotated[float, 0.0, inf]
     rounding_allowance: Annotated[float, 0.0, inf]
-    dual_counts: Annotated[IntArray, "regions"]
     dual_split: Annotated[FloatArray, "splits"]
     dual_correction: Annotated[FloatArray, "anchors", "functions", "outputs", "residual"]
     dual_residual: Annotated[FloatArray, "anchors", "outputs", "dual rows", "dual columns"]
@@ -141,16 +134,6 @@ class ReducedArrays(KeptArrays):
     cross_mass: Annotated[FloatArray, "masses", "modal", "static"]
 
     def __post_init__(self) -> None:
-        counts = self.dual_counts
-        if (
-            counts.dtype != np.int64
-            or counts.ndim != 1
-            or not 1 <= counts.min(initial=1) <= counts.prod() <= MOST_ANCHORS
-        ):
-            self.refuse(
-                f"must have 1 to {MOST_ANCHORS} anchors of dual functions, at least one along a loss, but "
-                f"has {counts.tolist()}"
-            )
         super().__post_init__()
         modal = self.modal_stiffness.shape[1]
         if not 1 <= self.mode_count <= modal:
@@ -174,7 +157,7 @@ class ReducedArrays(KeptArrays):
         return len(self.gauges) + len(self.displacements)
 
     def _lengths(self) -> dict[str | int, int]:
-        terms, masses, regions = len(self.stiffness_factors), len(self.masses), len(self.regions)
+        terms, masses = len(self.stiffness_factors), len(self.masses)
         return {
             "chosen": len(self.chosen),
             "terms": terms,
@@ -182,9 +165,8 @@ class ReducedArrays(KeptArrays):
             "modal": self.modal_stiffness.shape[-1],
             "outputs": self.static_count,
             "all outputs": self.static_count + len(self.accelerations),
-            "regions": regions,
-            "splits": int(self.dual_counts.sum()) - regions,
-            "anchors": int(self.dual_counts.prod()),
+            "splits": len(self.regions) if self.dual_split.size else 0,
+            "anchors": 2**self.dual_split.size,
             "dual columns": 1 + terms * self.dual_output.shape[-1],
             "masses": 1 + masses,
         }
@@ -207,7 +189,7 @@ class OnlineArrays:
     """
 
     def __init__(self, arrays: ReducedArrays) -> None:
-        stiffness, residual, split = arrays.static_stiffness, arrays.residual_load, arrays.dual_counts - 1
+        stiffness, residual = arrays.static_stiffness, arrays.residual_load
         self.square = stiffness.shape[1:]
         self.stiffness = np.ascontiguousarray(stiffness.reshape(len(stiffness), -1))
         self._load, self._output = arrays.static_load, arrays.static_output
@@ -216,7 +198,7 @@ class OnlineArrays:
         self._residual = np.concatenate((residual, -terms), axis=1)
         self._allowance = arrays.residual_allowance
         self._reference = np.append(arrays.bound_reference, 1.0)
-        self._splits = [part.tolist() for part in np.split(arrays.dual_split, np.cumsum(split)[:-1])]
+        self._splits = arrays.dual_split.tolist()
         of_terms = arrays.dual_stiffness.swapaxes(1, 2).reshape(len(arrays.dual_output), len(stiffness), -1)
         by_output = np.ascontiguousarray(arrays.dual_correction.swapaxes(1, 2))
         output = arrays.dual_output[..., np.newaxis]
@@ -232,8 +214,8 @@ class OnlineArrays:
         if last is not None and last[0] == key:
             return last[1]
         number = 0
-        for split, value in zip(self._splits, loss, strict=True):
-            number = number * (len(split) + 1) + bisect_right(split, value)
+        for split, value in zip(self._splits, loss, strict=False):
+            number = 2 * number + (value >= split)
         stiffness, output, corrections, factor = self._anchors[number]
         outputs, functions, _ = output.shape
         weights = solve((theta @ stiffness).reshape(outputs, functions, functions), output)

@@ -144,12 +144,9 @@ class WingRows:
         cell = min(max(int(np.searchsorted(stations[2::2], y)), 0), (len(stations) - 3) // 2)
         first, last = stations[2 * cell], stations[2 * cell + 2]
         t = (y - first) / (last - first)
-        weights = np.zeros(len(stations))
-        weights[2 * cell : 2 * cell + 3] = (
-            (1.0 - t) * (1.0 - 2.0 * t),
-            4.0 * t * (1.0 - t),
-            t * (2.0 * t - 1.0),
-        )
+        weights, parabola = np.zeros(len(stations)), np.array((1.0 - t, 4.0 * t * (1.0 - t), t))
+        parabola[::2] *= (1.0 - 2.0 * t, 2.0 * t - 1.0)
+        weights[2 * cell : 2 * cell + 3] = parabola
         return weights
 
     def displacement_row(self, y: float, chord: float, beside: float | None = None) -> FloatArray:

@@ -46,12 +46,11 @@ class PatchOperators(NamedTuple):
 
 def area_shares(stations: FloatArray, root_chord: float, tip_chord: float) -> FloatArray:
     """Weights (P,) of the mean over the planform of what is quadratic between every other station."""
-    chord = root_chord + (tip_chord - root_chord) * stations / stations[-1]
-    weights = np.zeros(len(stations))
     length = stations[2::2] - stations[:-2:2]
-    for offset, share in ((0, 1.0), (1, 4.0), (2, 1.0)):
-        np.add.at(weights, np.arange(offset, len(stations) - 2 + offset, 2), share / 6.0 * length)
-    weights *= chord
+    weights = np.zeros(len(stations))
+    for offset, share in enumerate((1.0, 4.0, 1.0)):  # Simpson's rule
+        weights[offset : len(stations) - 2 + offset : 2] += share * length
+    weights *= root_chord + (tip_chord - root_chord) * stations / stations[-1]
     return np.asarray(weights / weights.sum())
 
 

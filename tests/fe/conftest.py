@@ -8,7 +8,6 @@ from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import WingDesign, load_design
 from fe.wing.operators import AffineOperators, assemble
-from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
 from tests.kept import FE, kept
 
 
@@ -24,7 +23,7 @@ def coarse_design(shipped_design: WingDesign) -> WingDesign:
 
 @pytest.fixture(scope="session")
 def coarse_operators(coarse_design: WingDesign) -> AffineOperators:
-    with threadpool_limits(1):  # as `fe.reduction.model_cache.build`, so that their bytes can be compared
+    with threadpool_limits(1):  # as `fe.reduction.model_cache` builds, so that their bytes can be compared
         return assemble(coarse_design)
 
 
@@ -43,11 +42,6 @@ def coarse_reduction(coarse_design: WingDesign, coarse_operators: AffineOperator
 def coarse_fields(coarse_operators: AffineOperators, coarse_reduction: Reduction) -> WingFields:
     with threadpool_limits(1):
         return field_basis(coarse_operators, coarse_reduction)
-
-
-@pytest.fixture(scope="session")
-def coarse_patch_operators(coarse_operators: AffineOperators) -> PatchOperators:
-    return assemble_patch_operators(coarse_operators)
 
 
 @pytest.fixture(scope="session")

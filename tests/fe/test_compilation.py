@@ -9,6 +9,7 @@ from fe.compilation import compiled
 
 
 def test_without_a_folder_for_the_cache_it_still_compiles(monkeypatch):
+    assert compiled(lambda value: 2.0 * value)(3.0) == 6.0
     njit, asked = numba.njit, []
 
     def no_folder(**options):

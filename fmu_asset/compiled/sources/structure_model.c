@@ -81,34 +81,6 @@ static bool take_chosen(structure_model *model, structure_problem *problem) {
     return true;
 }
 
-/* Read how many anchors of dual functions lie along each loss, and where the next one takes over. */
-static bool take_anchors(structure_model *model, structure_problem *problem) {
-    const structure_data *data = &model->data;
-    const double *counts = shaped(data, "dual_counts", 1, &model->regions, problem);
-    if (counts == NULL) {
-        return false;
-    }
-    size_t splits = 0;
-    for (size_t k = 0; k < model->regions; ++k) {
-        if (!(counts[k] >= 1.0 && counts[k] <= LARGEST_SIZE)) {
-            return structure_fail(problem, "the data file announces %g anchors along a loss", counts[k]);
-        }
-        model->anchors[k] = (size_t)counts[k];
-        splits += model->anchors[k] - 1;
-    }
-    if (splits > 0) { /* an array without values is not in the file */
-        const double *values = shaped(data, "dual_split", 1, &splits, problem);
-        if (values == NULL) {
-            return false;
-        }
-        for (size_t k = 0; k < model->regions; ++k) {
-            model->dual_split[k] = values;
-            values += model->anchors[k] - 1;
-        }
-    }
-    return true;
-}
-
 /* Read a table of two numbers a row, counted from one, and turn them into positions among what can be chosen. */
 static bool take_factors(const structure_model *model, structure_factors *factors, const char *name, size_t rows,
                          const size_t counts[2], const size_t starts[2], structure_problem *problem) {
@@ -211,13 +183,17 @@ static bool take_arrays(structure_model *model, structure_problem *problem) {
                  modal_outputs = extent(data, "modal_output", 0);
     model->terms = extent(data, "static_stiffness", 0);
     model->loads = extent(data, "static_load", 0);
-    if (!take_chosen(model, problem) || !take_anchors(model, problem) || !take_terms(model, problem)) {
+    if (!take_chosen(model, problem) || !take_terms(model, problem)) {
         return false;
     }
     const size_t terms = model->terms, loads = model->loads, mass_terms = model->masses + 1;
-    size_t anchors = 1;
-    for (size_t k = 0; k < model->regions; ++k) {
-        anchors *= model->anchors[k];
+    const size_t splits = extent(data, "dual_split", 0) == 0 ? 0 : model->regions; /* none are not in the file */
+    const size_t anchors = (size_t)1 << splits;
+    if (splits > 0) {
+        model->dual_split = shaped(data, "dual_split", 1, &splits, problem);
+        if (model->dual_split == NULL) {
+            return false;
+        }
     }
     model->static_size = n;
     model->padded_size = structure_padded(n);

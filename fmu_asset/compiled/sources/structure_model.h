@@ -40,14 +40,13 @@ typedef struct {
     size_t chosen;        /* V, all that can be chosen */
     size_t health;        /* parameters and losses, the first of what can be chosen: the stiffness */
     size_t key;           /* these and the masses: the modes */
-    size_t anchors[STRUCTURE_MOST_REGIONS]; /* of dual functions along each loss, A in all */
     size_t lasting;                 /* terms whose coefficient no loss changes; the first of `order` */
     size_t *order;                  /* (T) terms in the order of `stiffness_terms`: the last one, others, damage */
     structure_factors *stiffness_factors; /* (T) parameter and loss of each term */
     structure_factors *load_factors;      /* (L) control and mass of each load */
     const double *static_load;      /* (L, N) */
     const double *bound_reference;  /* (T - 1) */
-    const double *dual_split[STRUCTURE_MOST_REGIONS]; /* (anchors less one) of each region, ascending */
+    const double *dual_split;       /* (K) where the second of two anchors along a loss takes over, A = 2^K; or NULL */
     size_t functions;               /* M, dual functions of an output that are combined */
     size_t dual_rows, dual_columns; /* F and 1 + T M, of a factor of a dual residual */
     const double *dual_stiffness;   /* (A, O, T, M, M) */

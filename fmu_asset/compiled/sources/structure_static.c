@@ -171,20 +171,12 @@ void structure_static_derivative(structure_static *steady, const double *chosen,
     *load_point = structure_dot(model->static_load + point * n, change, n);
 }
 
-/* Index of the approximate dual solution of one region: how many splits its loss has reached. */
-static size_t anchor_index(const structure_model *model, size_t region, double loss) {
-    size_t index = 0;
-    while (index + 1 < model->anchors[region] && model->dual_split[region][index] <= loss) {
-        ++index;
-    }
-    return index;
-}
-
+/* Number of the anchor at the losses; that of the last region changes first. */
 static size_t anchor_of(const structure_static *steady) {
     const structure_model *model = steady->model;
     size_t index = 0;
-    for (size_t k = 0; k < model->regions; ++k) {
-        index = index * model->anchors[k] + anchor_index(model, k, steady->health[model->parameters + k]);
+    for (size_t k = 0; k < model->regions && model->dual_split != NULL; ++k) {
+        index = 2 * index + (steady->health[model->parameters + k] >= model->dual_split[k]);
     }
     return index;
 }

@@ -116,15 +116,6 @@ def test_solutions_are_those_of_a_general_solver(seed, size, share, copies, colu
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-9 * np.abs(expected).max())
 
 
-def test_a_body_of_many_fronts():
-    matrix = grid(40, 12, 9)
-    right = np.random.default_rng(5).standard_normal((matrix.shape[0], 3))
-    factors, expected = Factorisation(matrix), spsolve(matrix.tocsc(), right)
-    assert factors.riesz(right) == pytest.approx(expected, rel=1e-11, abs=1e-11)
-    assert factors.riesz(right[:, 0]) == pytest.approx(expected[:, 0], rel=1e-11, abs=1e-11)
-    assert factors.solve(np.zeros(len(right))) == pytest.approx(0.0)
-
-
 def test_the_wing_is_solved_as_by_a_general_solver(coarse_operators):
     stiffness, load = coarse_operators.stiffness(None, (0.3, 0.7)), coarse_operators.turn(3.0, 5.0)
     factors = Factorisation(stiffness)

@@ -87,28 +87,21 @@ def kept(request: pytest.FixtureRequest) -> KeptArrays:
     return found
 
 
-def test_what_is_kept_comes_back_to_the_last_bit(kept: KeptArrays, tmp_path) -> None:
-    path = tmp_path / "kept.npz"
-    path.write_bytes(kept.to_bytes())
-    again = type(kept).load(path)
+def test_what_is_kept_comes_back_to_the_last_bit_or_is_refused(kept: KeptArrays, tmp_path) -> None:
+    kind, path, content = type(kept), tmp_path / "kept.npz", kept.to_bytes()
+    path.write_bytes(content)
+    again = kind.load(path)
     for item in fields(kept):
         np.testing.assert_array_equal(getattr(again, item.name), getattr(kept, item.name))
-    assert again.to_bytes() == kept.to_bytes() == path.read_bytes()
-
-
-def test_incomplete_damaged_or_foreign_files_are_refused(kept: KeptArrays, tmp_path) -> None:
-    kind, path, content = type(kept), tmp_path / "kept.npz", kept.to_bytes()
-    with pytest.raises(FileNotFoundError):
-        kind.load(path)
+    assert again.to_bytes() == content
     path.write_bytes(content[:1000])
     with refused(ReducedModelFileError, r"kept\.npz is not a sound archive"):
         kind.load(path)
     arrays = arrays_from_bytes(content, "it")
-    for name, value, sentence in (
-        ("load_tip" if "load_tip" in arrays else "cross_mass", None, "lacks (load_tip|cross_mass)"),
-        ("format", np.array(99), "has the format 99"),
+    for wrong, sentence in (
+        ({name: array for name, array in arrays.items() if name != "regions"}, "lacks regions"),
+        (arrays | {"format": np.array(99)}, "has the format 99"),
     ):
-        wrong = {own: array for own, array in {**arrays, name: value}.items() if array is not None}
         with refused(ReducedModelFileError, sentence):
             kind.from_bytes(arrays_to_bytes(wrong))
 
@@ -131,7 +124,6 @@ def test_arrays_of_a_wrong_kind_are_refused(kept: KeptArrays, value: np.ndarray)
         ("static_load", lambda load: load * np.nan, "finite"),
         ("mode_count", lambda _: 0, "modes"),
         ("rounding_allowance", lambda _: -1.0, "rounding_allowance"),
-        ("cells", lambda cells: cells + 1, "nodes that are not there"),
         *((name, lambda rows: rows[:-1], "field basis") for name in ("points", "cells", "region")),
         *((f"{kind}_displacement", lambda rows: rows[:-1], "field basis") for kind in ("static", "modal")),
         ("load_tip", lambda _: np.full(3, np.nan), "array"),

@@ -5,7 +5,6 @@ import pytest
 from scipy.linalg import expm
 
 from fe.runtime.errors import InvalidStateError, OutsideModelError
-from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE
 from fe.runtime.transient import ModalIntegrator, TransientState
@@ -75,7 +74,7 @@ def test_the_load_point_rests_where_its_compliance_puts_it(integrator, model: Re
     assert 0.9 * 0.03 < integrator.point_displacement(released, TIP_FORCE) < 0.03
 
 
-def test_a_released_tip_starts_where_it_was_held_and_rings_down(integrator: ModalIntegrator) -> None:
+def test_a_released_tip_starts_where_it_was_held_and_comes_to_rest(integrator: ModalIntegrator) -> None:
     under = integrator.released(-0.01, (2.0, 0.0), TIP_FORCE)
     rest = integrator.outputs(integrator.at_rest((2.0, 0.0)))
     assert integrator.outputs(under)[-1] == pytest.approx(rest[-1] - 0.01, rel=5e-3)
@@ -85,16 +84,6 @@ def test_a_released_tip_starts_where_it_was_held_and_rings_down(integrator: Moda
     # the static correction belongs to the load, which is gone: what is left is what six modes can hold
     assert integrator.outputs(state)[-1] == pytest.approx(0.02, rel=5e-3)
     assert not state.velocity.any()
-    first = integrator.modes.followed[0]
-    zeta, omega = integrator.damping_ratio[first], 2 * np.pi * integrator.modes.frequency[first]
-    amplitude = []
-    for _ in range(9):
-        amplitude.append(abs(state.displacement[first]))
-        state = integrator.advance(state, 2 * np.pi / (omega * np.sqrt(1 - zeta**2)), (0.0, 0.0))
-    decrement = -np.diff(np.log(amplitude))
-    np.testing.assert_allclose(decrement, 2 * np.pi * zeta / np.sqrt(1 - zeta**2), rtol=1e-6)
-    ratio = rayleigh_damping_ratio(ALPHA, BETA, integrator.modes.frequency[first])
-    np.testing.assert_allclose(zeta, ratio, rtol=1e-14)
 
 
 def energy_of(integrator: ModalIntegrator, state: TransientState) -> float:
