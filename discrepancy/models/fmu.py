@@ -12,7 +12,8 @@ from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course, LoadChange, divided, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.fmu_motion import FmuMotion, Motive, Sampled, record_of
+from discrepancy.models.fmu_motion import FmuMotion, Sampled
+from discrepancy.models.fmu_pace import Motive, record_of
 from discrepancy.models.fmu_runs import State
 from discrepancy.models.interface import NO_PATCH, Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.model_file import DescribedModel
