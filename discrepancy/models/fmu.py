@@ -1,10 +1,9 @@
 """Any FMU with a binding as a model: its inputs loaded, its outputs read, internal forces at its ports."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
-from math import ceil
 from pathlib import Path
+from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -13,21 +12,16 @@ from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course, LoadChange, divided, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.fmu_laws import FmuLaws
-from discrepancy.models.fmu_motion import Sampled, sampled
-from discrepancy.models.fmu_runs import Excitation, Run, State
-from discrepancy.models.interface import NO_PATCH, Conditions, Memory, Outputs, PortedSystem, Response
+from discrepancy.models.fmu_motion import FmuMotion, Sampled
+from discrepancy.models.fmu_pace import Motive, record_of
+from discrepancy.models.fmu_runs import State
+from discrepancy.models.interface import NO_PATCH, Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from fe.runtime import patch as changes
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, Primitive
 from fmu_asset.errors import FmuError
-
-FINER = 2
-"""Steps under a recorded force are so many times smaller where laws act on the motion, too."""
-KEPT_SHOWN = 16
-"""Responses without laws that are kept while laws are tried."""
 
 
 class Asked(NamedTuple):
@@ -39,8 +33,8 @@ class Asked(NamedTuple):
         As they come.
     laws : Laws
         Internal forces at ports.
-    settings : tuple of (str, float)
-        Parameters that the FMU itself has for primitives, sorted by name.
+    settings : mapping of str to float
+        Parameters that the FMU itself has for primitives.
     load : LoadChange
         Of the recorded force.
     """
@@ -48,7 +42,7 @@ class Asked(NamedTuple):
     trial: Trial
     conditions: Conditions
     laws: Laws = NO_LAWS
-    settings: tuple[tuple[str, float], ...] = ()
+    settings: Mapping[str, float] = MappingProxyType({})
     load: LoadChange = LoadChange()
 
 
@@ -78,7 +72,7 @@ class FmuModel(DescribedModel):
 
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
         self.description: FmuModelDescription = description
-        self.fmu = fmu = FmuLaws(description, Path(folder))
+        self.fmu = fmu = FmuMotion(description, Path(folder))
         super().__init__(description, fmu.quantities)
         self.length, self.regions = description.scales.length, tuple(description.inputs.regions)
         flies = description.inputs.load_factor is not None
@@ -99,7 +93,6 @@ class FmuModel(DescribedModel):
                         f"to {item.high:g}, which the FMU {fmu.asset.description.path} cannot have: {cause}"
                     ) from cause
         fmu.nominal = self._state(Asked(_any_trial(TrialKind.RINGDOWN, 1.0), Conditions(self.prior_mean())))
-        self._shown = Memory(KEPT_SHOWN)
 
     @classmethod
     def load(cls, path: Path | str) -> "FmuModel":
@@ -125,26 +118,26 @@ class FmuModel(DescribedModel):
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign: those of the file, else what the FMU shows."""
         given, fmu, trials = self.description.scales, self.fmu, campaign.trials
-        conditions, largest = Conditions(self.prior_mean(campaign)), np.zeros(len(self.ports()))
+        conditions, largest = Conditions(self.prior_mean(campaign)), np.zeros(len(fmu.ports))
         for trial in trials:
             if trial.is_dynamic:
-                moved = fmu.free(self._run(Asked(trial, conditions), 1))
+                moved, _ = self._moving(Asked(trial, conditions), fmu.x, [0] * len(fmu.x))
             else:
-                moved = self._at_rest(Asked(trial, replace(conditions, health=trial.health)))
-            largest = np.maximum(largest, np.max(np.abs(moved[:, fmu.x]), axis=0))
+                moved = self._at_rest(Asked(trial, replace(conditions, health=trial.health)))[:, fmu.x]
+            largest = np.maximum(largest, np.max(np.abs(moved), axis=0))
+        still = next((item for item in trials if not item.is_dynamic), _any_trial(TrialKind.STATIC, 1.0))
+        flexible = fmu.flexibility(self._state(Asked(still, conditions)), range(len(largest)))
+        stiffness = [(1.0 / own, 1.0 / own) for own in np.diag(flexible).tolist()]
         frequency, moving = given.angular_frequency, next((item for item in trials if item.is_dynamic), None)
         if moving is not None:
-            state, step = self._state(Asked(moving, conditions)), fmu.step(moving)
-            stiffness = [fmu.stiffness(number, state, step) for number in range(len(largest))]
-            frequency = frequency or fmu.measured_frequency(moving, state)
-        else:
-            still, interval = trials[0] if trials else _any_trial(TrialKind.STATIC, 1.0), 0.01
-            flexible = fmu.flexibility(self._state(Asked(still, replace(conditions, health=still.health))))
-            stiffness = [(1.0 / own, 1.0 / own) for own in np.diag(flexible).tolist()]
-            for _ in range(0 if trials or given.angular_frequency else 3):  # until the interval suits it
-                trial = _any_trial(TrialKind.RINGDOWN, interval)
-                frequency = fmu.measured_frequency(trial, self._state(Asked(trial, conditions)))
-                interval = 0.3 / frequency
+            state = self._state(Asked(moving, conditions))
+            frequency = frequency or fmu.pace(moving, state)[0]
+            stiffness = fmu.stiffness(state, fmu.usual(moving)[1], record_of(moving)) or stiffness
+        interval = 0.01
+        for _ in range(0 if trials or frequency else 3):  # until the interval suits it
+            trial = _any_trial(TrialKind.RINGDOWN, interval)
+            frequency = fmu.pace(trial, self._state(Asked(trial, conditions)))[0]
+            interval = 0.3 / frequency
         forces = zip(fmu.forces, stiffness, strict=True)
         pushed = [pair for force, pair in forces if force in self._forces.values()]
         modal, tip = (pushed or stiffness or [(1.0, 1.0)])[0]
@@ -182,29 +175,16 @@ class FmuModel(DescribedModel):
         orders = [quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs]
         return [self.fmu.columns[output] for output, _ in outputs], orders
 
-    def _moving(self, asked: Asked, columns: Sequence[int], orders: Sequence[int], parts: int = 1) -> Sampled:
+    def _moving(self, asked: Asked, columns: list[int], orders: list[int], parts: int = 1) -> Sampled:
         """Return columns of the FMU's outputs in a dynamic trial, derived so many times, and their rates.
 
         At samples that are so many times as dense as those of the trial.
         """
-        (trial, conditions, laws, *_), fmu = asked, self.fmu
-        stamps, excite = divided(conditions.stamps(trial.time), parts), partial(self._run, asked)
-        finer = FINER if len(laws) and trial.kind is TrialKind.FORCED else 1
-        run = excite(conditions.refinement * finer)
-
-        def shown(values: FloatArray, step: float) -> Sampled:
-            return sampled(values, step, stamps, orders)
-
-        free = fmu.free(run)
-        added = fmu.added(laws, run, free, trial, columns) if len(laws) else None
-        if len(laws) and added is None:
-            return shown(*fmu.stepped(laws, excite, trial, conditions.refinement, columns))
-        key = (*columns, *orders, stamps.tobytes(), run.key)
-        found = self._shown.get(key, lambda: shown(free[:, columns], run.step))
-        if added is None:
-            return found
-        values, rates = shown(*added)
-        return found[0] + values, found[1] + rates
+        trial, conditions, laws, *_ = asked
+        return self.fmu.motion(
+            trial, divided(conditions.stamps(trial.time), parts), self._state(asked), self._motive(asked),
+            laws, columns, orders, conditions.refinement,
+        )  # fmt: skip
 
     def _at_rest(self, asked: Asked) -> FloatArray:
         """Return all outputs (N, C) of a static trial or a flight."""
@@ -223,17 +203,10 @@ class FmuModel(DescribedModel):
             given = {self.fmu.variable(str(self.description.inputs.load_factor)): trial.load_factor}
         elif not given or np.any(trial.force):
             acting = change.changed(trial.force, trial.force)
-            given |= {name: acting * lever for name, lever in self._pushed(asked)}
+            given |= {name: acting * lever for name, lever in self._levers(asked).items()}
         loads = [dict(zip(given, row, strict=True)) for row in np.array([*given.values()]).T.tolist()]
-        states, found = [self._state(asked, row) for row in range(len(loads))], list[FloatArray]()
-        if len(laws):
-            return self.fmu.at_rest_under(laws, trial.name, states, loads)
-        for row, held in enumerate(zip(states, loads, strict=True), start=1):
-            try:
-                found.append(self.fmu.rest(*held))
-            except ModelError as cause:
-                raise ModelError(f"The trial {trial.name!r}, row {row} of its table: {cause}") from cause
-        return np.array(found)
+        states = [self._state(asked, row) for row in range(len(loads))]
+        return self.fmu.at_rest(states, loads, laws, trial.name)
 
     # ------------------------------------------------------------ ports
 
@@ -245,9 +218,9 @@ class FmuModel(DescribedModel):
         ModelError
             If the FMU is not linear, or its answers to forces at the ports do not tell its system.
         """
-        fmu, step = self.fmu, self.fmu.step(trial)
+        fmu, motive = self.fmu, Motive(self.ports(), record=record_of(trial))
         base, found = (
-            fmu.system(self._state(self._asked(trial, conditions, self.patch)), step, len(trial.time))
+            fmu.system(self._state(self._asked(trial, conditions, self.patch)), fmu.usual(trial)[1], motive)
             for values in (self.prior_mean(), parameters)
             for conditions in [Conditions(values, health=trial.health[:1])]
         )
@@ -257,8 +230,8 @@ class FmuModel(DescribedModel):
                 "move; it is not linear, or they are too few or too rough."
             )
         found = found.in_state_of(base)
-        position, speed = np.split(found.of_ports(fmu.x, fmu.v).outputs, 2)
-        rows, at_once = found.rows(list(zip(*self._read(outputs), strict=True)))
+        (position, _), (speed, _) = (found.rows(fmu.x, order) for order in (0, 1))
+        rows, at_once = found.rows(*self._read(outputs))
         return PortedSystem(found.generator, self.ports(), found.push.T, position, speed, rows, at_once.T)
 
     def port_motion(
@@ -266,7 +239,7 @@ class FmuModel(DescribedModel):
     ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         asked = self._asked(trial, conditions, self.patch)._replace(laws=NO_LAWS)
-        return self._moving(asked, self.fmu.x, [0] * len(self.ports()), parts)
+        return self._moving(asked, self.fmu.x, [0] * len(self.fmu.x), parts)
 
     # ------------------------------------------------------------ trials in its names and units
 
@@ -282,56 +255,41 @@ class FmuModel(DescribedModel):
             if f"{effect}.active" in settings:
                 raise ModelError(f"Of the two primitives {item.kind!r} {what} carries one ({effect}).")
             values = {"active": 1.0, **item.to_mapping()}
-            given = {key: float(value) for key, value in values.items() if key != "kind"}
-            settings |= {f"{effect}.{key}": value for key, value in given.items()}
+            settings |= {f"{effect}.{key}": float(value) for key, value in values.items() if key != "kind"}
         laws = laws_of(rest.of(*INTERNAL_FORCES), self.ports())
-        return Asked(trial, conditions, laws, tuple(sorted(settings.items())), load)
+        return Asked(trial, conditions, laws, settings, load)
 
-    def _run(self, asked: Asked, refinement: int) -> Run:
-        """Return the run by which the FMU follows a dynamic trial."""
-        (trial, conditions, _, _, (gain, tare, *_)), fmu = asked, self.fmu
-        state, step, (rate, zero) = self._state(asked), fmu.step(trial, refinement), conditions.clock
-        end = max((1.0 + rate) * float(trial.time[-1]) + zero, float(trial.time[-1]))
-        # a little longer, so that a clock that is being fitted does not ask for another run
-        steps = ceil(end / step * (1.0 + 2e-9) - 1e-6) + (0 if (rate, zero) == (0.0, 0.0) else 1)
-        loads = list[tuple[Excitation, float]]()
+    def _motive(self, asked: Asked) -> Motive:
+        """Return what moves the FMU in a dynamic trial."""
+        (trial, conditions, laws, _, load), fmu = asked, self.fmu
+        motive = Motive(tuple(dict.fromkeys(laws.ports)), record=record_of(trial))
         if trial.kind is not TrialKind.RINGDOWN:
-            course = Course.of(trial.time, trial.force, trial.hold)
-            begins, ends = course.ends(np.linspace(0.0, steps * step, steps + 1))
-            held, first = 0.5 * (begins + ends), float(trial.force[0])
-            on = ((begins != 0.0) | (ends != 0.0)).astype(float)
-            for variable, lever in self._pushed(asked):
-                loads.append((Excitation("input", variable, held, first), (1.0 + gain) * lever))
-                if tare:
-                    loads.append((Excitation("input", variable, on, float(first != 0.0)), tare * lever))
-            return Run(state, step, steps, loads)
-        release, way = release_of(trial), self.description.release
-        if way is None:
+            course = Course.of(trial.time, load.changed(trial.force, trial.force), trial.hold)
+            return motive._replace(levers=self._levers(asked), course=course)
+        release = release_of(trial)
+        if not fmu.release:
             raise ModelError(
                 f"The FMU model {self.name!r} cannot ring down: state in [release] the FMU's parameter of "
                 f"the release displacement, or the force that holds it."
             )
         first_mode = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
         if release.at_rest:
-            loads = [fmu.let_go(state, step, release.displacement * (1.0 + float(first_mode[0])))]
-        elif way.displacement is None or way.velocity is None:
+            return motive._replace(starts={fmu.release[0]: release.displacement * float(1.0 + first_mode[0])})
+        if len(fmu.release) < 2:
             raise ModelError(
                 f"The ring-down {trial.name!r} does not begin at rest, which the FMU model {self.name!r} "
                 f"can follow only if [release] names parameters of displacement and velocity."
             )
-        else:
-            at, speed = release.displacement * first_mode * (1.0, fmu.angular_frequency(trial))
-            moving = Excitation("parameter", fmu.parameter(way.velocity))
-            loads = [fmu.let_go(state, step, float(at)), (moving, float(speed))]
-        return Run(state, step, steps, loads)
+        first = release.displacement * first_mode * (1.0, fmu.usual(trial)[0])
+        return motive._replace(starts=dict(zip(fmu.release, first.tolist(), strict=True)))
 
-    def _pushed(self, asked: Asked) -> list[tuple[str, float]]:
+    def _levers(self, asked: Asked) -> dict[str, float]:
         """Return the inputs that a force at a place of a patch pushes, each with its lever."""
         inputs, trial, load = self.description.inputs, asked.trial, asked.load
         moments = ((inputs.bending_moment, load.along_span), (inputs.torque, load.along_chord))
         place = place_among([*self._forces], trial.load_place, self.what, f"the trial {trial.name!r}")
-        levers = [(self.fmu.variable(name), lever) for name, lever in moments if name is not None and lever]
-        return [(self._forces[place], 1.0), *levers]
+        levers = {self.fmu.variable(name): lever for name, lever in moments if name is not None and lever}
+        return {self._forces[place]: 1.0} | levers
 
     def _state(self, asked: Asked, row: int = 0) -> State:
         """Return parameters and constant inputs of a row of a trial."""
@@ -345,8 +303,7 @@ class FmuModel(DescribedModel):
         table = self.description.motion if trial.is_dynamic else self.description.static
         parameters = {fmu.parameter(name): value for name, value in table.parameters.items()}
         parameters |= dict(zip(self._keys, conditions.parameters.tolist(), strict=True))
-        parameters |= dict(asked.settings)
-        return State(tuple(sorted(parameters.items())), tuple(sorted(inputs.items())))
+        return State((), tuple(sorted(inputs.items()))).having(parameters | dict(asked.settings))
 
 
 def _any_trial(kind: TrialKind, interval: float) -> Trial:

@@ -2,9 +2,7 @@
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from hashlib import blake2b
-from math import pi
+from math import log2, pi
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -28,6 +26,8 @@ KEPT_BYTES = 256 * 2**20
 """Results that are remembered."""
 REVOLUTIONS = ("1/min", "rpm", "r/min", "rev/min")
 """Units of FMUs in which an angular velocity is revolutions in a minute."""
+LINEAR = 1e-6
+"""Largest deviation from superposition, as a share of the motion, of an FMU that is taken as linear."""
 SETTLE_CHUNK = 200
 """Steps after which it is asked whether the motion has come to rest."""
 
@@ -35,54 +35,26 @@ SETTLE_CHUNK = 200
 class State(NamedTuple):
     """Parameters and constant inputs of a run, sorted by name; by keys of the binding and the FMU's names."""
 
-    parameters: tuple[tuple[str, float], ...]
-    inputs: tuple[tuple[str, float], ...]
+    parameters: tuple[tuple[str, float], ...] = ()
+    inputs: tuple[tuple[str, float], ...] = ()
 
-
-@dataclass(frozen=True)
-class Excitation:
-    """What moves the FMU, per unit of a factor.
-
-    Attributes
-    ----------
-    kind : str
-        "parameter": a parameter of the release; "hold": an input that holds until the start; "input": one
-        that has a course.
-    name : str
-        The key of the parameter, or the FMU's name of the input.
-    series : (N,) ndarray
-        Its values, each held over a step.
-    begin : float
-        Its value before the motion, under which the FMU is at rest.
-    """
-
-    kind: str
-    name: str
-    series: FloatArray = field(default_factory=lambda: np.zeros(0))
-    begin: float = 0.0
-
-    @property
-    def key(self) -> Hashable:
-        """What tells it from others."""
-        return self.kind, self.name, blake2b(self.series.tobytes(), digest_size=16).digest(), self.begin
-
-
-Loads = Sequence[tuple[Excitation, float]]
-"""Excitations with their factors."""
+    def having(self, more: Mapping[str, float]) -> "State":
+        """Return it with other values of parameters."""
+        return self._replace(parameters=tuple(sorted({**dict(self.parameters), **more}.items())))
 
 
 class Run(NamedTuple):
-    """A motion that is asked of an FMU: in which state, communication step [s], how many, what excites it."""
+    """A motion that is asked of an FMU: in which state, communication step [s], how many of them.
+
+    `begin` has what is added to inputs before it, under which the FMU is at rest, `courses` (steps,) what is
+    added over its steps.
+    """
 
     state: State
     step: float
     steps: int
-    loads: Loads
-
-    @property
-    def key(self) -> Hashable:
-        """What tells it from others."""
-        return *self[:3], tuple((part.key, value) for part, value in self.loads)
+    begin: Mapping[str, float] = MappingProxyType({})
+    courses: Mapping[str, FloatArray] = MappingProxyType({})
 
 
 class FmuRuns:
@@ -101,8 +73,6 @@ class FmuRuns:
         Column of each output of the description, and of `port.NAME.displacement` and `.velocity`.
     asset : FmiAsset
         The door to the FMU, for what it declares.
-    resting : (FmiAsset, parameters) or None
-        Instance that a step at rest left so, with its parameters; None once another thing was asked of it.
     input_factors : dict of str to float
         By which an `[[input]]` of the description is multiplied, by the FMU's name: revolutions in a minute
         stand for an angular velocity and have no unit that converts to rad/s.
@@ -118,7 +88,8 @@ class FmuRuns:
         self._path = folder / description.fmu
         self._assets = Memory(MOST_INSTANCES, end=FmiAsset.close)
         self._kept = Memory(KEPT_BYTES, lambda found: found.nbytes)
-        self.resting: tuple[FmiAsset, tuple[tuple[str, float], ...]] | None = None
+        self._adds = dict[tuple[str, ...], bool]()  # whether what some inputs do adds up
+        self._units = dict[str, float]()  # of which this is made
         with self._refusals():
             self._fmu = read_fmu(self._path)
             file = description.binding_file(folder)
@@ -258,18 +229,9 @@ class FmuRuns:
         return found
 
     def started(
-        self, step: float, parameters: Mapping[str, float], inputs: Mapping[str, float], *, settle: bool
+        self, state: State, step: float, begin: Mapping[str, float], *, settle: bool
     ) -> tuple[FmiAsset, FloatArray]:
         """Return an instance at its start, at rest under its inputs if wanted, and its outputs (C,).
-
-        Parameters
-        ----------
-        step : float
-            Communication step [s].
-        parameters, inputs : mapping of str to float
-            By the keys of `parameter` and the FMU's names.
-        settle : bool
-            Whether to follow the motion until it rests.
 
         Raises
         ------
@@ -278,8 +240,7 @@ class FmuRuns:
         """
         with self._refusals():
             asset, rest = self.open(step), self.description.static
-            self.resting = None
-            asset.reset(parameters, load=inputs or None)
+            asset.reset(dict(state.parameters), load=self.inputs(state, begin) or None)
             if not settle:
                 return asset, np.array(asset.observe().values)
         waited, largest = 0.0, np.zeros(len(self._binding.observation_variables))
@@ -299,10 +260,64 @@ class FmuRuns:
                     "[static], or give the FMU's parameters for a state at rest there."
                 )
 
-    def advanced(self, asset: FmiAsset, courses: Mapping[str, FloatArray | float], steps: int) -> FloatArray:
+    def advanced(self, asset: FmiAsset, courses: Mapping[str, FloatArray], steps: int) -> FloatArray:
         """Return the outputs (steps, C) at the ends of steps, inputs held in each; raises `ModelError`."""
         with self._refusals():
             return asset.simulate(load=courses, steps=steps).values
+
+    def begun(self, run: Run) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
+        """Return an instance at the begin of a motion, its outputs there, and the inputs (steps,) to come."""
+        courses = {name: value + np.zeros(run.steps) for name, value in self.inputs(run.state).items()}
+        for name, values in run.courses.items():
+            courses[name] += values
+        settle = any(run.begin.values())
+        return *self.started(run.state, run.step, run.begin, settle=settle), courses
+
+    def followed(self, run: Run) -> FloatArray:
+        """Return the outputs (steps + 1, C) of a motion; raises `ModelError`."""
+        asset, first, courses = self.begun(run)
+        return np.vstack((first, self.advanced(asset, courses, run.steps)))
+
+    # ------------------------------------------------------------ rest
+
+    def rest(self, states: Sequence[State], loads: Sequence[Mapping[str, float]]) -> FloatArray:
+        """Return the outputs (L, C) at rest in states that differ in inputs, under more on some of them."""
+        step = self.description.static.step
+        if self.description.static.settle:
+            return np.array([self._settled(*row) for row in zip(states, loads, strict=True)])
+        rows = [self.inputs(*row) for row in zip(states, loads, strict=True)]
+        asset, _ = self.started(states[0], step, loads[0], settle=False)
+        return self.advanced(
+            asset, {name: np.array([row[name] for row in rows]) for name in rows[0]}, len(rows)
+        )
+
+    def _settled(self, state: State, loads: Mapping[str, float]) -> FloatArray:
+        """Return the outputs (C,) when a motion has come to rest.
+
+        Put together from answers to units where half of all loads gives half of the sum of what each gives.
+        """
+
+        def asked(loads: Mapping[str, float]) -> FloatArray:
+            step, key = self.description.static.step, (state, tuple(sorted(loads.items())))
+            return self.remembered(key, lambda: self.started(state, step, loads, settle=True)[1])
+
+        loads = {name: value for name, value in loads.items() if value != 0.0}
+        names = tuple(sorted(loads))
+        if not (self.description.superposition and names) or self._adds.get(names) is False:
+            return asked(loads)
+        units = {name: self._units.setdefault(name, 2.0 ** round(log2(abs(loads[name])))) for name in names}
+        zero = asked({})
+        moved = np.array([asked({name: unit}) - zero for name, unit in units.items()])
+        if names not in self._adds:
+            half = asked({name: 0.5 * unit for name, unit in units.items()}) - zero
+            allowed = LINEAR * np.sum(np.abs(moved), axis=0) + 1e-12 * np.abs(zero)
+            self._adds[names] = bool(np.all(np.abs(half - 0.5 * np.sum(moved, axis=0)) <= allowed))
+            return self._settled(state, loads)
+        return np.asarray(zero + np.array([loads[name] / unit for name, unit in units.items()]) @ moved)
+
+    def size(self, name: str) -> float:
+        """Return a force that an input can have."""
+        return min(1.0, 0.1 * self.input_limit(name))
 
     def one_step(self, asset: FmiAsset, inputs: Mapping[str, float]) -> FloatArray:
         """Return the outputs (C,) after one step; `ModelError` if the FMU refuses."""

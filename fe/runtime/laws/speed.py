@@ -179,28 +179,3 @@ def crossing(
         # the force ends, but here the next force begins, of the other sign.
         moment -= sign * strength * h * h / 6.0
     return drag - push + lost, moment + lost * h, 0.0
-
-
-def held(law: FloatArray, speed: float, push: float, gain: float, strength: float, h: float) -> float:
-    """Return the force that is given when it is held over a whole step.
-
-    `speed` of the port at the begin, its acceleration `push` without this force, `gain` of its speed by a
-    unit of force over the step.
-    """
-    if strength == 0.0 or gain <= 0.0:
-        return 0.0
-    if law[1] == 0.0:
-        sign = np.sign(speed)
-        if sign * (speed + (push - sign * strength) * h) > 0.0:
-            return float(sign * strength * h / gain)
-        if abs(push) <= strength:  # it stops, and stays
-            return (speed + push * h) / gain
-        first = 0.0 if speed == 0.0 else speed / (sign * strength - push)  # time until it turns
-        first = min(max(first, 0.0), h)
-        return float((sign * first + np.sign(push) * (h - first)) * strength / gain)
-    middle = speed + 0.5 * h * push
-    after = kick(law, middle, strength, h, False)
-    if law[1] < 1.0 and (after == 0.0 or after * speed < 0.0):
-        middle = speed + h * push
-        after = kick(law, middle, strength, h, False)
-    return float((middle - after) / gain)

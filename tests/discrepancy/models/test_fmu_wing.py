@@ -1,10 +1,8 @@
-"""Our own wing FMU as a model, against the wing model of the same chain of springs; its effects used."""
+"""Our own wing FMU as a model, against the wing model of the same design; its effects used."""
 
-import importlib.util
 import json
 import tomllib
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +16,7 @@ from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, RootCompliance
 from fmu_asset.packing.patch_file import parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
 from tests.discrepancy.asking import FloatArray, campaign, seen, trial
+from tests.fmu_asset.ours import wing_arrays, wing_model
 from tests.refusals import Inputs
 
 TEXT = Inputs(__file__).text("wing.toml")
@@ -39,7 +38,7 @@ RINGDOWN = record(TrialKind.RINGDOWN, 400, release=Release(0.01))
 
 
 class Pair(NamedTuple):
-    """One chain of springs as an FMU with two effects, and as a wing model."""
+    """A wing on a coarse mesh as an FMU with two effects, and as a wing model."""
 
     fmu: FmuModel
     wing: WingModel
@@ -63,12 +62,7 @@ class Pair(NamedTuple):
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
-    path = Path(__file__).parents[2] / "fmu_asset" / "conftest.py"
-    specification = importlib.util.spec_from_file_location("fmu_chain", path)
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    chain, folder = module.chain_model(), tmp_path_factory.mktemp("wing")
-    arrays = module.chain_arrays(chain)
+    chain, arrays, folder = wing_model(), wing_arrays(), tmp_path_factory.mktemp("wing")
     rows = [{"id": name, "primitives": ModelPatch((item,)).to_list()} for name, item in CARRIED.items()]
     content = {"schema": "uav-twin patch 1", "effects": rows, "channels": {}}
     build_fmu(chain, folder / "wing.fmu", patch=parse_patch(json.dumps(content).encode()), arrays=arrays)
@@ -79,16 +73,10 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
     model.close()
 
 
-@pytest.mark.parametrize(("case", "tolerance"), [(LOADS, 1e-9), (FLIGHT, 1e-9), (RINGDOWN, 1e-4)])
+@pytest.mark.parametrize(("case", "tolerance"), [(LOADS, 3e-3), (FLIGHT, 3e-3), (RINGDOWN, 1e-4)])
 @pytest.mark.parametrize("state", [{}, {"health": np.array([[0.2, 0.3]])}])
 def test_it_is_the_wing(pair: Pair, case: Trial, tolerance: float, state: dict[str, Any]) -> None:
     assert pair.share(case, **state) < tolerance
-
-
-def test_another_use_of_the_instance_at_rest_leaves_no_trace(pair: Pair) -> None:
-    for health in (0.1, 0.4):  # inputs of one step after another; parameters would ask for a reset
-        assert pair.share(LOADS, health=np.full((1, 2), health)) < 1e-9
-        pair.fmu.fmu.started(1.0, {}, {}, settle=False)
 
 
 @pytest.mark.parametrize("item", [PointMass(0.3, 0.9), RootCompliance(3e-4)])

@@ -117,30 +117,19 @@ def test_any_region_is_known_by_its_name(model: Model, kinds: Kinds) -> None:
         seen(model, named, OUTPUTS[:1], **at(1.0, 0.05, health=health[:, ::-1]))
 
 
-def test_small_steps_beside_a_law_are_not_asked_of_the_fmu(kinds: Kinds, monkeypatch) -> None:
+def test_the_fmu_is_not_asked_again_for_another_law(kinds: Kinds, monkeypatch) -> None:
     """Nor are springs of next to no stiffness, which change nothing, whatever steps they take."""
     model, asked = kinds.fmu, []
     advanced = model.fmu.advanced
     monkeypatch.setattr(model.fmu, "advanced", lambda *given: (asked.append(given[-1]), advanced(*given))[1])
     for e in (1.0, 1.03):
         wanted = seen(model, RELEASED, OUTPUTS, **at(e, 0.05))
-        for force in (1e-9, 1e-6, 100.0):
+        for number, force in enumerate((1e-9, 1e-6, 100.0)):
             before = len(asked)
             values = seen(model, RELEASED, OUTPUTS, PowerStiffness("tip", force, 3.0, 0, 1e-4), **at(e, 0.05))
             if force < 1.0:
                 alike(values, wanted, 1e-6)
-        assert 0 < len(asked) == before
-    assert max(parts for parts, _ in model.fmu._refinements.values()) > 1
-
-
-def test_an_accelerometer_that_nobody_reads_does_not_shorten_the_steps(kinds: Kinds) -> None:
-    model, found, refinements = kinds.fmu, [], []
-    for outputs in (OUTPUTS, OUTPUTS[:2]):
-        model.fmu._refinements.clear()
-        found.append(seen(model, RELEASED, outputs, SPRING, **at(1.0, 0.05))[:, :2])
-        refinements += [parts for parts, _ in model.fmu._refinements.values()]
-    alike(found[1], found[0], 5e-4)
-    assert refinements[1] < refinements[0]
+            assert (len(asked) == before) == (number > 0)
 
 
 def test_a_structure_without_a_force_is_refused(write_beam, tmp_path: Path) -> None:
