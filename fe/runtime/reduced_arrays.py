@@ -218,13 +218,17 @@ class OnlineArrays:
             number = 2 * number + (value >= split)
         stiffness, output, corrections, factor = self._anchors[number]
         outputs, functions, _ = output.shape
-        weights = solve((theta @ stiffness).reshape(outputs, functions, functions), output)
-        across = weights.transpose(0, 2, 1)
-        coefficients = np.empty((outputs, factor.shape[2], 1))
-        coefficients[:, 0] = 1.0
-        coefficients[:, 1:] = (-theta[:, np.newaxis] * across).reshape(outputs, -1, 1)
-        left = (factor @ coefficients)[:, :, 0]
-        found = (across @ corrections)[:, 0], np.sqrt(einsum("ij,ij->i", left, left))
+        if functions == 1:  # stacks of single numbers are dear
+            weights = output[:, 0] / (theta @ stiffness)[:, np.newaxis]
+            left = factor[:, :, 0] - weights * (factor[:, :, 1:] @ theta)
+            correction = weights * corrections[:, 0]
+        else:
+            weights = solve((theta @ stiffness).reshape(outputs, functions, functions), output)
+            across = weights.transpose(0, 2, 1)
+            coefficients = (-theta[:, np.newaxis] * across).reshape(outputs, -1, 1)
+            left = factor[:, :, 0] + (factor[:, :, 1:] @ coefficients)[:, :, 0]
+            correction = (across @ corrections)[:, 0]
+        found = correction, np.sqrt(einsum("ij,ij->i", left, left))
         self._last = key, found
         return found
 

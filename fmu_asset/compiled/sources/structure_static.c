@@ -191,6 +191,10 @@ static void combine_duals(structure_static *steady, size_t anchor) {
         structure_sum_terms(stiffness, m, model->dual_stiffness + place * model->terms * m * m, model->terms,
                             steady->theta);
         memcpy(weights, model->dual_output + place * m, m * sizeof *weights);
+        if (m == 1) { /* the most frequent case is much cheaper alone */
+            steady->dual_weights[o] = weights[0] / stiffness[0];
+            continue;
+        }
         structure_pad(factor, stiffness, m);
         /* positive definite where the stiffness is */
         (void)structure_cholesky(factor, m, stride, factor, NULL, 0, NULL);
