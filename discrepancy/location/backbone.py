@@ -10,7 +10,7 @@ modes, has no end effects, and has error bars from the noise.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import log, nan, sqrt
+from math import sqrt
 
 import numpy as np
 
@@ -152,48 +152,3 @@ def _credible(point: tuple[float, ...], start: float) -> bool:
     _, amplitude, amplitude_error, frequency, _, ratio, _ = point
     near = abs(2.0 * np.pi * frequency / start - 1.0) < _GREATEST_CHANGE
     return amplitude > SMALLEST_SIGNAL * amplitude_error and near and abs(ratio) < 0.5
-
-
-@dataclass(frozen=True)
-class BackboneValue:
-    """Frequency [Hz] and damping ratio [1] of a mode at one amplitude, with standard errors."""
-
-    amplitude: float
-    frequency: float
-    frequency_error: float
-    damping_ratio: float
-    damping_ratio_error: float
-    trial_count: int
-
-
-def at_amplitude(curves: Sequence[Backbone], amplitude: float, factor: float = 2.0) -> BackboneValue:
-    """Return the mean over trials of a mode's frequency and damping ratio at an amplitude.
-
-    In each trial a straight line in ln A, weighted by the errors, is laid through the points within `factor`
-    of the amplitude; overlapping windows count as independent. The error is that of the mean over trials by
-    their scatter, or of the line if there is one trial; nan where no trial has two such points.
-    """
-    values = []
-    for curve in curves:
-        x = np.log(curve.amplitude / amplitude)
-        near = np.abs(x) <= log(factor)
-        if near.sum() < 2:
-            continue
-        row = []
-        for value, error in (
-            (curve.frequency, curve.frequency_error),
-            (curve.damping_ratio, curve.damping_ratio_error),
-        ):
-            weight = 1.0 / np.clip(error[near], 1e-300, None)
-            design = np.column_stack([np.ones(int(near.sum())), x[near]]) * weight[:, np.newaxis]
-            found = np.linalg.lstsq(design, value[near] * weight, rcond=None)[0]
-            row += [float(found[0]), sqrt(float(np.linalg.pinv(design.T @ design)[0, 0]))]
-        values.append(row)
-    if not values:
-        return BackboneValue(amplitude, nan, nan, nan, nan, 0)
-    table = np.array(values)
-    found = table.mean(axis=0)
-    if len(table) > 1:
-        found[1::2] = table[:, ::2].std(axis=0, ddof=1) / sqrt(len(table))
-    frequency, frequency_error, ratio, ratio_error = found.tolist()
-    return BackboneValue(amplitude, frequency, frequency_error, ratio, ratio_error, len(table))
