@@ -77,6 +77,8 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pair]:
 @pytest.mark.parametrize("state", [{}, {"health": np.array([[0.2, 0.3]])}])
 def test_it_is_the_wing(pair: Pair, case: Trial, tolerance: float, state: dict[str, Any]) -> None:
     assert pair.share(case, **state) < tolerance
+    # With an effect of no size both are the same wing, where it rests in the same basis.
+    assert pair.share(case, PointMass(1e-9, 0.9), **state) < (1e-4 if case.is_dynamic else 1e-8)
 
 
 @pytest.mark.parametrize("item", [PointMass(0.3, 0.9), RootCompliance(3e-4)])

@@ -5,13 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.optimize import brentq
+from scipy.special import ellipk
 
 from fe.compilation import compiled_kernel
 from fe.runtime import patch
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, laws_of, static_solution
 from fe.runtime.motion_arrays import ModalMotion
-from fe.runtime.patch import BoucWen, MicroSlip, PowerDamping, PowerStiffness, Primitive
+from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
 from tests.fe.runtime.stepping import exact, second_order, simulate
 
 W = 2.0 * np.pi  # one second for a period
@@ -104,6 +106,76 @@ def test_friction_stops_a_mass_where_it_stops_to_the_fourth_order_of_the_step(
     )
     assert moved.v[-1, 0] == pytest.approx(0.0, abs=1e-12)
     assert moved.q[-1, 0] == pytest.approx(2.0 * ratio - 1.0, abs=0.03 * shift)
+
+
+def test_structural_damping_is_alike_at_all_amplitudes() -> None:
+    # k g |x| sgn v: each half cycle ends at (1 - g) / (1 + g) of the amplitude, exactly
+    g = 0.03
+    moved = ring(PowerDamping("mass", g * STIFFNESS, 0.0, 1.0, 1.0, 1.0), duration=6.0, count=6001)
+    turns = np.abs(moved.q[np.flatnonzero(np.diff(np.sign(moved.v[:, 0]))), 0])[1:]
+    # quarter cycles have frequencies w sqrt(1 +- g): outwards stiffer
+    np.testing.assert_allclose(turns[1:] / turns[:-1], np.sqrt((1 - g) / (1 + g)), atol=3e-4)
+
+
+# ---------------------------------------------------------------- stiffness
+
+
+def potential(law: Primitive, x: Any) -> Any:
+    """Energy of spring and law at a displacement."""
+    if isinstance(law, FreePlay):
+        inner = np.minimum(np.abs(x), law.half_width)
+        extra = -law.stiffness * (0.5 * inner**2 + law.half_width * (np.abs(x) - inner))
+    else:
+        size = law.coefficient * law.reference_displacement / (law.exponent + 1.0)
+        extra = size * np.abs(x / law.reference_displacement) ** (law.exponent + 1.0) * (law.side * x >= 0.0)
+    return 0.5 * STIFFNESS * x**2 + extra
+
+
+def first_integral(law: Primitive) -> float:
+    """Quarter [s] of the period of a law that is the same on both sides, released from 1 m."""
+    return float(quad(
+        lambda u: np.cos(u) / np.sqrt(2.0 * (potential(law, 1.0) - potential(law, np.sin(u)))),
+        0.0, np.pi / 2, points=[np.arcsin(0.2)], epsabs=1e-12, limit=400,
+    )[0])  # fmt: skip
+
+
+CRACK, PLAY = PowerStiffness("mass", -0.4 * STIFFNESS, 1.0, -1, 1.0), FreePlay("mass", 0.5 * STIFFNESS, 0.2)
+SOFT = 1.0 / np.sqrt(0.6)
+
+
+@pytest.mark.parametrize(
+    ("law", "period", "least", "tolerance"),
+    [
+        *(
+            (PowerStiffness("mass", share * STIFFNESS, 3.0, 0, 1.0),
+             4.0 * ellipk(-share / (2.0 + share)) / (W * np.sqrt(1.0 + share / 2.0)), -1.0, 2e-6)
+            for share in (-0.3, 0.05, 0.3, 2.0)
+        ),
+        (CRACK, (1.0 + SOFT) * np.pi / W, -SOFT, 2e-6),  # half a period of each spring
+        (PLAY, 4.0 * first_integral(PLAY), -1.0, 1e-5),
+    ],
+)  # fmt: skip
+def test_a_nonlinear_spring_has_its_period(
+    law: Primitive, period: float, least: float, tolerance: float
+) -> None:
+    x = ring(law, duration=20.0, count=4001, substeps=40).q[:, 0]
+    times = []  # of rising zero crossings, from the cubic through four samples
+    for i in np.flatnonzero((x[:-1] < 0.0) & (x[1:] >= 0.0)):
+        cubic = np.polyfit(np.arange(-1.0, 3.0), x[i - 1 : i + 3], 3)
+        times.append((i + brentq(lambda u, c=cubic: np.polyval(c, u), 0.0, 1.0)) * 0.005)
+    assert np.mean(np.diff(times)) == pytest.approx(period, rel=tolerance)
+    assert x.min() == pytest.approx(least, rel=1e-4)
+    if law is not CRACK:
+        assert 4.0 * first_integral(law) == pytest.approx(period, rel=1e-10)
+
+
+@pytest.mark.parametrize("law", [PowerStiffness("mass", 0.2 * STIFFNESS, 3.0, 0, 1.0), CRACK, PLAY])
+def test_energy_does_not_drift_without_damping(law: Primitive) -> None:
+    moved = ring(law, duration=200.0, count=4001)
+    energies = 0.5 * moved.v[:, 0] ** 2 + potential(law, moved.q[:, 0])
+    half = len(energies) // 2
+    assert np.ptp(energies) < 2e-3 * energies[0]
+    assert np.mean(energies[half:]) == pytest.approx(np.mean(energies[:half]), rel=1e-4)
 
 
 # ---------------------------------------------------------------- hysteresis
