@@ -122,7 +122,7 @@ def test_a_calibration_of_the_other_kind_is_not_overwritten(lab, make_calibratio
     [
         ("[[parameter]]", "[[place]]", "'place[1].high' are not keys of a lumped model"),
         ('unit = "mm"', 'unit = "m"', "1000"),
-        ("mean = 1.0", "mean = 1.6", "a factor needs 0 < low <= mean <= high"),
+        ("mean = 1.0", "mean = 1.6", "the mean 1.6 is not between low 0.5 and high 1.5"),
         ('unit = "mm"', 'unit = "N"', "unit"),
         (MODEL[MODEL.index("[[parameter]]") :], "", "has no parameter to calibrate: it lists none"),
         (".", ",", "line 2: 4 cells came, and the header has 2 columns. A decimal comma makes two cells"),
