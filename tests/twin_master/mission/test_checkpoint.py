@@ -12,7 +12,14 @@ from tests.twin_master.runs import journal, of_library
 from twin_master.assets.strain_library_source import StrainLibrarySource
 from twin_master.errors import NotResumableError
 from twin_master.mission import loop
-from twin_master.mission.journal import JOURNAL_NAME, JournalFile, reading_of, turn_record
+from twin_master.mission.journal import (
+    JOURNAL_NAME,
+    JournalFile,
+    line_of,
+    reading_of,
+    turn_record,
+    whole_record,
+)
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import Plant
 from twin_master.mission.turns import Happened, History, Reading, Turn
@@ -114,6 +121,17 @@ def test_a_changed_or_foreign_journal_is_refused(known, tmp_path):
         path.write_bytes(damaged)
         with pytest.raises(NotResumableError, match=rf"line {line} of .*changed or is damaged.*--replace"):
             fly(known, tmp_path, 3)
+
+
+def test_another_decision_between_others_is_refused(known, tmp_path):
+    fly(known, tmp_path, 3)
+    path = tmp_path / JOURNAL_NAME
+    lines = path.read_bytes().splitlines(keepends=True)
+    record = whole_record(lines[2])
+    lines[2] = line_of(record | {"next_control": 1 - record["next_control"]})
+    path.write_bytes(b"".join(lines))
+    with pytest.raises(NotResumableError, match=r"decided otherwise after turn 1 .*--replace"):
+        fly(known, tmp_path, 3)
 
 
 def test_large_states_are_kept_less_often_and_their_turns_flown_again(known, tmp_path, monkeypatch):
