@@ -65,7 +65,7 @@ def judged_in_part(problem: Problem, found: Search, first: Verdict) -> Outcome:
     Outcome
         As `naming.name` returns it; the fit is that of the best hypothesis for an unexplained gap too.
     """
-    if found.force is not None:
+    if found.force is not None and found.forces:
         return _verdict_of(ByForce(problem, found, found.force), first)
     weigh_with_remainders(found)
     court = ByReadings(problem, found)
