@@ -94,8 +94,6 @@ class SearchSettings:
     """Gain of log evidence from which a neighbour is the better optimum."""
     rounds: int = 5
     """How often one neighbour leads to the next."""
-    shape_iterations: int = 40
-    """Steps of a fit with a free shape, whose valleys are long."""
 
     # ---------------------------------------------------------------- far from the truth
     far: float = 1.5

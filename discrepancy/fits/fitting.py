@@ -90,7 +90,7 @@ def fit(
     start: Point,
     *,
     known: tuple[Linearisation, ...] | None = None,
-    iterations: int = 20,
+    iterations: int = 60,
     evidence: bool = True,
     local_only: bool = False,
     give_up: float | None = None,
