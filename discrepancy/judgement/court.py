@@ -161,9 +161,10 @@ class Court:
         gates: list[Gate] = [consistency_gate(self.problem, item), held_out_gate(self.residuals(item))]
         return next((gate.reason for gate in gates if gate.passed is False), "")
 
-    def fitted(self, item: CandidateFit) -> CandidateFit:
+    def fitted(self, item: Any) -> CandidateFit:
         """Return the simulation that stands for a hypothesis: itself."""
-        return item
+        found: CandidateFit = item
+        return found
 
     def left(self, item: Any, share: Share) -> str:
         """Return in words what is left beside a hypothesis."""
