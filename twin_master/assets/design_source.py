@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.wing.design import WingDesign, load_design, wing_structure
 from fmu_asset.door.binding import Binding
+from reporting.arrays import Float
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.assets.asset_source import (
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from calibration.result.record import Calibration
     from fmu_asset.packing.patch_file import PatchFile
 
-Float = NDArray[np.float64]
 
 DESIGN_COPY = "asset/design.toml"
 FLOWN_DESIGN_COPY = "asset/flown_design.toml"

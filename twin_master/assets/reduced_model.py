@@ -4,10 +4,10 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fmu_asset.door.binding import Binding
+from reporting.arrays import Float
 from reporting.progress import Progress
 from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, InnerTruth, StatelessAsset
 from twin_master.assets.parameter import ParameterDraws
@@ -22,8 +22,6 @@ from twin_master.seeds import seed_sequence
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
     from twin_master.assets.fmu_source import Session
-
-Float = NDArray[np.float64]
 
 
 class ReducedModelSource(AssetSource):
