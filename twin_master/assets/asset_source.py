@@ -8,14 +8,16 @@ names end in `_source`: each holds the tables of its kinds and what is made of t
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmu_asset.errors import FmuCallError
+from reporting.arrays import Float
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
@@ -27,8 +29,6 @@ from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -117,6 +117,19 @@ def asked_table(
     settings = list(controls)
     rows = (dict(zip(names, levels, strict=True)) for levels in states.tolist())
     return np.array([[ask(values, health) for values in settings] for health in rows])
+
+
+def shown_without_noise(scenario: Scenario, states: Float, asset: Asset) -> Float:
+    """Ask an asset as it is in all states (S, F) and controls: (S, U, G), NaN where it refuses."""
+    start, controls = asset.save_state(), [control.values for control in scenario.control]
+
+    def ask(control: Mapping[str, float], health: Mapping[str, float]) -> Float:
+        asset.restore_state(start)  # an asset with hidden effects may remember
+        with suppress(FmuCallError):
+            return asset.step(control, health).values
+        return np.full(scenario.observation.count, np.nan)
+
+    return asked_table(scenario.state_names, states, controls, ask)
 
 
 @dataclass(frozen=True)

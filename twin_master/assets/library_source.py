@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fmu_asset.door.binding import load_binding
+from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
@@ -34,7 +34,6 @@ from twin_master.scenario.schema import Scenario
 if TYPE_CHECKING:
     import xarray as xr
 
-Float = NDArray[np.float64]
 
 OBSERVATIONS_COPY = "asset/observation_library.nc"
 KIND = "uav-twin observation library"

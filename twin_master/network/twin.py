@@ -1,7 +1,7 @@
 """The twin: it is shown observations and the control in force, and says what to do; it holds no truth."""
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -230,11 +230,7 @@ class Twin:
         """
         given = np.array(observation, dtype=np.float64)
         index = self._proposed if control is None else self._index_of(control)
-        before = self._seen[-1].estimate if self._seen else None
-        estimate = self._estimate(before, given, index, self._turns)
-        self._seen.append(_Seen(given, estimate.carried))
-        self._turns += 1
-        return self._decided(estimate)
+        return self._assimilated(len(self._seen), [(given, index)])
 
     def revise(self, turn: int, observation: ArrayLike, control: int | str | None = None) -> TwinTurn:
         """Put an observation that came late in its place, and filter anew from there.
@@ -267,21 +263,25 @@ class Twin:
                 f"turn {turn} cannot be revised: the twin keeps the turns from {self.first_kept} on and has "
                 f"seen {self._turns}"
             )
-        offset = self._turns - len(self._seen)
-        at = turn - offset
+        at = turn - self._turns + len(self._seen)
         index = self._seen[at].estimate.control_index if control is None else self._index_of(control)
         rows = [(np.array(observation, dtype=np.float64), index)]
         rows += [(seen.observation, seen.estimate.control_index) for seen in list(self._seen)[at + 1 :]]
+        return self._assimilated(at, rows)
+
+    def _assimilated(self, at: int, rows: Sequence[tuple[Float, int]]) -> TwinTurn:
+        """Filter observations under their controls from a place of what is kept on, and decide."""
+        first, anew, notices = self._turns - len(self._seen) + at, list[_Seen](), list[Notice]()
         before = self._seen[at - 1].estimate if at else None
-        anew: list[_Seen] = []
-        notices: list[Notice] = []
-        for number, (given, in_force) in enumerate(rows, start=turn):
+        for number, (given, in_force) in enumerate(rows, start=first):
             estimate = self._estimate(before, given, in_force, number)
             before = estimate.carried
             anew.append(_Seen(given, before))
             notices += estimate.notices
-        for position, seen in enumerate(anew, start=at):
-            self._seen[position] = seen
+        for _ in range(len(self._seen) - at):
+            self._seen.pop()
+        self._seen.extend(anew)
+        self._turns = first + len(rows)
         return self._decided(replace(estimate, notices=tuple(notices)))
 
     def observed(self, turn: int) -> Float:

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from twin_master.errors import RunFolderError
@@ -28,8 +28,6 @@ from twin_master.network.inference import known_control, predict
 from twin_master.run_folder import PICTURE, VERDICT, read_config
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
-
-Float = NDArray[np.float64]
 
 TURNS_AT_ONCE = 200
 """Turns that are read before the viewers are answered again."""

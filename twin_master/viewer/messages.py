@@ -9,14 +9,12 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from reporting.arrays import Float
 from twin_master.report.view import NORMAL_95
 from twin_master.viewer.flight import BegunAnewError, Belief, Flight
 from twin_master.viewer.scene import LATEST, WINDOW, Scene
-
-Float = NDArray[np.float64]
 
 
 class Request(BaseModel, frozen=True, extra="forbid", strict=True):

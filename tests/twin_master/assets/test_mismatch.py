@@ -13,6 +13,7 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.misfit import find_misfit
 from benchmarks.seeds import fly_seeds
 from calibration.result.file import load_calibration, save_calibration
 from fe.reduction.model_cache import reduced_model
@@ -22,7 +23,6 @@ from tests.command_line import refused
 from tests.conftest import synthetic_library
 from tests.twin_master.runs import text_of, written
 from twin_master.assets.asset_source import AssetReading, PairedSource, StatelessAsset
-from twin_master.assets.mismatch import find_misfit
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
