@@ -1,7 +1,6 @@
 """Lumped models against matrices inverted by hand and general integrators of their equations of motion."""
 
 import tomllib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ from hypothesis import strategies as st
 from scipy.linalg import eigh
 
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
-from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course
 from discrepancy.models.interface import Conditions
 from discrepancy.models.linear_system import LinearSystem
@@ -22,11 +20,11 @@ from discrepancy.models.system_model import State
 from fe.runtime import patch as patches
 from fe.runtime.motion import NO_LAWS
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
-from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
+from tests.discrepancy.asking import FloatArray, integrated, seen
 from tests.discrepancy.asking import trial as asked
 from tests.discrepancy.rigs import model_of
 from tests.fe.runtime.stepping import exact, second_order
-from tests.refusals import Inputs, refused
+from tests.refusals import Inputs
 
 pytestmark = pytest.mark.xdist_group("compiling")
 
@@ -256,33 +254,10 @@ def test_leaving_samples_out_changes_nothing_at_the_others(chain, kind: TrialKin
 # ---------------------------------------------------------------- what it says of itself
 
 
-def test_scales_are_those_of_the_campaign(chain: LumpedModel) -> None:
-    found = chain.scales(campaign(static([1.0, -6.0]), ringdown(start=100.0), temperature=20.0))
-    wanted = {
-        "length": 0.6, "tip_stiffness": 1.0 / END[2], "modal_mass": 1.0 / SHAPES[2, 0] ** 2,
-        "angular_frequency": np.sqrt(SQUARE[0]), "force": 6.0, "duration": 3.99, "campaign_time": 103.99,
-    }  # fmt: skip
-    assert {name: getattr(found, name) for name in wanted} == pytest.approx(wanted)
-    joint = found.ports["joint"]
-    assert joint.displacement == pytest.approx(max(0.02 * abs(JOINT @ END / END[2]), 6.0 * abs(JOINT @ END)))
-    assert joint.stiffness == pytest.approx(SQUARE[0] / (JOINT @ SHAPES[:, 0]) ** 2)
-
-
 def test_the_default_place_of_a_load_is_the_one_input() -> None:
     what = static([1974.0], load_place="tip_load")
     found = shown(LumpedModel.load("single_mass_rig"), what, outputs={"displacement": Quantity.DISPLACEMENT})
     assert found[0, 0] == pytest.approx(1.0)
-
-
-ROWS = [*(("two_masses", *row) for row in INPUTS.refused("two_masses")), *INPUTS.refused("rigs")]
-
-
-@pytest.mark.parametrize(("name", "old", "new", "sentence"), ROWS)
-def test_a_wrong_file_is_refused_in_one_sentence(tmp_path: Path, name, old, new, sentence: str) -> None:
-    file = tmp_path / "model.toml"
-    file.write_text(INPUTS.text(f"{name}.toml", (old, new)))
-    with refused(ModelError, f"model.toml.*({sentence})"):
-        LumpedModel.load(file)
 
 
 SPRINGS = "stiffness = [[3.0, -1.0], [-1.0, 1.0]]\n"
@@ -316,15 +291,3 @@ def test_with_one_unknown_a_number_is_a_matrix_and_a_vector(damping: str, matrix
     rig, pulled = model_of(text.replace("ROW", vector.format(1.0))), static([1.65], load_place="mass")
     found = seen(rig, pulled, {"x": Quantity.DISPLACEMENT})
     assert found[0, 0] == pytest.approx(1.65 / 825.0, rel=1e-12)
-
-
-def test_a_missing_or_broken_file_is_refused(tmp_path: Path) -> None:
-    broken = tmp_path / "broken.toml"
-    broken.write_text("format = ")
-    for file, sentence in (
-        ("four_mass_chain", "shipped are single_mass_rig, three_mass_chain"),
-        (tmp_path / "none.toml", "cannot be read"),
-        (broken, "not valid TOML"),
-    ):
-        with pytest.raises(ModelError, match=sentence):
-            LumpedModel.load(file)

@@ -22,7 +22,7 @@ def simulate(
     q: FloatArray,
     v: FloatArray,
     force: FloatArray,
-    interval: float,
+    interval: float | FloatArray,
     shape: FloatArray | float = 0.0,
     constant: FloatArray | float = 0.0,
     memory: FloatArray | None = None,
@@ -31,8 +31,8 @@ def simulate(
     substeps: int | None = None,
     kernel: Kernel | None = None,
 ) -> ModalMotion:
-    """Return the motion at samples (N,) under modal forces shape f(t) + constant."""
-    stamps = interval * np.arange(len(force))
+    """Return the motion at samples (N,) under forces shape f(t) + constant; all intervals, or each."""
+    stamps = np.append(0.0, np.cumsum(np.broadcast_to(interval, len(force) - 1)))
     boundaries = divided(system, NO_LAWS if substeps else laws, stamps, refinement * (substeps or 1))
     modal = np.outer(np.interp(boundaries.time, stamps, force), np.broadcast_to(shape, q.shape)) + constant
     feed = np.zeros((len(boundaries.time), len(laws)))
