@@ -20,6 +20,7 @@ from twin_master.fleet.store import has_flown, open_group
 from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -146,8 +147,7 @@ def _lessons(folder: Path, record: dict[str, Any]) -> Iterator[_Lessons]:
 
     if len(worsening.names) > max(POINTS):
         raise FleetError(
-            f"group {record['name']} has {len(worsening.names)} probabilities to worsen, and {max(POINTS)} "
-            "are learnt together at most: fly fewer controls, or let factors share a probability."
+            said("fleet.probabilities", group=record["name"], count=len(worsening.names), most=max(POINTS))
         )
     explained = [np.isfinite(own[:, 0]) for own in evidence(worsening.assumed.clip(1e-3, 0.9)[None])]
 
@@ -159,10 +159,7 @@ def _lessons(folder: Path, record: dict[str, Any]) -> Iterator[_Lessons]:
     learnt = np.array([marginal.mean for marginal in grid.marginals])
     twins = sum(int(kept.sum()) for kept in explained)
     if not twins:
-        raise FleetError(
-            f"no state of the twins explains what was observed in group {record['name']}: nothing can be "
-            "learnt of it; look at its model and its noise."
-        )
+        raise FleetError(said("fleet.unexplained", group=record["name"]))
     figures: dict[str, Any] = {"noise_factor": noise.figures}
     if nodes is not None:
         at_nodes = _noisier(models[0], 1.0, nodes)
