@@ -122,10 +122,7 @@ class Teller:
         return self._printed(believed, observed) | {
             "control": [turn["control_index"] for turn in seen],
             "notices": [
-                [
-                    notice["sentence"].replace(" DIR", f" {flight.folder}")
-                    for notice in turn.get("notices", ())
-                ]
+                [notice["sentence"].replace(" DIR", folder) for notice in turn.get("notices", ())]
                 for turn in seen
             ],
             "learnt": [turn.get("learnt", {}) for turn in seen],
