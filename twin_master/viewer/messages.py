@@ -42,17 +42,6 @@ class Request(BaseModel, frozen=True, extra="forbid", strict=True):
     count: int
 
 
-def parse_request(text: str | bytes) -> Request:
-    """Return what a page asked for.
-
-    Raises
-    ------
-    ValueError
-        It is no such request.
-    """
-    return Request.model_validate_json(text)
-
-
 class Teller:
     """Answers of one flight, for any number of viewers.
 
