@@ -107,13 +107,11 @@ class FmuRuns:
                 observation={"outputs": self._observed()},
             )
             self.asset = FmiAsset(self._path, self._binding, isolated=description.isolated)
-            tables = (description.static, description.motion)
-            self.asset.check_parameters(
-                {self.parameter(n): v for item in tables for n, v in item.parameters.items()}
-            )
-            self.asset.check_parameters(
-                {f"effect.{name}.active": 1.0 for name in description.effects.values()}
-            )
+            for (
+                item
+            ) in description.parameter:  # beyond its own range it refuses, and a posterior is cut there
+                for end in (item.low, item.high):
+                    self.asset.check_parameters({self.parameter(item.variable): end})
         self._none = dict.fromkeys(self._binding.load, 0.0)
 
     @contextmanager
@@ -155,14 +153,20 @@ class FmuRuns:
 
     def _parameters(self, known: Mapping[str, Parameter]) -> dict[str, Parameter]:
         """Return the parameters that are not known so: a value or range in another unit is none of theirs."""
-        way, units = self.description.release, dict[str | None, str]()
-        units |= {item.variable: item.unit for item in self.description.parameter}
-        units |= {way.displacement: "m", way.velocity: "m/s"} if way is not None else {}
-        found = ((self.parameter(name), unit) for name, unit in units.items() if name is not None)
+        given, way = self.description, self.description.release
+        units: dict[str | None, str | None] = {
+            **dict.fromkeys((*given.static.parameters, *given.motion.parameters)),  # in their own
+            **{f"effect.{identifier}.active": None for identifier in given.effects.values()},
+            **{item.variable: item.unit for item in given.parameter},
+            **({way.displacement: "m", way.velocity: "m/s"} if way is not None else {}),
+        }
+        named = ((self.parameter(name), unit) for name, unit in units.items() if name is not None)
         return {
-            key: Parameter(variable=known[key].variable if key in known else key, unit=unit)
-            for key, unit in found
-            if key not in known or known[key].unit != unit
+            key: Parameter(
+                variable=known[key].variable if key in known else key, unit=unit or self._own_unit(key)
+            )
+            for key, unit in named
+            if key not in known or unit not in (None, known[key].unit)
         }
 
     def _observed(self) -> Vector:
