@@ -52,7 +52,7 @@ class FmuModel(DescribedModel):
         flies = description.inputs.load_factor is not None
         self.kinds = frozenset(TrialKind) - {TrialKind.DRIVEN, *(() if flies else (TrialKind.FLIGHT,))}
         self._keys = [fmu.parameter(item.variable) for item in description.parameter]
-        self._forces = {place: fmu.variable(name) for place, name in description.inputs.forces.items()}
+        self._forces = {place: fmu.variable(name) for place, name in description.inputs.force.items()}
         self._inputs = {item.name: fmu.variable(item.variable) for item in description.input}
         self.load_places = tuple(self._forces)
         limits = (fmu.asset.input_range("load", name)[1] for name in self._forces.values())
@@ -75,7 +75,7 @@ class FmuModel(DescribedModel):
         if primitive in SENSORS or primitive.kind in effects:
             return True
         if primitive in (LoadGain, LoadPlace):
-            return bool(inputs.forces) and (primitive is LoadGain or inputs.bending_moment is not None)
+            return bool(inputs.force) and (primitive is LoadGain or inputs.bending_moment is not None)
         return issubclass(primitive, PortForce) and bool(self.ports())
 
     def scales(self, campaign: Campaign) -> Scales:

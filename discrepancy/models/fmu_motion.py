@@ -73,8 +73,8 @@ class FmuMotion(FmuPace):
             stamps = case.step * np.arange(ceil(end / case.step - 1e-6) + 1.0)
         loads = [] if case.course is None else [(case.lever, case.course)]
         states, forces = system.motion(
-            Acting(trial.time, stamps, loads), self._start(system, case, amounts), still[seen], laws, seen,
-            numbers, refinement,
+            Acting(trial.time, stamps, loads), self._start(system, case, amounts), laws, seen, numbers,
+            still[seen], refinement,
         )  # fmt: skip
         rows, at_once = system.rows(columns, orders)
         values = states @ rows.T + forces @ at_once.T + np.where(derived, 0.0, still[columns])
@@ -99,8 +99,7 @@ class FmuMotion(FmuPace):
 
         def moved(parts: int) -> FloatArray:
             step = fixed or whole / parts
-            finer = case._replace(step=step, record=ceil(end / step - 1e-6))
-            run = self._run(finer, amounts)
+            run = self._run(case._replace(step=step, record=ceil(end / step - 1e-6)), amounts)
             if len(laws):
                 with np.errstate(all="ignore"):  # an unstable coupling grows beyond all numbers
                     return self._beside(run, laws)
@@ -108,8 +107,10 @@ class FmuMotion(FmuPace):
             return self.remembered((*run[:3], *run.begin.items(), *given), lambda: self.followed(run))
 
         if len(laws) and fixed is None:
-            watched = [*columns, *self.x]
-            parts = self._parts_for(laws, trial, watched, whole, lambda parts: moved(parts)[::parts, watched])
+            # an accelerometer that nobody reads would ask for steps many times smaller
+            watched = sorted({*columns, *self.x})
+            key = (*watched, trial.kind, trial.interval)
+            parts = self._parts_for(laws, key, whole, lambda parts: moved(parts)[::parts, watched])
         parts *= refinement
         return moved(parts)[:, columns], fixed or whole / parts
 
@@ -168,15 +169,11 @@ class FmuMotion(FmuPace):
                 values.append(asset.step(load=dict(zip(courses, row.tolist(), strict=True))).values)
         return np.array(values)
 
-    def _parts_for(
-        self, laws: Laws, trial: Trial, watched: Sequence[int], step: float,
-        moved: Callable[[int], FloatArray],
-    ) -> int:  # fmt: skip
+    def _parts_for(self, laws: Laws, key: Hashable, step: float, moved: Callable[[int], FloatArray]) -> int:
         """Return into how many parts steps [s] are divided for laws.
 
-        Steps are halved until that changes nothing that is watched by more than `CONVERGED` of its largest
-        motion (rms); what was enough is kept for laws of this kind up to twice as strong. An accelerometer
-        that nobody reads would ask for steps many times smaller.
+        Steps are halved until that changes nothing that moves by more than `CONVERGED` of its largest motion
+        (rms); what was enough is kept for laws of this kind up to twice as strong.
 
         Raises
         ------
@@ -185,23 +182,22 @@ class FmuMotion(FmuPace):
         """
         strength = float(np.max(np.abs(laws.values[:, 0])))
         exponents = np.round(np.clip(laws.values[:, 1:3], -9.0, 9.0), 1)  # roughness asks for short steps
-        kinds = laws.ports, laws.numbers.tobytes(), exponents.tobytes()
-        key = (tuple(sorted(set(watched))), trial.kind, trial.interval, *kinds)
+        key = (key, laws.ports, laws.numbers.tobytes(), exponents.tobytes())
         parts, tried = self._refinements.get(key, (1, 0.0))
         if strength <= 2.0 * tried:
             return parts
-        coarse = moved(parts)
+        fine = moved(parts)
         while parts <= MOST_REFINEMENT:
-            fine = moved(2 * parts)
+            coarse, fine = fine, moved(2 * parts)
             rows = min(len(fine), len(coarse))
             with np.errstate(all="ignore"):
-                size = np.max(np.abs(fine[:rows] - fine[:rows].mean(axis=0)), axis=0)
+                size = np.max(np.abs(fine - fine.mean(axis=0)), axis=0)
                 difference = np.sqrt(np.mean((coarse[:rows] - fine[:rows]) ** 2, axis=0))
-                change = float(np.max(difference / np.where(size > 0.0, size, np.inf)))
-            if np.isfinite(difference).all() and change <= CONVERGED:
+                change = float(np.max(difference / np.where(size == 0.0, np.inf, size)))
+            if change <= CONVERGED:
                 self._refinements[key] = (parts, strength)
                 return parts
-            parts, coarse = 2 * parts, fine
+            parts *= 2
         raise ModelError(
             f"The internal force at {', '.join(dict.fromkeys(laws.ports))} does not converge in the "
             f"co-simulation with the FMU model {self.description.name!r}: halving steps of "

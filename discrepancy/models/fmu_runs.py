@@ -135,7 +135,7 @@ class FmuRuns:
     def _inputs(self) -> dict[str, Input]:
         given, wanted = self.description, self.description.inputs
         units: dict[str | None, str] = {
-            **dict.fromkeys(wanted.forces.values(), "N"),
+            **dict.fromkeys(wanted.force.values(), "N"),
             **dict.fromkeys((wanted.load_factor, *wanted.regions.values()), "1"),
             wanted.temperature: "K" if wanted.temperature_reference is None else "degC",
             wanted.bending_moment: "N.m", wanted.torque: "N.m",
