@@ -169,9 +169,8 @@ class FmuModel(DescribedModel):
         elif not given or np.any(trial.force):
             acting = self._load(patch).changed(trial.force, trial.force)
             given |= {name: acting * lever for name, lever in self._levers(trial, patch).items()}
-        loads = [dict(zip(given, row, strict=True)) for row in np.array([*given.values()]).T.tolist()]
-        states = [self._state(trial, conditions, patch, row) for row in range(len(loads))]
-        return self.fmu.at_rest(states, loads, self._laws(patch), trial.name)
+        states = [self._state(trial, conditions, patch, row) for row in range(len(trial.time))]
+        return self.fmu.at_rest(states, given, self._laws(patch), trial.name)
 
     # ------------------------------------------------------------ ports
 

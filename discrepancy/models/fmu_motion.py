@@ -207,46 +207,49 @@ class FmuMotion(FmuPace):
 
     # ------------------------------------------------------------ rest
 
-    def rest(self, states: Sequence[State], loads: Sequence[Mapping[str, float]]) -> FloatArray:
-        """Return the outputs (L, C) at rest in states that differ in inputs, under more on some of them.
+    def rest(self, states: Sequence[State], loads: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the outputs (L, C) at rest in states that differ in inputs, under more (L,) on some of them.
 
         Where the FMU has to come to rest and is linear, what loads add is that of its system.
         """
         if not self.description.static.settle:
             return self.resting(states, loads)
-        return np.array([self._rested(*pair) for pair in zip(states, loads, strict=True)])
+        names = tuple(sorted(name for name, values in loads.items() if np.any(values)))
+        rows = np.array([loads[name] for name in names]).reshape(-1, len(states)).T
+        order = np.argsort(-np.abs(rows).sum(axis=1), kind="stable")  # the largest load says whether it is
+        found = {row: self._rested(states[row], rows[row], names) for row in order.tolist()}
+        return np.array([found[row] for row in range(len(states))])
 
-    def _rested(self, state: State, loads: Mapping[str, float]) -> FloatArray:
-        """Return the outputs (C,) when a motion has come to rest."""
-        acting = {name: value for name, value in sorted(loads.items()) if value != 0.0}
-        names, amounts = tuple(acting), np.array([*acting.values()])
+    def _rested(self, state: State, amounts: FloatArray, names: tuple[str, ...]) -> FloatArray:
+        """Return the outputs (C,) when a motion has come to rest under amounts (E,) on some inputs."""
 
-        def asked(loads: Mapping[str, float]) -> FloatArray:
-            key = (state, *loads.items(), "rest")
-            return self.remembered(key, lambda: self.resting([state], [loads])[0])
+        def asked(amounts: FloatArray) -> FloatArray:
+            loads, key = dict(zip(names, amounts[:, None], strict=True)), (state, names, amounts.tobytes())
+            return self.remembered(key, lambda: self.resting([state], loads)[0])
 
         case = Case(state, self.description.static.step, RECORD, names, at_rest=True)
         if self._adds.get(names) is False or (system := self.system(case)) is None:
-            return asked(acting)
-        zero = asked({})
-        moved = system.gain @ amounts
+            return asked(amounts)
+        zero, moved = asked(0.0 * amounts), system.gain @ amounts
         if names not in self._adds:
             passing = [np.max(np.abs(self._answer(case, name)), axis=0) for name in names]
             allowed = LINEAR * (np.abs(moved) + np.abs(amounts) @ passing)
-            self._adds[names] = bool(np.all(np.abs(asked(acting) - zero - moved) <= allowed))
-        return np.asarray(zero + moved) if self._adds[names] else asked(acting)
+            self._adds[names] = bool(np.all(np.abs(asked(amounts) - zero - moved) <= allowed))
+        return np.asarray(zero + moved) if self._adds[names] else asked(amounts)
 
     def flexibility(self, state: State) -> FloatArray:
         """Return the displacements (P, P) of ports at rest under unit forces at each."""
         if not self.ports:  # loads of zero may be outside of what the FMU takes
             return np.zeros((0, 0))
-        sizes = np.array([self.size(name) for name in self.forces])
-        loads = [{}, *({name: size} for name, size in zip(self.forces, sizes.tolist(), strict=True))]
-        found = self.rest([state] * len(loads), loads)[:, self.x]
-        return np.asarray((found[1:] - found[0]).T / sizes)
+        pushes = np.diag([self.size(name) for name in self.forces])
+        loads = dict.fromkeys(self.forces, np.zeros(len(pushes) + 1))
+        for name, push in zip(self.forces, pushes, strict=True):
+            loads[name] = loads[name] + np.append(0.0, push)
+        found = self.rest([state] * (len(pushes) + 1), loads)[:, self.x]
+        return np.asarray((found[1:] - found[0]).T / np.diag(pushes))
 
     def at_rest(
-        self, states: Sequence[State], loads: Sequence[Mapping[str, float]], laws: Laws, trial: str
+        self, states: Sequence[State], loads: Mapping[str, FloatArray], laws: Laws, trial: str
     ) -> FloatArray:
         """Return the outputs (L, C) where laws follow the load path; the FMU itself is asked at the end.
 
@@ -258,11 +261,11 @@ class FmuMotion(FmuPace):
         try:
             values = self.rest(states, loads)
         except ModelError:
-            for number, (state, load) in enumerate(zip(states, loads, strict=True), start=1):
+            for row, state in enumerate(states):
                 try:
-                    self.rest([state], [load])
+                    self.rest([state], {name: values[row : row + 1] for name, values in loads.items()})
                 except ModelError as own:
-                    raise ModelError(f"The trial {trial!r}, row {number} of its table: {own}") from own
+                    raise ModelError(f"The trial {trial!r}, row {row + 1} of its table: {own}") from own
             raise
         if not len(laws):
             return values
@@ -271,10 +274,9 @@ class FmuMotion(FmuPace):
         linear = values[:, columns]
         for _ in range(STATIC_ITERATIONS):
             forces = static_solution(laws, linear, compliance, kernel=compiled_kernel()).forces
-            given = [dict(load) for load in loads]
-            for row, pulls in zip(given, forces.tolist(), strict=True):
-                for port, pull in zip(at, pulls, strict=True):
-                    row[self.forces[port]] = row.get(self.forces[port], 0.0) - pull
+            given = dict(loads)
+            for port, pull in zip(at, forces.T, strict=True):
+                given[self.forces[port]] = given.get(self.forces[port], 0.0) - pull
             values = self.rest(states, given)
             # where the FMU is not linear, the law is solved again about the points that were reached
             again = values[:, columns] + forces @ compliance.T

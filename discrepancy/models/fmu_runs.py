@@ -271,15 +271,17 @@ class FmuRuns:
         with self.refusals():
             return np.vstack((first, asset.simulate(load=courses, steps=run.steps).values))
 
-    def resting(self, states: Sequence[State], loads: Sequence[Mapping[str, float]]) -> FloatArray:
-        """Return the outputs (L, C) at rest in states that differ in inputs, under more on some of them."""
-        step, pairs = self.description.static.step, list(zip(states, loads, strict=True))
+    def resting(self, states: Sequence[State], loads: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the outputs (L, C) at rest in states that differ in inputs, under more (L,) on some."""
+        step = self.description.static.step
+        more = [{name: float(values[row]) for name, values in loads.items()} for row in range(len(states))]
         with self.refusals():
             if self.description.static.settle:
-                return np.array([self._settled(self._opened(state, step, load)) for state, load in pairs])
-            rows = [self.inputs(*pair) for pair in pairs]
+                pairs = zip(states, more, strict=True)
+                return np.array([self._settled(self._opened(state, step, own)) for state, own in pairs])
+            rows = [self.inputs(*pair) for pair in zip(states, more, strict=True)]
             courses = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-            return self._opened(states[0], step, loads[0]).simulate(load=courses, steps=len(rows)).values
+            return self._opened(states[0], step, more[0]).simulate(load=courses, steps=len(rows)).values
 
     def size(self, name: str) -> float:
         """Return a force that an input can have, both signs."""
