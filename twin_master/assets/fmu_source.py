@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from fmu_asset.archive.fmu_file import packed_design_hash
@@ -14,6 +13,7 @@ from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError
 from fmu_asset.folders import scratch_folder
+from reporting.arrays import Float
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.assets.asset_source import (
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     Session = FmiAsset | CoupledAsset
     """One FMU, or several as one, with the same face."""
 
-Float = NDArray[np.float64]
 
 FMU_COPY = "asset/asset.fmu"
 LARGEST_SEED = 2**31 - 1
@@ -295,7 +294,6 @@ class FmuSource(AssetSource):
         That holds for assets without memory.
         """
         scenario, load, rows = self._scenario, self.section.load, []
-        controls = [control.values for control in scenario.control]
         with self._session(self.binding(), self.parameters()) as session:
             chosen = self._observed(session.binding)
             for row, value in enumerate(draws.values):
@@ -303,9 +301,8 @@ class FmuSource(AssetSource):
                 session.reset({**self.parameters(), **others, draws.name: float(value)})
                 rows.append(
                     asked_table(
-                        scenario.state_names,
+                        scenario,
                         model.states.coordinates,
-                        controls,
                         lambda control, health: session.step(control, health, load).values[chosen],
                     )
                 )

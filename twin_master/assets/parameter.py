@@ -7,8 +7,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from twin_master.errors import MissingObservationModelError, MissionInputError, check_names
 from twin_master.scenario.schema import Calibration
 from twin_master.seeds import generator, seed_sequence
@@ -16,8 +16,6 @@ from twin_master.seeds import generator, seed_sequence
 if TYPE_CHECKING:
     from calibration.result.record import Calibration as Calibrated
     from fe.runtime.reduced import ReducedModel
-
-Float = NDArray[np.float64]
 
 
 SAME_NAMES = "give parameters the same names in the model file of the calibration"

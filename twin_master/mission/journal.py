@@ -16,13 +16,12 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reporting.arrays import Float
 from reporting.files import synchronise, write_error
 from twin_master.errors import NotResumableError
 from twin_master.mission.turns import Happened, Reading, Turn
-
-Float = NDArray[np.float64]
 
 JOURNAL_NAME = "journal.jsonl"
 _DIGEST = 64

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reporting.arrays import Float, Index
 from reporting.files import atomic_write_bytes
 from twin_master.errors import PlanningError
 from twin_master.network.belief_planning import BeliefPlan, DecisionProblem, plan_on_belief
@@ -19,9 +19,6 @@ from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.simulated_return import Decide, simulated_returns
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 MISSIONS = 400
 """That are simulated for each rule."""

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin_master.errors import NotResumableError
 from twin_master.mission.journal import array_of, damaged, reading_of, records_backwards
@@ -19,9 +18,6 @@ from twin_master.network.inference import known_control
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
-
-Float = NDArray[np.float64]
-
 
 _SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
 """What is told of a suspicion."""

@@ -11,15 +11,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from reporting.arrays import Float, Index
 from twin_master.errors import MissionInputError
 from twin_master.mission.preparation import Knowledge
 from twin_master.seeds import generator
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 SAMPLES = 300
 """Readings that are drawn for each control."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmu_asset.errors import FmuEndedError
+from reporting.arrays import Float, Index
 from twin_master.assets.asset_source import Asset, AssetReading
 from twin_master.errors import AssetOutputError, TwinMasterError
 from twin_master.mission.turns import Happened, History, Reading
@@ -15,9 +16,6 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class SensorStatus(IntEnum):

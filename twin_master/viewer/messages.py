@@ -5,18 +5,15 @@ One that was away, or is slow, asks for more at once, and nothing is kept for it
 """
 
 import json
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from reporting.arrays import Float
 from twin_master.report.view import NORMAL_95
 from twin_master.viewer.flight import BegunAnewError, Belief, Flight
 from twin_master.viewer.scene import LATEST, WINDOW, Scene
-
-Float = NDArray[np.float64]
 
 
 class Request(BaseModel, frozen=True, extra="forbid", strict=True):
@@ -43,17 +40,6 @@ class Request(BaseModel, frozen=True, extra="forbid", strict=True):
     turn: int
     shown: int
     count: int
-
-
-def parse_request(text: str | bytes) -> Request:
-    """Return what a page asked for.
-
-    Raises
-    ------
-    ValueError
-        It is no such request.
-    """
-    return Request.model_validate_json(text)
 
 
 class Teller:
@@ -120,17 +106,15 @@ class Teller:
     def _past(self, first: int, end: int) -> dict[str, Any]:
         flight, scene = self._flight, self._scene
         believed, observed = flight.believed(first, end), flight.observed(first, end)
+        seen, folder = flight.seen(first, end), f" {flight.folder}"
         scales = np.array([factor.scale for factor in scene.factors])
         return self._printed(believed, observed) | {
-            "control": [turn.control_index for turn in flight.seen(first, end)],
+            "control": [turn["control_index"] for turn in seen],
             "notices": [
-                [notice.sentence.replace(" DIR", f" {flight.folder}") for notice in turn.notices]
-                for turn in flight.seen(first, end)
+                [notice["sentence"].replace(" DIR", folder) for notice in turn.get("notices", ())]
+                for turn in seen
             ],
-            "learnt": [
-                {name: asdict(learnt) for name, learnt in turn.learnt.items()}
-                for turn in flight.seen(first, end)
-            ],
+            "learnt": [turn.get("learnt", {}) for turn in seen],
             "truth": _plain(scales * flight.truth(first, end)),
         }
 

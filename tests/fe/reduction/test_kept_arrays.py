@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from fe.runtime import kept_arrays
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.reduced import ReducedModel
@@ -109,13 +110,15 @@ def test_what_is_kept_comes_back_to_the_last_bit_or_is_refused(kept: KeptArrays,
 @pytest.mark.parametrize(
     "value", [np.array(1.0), np.array("a"), np.zeros(5), np.zeros(0), np.zeros((0, 0, 0)), np.array(1j)]
 )
-def test_arrays_of_a_wrong_kind_are_refused(kept: KeptArrays, value: np.ndarray) -> None:
+def test_arrays_of_a_wrong_kind_are_refused(kept: KeptArrays, value: np.ndarray, monkeypatch) -> None:
     arrays = arrays_from_bytes(kept.to_bytes(), "it")
     for item in fields(kept):
         if item.type is str or (arrays[item.name].shape == value.shape == () and value.dtype.kind == "f"):
             continue
+        given = {**arrays, item.name: value}
+        monkeypatch.setattr(kept_arrays, "arrays_from_bytes", lambda *_, own=given: own)
         with pytest.raises(ReducedModelFileError):
-            type(kept).from_bytes(arrays_to_bytes({**arrays, item.name: value}))
+            type(kept).from_bytes(b"")
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Exact steps of modes against matrix exponentials, and the damping of Rayleigh."""
+"""Steps of an oscillator against the matrix exponential, and the damping of Rayleigh."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,6 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from fe.runtime.modal_system import ModalSystem, rayleigh_coefficients, rayleigh_damping_ratio
-from fe.runtime.stepwise import Boundaries
-from tests.fe.runtime.stepping import second_order
 
 
 def transition(omega: float, damping: float, duration: float, unit: float) -> np.ndarray:
@@ -33,25 +31,6 @@ def test_the_step_of_any_oscillator_is_the_exponential(omega: float, damping: fl
 def test_a_step_near_critical_damping_is_the_exponential(zeta: float) -> None:
     for duration in (1e-5, 0.01, 0.3, 2.0):
         is_the_exponential(9.0, 18.0 * zeta, duration)
-
-
-@pytest.mark.parametrize("coupled", [False, True])
-def test_steps_of_any_length_are_matrix_exponentials(coupled: bool) -> None:
-    """With the parts of forces that are linear in time, Van Loan 1978."""
-    damping = np.diag([0.3, 1.0, 200.0]) + coupled * np.random.default_rng(3).normal(size=(3, 3))
-    frequency, lengths = np.array([0.0, 7.0, 60.0]), np.array([0.01, 0.013, 0.01, 0.4])
-    time = np.concatenate(([0.0], np.cumsum(lengths)))
-    distinct, which = Boundaries(time, np.arange(5), lengths).alike
-    np.testing.assert_array_equal(distinct[which], lengths)
-    transition, begin, end = ModalSystem(frequency, damping).exact_steps(distinct)
-    for h, at in zip(lengths, which, strict=True):
-        matrix = np.zeros((12, 12))
-        matrix[:6, :6] = second_order(np.diag(frequency**2), damping)
-        matrix[3:6, 6:9], matrix[6:9, 9:] = np.eye(3), np.eye(3) / h
-        whole = expm(h * matrix)
-        np.testing.assert_allclose(transition[at], whole[:6, :6], rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(end[at], whole[:6, 9:], rtol=1e-9, atol=1e-13)
-        np.testing.assert_allclose(begin[at], whole[:6, 6:9] - whole[:6, 9:], rtol=1e-9, atol=1e-13)
 
 
 @given(

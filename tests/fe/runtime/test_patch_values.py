@@ -1,7 +1,6 @@
 """What patches and states are made of: expressions, kinds of primitives, the digital state."""
 
 import math
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,8 +11,8 @@ from fe.runtime.errors import InvalidPatchError, InvalidStateError
 from fe.runtime.expression import Expression
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.patch import PRIMITIVES
-from fe.runtime.primitive import Primitive
 from fe.runtime.state import DigitalState, Geometry, losses_of, region_names
+from tests.refusals import Inputs, refused
 
 numbers = st.floats(-1e3, 1e3)
 
@@ -75,13 +74,6 @@ def test_kinds_are_the_keys_of_patches_that_were_kept() -> None:
     ]  # fmt: skip
 
 
-def test_a_class_may_name_its_own_kind() -> None:
-    class Renamed(Primitive):
-        kind: ClassVar[str] = "first_name"
-
-    assert Renamed.kind == "first_name"
-
-
 # ---------------------------------------------------------------- the digital state
 
 
@@ -94,23 +86,9 @@ def test_the_default_state_is_the_healthy_wing_as_built() -> None:
     assert ratio == pytest.approx((0.0281, 0.0717), rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("changes", "place"),
-    [
-        ({"young_modulus_factor": 0.0}, "young_modulus_factor"),
-        ({"young_modulus_factor": math.nan}, "young_modulus_factor"),
-        ({"servo_mass": -0.1}, "servo_mass"),
-        ({"pitot_mass": math.inf}, "pitot_mass"),
-        ({"damping_beta": -1e-9}, "damping_beta"),
-        ({"stiffness_loss": (0.2, 1.0)}, "stiffness_loss 2"),
-        ({"stiffness_loss": (40.0, 0.0)}, "not percent"),
-        ({"stiffness_loss": (math.nan, 0.0)}, "stiffness_loss 1"),
-        ({"stiffness_loss": (0.1,) * 9}, "at most 8 fractions"),
-        *(({name: -1.0}, f"geometry.{name}") for name in ("semi_span", "root_chord", "tip_chord")),
-    ],
-)
+@pytest.mark.parametrize(("changes", "place"), Inputs(__file__).refused("states"))
 def test_impossible_states_are_refused_with_the_place(changes, place: str) -> None:
-    with pytest.raises(InvalidStateError, match=place):
+    with refused(InvalidStateError, place):
         (Geometry if place.startswith("geometry") else DigitalState)(**changes)
 
 

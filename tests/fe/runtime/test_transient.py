@@ -27,12 +27,6 @@ def integrator(model: ReducedModel) -> ModalIntegrator:
     return wing_integrator(model, **HEALTHY)
 
 
-@pytest.fixture(scope="module")
-def moving(integrator: ModalIntegrator) -> TransientState:
-    """A wing that was let go under load and moves."""
-    return integrator.advance(integrator.released(0.03, (2.0, 0.0), TIP_FORCE), 0.013, (2.7, 1.0))
-
-
 @pytest.mark.parametrize("beta", [0.0, BETA, 0.05])  # with 0.05 s all but the first mode are overdamped
 def test_loads_that_are_held_are_integrated_exactly(model: ReducedModel, beta: float) -> None:
     integrator = wing_integrator(model, **{**HEALTHY, "damping_beta": beta})
@@ -86,14 +80,6 @@ def test_a_released_tip_starts_where_it_was_held_and_comes_to_rest(integrator: M
     assert not state.velocity.any()
 
 
-def energy_of(integrator: ModalIntegrator, state: TransientState) -> float:
-    """Kinetic plus strain energy of the kept modes about the equilibrium under the load [J]."""
-    omega, structure = 2.0 * np.pi * integrator.modes.frequency, integrator.structure
-    rest = structure.shapes.T @ structure.loads @ state.load / omega**2
-    deviation = omega * (state.displacement - rest)
-    return float(0.5 * (state.velocity @ state.velocity + deviation @ deviation))
-
-
 def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction) -> None:
     """Once the high modes have died away, strain, position and acceleration agree."""
     model, values = beam_reduction.model, {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 0.0}
@@ -118,17 +104,6 @@ def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction) -> None:
     np.testing.assert_allclose(taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max()))
 
 
-def test_state_is_plain_floats_and_goes_on_to_the_last_bit(model: ReducedModel, integrator, moving) -> None:
-    values = moving.to_list()
-    assert all(type(value) is float for value in values)
-    assert len(values) == 2 * model.mode_count + 2
-    other = wing_integrator(ReducedModel.from_bytes(model.to_bytes()), **HEALTHY)
-    one = integrator.advance(moving, 0.02, (3.0, 0.0))
-    two = other.advance(TransientState.from_list(values, model.mode_count), 0.02, (3.0, 0.0))
-    assert one.to_list() == two.to_list()
-    np.testing.assert_array_equal(integrator.outputs(one)[:-1], other.outputs(two)[:-1])
-
-
 def test_damage_in_flight_keeps_motion_and_changes_strain(model: ReducedModel, integrator) -> None:
     damaged = wing_integrator(model, **{**HEALTHY, "stiffness_loss": (0.4, 0.2)})
     for duration in (0.003, 0.05, 0.11):
@@ -147,11 +122,6 @@ def test_damage_in_flight_keeps_motion_and_changes_strain(model: ReducedModel, i
     taken = damaged.take_over(integrator.at_rest((3.0, 0.0)), integrator)
     kept = damaged.structure.to_modes @ integrator.structure.answers[:, :2] @ (3.0, 0.0)
     np.testing.assert_allclose(taken.displacement, kept, atol=1e-9 * np.abs(kept).max())
-    assert energy_of(damaged, taken) > 0.0
-    # in free vibration it creates no energy
-    worse = wing_integrator(model, **{**HEALTHY, "stiffness_loss": (0.6, 0.6)})
-    state = integrator.advance(integrator.released(0.03, (0.0, 0.0), TIP_FORCE), 0.02, (0.0, 0.0))
-    assert energy_of(worse, worse.take_over(state, integrator)) <= energy_of(integrator, state)
 
 
 def test_bad_input_is_refused(model: ReducedModel, integrator: ModalIntegrator) -> None:

@@ -7,23 +7,26 @@ from typing import Any
 import numpy as np
 import pytest
 from skfem import Basis, BilinearForm, ElementVector, MeshHex, MeshTet
-from skfem.element import ElementHex1, ElementHexS2, ElementTetP1, ElementTetP2, ElementWedge1
+from skfem.element import ElementHex1, ElementHexS2, ElementTetP1, ElementTetP2
 from skfem.helpers import ddot, sym_grad
 from skfem.models.elasticity import lame_parameters, linear_stress
 
 from fe.elements import cells as assembly
 from fe.elements.kinds import KINDS
 from fe.structure.design import Gauge
-from fe.structure.location import attach, face_areas, gauge_rows
+from fe.structure.location import attach, face_areas, gauge_rows, on_surface
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
 
+PRODUCTS = {  # of coordinates that a kind of element holds, by their powers
+    "tetra": (1, 0, 0), "tetra10": (1, 0, 1), "wedge": (1, 0, 1), "wedge15": (1, 0, 2),
+    "hexahedron": (1, 1, 1), "hexahedron20": (2, 1, 1),
+}  # fmt: skip
 SKFEM: dict[str, Any] = {
     "tetra": ElementTetP1(),
     "tetra10": ElementTetP2(),
     "hexahedron": ElementHex1(),
     "hexahedron20": ElementHexS2(),
-    "wedge": ElementWedge1(),
 }
 
 
@@ -44,19 +47,7 @@ def distorted(
     return read_mesh(write(moved, request.param, cells, "").parent / "mesh.vtu", 1.0, "m")
 
 
-@pytest.mark.parametrize("name", sorted(SKFEM))  # which has no wedge of 15 nodes; CalculiX has
-def test_shape_functions_are_those_of_scikit_fem(name: str) -> None:
-    kind, other = KINDS[name], SKFEM[name]
-    local = np.random.default_rng(0).random((7, 3)) / 3.0
-    values, gradients = kind.shape_functions(local)
-    for node, place in enumerate(kind.places):
-        number = int(np.flatnonzero((np.asarray(other.doflocs) == place).all(axis=1))[0])
-        value, gradient = other.lbasis(local.T, number)
-        np.testing.assert_allclose(values[:, node], value, atol=1e-14)
-        np.testing.assert_allclose(gradients[:, node], np.array(gradient).T, atol=1e-14)
-
-
-@pytest.mark.parametrize("name", ["tetra", "tetra10", "hexahedron", "hexahedron20"])
+@pytest.mark.parametrize("name", SKFEM)
 def test_element_arrays_are_those_of_scikit_fems_forms(name: str, box) -> None:
     (points, cells), kind = box(name, (1, 1, 1)), KINDS[name]
     points = points + 0.1 * points[:, [1, 2, 0]]  # sheared: straight, and no two edges alike
@@ -119,16 +110,27 @@ def test_faces_enclose_the_volume(distorted: StructureMesh) -> None:
     assert volume == pytest.approx(1.0)
 
 
-def test_a_point_inside_is_found(distorted: StructureMesh) -> None:
-    for point in np.random.default_rng(1).random((5, 3)) * (1.0, 2.0, 0.5):
+def test_the_mass_of_every_kind_is_exact_for_its_shape_functions(distorted: StructureMesh, box) -> None:
+    points, cells = box(distorted.kind.file_type, (1, 1, 1))
+    mass = assembly.CellMesh(distorted.kind, points, cells).mass(np.arange(len(cells)), 1.0)
+    power = np.array(PRODUCTS[distorted.kind.file_type])
+    field = (points**power).prod(axis=1)
+    assert field @ (mass @ field) == pytest.approx((1.0 / (2.0 * power + 1.0)).prod())
+
+
+def test_a_point_inside_is_found_and_one_outside_on_the_surface(distorted: StructureMesh) -> None:
+    size, random = np.array([1.0, 2.0, 0.5]), np.random.default_rng(1)
+    for number, point in enumerate(random.random((12, 3)) * size):
         cell, local = attach(distorted, point, "here")
-        values, _ = distorted.kind.shape_functions(local[None])
-        np.testing.assert_allclose(values[0] @ distorted.nodes[cell], point, atol=1e-12)
-
-
-def test_an_isotropic_material_does_not_feel_a_rotation():
-    elasticity = np.linalg.inv(assembly.isotropic_compliance(7.0, 0.3))
-    rotation, _ = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))
-    assert assembly.rotate_elasticity(elasticity[None], rotation[None])[0] == pytest.approx(
-        elasticity, abs=1e-13
-    )
+        assert np.abs(local - 0.5).max() < 0.5 + 1e-9
+        places = [(cell, local, point, 1e-12)]
+        aside = point.copy()
+        aside[[number % 3, number // 3 % 3]] = -0.004  # beside a face or an edge
+        found = on_surface(distorted, aside, "here")
+        nearest = np.clip(aside, 0.0, size)
+        # beside the slanting edge of a triangle it is only near the nearest
+        assert found.distance < 2.0 * np.linalg.norm(aside - nearest)
+        places += [(*on_face, nearest, 1e-2) for on_face in zip(found.cell, found.local, strict=True)]
+        for cell, local, wanted, tolerance in places:
+            values, _ = distorted.kind.shape_functions(local[None])
+            np.testing.assert_allclose(values[0] @ distorted.nodes[cell], wanted, atol=tolerance)

@@ -15,7 +15,7 @@ from fe.runtime.errors import InvalidDesignError, MeshError
 from fe.wing import operators as modelled
 from fe.wing.mesh import SKIN, build_mesh, chord_lines, straight_edged
 from fe.wing.parts import four_digit_half_thickness
-from fe.wing.turn_load import STANDARD_GRAVITY
+from fe.wing.turn_load import STANDARD_GRAVITY, lift_load
 from tests.wings import tip_stiffness
 
 RIB = {"thickness": 0.003, "young_modulus": 6e9, "poisson_ratio": 0.3, "density": 500.0}
@@ -158,6 +158,9 @@ def test_the_affine_sum_equals_direct_assembly(coarse_operators):
 def test_a_rigid_heave_meets_the_loads_of_the_design_and_moves_every_output_by_one(coarse_operators):
     wing, heave = coarse_operators, rigid(coarse_operators)
     assert heave @ wing.turn(3.0) == pytest.approx(wing.wing_mesh.design.lift.force)
+    assert lift_load(wing.wing_mesh)[::3].sum() * 3.0 == pytest.approx(
+        -wing.wing_mesh.design.lift.forward_force
+    )
     assert heave @ wing.turn(0.0, 2.5) == pytest.approx(2.5)
     assert wing.turn(2.0, 1.0) == pytest.approx(2.0 * wing.load_lift + wing.load_tip)
     assert (wing.load_tip @ heave, wing.tip_row @ heave) == pytest.approx((1.0, 1.0))
