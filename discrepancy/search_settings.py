@@ -63,6 +63,9 @@ class SearchSettings:
     out_of_reach: float = 36.0
     """They end where they have no prospect to come within this of the best: three times `close`."""
 
+    none_steps: int = 20
+    """Steps of the fit without effect: far from the truth its valley has no end that is worth reaching."""
+
     # ---------------------------------------------------------------- exact fits
     close: float = 12.0
     """Candidates within this log evidence of the best are fitted exactly: few steps err by less."""

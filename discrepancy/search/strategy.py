@@ -356,7 +356,7 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
         All candidates with their evidence.
     """
     tell("fitting the model as it is")
-    none = fit(problem, Candidate(), problem.start(Candidate()))
+    none = fit(problem, Candidate(), problem.start(Candidate()), iterations=SEARCH.none_steps)
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
     usable = (*usable, *in_events(usable, problem.setting))
     found = Search(problem, usable, none, tell=tell)
