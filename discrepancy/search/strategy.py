@@ -110,7 +110,7 @@ class Search(Hypotheses):
         """Fit effects from the best of a grid of their parameters, nuisances as the missing force has them.
 
         Those of a wrong model are far off and make a bad start; beside a force that is free they are where
-        they belong. Where no force is seen they are as expected before the data.
+        they belong. Beside trials at rest, which know no force, they are as expected before the data.
         """
         there = self._unbiased(base)
         starts = [_tried(self.problem, there, effect) for effect in effects]
@@ -119,7 +119,7 @@ class Search(Hypotheses):
     def _unbiased(self, base: CandidateFit) -> CandidateFit:
         """Return a base with its nuisances where they are beside a missing force."""
         point = self.problem.start(base.candidate)
-        if self.force is not None:
+        if self._moves and self.force is not None:
             along = self.force.whole
             if base.candidate.terms:
                 along = self.force.followed(along, base.candidate, base.effect) or along
@@ -197,10 +197,15 @@ class Search(Hypotheses):
         """Whether further effects are looked for: beside a law whose shape is free they would be anything."""
         return not self.best().candidate.is_family
 
+    @property
+    def _moves(self) -> bool:
+        """Whether all trials are in motion."""
+        return all(data.trial.is_dynamic for data in self.problem.trials)
+
     def by_force(self) -> bool:
         """Fit the sets of effects that follow the missing force best; False where that is not seen."""
-        force = self.force
-        if force is None or not all(data.trial.is_dynamic for data in self.problem.trials):
+        force = self.force if self._moves else None
+        if force is None:
             return False
         self.forces = force.name(self.effects)
         # beside another law a shape of its own would imitate nearly anything
