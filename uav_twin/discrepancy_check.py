@@ -105,11 +105,7 @@ def _show(
     if able is None:
         return
     shown = [at for at, title in enumerate(HEADINGS) if title not in ("testable", "confused with")]
-    rows = [
-        [row[at] for at in shown]
-        for row, item in zip(rows_of(able), able.detectability, strict=True)
-        if not item.reason
-    ]
+    rows = [[row[at] for at in shown] for row in rows_of(able)]
     terminal.print_table([HEADINGS[at] for at in shown], rows)
     told = group_lines(able, "to which is said above")
     for line in (*untested_lines(able), *confused_lines(able), *told, *needs(able, data, catalogue)):

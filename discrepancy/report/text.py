@@ -231,9 +231,8 @@ def nats(evidence: float) -> str:
     return f"{evidence:,.0f}" if abs(evidence) < BEYOND_DOUBT else f"more than {BEYOND_DOUBT:,.0f}"
 
 
-WORDS = Words(
-    "discrepancy.report", number=number, percent=percent, nats=nats, share_text=share_text, formula=formula
-)
+_NUMBERS = (number, percent, nats, share_text, formula, p_value_text)
+WORDS = Words("discrepancy.report", **{function.__name__: function for function in _NUMBERS})
 """Words of the report, of figures and of the summary on the terminal."""
 
 
