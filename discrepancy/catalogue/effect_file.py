@@ -52,6 +52,7 @@ from pydantic import ConfigDict, Field
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.errors import CatalogueError
+from discrepancy.sentences import said
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.expression import RESERVED, Expression
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive, Window
@@ -151,15 +152,10 @@ def _check_words(section: EffectSection, names: frozenset[str], where: str) -> N
             raise CatalogueError(f"{where}: 'needs' has {need!r}, but known are {', '.join(NEEDS)}.")
     places = section.places
     if isinstance(places, str) and places not in PLACES:
-        raise CatalogueError(
-            f"{where}: 'places' must be a list or one of {'; '.join(PLACES)}, but is {places!r}."
-        )
-    for name in places or ():
-        if not isinstance(places, str) and name in PLACES:
-            raise CatalogueError(
-                f"{where}: 'places' is a list that holds {name!r}, which would be the name of a single "
-                f'place; for all {name} write places = "{name}", without brackets.'
-            )
+        raise CatalogueError(said("effects.places", where=where, known="; ".join(PLACES), places=places))
+    for name in () if isinstance(places, str) else places or ():
+        if name in PLACES:
+            raise CatalogueError(said("effects.listed", where=where, name=name))
 
 
 def _places(places: str | tuple[str, ...] | None, entry: Entry, setting: Setting) -> tuple[str, ...]:
@@ -272,10 +268,7 @@ def _check_in_time(recipes: tuple[_Recipe, ...], acts_on: Kinds) -> None:
     still = [kind.value for kind in (TrialKind.STATIC, TrialKind.FLIGHT) if kind in acts_on]
     timed = [item for item in recipes if item.in_windows or PRIMITIVES[item.kind].courses]
     if timed and still:
-        raise CatalogueError(
-            f"{timed[0].where} asks for the time of trials, but 'acts_on' has {still[0]!r}, whose rows "
-            "are no course in time."
-        )
+        raise CatalogueError(said("effects.no_course", where=timed[0].where, kind=still[0]))
 
 
 def _build(

@@ -9,6 +9,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from discrepancy.errors import CatalogueError
+from discrepancy.sentences import said
 from fe.runtime.patch import SENSORS, ModelPatch, Window
 
 from .effect_file import effects_of_file
@@ -136,7 +137,7 @@ def check(effects: Iterable[Effect]) -> None:
     effects = tuple(effects)
     known = Counter(effect.identifier for effect in effects)
     for effect in effects:
-        for fault in _faults(effect):
+        if fault := next(_faults(effect), ""):
             raise CatalogueError(f"The effect {effect.identifier!r}{fault}")
     for identifier, count in known.items():
         if count > 1:
@@ -144,10 +145,7 @@ def check(effects: Iterable[Effect]) -> None:
     for effect in effects:
         for other in effect.confusable:
             if other not in known or other == effect.identifier:
-                raise CatalogueError(
-                    f"The effect {effect.identifier!r} names {other!r} as confusable, "
-                    "which is no other effect of the catalogue."
-                )
+                raise CatalogueError(said("effects.confusable", effect=effect, other=other))
 
 
 def _faults(effect: Effect) -> Iterator[str]:
@@ -173,7 +171,4 @@ def _faults(effect: Effect) -> Iterator[str]:
             yield f"{where}a log-normal prior must have low > 0, but has {prior.low:g}."
     for shape in effect.shape:
         if not shape.prior.low < shape.canonical < shape.prior.high:
-            yield (
-                f": the canonical value {shape.canonical:g} of {shape.name!r} must lie between "
-                f"{shape.prior.low:g} and {shape.prior.high:g}."
-            )
+            yield said("effects.canonical", shape=shape)
