@@ -60,7 +60,7 @@ from reporting.section import Section, checked
 from reporting.toml_file import read_toml
 
 from .entry import Effect, EffectParameter, Number, Setting, ShapeParameter
-from .needs import NEEDS, PLACES, USUAL, Entry, Kinds, Target, first_reason, targets_of
+from .needs import DYNAMIC, NEEDS, PLACES, USUAL, Entry, Target, first_reason, targets_of
 from .scales import SCALES, Here, names_with
 
 Text = Annotated[str, Field(min_length=0)]
@@ -125,12 +125,13 @@ def _effect(row: object, where: str) -> Effect:
         _recipe(item, names, moments, f"{where}, primitives {n}")
         for n, item in enumerate(section.primitives, start=1)
     )
-    _check_in_time(recipes, section.acts_on)
-    entry = Entry(
-        section.id, section.acts_on, section.places if isinstance(section.places, str) else "",
-        section.preferred, tuple(PRIMITIVES[recipe.kind] for recipe in recipes),
-        frozenset().union(*(recipe.moments for recipe in recipes)),
-    )  # fmt: skip
+    timed = [item for item in recipes if item.in_windows or PRIMITIVES[item.kind].courses]
+    if timed and (still := [kind for kind in TrialKind if kind in section.acts_on - DYNAMIC]):
+        raise CatalogueError(said("effects.no_course", where=timed[0].where, kind=still[0].value))
+    word = section.places if isinstance(section.places, str) else ""
+    kinds = tuple(PRIMITIVES[recipe.kind] for recipe in recipes)
+    needed = frozenset().union(*(recipe.moments for recipe in recipes))
+    entry = Entry(section.id, section.acts_on, word, section.preferred, kinds, needed)
     return Effect(
         identifier=section.id,
         build=partial(_build, recipes, entry),
@@ -261,14 +262,6 @@ def _recipe(
     written = [item for item in (*values.values(), *when.values()) if isinstance(item, Expression)]
     used = frozenset(name for item in written for name in item.used())
     return _Recipe(where, kind, values, when, used & SCALES.keys() - names, used & moments)
-
-
-def _check_in_time(recipes: tuple[_Recipe, ...], acts_on: Kinds) -> None:
-    """Refuse effects that ask for the time of trials which have none."""
-    still = [kind.value for kind in (TrialKind.STATIC, TrialKind.FLIGHT) if kind in acts_on]
-    timed = [item for item in recipes if item.in_windows or PRIMITIVES[item.kind].courses]
-    if timed and still:
-        raise CatalogueError(said("effects.no_course", where=timed[0].where, kind=still[0]))
 
 
 def _build(
