@@ -308,7 +308,7 @@ def _misfit(data: FloatArray, model: FloatArray, channel: Channel, trial: Trial)
     if trial.is_dynamic:
         # Amplitudes only: a small error of frequency would outweigh what the places of two gauges differ by.
         sign = 1.0 if float(data[: max(len(data) // 50, 3)].mean() * model[0]) >= 0.0 else -1.0
-        rest = sign * np.std(data) - np.std(model)
+        rest = np.asarray(sign * np.std(data) - np.std(model))
         deviation = np.hypot(noise / np.sqrt(len(data)), _FLOOR * np.std(model))
     else:
         rest = data - model

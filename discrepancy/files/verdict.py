@@ -182,9 +182,10 @@ class StoredPatch:
         """Return this patch and the one that was built into its model, for the model that had neither."""
         if earlier is None:
             return self
-        model = {"model_file": earlier.origin.model_file, "model_hash": earlier.origin.model_hash}
+        beneath = earlier.origin
+        origin = replace(self.origin, model_file=beneath.model_file, model_hash=beneath.model_hash)
         effects, channels = earlier.effects + self.effects, {**earlier.channels, **self.channels}
-        return replace(self, effects=effects, origin=replace(self.origin, **model), channels=channels)
+        return replace(self, effects=effects, origin=origin, channels=channels)
 
 
 def primitive_intervals(patch: ModelPatch, draws: Sequence[ModelPatch] = ()) -> tuple[PrimitiveInterval, ...]:
@@ -205,8 +206,8 @@ def primitive_intervals(patch: ModelPatch, draws: Sequence[ModelPatch] = ()) -> 
     kinds, *others = (", ".join(item.kind for item in each) or "none" for each in (patch, *draws))
     for count, came in enumerate(others, start=1):
         if came != kinds:
-            found = f"Draw {count} of the posterior has the primitives {came}"
-            raise VerdictFileError(f"{found}, but the patch has {kinds}.")
+            odd = f"Draw {count} of the posterior has the primitives {came}"
+            raise VerdictFileError(f"{odd}, but the patch has {kinds}.")
     found = []
     for place, primitive in enumerate(patch):
         for name, unit in PRIMITIVE_UNITS[primitive.kind].items():

@@ -162,9 +162,8 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
             for place, (axes, (name, label, scale)) in enumerate(zip(cells[row], drawn, strict=True)):
                 for found, shown in curves:
                     if (curve := found.get(mode)) is not None:
-                        look = {"color": shown.colour, "lw": 1.1, "alpha": 0.8, "label": shown.label}
-                        amplitude, values = factor * curve.amplitude, scale * getattr(curve, name)
-                        axes.plot(amplitude, values, shown.dashes, **look)
+                        (line,) = axes.plot(factor * curve.amplitude, scale * getattr(curve, name))
+                        line.set(color=shown.colour, ls=shown.dashes, lw=1.1, alpha=0.8, label=shown.label)
                 values, error = scale * getattr(points, name), scale * getattr(points, f"{name}_error")
                 axes.errorbar(
                     factor * points.amplitude, values, error, fmt="o", ms=2.6, color=OBSERVED, elinewidth=0.6,

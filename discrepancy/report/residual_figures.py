@@ -236,10 +236,10 @@ def _draw_record(axes: Axes, row: int, windows: Sequence[GapWindow], norm: Norma
         )
         middle, cap = low + 0.5 * height, 0.3 * height
         for moment in filter(None, (window.begin, window.end)):
-            ends = [moment.low, moment.high]
-            axes.hlines(middle, *ends, color="white", lw=2.6, zorder=3)
-            axes.hlines(middle, *ends, color=OBSERVED, lw=1.2, zorder=4)
-            axes.vlines(ends, middle - cap, middle + cap, color=OBSERVED, lw=0.9, zorder=4)
+            low, high = moment.low, moment.high
+            axes.hlines(middle, low, high, color="white", lw=2.6, zorder=3)
+            axes.hlines(middle, low, high, color=OBSERVED, lw=1.2, zorder=4)
+            axes.vlines([low, high], middle - cap, middle + cap, color=OBSERVED, lw=0.9, zorder=4)
 
 
 def _short(name: str) -> str:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Iterable, Sequence
 from math import floor, isfinite, isnan, log10
+from typing import Any
 
 from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.campaign.units import UNITS
@@ -229,8 +230,8 @@ def nats(evidence: float) -> str:
     return f"{evidence:,.0f}" if abs(evidence) < BEYOND_DOUBT else f"more than {BEYOND_DOUBT:,.0f}"
 
 
-_NUMBERS = (number, percent, nats, share_text, formula, p_value_text)
-WORDS = Words("discrepancy.report", **{function.__name__: function for function in _NUMBERS})
+_NUMBERS: tuple[Any, ...] = (number, percent, nats, share_text, formula, p_value_text)
+WORDS = Words("discrepancy.report", "words.toml", **{function.__name__: function for function in _NUMBERS})
 """Words of the report, of figures and of the summary on the terminal."""
 
 

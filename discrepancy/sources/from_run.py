@@ -107,7 +107,7 @@ def _campaign(
     if not observed.sizes["step"]:
         ends = zip(("from {} on", "up to {}"), turns, strict=True)
         wanted = ", ".join(text.format(turn) for text, turn in ends if turn is not None)
-        steps = run["observed"]["step"].values.tolist()
+        steps = np.asarray(run["observed"]["step"].values).tolist()
         has = f"{steps[0]} to {steps[-1]}" if steps else "none"
         raise CampaignDataError(f"{folder.name} has the turns {has}, and none {wanted}.")
     strain = np.asarray(observed[STRAIN].values, dtype=np.float64)
