@@ -18,6 +18,7 @@ from twin_master.network.inference import known_control
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
+from twin_master.sentences import said
 
 _SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
 """What is told of a suspicion."""
