@@ -42,17 +42,6 @@ class Request(BaseModel, frozen=True, extra="forbid", strict=True):
     count: int
 
 
-def parse_request(text: str | bytes) -> Request:
-    """Return what a page asked for.
-
-    Raises
-    ------
-    ValueError
-        It is no such request.
-    """
-    return Request.model_validate_json(text)
-
-
 class Teller:
     """Answers of one flight, for any number of viewers.
 
@@ -122,10 +111,7 @@ class Teller:
         return self._printed(believed, observed) | {
             "control": [turn["control_index"] for turn in seen],
             "notices": [
-                [
-                    notice["sentence"].replace(" DIR", f" {flight.folder}")
-                    for notice in turn.get("notices", ())
-                ]
+                [notice["sentence"].replace(" DIR", folder) for notice in turn.get("notices", ())]
                 for turn in seen
             ],
             "learnt": [turn.get("learnt", {}) for turn in seen],
