@@ -209,8 +209,10 @@ def test_what_a_kind_cannot_do_is_refused(kind: Kind, how: TrialKind, said, item
         kind.seen(replace(kind.trial(how, force=np.ones(3)), **said), *items)
 
 
-FILES = ["two_masses", "rig"]
-ROWS = [*((name, *row) for name in FILES for row in INPUTS.refused(name)), *INPUTS.refused("rigs")]
+ROWS = [
+    *((name, *row) for name in ("two_masses", "rig") for row in INPUTS.refused(name)),
+    *INPUTS.refused("rigs"),
+]
 
 
 @pytest.mark.parametrize(("name", "old", "new", "sentence"), ROWS)
