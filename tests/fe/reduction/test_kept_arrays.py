@@ -33,7 +33,7 @@ from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import WingDesign
-from tests.refusals import refused
+from tests.refusals import Inputs, refused
 
 KINDS = st.sampled_from([np.float64, np.float32, np.int64, np.uint8, np.bool_, np.dtype("U3")])
 SHAPES = hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4)
@@ -138,28 +138,23 @@ def test_arrays_of_a_wrong_kind_are_refused(kept: KeptArrays, value: np.ndarray,
             type(kept).from_bytes(b"")
 
 
-@pytest.mark.parametrize(
-    ("name", "change", "sentence"),
-    [
-        ("static_load", lambda load: load * np.nan, "finite"),
-        ("mode_count", lambda _: 0, "modes"),
-        ("rounding_allowance", lambda _: -1.0, "rounding_allowance"),
-        *((name, lambda rows: rows[:-1], "field basis") for name in ("points", "cells", "region")),
-        *((f"{kind}_displacement", lambda rows: rows[:-1], "field basis") for kind in ("static", "modal")),
-        ("load_tip", lambda _: np.full(3, np.nan), "array"),
-        ("flap_spring", lambda _: 0.0, "flap_spring"),
-        ("straight_chord_line", lambda _: 2.0, "straight_chord_line"),
-        ("weight", lambda _: np.zeros(2), "weight"),
-        ("strip_of", lambda strips: np.array([99, *strips[1:]]), "strips"),
-        ("stations", lambda stations: stations[::-1].copy(), "stations that rise"),
-    ],
-)
+SPOILT: dict[str, Callable[[Any], Any]] = {
+    "nan": lambda values: values * np.nan,
+    "zero": lambda values: 0 * values,
+    "more": lambda values: values + 99,
+    "less": lambda values: -1.0 - values,
+    "short": lambda values: values[:-1],
+    "turned": lambda values: values[::-1].copy(),
+}
+
+
+@pytest.mark.parametrize(("name", "how", "sentence"), Inputs(__file__).refused("values"))
 def test_values_that_cannot_be_are_refused(
-    coarse_fields: ReducedModel, coarse_patch_arrays, name: str, change: Any, sentence: str
+    coarse_fields: ReducedModel, coarse_patch_arrays, name: str, how: str, sentence: str
 ) -> None:
     kept = coarse_fields if hasattr(coarse_fields, name) else coarse_patch_arrays
     with refused(ReducedModelFileError, sentence):
-        replace(kept, **{name: change(getattr(kept, name))})
+        replace(kept, **{name: SPOILT[how](getattr(kept, name))})
 
 
 # ---------------------------------------------------------------- the cache

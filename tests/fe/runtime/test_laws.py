@@ -7,12 +7,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
-from numpy.typing import NDArray
 from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.linalg import expm
 from scipy.optimize import brentq
-from scipy.special import ellipk
+from scipy.special import airy, ellipk
 
 from fe.compilation import compiled_kernel
 from fe.runtime import laws as functions
@@ -200,58 +199,12 @@ TYPICAL: dict[str, tuple[Primitive, float, float]] = {
 }
 
 
-TIME = 0.005 * np.arange(100)
-
-
-def force_of(law: Any, x: float, v: float, z: NDArray[np.float64]) -> float:
-    """Force of a law of the tip, z the states of its elements."""
-    if isinstance(law, PowerDamping):
-        size = abs(v / law.reference_velocity) ** law.velocity_exponent * np.sign(v)
-        return float(
-            law.coefficient * size * abs(x / law.reference_displacement) ** law.displacement_exponent
-        )
-    if isinstance(law, PowerStiffness):
-        size = law.coefficient * abs(x / law.reference_displacement) ** law.exponent
-        return float(size * np.sign(x) * (law.side * x >= 0.0))
-    if isinstance(law, FreePlay):
-        return float(-law.stiffness * np.clip(x, -law.half_width, law.half_width))
-    return float(law.stiffness * (z.mean() - x)) if len(z) else 0.0
-
-
-def rates_of(law: Any, v: float, z: NDArray[np.float64]) -> Any:
-    """Rates of the states of its elements."""
-    if isinstance(law, BoucWen):
-        return np.where(z * v > 0.0, v * (1.0 - np.abs(z / law.yield_displacement) ** law.order), v)
-    return np.where((np.abs(z) >= law.elements()) & (z * v > 0.0), 0.0, v) if len(z) else z
-
-
-def integrated(law: Any, time: NDArray[np.float64]) -> Any:
-    """Displacement (N,) of the tip after its release, by a general integrator."""
-    given: dict[str, Any] = {"method": "DOP853", "rtol": 1e-9, "atol": 1e-12}
-    row, rate = PORTS["tip"], getattr(law, "rate", 0.0)
-    first = np.array([A / 1.3, 0.002, 0.0, 0.001, *np.zeros(4)])
-    z = np.zeros(law.element_count if isinstance(law, MicroSlip) else int(isinstance(law, BoucWen)))
-    x = float(row @ first[:4])
-    z = solve_ivp(lambda s, z: rates_of(law, x, z), (0.0, 1.0), z, max_step=0.01, **given).y[:, -1]
-
-    def slope(t: float, y: Any) -> Any:
-        q, v, z = np.split(y, (4, 8))
-        force = force_of(law, float(row @ q), float(row @ v), z)
-        a = -(W**2) * (1.0 + rate * t) * q - WING.damping @ v - row * force
-        return np.concatenate((v, a, rates_of(law, float(row @ v), z)))
-
-    begin = np.concatenate((first, z))
-    return row @ solve_ivp(slope, (0.0, time[-1]), begin, t_eval=time, max_step=2e-3, **given).y[:4]
-
-
 @pytest.mark.parametrize("name", TYPICAL)
 def test_default_steps_are_fine_and_the_order_is_two(name: str) -> None:
+    """Against steps that are far shorter; these obey the law, by closed forms and on flexible ports."""
     law, least_order, largest = TYPICAL[name]
-    runs = (moved(law, force=np.zeros(len(TIME)), refinement=n).q @ PORTS["tip"] for n in (1, 2, 4, 8, 128))
-    *coarse, exact = runs  # of dry friction, whose closed form is that of `test_motion`
-    if name != "coulomb":
-        exact = integrated(law, TIME)
-    errors = [np.max(np.abs(one - exact)) / A for one in coarse]
+    *runs, exact = (moved(law, force=np.zeros(100), refinement=n).q @ PORTS["tip"] for n in (1, 2, 4, 8, 128))
+    errors = [np.max(np.abs(one - exact)) / A for one in runs]
     assert errors[0] < largest
     # events fall differently into the steps of each refinement, so the order is that over a factor of eight
     assert np.log2(errors[0] / errors[-1]) / 3.0 > least_order
@@ -429,6 +382,15 @@ def test_friction_stops_a_mass_where_it_stops_to_the_fourth_order_of_the_step(
     )
     assert moved.v[-1, 0] == pytest.approx(0.0, abs=1e-12)
     assert moved.q[-1, 0] == pytest.approx(2.0 * ratio - 1.0, abs=0.03 * shift)
+
+
+def test_a_stiffness_that_drifts_makes_an_airy_function() -> None:
+    # x'' + w^2 (1 + r t) x = 0 is that of Airy in s = -(w / r)^(2/3) (1 + r t)
+    rate, time = 0.05, np.linspace(0.0, 10.0, 1001)
+    scale = (OMEGA / rate) ** (2.0 / 3.0)
+    a, slope_a, b, slope_b = airy(-scale * (1.0 + rate * time))
+    expected = (slope_b[0] * a - slope_a[0] * b) / (slope_b[0] * a[0] - slope_a[0] * b[0])
+    np.testing.assert_allclose(ring(patch.StiffnessDrift(rate)).q[:, 0], expected, atol=2e-4)
 
 
 def test_structural_damping_is_alike_at_all_amplitudes() -> None:

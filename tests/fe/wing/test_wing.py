@@ -3,6 +3,8 @@
 import json
 import tomllib
 from dataclasses import replace
+from functools import reduce
+from operator import getitem
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ from fe.wing.operators import assemble
 from fe.wing.parts import Planform, four_digit_half_thickness, four_digit_slope
 from fe.wing.responses import eigenmodes, solve_static
 from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY, lift_load, lifting_line, schrenk
-from tests.refusals import Inputs
+from tests.refusals import Inputs, refused
 from tests.wings import tip_stiffness
 
 TEXT = SHIPPED_DESIGN.read_text(encoding="utf-8")
@@ -55,15 +57,9 @@ def test_the_hash_covers_content_and_nothing_else(shipped_design, content, tmp_p
 def test_a_wrong_design_is_refused_with_one_sentence_that_names_the_place(content, path, value, sentence):
     if path == ["defects", 1, "span_start"]:
         content["defects"][1]["chord_end"] = 0.3
-    place = content
-    for part in path[:-1]:
-        place = place[part]
-    place[path[-1]] = value
-    with pytest.raises(InvalidDesignError, match=sentence) as caught:
+    reduce(getitem, path[:-1], content)[path[-1]] = value
+    with refused(InvalidDesignError, rf"^wing\.toml: .*({sentence}).*\.$"):
         parse_design(content, source="wing.toml")
-    message = str(caught.value)
-    assert (message[:11], message[-1]) == ("wing.toml: ", ".")
-    assert "\n" not in message
 
 
 def test_the_modulus_runs_straight_between_stations_and_steps_between_bands(shipped_design):
@@ -372,12 +368,6 @@ def test_lift_compresses_every_gauge_lifts_the_tip_and_is_reciprocal_to_a_force_
     assert coarse_operators.load_tip @ turn.displacement == pytest.approx(work, rel=1e-5)
 
 
-@pytest.mark.parametrize("factor", [0.98, 1.02])
-def test_tip_stiffness_is_the_published_one(shipped_operators, factor):
-    # Kapteyn et al. 2021, eq. (14): k(e) = 0.5752 e + 0.1018 N/mm.
-    assert tip_stiffness(shipped_operators, factor) == pytest.approx(575.2 * factor + 101.8, rel=0.001)
-
-
 def test_strains_at_3g_are_those_of_the_library(shipped_operators, published_library):
     """Those of the healthy wing, what damage makes of them, and which gauge limits the flight."""
     observations = json.loads(published_library.read_text())["observations"]
@@ -407,7 +397,10 @@ def test_bending_is_found_wherever_the_lag_mode_lies(coarse_design, coarse_opera
     assert modes.frequency[modes.flapwise_bending] == pytest.approx(wanted, rel=2e-3)
 
 
-def test_the_wing_has_the_published_frequencies(shipped_operators):
+def test_the_wing_has_the_published_stiffness_and_frequencies(shipped_operators):
+    # Kapteyn et al. 2021, eq. (14): k(e) = 0.5752 e + 0.1018 N/mm.
+    for factor in (0.98, 1.02):
+        assert tip_stiffness(shipped_operators, factor) == pytest.approx(575.2 * factor + 101.8, rel=0.001)
     # The published model after calibration: 5.632 Hz and 28.544 Hz at e = 1, one other mode between them.
     modes = eigenmodes(shipped_operators, *STATE)
     assert modes.frequency[modes.flapwise_bending] == pytest.approx([5.632, 28.544], rel=0.0007)
