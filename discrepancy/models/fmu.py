@@ -13,7 +13,7 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course, LoadChange, divided, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion, Sampled
-from discrepancy.models.fmu_pace import Motive, record_of
+from discrepancy.models.fmu_pace import Case
 from discrepancy.models.fmu_runs import State
 from discrepancy.models.interface import NO_PATCH, Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.model_file import DescribedModel
@@ -77,9 +77,9 @@ class FmuModel(DescribedModel):
         self.length, self.regions = description.scales.length, tuple(description.inputs.regions)
         flies = description.inputs.load_factor is not None
         self.kinds = frozenset(TrialKind) - {TrialKind.DRIVEN, *(() if flies else (TrialKind.FLIGHT,))}
-        self._keys = [fmu.parameter(item.variable or item.name) for item in description.parameter]
+        self._keys = [fmu.parameter(item.variable) for item in description.parameter]
         self._forces = {place: fmu.variable(name) for place, name in description.inputs.forces.items()}
-        self._inputs = {item.name: fmu.variable(item.variable or item.name) for item in description.input}
+        self._inputs = {item.name: fmu.variable(item.variable) for item in description.input}
         self.load_places = tuple(self._forces)
         limits = (fmu.asset.input_range("load", name)[1] for name in self._forces.values())
         self.largest_force = 0.5 * min(limits, default=np.inf)
@@ -126,21 +126,23 @@ class FmuModel(DescribedModel):
                 moved = self._at_rest(Asked(trial, replace(conditions, health=trial.health)))[:, fmu.x]
             largest = np.maximum(largest, np.max(np.abs(moved), axis=0))
         still = next((item for item in trials if not item.is_dynamic), _any_trial(TrialKind.STATIC, 1.0))
-        flexible = fmu.flexibility(self._state(Asked(still, conditions)), range(len(largest)))
-        stiffness = [(1.0 / own, 1.0 / own) for own in np.diag(flexible).tolist()]
+        flexible = np.diag(fmu.flexibility(self._state(Asked(still, conditions))))
+        pairs = [(1.0 / own, 1.0 / own) for own in flexible.tolist()]
         frequency, moving = given.angular_frequency, next((item for item in trials if item.is_dynamic), None)
         if moving is not None:
             state = self._state(Asked(moving, conditions))
             frequency = frequency or fmu.pace(moving, state)[0]
-            stiffness = fmu.stiffness(state, fmu.usual(moving)[1], record_of(moving)) or stiffness
+            if (system := fmu.system(fmu.case(moving, state, self.ports()))) is not None:
+                pairs = [system.stiffness(column, number) for number, column in enumerate(fmu.x)]
         interval = 0.01
         for _ in range(0 if trials or frequency else 3):  # until the interval suits it
             trial = _any_trial(TrialKind.RINGDOWN, interval)
             frequency = fmu.pace(trial, self._state(Asked(trial, conditions)))[0]
             interval = 0.3 / frequency
-        forces = zip(fmu.forces, stiffness, strict=True)
-        pushed = [pair for force, pair in forces if force in self._forces.values()]
-        modal, tip = (pushed or stiffness or [(1.0, 1.0)])[0]
+        pushed = [
+            pair for force, pair in zip(fmu.forces, pairs, strict=True) if force in self._forces.values()
+        ]
+        modal, tip = (pushed or pairs or [(1.0, 1.0)])[0]
         frequency = frequency or 1.0
         return Scales(
             length=given.length or 1.0,
@@ -149,8 +151,8 @@ class FmuModel(DescribedModel):
             angular_frequency=frequency,
             **campaign_sizes(campaign),
             ports={
-                port: PortScale(float(most) or 1.0, own[0], frequency, own[1])
-                for port, most, own in zip(self.ports(), largest, stiffness, strict=True)
+                port: PortScale(float(most) or 1.0, own, frequency, rest)
+                for port, most, (own, rest) in zip(self.ports(), largest, pairs, strict=True)
             },
         )
 
@@ -181,10 +183,9 @@ class FmuModel(DescribedModel):
         At samples that are so many times as dense as those of the trial.
         """
         trial, conditions, laws, *_ = asked
-        return self.fmu.motion(
-            trial, divided(conditions.stamps(trial.time), parts), self._state(asked), self._motive(asked),
-            laws, columns, orders, conditions.refinement,
-        )  # fmt: skip
+        times = divided(conditions.stamps(trial.time), parts)
+        case, refinement = self._case(asked), conditions.refinement
+        return self.fmu.motion(case, trial, times, laws, columns, orders, refinement)
 
     def _at_rest(self, asked: Asked) -> FloatArray:
         """Return all outputs (N, C) of a static trial or a flight."""
@@ -218,16 +219,22 @@ class FmuModel(DescribedModel):
         ModelError
             If the FMU is not linear, or its answers to forces at the ports do not tell its system.
         """
-        fmu, motive = self.fmu, Motive(self.ports(), record=record_of(trial))
+        fmu = self.fmu
         base, found = (
-            fmu.system(self._state(self._asked(trial, conditions, self.patch)), fmu.usual(trial)[1], motive)
+            fmu.system(fmu.case(trial, self._state(self._asked(trial, conditions, self.patch)), self.ports()))
             for values in (self.prior_mean(), parameters)
             for conditions in [Conditions(values, health=trial.health[:1])]
         )
-        if base is None or found is None or len(base.push) != len(found.push):
+        columns, numbers = np.array(fmu.x, dtype=np.int64), np.arange(len(fmu.x))
+        if (
+            base is None
+            or found is None
+            or len(base.push) != len(found.push)
+            or found.jumps(columns, numbers)
+        ):
             raise ModelError(
                 f"The FMU model {self.name!r} does not tell by its answers to single forces how its ports "
-                "move; it is not linear, or they are too few or too rough."
+                "move; it is not linear, or they are too few or too rough, or speeds jump with forces."
             )
         found = found.in_state_of(base)
         (position, _), (speed, _) = (found.rows(fmu.x, order) for order in (0, 1))
@@ -259,13 +266,15 @@ class FmuModel(DescribedModel):
         laws = laws_of(rest.of(*INTERNAL_FORCES), self.ports())
         return Asked(trial, conditions, laws, settings, load)
 
-    def _motive(self, asked: Asked) -> Motive:
+    def _case(self, asked: Asked) -> Case:
         """Return what moves the FMU in a dynamic trial."""
         (trial, conditions, laws, _, load), fmu = asked, self.fmu
-        motive = Motive(tuple(dict.fromkeys(laws.ports)), record=record_of(trial))
-        if trial.kind is not TrialKind.RINGDOWN:
+        forced = trial.kind is not TrialKind.RINGDOWN
+        levers = self._levers(asked) if forced else {}
+        case = fmu.case(trial, self._state(asked), laws.ports, levers)
+        if forced:
             course = Course.of(trial.time, load.changed(trial.force, trial.force), trial.hold)
-            return motive._replace(levers=self._levers(asked), course=course)
+            return case._replace(course=course)
         release = release_of(trial)
         if not fmu.release:
             raise ModelError(
@@ -274,14 +283,14 @@ class FmuModel(DescribedModel):
             )
         first_mode = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
         if release.at_rest:
-            return motive._replace(starts={fmu.release[0]: release.displacement * float(1.0 + first_mode[0])})
+            return case._replace(starts={fmu.release[0]: release.displacement * float(1.0 + first_mode[0])})
         if len(fmu.release) < 2:
             raise ModelError(
                 f"The ring-down {trial.name!r} does not begin at rest, which the FMU model {self.name!r} "
                 f"can follow only if [release] names parameters of displacement and velocity."
             )
         first = release.displacement * first_mode * (1.0, fmu.usual(trial)[0])
-        return motive._replace(starts=dict(zip(fmu.release, first.tolist(), strict=True)))
+        return case._replace(starts=dict(zip(fmu.release, first.tolist(), strict=True)))
 
     def _levers(self, asked: Asked) -> dict[str, float]:
         """Return the inputs that a force at a place of a patch pushes, each with its lever."""

@@ -1,7 +1,7 @@
 """An FMU as a model, described by a TOML file: which variables are parameters, inputs, outputs and ports."""
 
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -120,10 +120,14 @@ class ReleaseOf(Section):
         return self
 
 
+Variable = Annotated[Name, Field(default_factory=lambda known: known.get("name", ""))]
+"""A variable of the FMU, of the same name where none is said."""
+
+
 class OutputOf(NamedSection):
     """`[[output]]`: what a channel's `output` names; `{a..b}` stands for all numbers from a to b."""
 
-    variable: Name | None = None
+    variable: Variable
     quantity: Quantity = Quantity.DISPLACEMENT
 
 
@@ -145,7 +149,7 @@ class PortOf(NamedSection):
 class VariableParameter(ParameterSection):
     """`[[parameter]]`: a calibrated parameter that is a variable of the FMU."""
 
-    variable: Name | None = None
+    variable: Variable
 
 
 class ScalesOf(Section):

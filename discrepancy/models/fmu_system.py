@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from warnings import catch_warnings, simplefilter
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import logm
 from scipy.signal import cont2discrete
 
@@ -17,6 +18,7 @@ from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import Laws
 from fe.runtime.stepwise import Begin, advance, steps_under, substeps
 
+ComplexArray = NDArray[np.complex128]
 KEPT = 16
 """Lengths of steps, and sets of ports, that a system keeps."""
 MOST_STATES = 40
@@ -28,6 +30,8 @@ INDEPENDENT = 1e5
 """Condition up to which eigenvectors give the logarithm of a matrix, 20 times faster than `logm`."""
 FIT = 1e-7
 """Largest error of a linear system against the record that it is made of, as a share of the record."""
+JUMP = 1e-2
+"""Share of a port's speed that may come at once with a force: a solver of coarse steps shows a little."""
 ROUNDING = 1e-9
 """Share of the displacement at rest below which what a force moves at once is rounding."""
 
@@ -86,20 +90,32 @@ class FmuSystem:
         """Outputs (C, E) at rest under unit forces."""
         return np.asarray(self.direct + self.outputs @ self.at_rest(np.eye(self.push.shape[1])))
 
+    def _residues(self, column: int, number: int) -> tuple[ComplexArray, ComplexArray]:
+        """Return the rates (n,) [1/s] of the modes, and the residues of an output's answer to a force."""
+        rates, shapes = self._kept.get("modes", lambda: np.linalg.eig(self.generator))
+        into = np.linalg.solve(shapes, self.push[:, number].astype(complex))
+        return rates, (self.outputs[column] @ shapes) * into
+
     def most_flexible(self, column: int, number: int) -> tuple[float, float] | None:
         """Return the mode that gives an output the most at rest under a force; None if none vibrates.
 
-        Its angular frequency [rad/s], and the squared shape that both see [1/kg].
+        Its angular frequency [rad/s], and its flexibility between the two [m/N].
         """
-        rates, shapes = np.linalg.eig(self.generator)
-        into = np.linalg.solve(shapes, self.push[:, number].astype(complex))
-        residues = (self.outputs[column] @ shapes) * into
-        found = [
-            (float(abs(rate)), float(abs(2.0 * rate.imag * residue)))
-            for rate, residue in zip(rates, residues, strict=True)
-            if rate.imag > 1e-9 * abs(rate)
-        ]
-        return max(found, key=lambda mode: mode[1] / mode[0] ** 2, default=None)
+        rates, residues = self._residues(column, number)
+        frequency, vibrating = np.abs(rates), rates.imag > 1e-9 * np.abs(rates)
+        flexible = np.where(vibrating, np.abs(2.0 * rates.imag * residues) / frequency**2, 0.0)
+        best = int(np.argmax(flexible))
+        return (float(frequency[best]), float(flexible[best])) if vibrating.any() else None
+
+    def stiffness(self, column: int, number: int) -> tuple[float, float]:
+        """Return the stiffness of the most flexible mode between output and force, and that at rest [N/m]."""
+        at_rest, mode = 1.0 / float(self.gain[column, number]), self.most_flexible(column, number)
+        return (at_rest if mode is None or mode[1] * at_rest < 1e-6 else 1.0 / mode[1]), at_rest
+
+    def jumps(self, columns: IntArray, numbers: IntArray) -> bool:
+        """Whether the speed of an output jumps with its force, so that laws there find no mass."""
+        found = (self._residues(*pair)[1] for pair in zip(columns, numbers, strict=True))
+        return any(abs(item.sum()) > JUMP * np.abs(item).sum() for item in found)
 
     # ------------------------------------------------------------ motion
 

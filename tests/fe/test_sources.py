@@ -1,10 +1,9 @@
-"""Sources of `fe`: compiled loops are kept by them, sentences said in them; the runtime imports little."""
+"""Sources of `fe`: compiled loops are kept by them, and those of the runtime import little."""
 
 import ast
 import importlib.util
 import sys
 from pathlib import Path
-from string import Formatter
 
 import numba
 import pytest
@@ -12,7 +11,6 @@ import pytest
 import fe
 import fe.runtime
 from fe.compilation import compiled
-from fe.sentences import SENTENCES
 
 
 def test_without_a_folder_for_the_cache_it_still_compiles(monkeypatch):
@@ -66,24 +64,6 @@ def test_loops_are_kept_by_content_wherever_they_lie_and_a_changed_source_never_
     changed = change.get("step", 1.0) * (1.0 + change.get("added", 1.0))
     assert outer("there", **change) == (changed, 1)
     assert outer("here") == (2.0, 0)
-
-
-# ---------------------------------------------------------------- sentences
-
-
-def test_every_sentence_is_said_with_its_values():
-    known = {f"{table}.{key}": text for table, own in SENTENCES.items() for key, text in own.items()}
-    said = set()
-    for path in Path(fe.__file__).parent.rglob("*.py"):
-        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "said":
-                name, given = ast.literal_eval(call.args[0]), {item.arg for item in call.keywords}
-                wanted = {
-                    key.split(".")[0].split("[")[0] for _, key, _, _ in Formatter().parse(known[name]) if key
-                }
-                assert wanted == given or (None in given and given - {None} <= wanted), (path.name, name)
-                said.add(name)
-    assert said == known.keys()
 
 
 # ---------------------------------------------------------------- the runtime

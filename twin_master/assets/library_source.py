@@ -128,18 +128,16 @@ class ObservationLibrary:
                 f"the observation library has the states {', '.join(self.states.names)}, and the scenario "
                 f"asks for {', '.join(names)}: sample one for this scenario."
             )
-        index = np.zeros(len(coordinates), dtype=int)
-        for factor in self.states.factors:
-            levels, wanted = np.asarray(factor.levels), coordinates[:, names.index(factor.name)]
-            distance = np.abs(levels - wanted[:, None])
-            missing = distance.min(axis=1) > _SAME * np.maximum(np.abs(wanted), 1.0)
-            if missing.any():
-                raise InvalidObservationLibraryError(
-                    f"the observation library has the levels {_listed(levels)} of {factor.name}, and the "
-                    f"scenario asks for {wanted[missing][0]:g}: sample one for this scenario."
-                )
-            index = index * len(levels) + distance.argmin(axis=1)
-        return [int(row) for row in index]
+        wanted = coordinates[:, [names.index(name) for name in self.states.names]]
+        for factor, asked in zip(self.states.factors, wanted.T, strict=True):
+            levels = np.array(factor.levels)
+            for level in np.unique(asked):
+                if _place(levels[:, None], level) is None:
+                    raise InvalidObservationLibraryError(
+                        f"the observation library has the levels {_listed(levels)} of {factor.name}, and the "
+                        f"scenario asks for {level:g}: sample one for this scenario."
+                    )
+        return [_place(self.states.coordinates, state) or 0 for state in wanted]
 
     def control_of(self, name: str, values: Mapping[str, float]) -> int:
         """Return the index of the control whose inputs have the given values; its name does not matter.
@@ -154,20 +152,14 @@ class ObservationLibrary:
                 f"the observation library has the control inputs {', '.join(self.control_values)}, and the "
                 f"scenario sets {', '.join(values)}: sample one for this scenario."
             )
-        distance = np.max(
-            [
-                np.abs(self.control_values[key] - value) / max(abs(value), 1.0)
-                for key, value in values.items()
-            ],
-            axis=0,
-        )
-        if distance.min() > _SAME:
+        known = np.column_stack([self.control_values[key] for key in values])
+        if (place := _place(known, np.array([*values.values()]))) is None:
             shown = ", ".join(f"{key} = {value:g}" for key, value in values.items())
             raise InvalidObservationLibraryError(
                 f"the observation library was not sampled at {shown}, the control {name} of the scenario; it "
                 f"has {', '.join(self.controls)}: sample one for this scenario."
             )
-        return int(distance.argmin())
+        return place
 
     def at_draws(self, name: str, draws: Float) -> Float:
         """Return the observations (N, S, U, G) at N values of the parameter, linear between the sampled ones.
@@ -193,18 +185,18 @@ class ObservationLibrary:
                 f"library from {nodes[0]:.6g} to {nodes[-1]:.6g}: sample one for this scenario and seed, or "
                 f"over a wider range with --grid parameter.{name}=..."
             )
-        upper = np.clip(np.searchsorted(nodes, draws, side="left"), 0, len(nodes) - 1)
-        lower = np.maximum(upper - 1, 0)
-        width = nodes[upper] - nodes[lower]
-        share = np.divide(draws - nodes[lower], width, out=np.ones(len(draws)), where=width > 0.0)
-        share = np.clip(share, 0.0, 1.0)[:, None, None, None]
-        low, high = self.values[order[lower]], self.values[order[upper]]
-        # At a sampled value exactly what was sampled.
-        return np.where(share == 1.0, high, (1.0 - share) * low + share * high)
+        share = np.array([np.interp(draws, nodes, own) for own in np.eye(len(nodes))])
+        return np.tensordot(share.T, self.values[order], axes=1)
 
     def holds_draws(self, draws: Float) -> bool:
         """Return whether every value of the parameter was sampled, so that nothing is interpolated."""
         return bool(np.isin(draws, self.draws).all())
+
+
+def _place(known: Float, wanted: Float) -> int | None:
+    """Return which of the points (N, K) is the wanted one (K,); None if none is."""
+    distance = np.max(np.abs(known - wanted) / np.maximum(np.abs(wanted), 1.0), axis=1)
+    return int(distance.argmin()) if distance.min() <= _SAME else None
 
 
 def write_observation_library(path: Path, library: ObservationLibrary) -> Path:

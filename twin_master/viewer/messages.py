@@ -5,7 +5,6 @@ One that was away, or is slow, asks for more at once, and nothing is kept for it
 """
 
 import json
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -118,17 +117,18 @@ class Teller:
     def _past(self, first: int, end: int) -> dict[str, Any]:
         flight, scene = self._flight, self._scene
         believed, observed = flight.believed(first, end), flight.observed(first, end)
+        seen, folder = flight.seen(first, end), f" {flight.folder}"
         scales = np.array([factor.scale for factor in scene.factors])
         return self._printed(believed, observed) | {
-            "control": [turn.control_index for turn in flight.seen(first, end)],
+            "control": [turn["control_index"] for turn in seen],
             "notices": [
-                [notice.sentence.replace(" DIR", f" {flight.folder}") for notice in turn.notices]
-                for turn in flight.seen(first, end)
+                [
+                    notice["sentence"].replace(" DIR", f" {flight.folder}")
+                    for notice in turn.get("notices", ())
+                ]
+                for turn in seen
             ],
-            "learnt": [
-                {name: asdict(learnt) for name, learnt in turn.learnt.items()}
-                for turn in flight.seen(first, end)
-            ],
+            "learnt": [turn.get("learnt", {}) for turn in seen],
             "truth": _plain(scales * flight.truth(first, end)),
         }
 

@@ -334,7 +334,7 @@ def test_silence_is_told_and_journalled(base, mission, plain, tmp_path, source):
     assert [journalled_decision(line, watch.scenario, model) for line in journal(watch.folder)] == told
     assert ran(watch, CsvFeed(plain, watch.scenario))
     seen = [
-        [notice.kind for notice in turn.notices] for turn in viewed(watch).seen(0, 4)
+        [notice["kind"] for notice in turn.get("notices", ())] for turn in viewed(watch).seen(0, 4)
     ]  # as the page shows it
     assert seen == [["heard", "quiet", "quiet"], ["heard", "quiet"], ["heard"], []]
     assert [turn for turn, notice in watch.told(0) if notice.kind == "quiet"] == [0, 0, 1]
