@@ -76,11 +76,8 @@ def test_runtime_files_import_only_numpy_the_standard_library_and_each_other() -
     assert len(files) > 15
     for name in files:
         for node in ast.walk(ast.parse(name.read_text(encoding="utf-8"))):
-            modules = []
-            if isinstance(node, ast.Import):
-                modules = [alias.name.split(".")[0] for alias in node.names]
-            elif isinstance(node, ast.ImportFrom) and node.level == 0:
-                modules = [str(node.module).split(".")[0]]
-            elif isinstance(node, ast.ImportFrom):
+            modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
                 assert node.level <= len(name.relative_to(PACKAGE).parts), name
-            assert set(modules) <= {"numpy", *sys.stdlib_module_names}, name
+                modules = [str(node.module)] if node.level == 0 else []
+            assert {module.split(".")[0] for module in modules} <= {"numpy", *sys.stdlib_module_names}, name
