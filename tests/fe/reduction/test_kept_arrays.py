@@ -159,8 +159,6 @@ def test_values_that_cannot_be_are_refused(
 
 # ---------------------------------------------------------------- the cache
 
-ROOT = Path(__file__).parents[3]
-
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -264,7 +262,7 @@ def test_without_a_place_to_keep_it_the_model_is_still_given(
 def test_every_file_that_shapes_the_model_counts_for_the_key() -> None:
     code = "import sys, fe.reduction.patch_basis; print(*(n for n in sys.modules if n.startswith('fe.')))"
     words = [sys.executable, "-c", code]
-    result = subprocess.run(words, capture_output=True, text=True, check=True, cwd=ROOT)
+    result = subprocess.run(words, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3])
     rooms = {name.split(".")[1] for name in result.stdout.split()}
     assert rooms - {"designs", "sentences"} == set(MODELLING_ROOMS)
 

@@ -22,7 +22,7 @@ from pymor.reductors.coercive import CoerciveRBReductor
 from benchmarks.study_regions import bracket, plate, tube
 from fe.reduction.fields import WingFields, write_modes_vtu, write_wing_vtu
 from fe.reduction.model_cache import reduced_structure
-from fe.reduction.reduced_basis import Reduction, measured_errors, reduce_structure
+from fe.reduction.reduced_basis import measured_errors, reduce_structure
 from fe.reduction.settings import StructureSettings
 from fe.reduction.terms import ReductionTerms
 from fe.runtime.errors import FiniteElementError, OutsideModelError
@@ -36,8 +36,6 @@ from reporting.errors import FileNotWrittenError
 from tests.fe.springs import ROUGH, SETTINGS, reduced_springs, rough_springs, springs
 from tests.refusals import Inputs, refused
 from tests.wings import tip_stiffness
-
-HURT = {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 3.0, "push": -120.0}
 
 
 class Pair(NamedTuple):
@@ -243,11 +241,6 @@ STIFFNESS = tuple(term.matrix for term in SYSTEM.stiffness_terms)
 TERMS = ReductionTerms(SYSTEM)
 
 
-@pytest.fixture(scope="module")
-def reduction() -> Reduction:
-    return reduced_springs(2)
-
-
 def values(state: Any) -> dict[str, float]:
     return dict(zip(("young_modulus_factor", *SYSTEM.regions), state, strict=True))
 
@@ -264,9 +257,9 @@ def test_bound_is_not_wildly_pessimistic() -> None:
     assert np.median(ratios) < 1.8
 
 
-def test_the_rounding_that_was_measured_is_allowed_for(reduction: Reduction) -> None:
+def test_the_rounding_that_was_measured_is_allowed_for() -> None:
     """On a soft first spring the chain moves far and stretches little: digits of the stretches are lost."""
-    assert reduction.model.rounding_allowance == 5e-6  # the least
+    assert reduced_springs(2).model.rounding_allowance == 5e-6  # the least
     root = 1e-10
     model = reduce_structure(springs(root=root), replace(SETTINGS, bound_tolerance=1e-2)).model
     # in doubles a displacement of all is known to 2^-53 of itself, and moves by (pull / stretch) / root
@@ -274,9 +267,9 @@ def test_the_rounding_that_was_measured_is_allowed_for(reduction: Reduction) -> 
     assert model.static_response({"load_factor": 1.0}).strain_error_bound > 5e-6
 
 
-def test_pymor_reduces_and_bounds_alike(reduction: Reduction) -> None:
+def test_pymor_reduces_and_bounds_alike() -> None:
     """On the same basis pyMOR's coercive reductor must give the same solution and the same energy bound."""
-    model, basis = reduction.model, reduction.static_basis
+    model, basis = reduced_springs(2).model, reduced_springs(2).static_basis
     coefficients = [ProjectionParameterFunctional("theta", 4, k) for k in range(4)]
     operators = [NumpyMatrixOperator(term) for term in STIFFNESS]
     reference = {"theta": np.append(model.bound_reference, 1.0)}
@@ -309,8 +302,8 @@ def test_search_ends_below_the_tolerance_and_starts_high(regions: int, tolerance
     assert found.model.dual_output.shape[::2] == {1: (2, 1), 2: (4, 1), 4: (1, 12)}[regions]
 
 
-def test_same_system_gives_the_same_bytes(reduction: Reduction) -> None:
-    assert reduce_structure(springs(), SETTINGS).model.to_bytes() == reduction.model.to_bytes()
+def test_same_system_gives_the_same_bytes() -> None:
+    assert reduce_structure(springs(), SETTINGS).model.to_bytes() == reduced_springs(2).model.to_bytes()
 
 
 def test_progress_is_told() -> None:
@@ -320,8 +313,8 @@ def test_progress_is_told() -> None:
     assert "'full solution 1'" in str(listener.mock_calls)
 
 
-def test_anchors_part_the_losses_in_equal_ratios(reduction: Reduction) -> None:
-    np.testing.assert_allclose(1.0 - reduction.model.dual_split, np.sqrt(0.2))
+def test_anchors_part_the_losses_in_equal_ratios() -> None:
+    np.testing.assert_allclose(1.0 - reduced_springs(2).model.dual_split, np.sqrt(0.2))
     kept = np.array([anchor[1:3] for (anchor,) in TERMS.anchors()])
     np.testing.assert_allclose(
         kept, 0.2 ** np.array([(0.25, 0.25), (0.25, 0.75), (0.75, 0.25), (0.75, 0.75)])

@@ -106,8 +106,8 @@ def test_a_released_wing_for_patches_moves_as_all_its_unknowns(coarse_patched_wi
     ratio = np.linalg.solve(structure.mass, structure.stiffness)
     generator = second_order(ratio, ALPHA * np.eye(n) + BETA * ratio)
     wanted = rest + (expm(5e-4 * generator) @ np.concatenate((held, np.zeros(n))))[:n]
-    assert state.memory[0, PLACE] == pytest.approx(tip @ wanted, rel=5e-5)
-    assert motion.point_displacement(state, HOLDING) == pytest.approx(tip @ wanted, rel=5e-5)
+    assert state.memory[0, PLACE] == pytest.approx(tip @ wanted, rel=1e-4)
+    assert motion.point_displacement(state, HOLDING) == pytest.approx(tip @ wanted, rel=1e-4)
     error = np.abs(motion.outputs(state) - structure.outputs @ wanted)
     assert np.all(error < 5e-3 * np.abs(structure.outputs @ held))
 

@@ -281,13 +281,10 @@ def test_nodes_of_abaqus_in_a_system_of_their_own(kind: str, box, tmp_path: Path
 
 # ---------------------------------------------------------------- hostile files
 
-LIMIT = 60
-"""Seconds after which a reader that hangs is ended with its process; all is read in hundredths of one."""
-
 
 def check(read: Callable[[], Any], *expected: type[Exception]) -> bool:
     """Whether something was read; what is refused is one sentence."""
-    signal.alarm(LIMIT)
+    signal.alarm(60)  # seconds; who hangs is ended with the process, and all is read in hundredths of one
     try:
         read()
     except expected as error:
