@@ -73,8 +73,8 @@ class FmuMotion(FmuPace):
             stamps = case.step * np.arange(ceil(end / case.step - 1e-6) + 1.0)
         loads = [] if case.course is None else [(case.lever, case.course)]
         states, forces = system.motion(
-            Acting(trial.time, stamps, loads), self._start(system, case, amounts), still[seen], laws, seen,
-            numbers, refinement,
+            Acting(trial.time, stamps, loads), self._start(system, case, amounts), laws, seen, numbers,
+            still[seen], refinement,
         )  # fmt: skip
         rows, at_once = system.rows(columns, orders)
         values = states @ rows.T + forces @ at_once.T + np.where(derived, 0.0, still[columns])
@@ -99,8 +99,7 @@ class FmuMotion(FmuPace):
 
         def moved(parts: int) -> FloatArray:
             step = fixed or whole / parts
-            finer = case._replace(step=step, record=ceil(end / step - 1e-6))
-            run = self._run(finer, amounts)
+            run = self._run(case._replace(step=step, record=ceil(end / step - 1e-6)), amounts)
             if len(laws):
                 with np.errstate(all="ignore"):  # an unstable coupling grows beyond all numbers
                     return self._beside(run, laws)
@@ -108,8 +107,10 @@ class FmuMotion(FmuPace):
             return self.remembered((*run[:3], *run.begin.items(), *given), lambda: self.followed(run))
 
         if len(laws) and fixed is None:
-            watched = [*columns, *self.x]
-            parts = self._parts_for(laws, trial, watched, whole, lambda parts: moved(parts)[::parts, watched])
+            # an accelerometer that nobody reads would ask for steps many times smaller
+            watched = sorted({*columns, *self.x})
+            key = (*watched, trial.kind, trial.interval)
+            parts = self._parts_for(laws, key, whole, lambda parts: moved(parts)[::parts, watched])
         parts *= refinement
         return moved(parts)[:, columns], fixed or whole / parts
 
@@ -168,15 +169,11 @@ class FmuMotion(FmuPace):
                 values.append(asset.step(load=dict(zip(courses, row.tolist(), strict=True))).values)
         return np.array(values)
 
-    def _parts_for(
-        self, laws: Laws, trial: Trial, watched: Sequence[int], step: float,
-        moved: Callable[[int], FloatArray],
-    ) -> int:  # fmt: skip
+    def _parts_for(self, laws: Laws, key: Hashable, step: float, moved: Callable[[int], FloatArray]) -> int:
         """Return into how many parts steps [s] are divided for laws.
 
-        Steps are halved until that changes nothing that is watched by more than `CONVERGED` of its largest
-        motion (rms); what was enough is kept for laws of this kind up to twice as strong. An accelerometer
-        that nobody reads would ask for steps many times smaller.
+        Steps are halved until that changes nothing that moves by more than `CONVERGED` of its largest motion
+        (rms); what was enough is kept for laws of this kind up to twice as strong.
 
         Raises
         ------
@@ -185,23 +182,22 @@ class FmuMotion(FmuPace):
         """
         strength = float(np.max(np.abs(laws.values[:, 0])))
         exponents = np.round(np.clip(laws.values[:, 1:3], -9.0, 9.0), 1)  # roughness asks for short steps
-        kinds = laws.ports, laws.numbers.tobytes(), exponents.tobytes()
-        key = (tuple(sorted(set(watched))), trial.kind, trial.interval, *kinds)
+        key = (key, laws.ports, laws.numbers.tobytes(), exponents.tobytes())
         parts, tried = self._refinements.get(key, (1, 0.0))
         if strength <= 2.0 * tried:
             return parts
-        coarse = moved(parts)
+        fine = moved(parts)
         while parts <= MOST_REFINEMENT:
-            fine = moved(2 * parts)
+            coarse, fine = fine, moved(2 * parts)
             rows = min(len(fine), len(coarse))
             with np.errstate(all="ignore"):
-                size = np.max(np.abs(fine[:rows] - fine[:rows].mean(axis=0)), axis=0)
+                size = np.max(np.abs(fine - fine.mean(axis=0)), axis=0)
                 difference = np.sqrt(np.mean((coarse[:rows] - fine[:rows]) ** 2, axis=0))
-                change = float(np.max(difference / np.where(size > 0.0, size, np.inf)))
-            if np.isfinite(difference).all() and change <= CONVERGED:
+                change = float(np.max(difference / np.where(size == 0.0, np.inf, size)))
+            if change <= CONVERGED:
                 self._refinements[key] = (parts, strength)
                 return parts
-            parts, coarse = 2 * parts, fine
+            parts *= 2
         raise ModelError(
             f"The internal force at {', '.join(dict.fromkeys(laws.ports))} does not converge in the "
             f"co-simulation with the FMU model {self.description.name!r}: halving steps of "
@@ -211,46 +207,49 @@ class FmuMotion(FmuPace):
 
     # ------------------------------------------------------------ rest
 
-    def rest(self, states: Sequence[State], loads: Sequence[Mapping[str, float]]) -> FloatArray:
-        """Return the outputs (L, C) at rest in states that differ in inputs, under more on some of them.
+    def rest(self, states: Sequence[State], loads: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the outputs (L, C) at rest in states that differ in inputs, under more (L,) on some of them.
 
         Where the FMU has to come to rest and is linear, what loads add is that of its system.
         """
         if not self.description.static.settle:
             return self.resting(states, loads)
-        return np.array([self._rested(*pair) for pair in zip(states, loads, strict=True)])
+        names = tuple(sorted(name for name, values in loads.items() if np.any(values)))
+        rows = np.array([loads[name] for name in names]).reshape(-1, len(states)).T
+        order = np.argsort(-np.abs(rows).sum(axis=1), kind="stable")  # the largest load says whether it is
+        found = {row: self._rested(states[row], rows[row], names) for row in order.tolist()}
+        return np.array([found[row] for row in range(len(states))])
 
-    def _rested(self, state: State, loads: Mapping[str, float]) -> FloatArray:
-        """Return the outputs (C,) when a motion has come to rest."""
-        acting = {name: value for name, value in sorted(loads.items()) if value != 0.0}
-        names, amounts = tuple(acting), np.array([*acting.values()])
+    def _rested(self, state: State, amounts: FloatArray, names: tuple[str, ...]) -> FloatArray:
+        """Return the outputs (C,) when a motion has come to rest under amounts (E,) on some inputs."""
 
-        def asked(loads: Mapping[str, float]) -> FloatArray:
-            key = (state, *loads.items(), "rest")
-            return self.remembered(key, lambda: self.resting([state], [loads])[0])
+        def asked(amounts: FloatArray) -> FloatArray:
+            loads, key = dict(zip(names, amounts[:, None], strict=True)), (state, names, amounts.tobytes())
+            return self.remembered(key, lambda: self.resting([state], loads)[0])
 
         case = Case(state, self.description.static.step, RECORD, names, at_rest=True)
         if self._adds.get(names) is False or (system := self.system(case)) is None:
-            return asked(acting)
-        zero = asked({})
-        moved = system.gain @ amounts
+            return asked(amounts)
+        zero, moved = asked(0.0 * amounts), system.gain @ amounts
         if names not in self._adds:
             passing = [np.max(np.abs(self._answer(case, name)), axis=0) for name in names]
             allowed = LINEAR * (np.abs(moved) + np.abs(amounts) @ passing)
-            self._adds[names] = bool(np.all(np.abs(asked(acting) - zero - moved) <= allowed))
-        return np.asarray(zero + moved) if self._adds[names] else asked(acting)
+            self._adds[names] = bool(np.all(np.abs(asked(amounts) - zero - moved) <= allowed))
+        return np.asarray(zero + moved) if self._adds[names] else asked(amounts)
 
     def flexibility(self, state: State) -> FloatArray:
         """Return the displacements (P, P) of ports at rest under unit forces at each."""
         if not self.ports:  # loads of zero may be outside of what the FMU takes
             return np.zeros((0, 0))
-        sizes = np.array([self.size(name) for name in self.forces])
-        loads = [{}, *({name: size} for name, size in zip(self.forces, sizes.tolist(), strict=True))]
-        found = self.rest([state] * len(loads), loads)[:, self.x]
-        return np.asarray((found[1:] - found[0]).T / sizes)
+        pushes = np.diag([self.size(name) for name in self.forces])
+        loads = dict.fromkeys(self.forces, np.zeros(len(pushes) + 1))
+        for name, push in zip(self.forces, pushes, strict=True):
+            loads[name] = loads[name] + np.append(0.0, push)
+        found = self.rest([state] * (len(pushes) + 1), loads)[:, self.x]
+        return np.asarray((found[1:] - found[0]).T / np.diag(pushes))
 
     def at_rest(
-        self, states: Sequence[State], loads: Sequence[Mapping[str, float]], laws: Laws, trial: str
+        self, states: Sequence[State], loads: Mapping[str, FloatArray], laws: Laws, trial: str
     ) -> FloatArray:
         """Return the outputs (L, C) where laws follow the load path; the FMU itself is asked at the end.
 
@@ -262,11 +261,11 @@ class FmuMotion(FmuPace):
         try:
             values = self.rest(states, loads)
         except ModelError:
-            for number, (state, load) in enumerate(zip(states, loads, strict=True), start=1):
+            for row, state in enumerate(states):
                 try:
-                    self.rest([state], [load])
+                    self.rest([state], {name: values[row : row + 1] for name, values in loads.items()})
                 except ModelError as own:
-                    raise ModelError(f"The trial {trial!r}, row {number} of its table: {own}") from own
+                    raise ModelError(f"The trial {trial!r}, row {row + 1} of its table: {own}") from own
             raise
         if not len(laws):
             return values
@@ -275,10 +274,9 @@ class FmuMotion(FmuPace):
         linear = values[:, columns]
         for _ in range(STATIC_ITERATIONS):
             forces = static_solution(laws, linear, compliance, kernel=compiled_kernel()).forces
-            given = [dict(load) for load in loads]
-            for row, pulls in zip(given, forces.tolist(), strict=True):
-                for port, pull in zip(at, pulls, strict=True):
-                    row[self.forces[port]] = row.get(self.forces[port], 0.0) - pull
+            given = dict(loads)
+            for port, pull in zip(at, forces.T, strict=True):
+                given[self.forces[port]] = given.get(self.forces[port], 0.0) - pull
             values = self.rest(states, given)
             # where the FMU is not linear, the law is solved again about the points that were reached
             again = values[:, columns] + forces @ compliance.T

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.optimize import root_scalar
 from scipy.signal import periodogram
 
-from discrepancy.campaign.records import FloatArray, Trial
+from discrepancy.campaign.records import FloatArray, Hold, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Course
+from discrepancy.models.acting import Acting, Course
 from discrepancy.models.fmu_file import FmuModelDescription, ReleaseOf
 from discrepancy.models.fmu_runs import FmuRuns, Run, State
 from discrepancy.models.fmu_system import FmuSystem, fmu_system
@@ -157,10 +157,11 @@ class FmuPace(FmuRuns):
         run = self._run(case, amounts)
         courses = {name: self.size(name) * random.uniform(-1.0, 1.0, run.steps) for name in case.inputs}
         courses |= run.courses
-        moved = self._moved(case, run._replace(courses=courses))
-        forces = np.array([*courses.values()]).reshape(-1, run.steps).T
-        shown = system.stepped(self._start(system, case, amounts), forces, case.step)
-        error = np.max(np.abs(moved - shown)[1:], axis=0)
+        moved, time = self._moved(case, run._replace(courses=courses)), case.step * np.arange(run.steps + 1.0)
+        held = (Course(time, np.append(values, 0.0), Hold.ZERO_ORDER) for values in courses.values())
+        acting = Acting(time, time, list(zip(np.eye(len(courses)), held, strict=True)))
+        states, forces = system.motion(acting, self._start(system, case, amounts))
+        error = np.max(np.abs(moved - states @ system.outputs.T - forces @ system.direct.T)[1:], axis=0)
         return bool(np.all(error <= tolerance * np.max(np.abs(moved), axis=0) + 1e-300))
 
     def _amounts(self, case: Case, *, linear: bool) -> dict[str, float]:

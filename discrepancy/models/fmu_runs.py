@@ -107,13 +107,11 @@ class FmuRuns:
                 observation={"outputs": self._observed()},
             )
             self.asset = FmiAsset(self._path, self._binding, isolated=description.isolated)
-            tables = (description.static, description.motion)
-            self.asset.check_parameters(
-                {self.parameter(n): v for item in tables for n, v in item.parameters.items()}
-            )
-            self.asset.check_parameters(
-                {f"effect.{name}.active": 1.0 for name in description.effects.values()}
-            )
+            for (
+                item
+            ) in description.parameter:  # beyond its own range it refuses, and a posterior is cut there
+                for end in (item.low, item.high):
+                    self.asset.check_parameters({self.parameter(item.variable): end})
         self._none = dict.fromkeys(self._binding.load, 0.0)
 
     @contextmanager
@@ -137,7 +135,7 @@ class FmuRuns:
     def _inputs(self) -> dict[str, Input]:
         given, wanted = self.description, self.description.inputs
         units: dict[str | None, str] = {
-            **dict.fromkeys(wanted.forces.values(), "N"),
+            **dict.fromkeys(wanted.force.values(), "N"),
             **dict.fromkeys((wanted.load_factor, *wanted.regions.values()), "1"),
             wanted.temperature: "K" if wanted.temperature_reference is None else "degC",
             wanted.bending_moment: "N.m", wanted.torque: "N.m",
@@ -155,14 +153,20 @@ class FmuRuns:
 
     def _parameters(self, known: Mapping[str, Parameter]) -> dict[str, Parameter]:
         """Return the parameters that are not known so: a value or range in another unit is none of theirs."""
-        way, units = self.description.release, dict[str | None, str]()
-        units |= {item.variable: item.unit for item in self.description.parameter}
-        units |= {way.displacement: "m", way.velocity: "m/s"} if way is not None else {}
-        found = ((self.parameter(name), unit) for name, unit in units.items() if name is not None)
+        given, way = self.description, self.description.release
+        units: dict[str | None, str | None] = {
+            **dict.fromkeys((*given.static.parameters, *given.motion.parameters)),  # in their own
+            **{f"effect.{identifier}.active": None for identifier in given.effects.values()},
+            **{item.variable: item.unit for item in given.parameter},
+            **({way.displacement: "m", way.velocity: "m/s"} if way is not None else {}),
+        }
+        named = ((self.parameter(name), unit) for name, unit in units.items() if name is not None)
         return {
-            key: Parameter(variable=known[key].variable if key in known else key, unit=unit)
-            for key, unit in found
-            if key not in known or known[key].unit != unit
+            key: Parameter(
+                variable=known[key].variable if key in known else key, unit=unit or self._own_unit(key)
+            )
+            for key, unit in named
+            if key not in known or unit not in (None, known[key].unit)
         }
 
     def _observed(self) -> Vector:
@@ -267,15 +271,17 @@ class FmuRuns:
         with self.refusals():
             return np.vstack((first, asset.simulate(load=courses, steps=run.steps).values))
 
-    def resting(self, states: Sequence[State], loads: Sequence[Mapping[str, float]]) -> FloatArray:
-        """Return the outputs (L, C) at rest in states that differ in inputs, under more on some of them."""
-        step, pairs = self.description.static.step, list(zip(states, loads, strict=True))
+    def resting(self, states: Sequence[State], loads: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the outputs (L, C) at rest in states that differ in inputs, under more (L,) on some."""
+        step = self.description.static.step
+        more = [{name: float(values[row]) for name, values in loads.items()} for row in range(len(states))]
         with self.refusals():
             if self.description.static.settle:
-                return np.array([self._settled(self._opened(state, step, load)) for state, load in pairs])
-            rows = [self.inputs(*pair) for pair in pairs]
+                pairs = zip(states, more, strict=True)
+                return np.array([self._settled(self._opened(state, step, own)) for state, own in pairs])
+            rows = [self.inputs(*pair) for pair in zip(states, more, strict=True)]
             courses = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-            return self._opened(states[0], step, loads[0]).simulate(load=courses, steps=len(rows)).values
+            return self._opened(states[0], step, more[0]).simulate(load=courses, steps=len(rows)).values
 
     def size(self, name: str) -> float:
         """Return a force that an input can have, both signs."""

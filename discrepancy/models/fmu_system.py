@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import logm
-from scipy.signal import cont2discrete
 
 from discrepancy.campaign.records import FloatArray, Hold
 from discrepancy.models.acting import SMOOTH_PARTS, Acting
@@ -15,9 +15,10 @@ from discrepancy.models.interface import Memory
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import Laws
+from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.stepwise import Begin, advance, steps_under, substeps
 
+NONE: Any = np.zeros(0, dtype=np.int64)
 ComplexArray = NDArray[np.complex128]
 KEPT = 16
 """Lengths of steps, and sets of ports, that a system keeps."""
@@ -28,6 +29,8 @@ HANKEL_ROWS, MIXTURES = 64, 3
 HANKEL_COLUMNS = 160
 INDEPENDENT = 1e5
 """Condition up to which eigenvectors give the logarithm of a matrix, 20 times faster than `logm`."""
+THRESHOLDS = 10.0 ** np.arange(-12, -6)
+"""Shares of the largest singular value below which one is rounding, one after the other."""
 FIT = 1e-7
 """Largest error of a linear system against the record that it is made of, as a share of the record."""
 JUMP = 1e-2
@@ -62,8 +65,7 @@ class FmuSystem:
         parameters, wherever its modes go.
         """
         mine, others = (np.vstack((item.outputs, item.outputs @ item.generator)) for item in (self, base))
-        size = np.linalg.norm(others, axis=1, keepdims=True)
-        size[size == 0.0] = 1.0
+        size = _not_zero(np.linalg.norm(others, axis=1, keepdims=True))
         way = np.linalg.lstsq(mine / size, others / size, rcond=None)[0]
         back = np.linalg.inv(way)
         return FmuSystem(
@@ -75,10 +77,8 @@ class FmuSystem:
         row, at_once = self.outputs[columns], self.direct[columns]
         for times in (0, 1):
             further = np.broadcast_to(orders, len(columns))[:, None] > times
-            row, at_once = (
-                np.where(further, row @ self.generator, row),
-                np.where(further, row @ self.push, at_once),
-            )
+            at_once = np.where(further, row @ self.push, at_once)
+            row = np.where(further, row @ self.generator, row)
         return row, at_once
 
     def at_rest(self, forces: FloatArray) -> FloatArray:
@@ -119,18 +119,9 @@ class FmuSystem:
 
     # ------------------------------------------------------------ motion
 
-    def stepped(self, start: FloatArray, forces: FloatArray, step: float) -> FloatArray:
-        """Return the outputs (N + 1, C) from a state under forces (N, E) held over steps [s]."""
-        system = self.generator, self.push, self.outputs, self.direct
-        transition, drive = self._kept.get(step, lambda: cont2discrete(system, step)[:2])
-        states = np.vstack((start, forces @ drive.T))
-        for k in range(len(forces)):
-            states[k + 1] += transition @ states[k]
-        return np.asarray(states @ self.outputs.T + np.vstack((forces[:1], forces)) @ self.direct.T)
-
     def motion(
-        self, acting: Acting, start: FloatArray, still: FloatArray, laws: Laws, columns: IntArray,
-        numbers: IntArray, refinement: int,
+        self, acting: Acting, start: FloatArray, laws: Laws = NO_LAWS, columns: IntArray = NONE,
+        numbers: IntArray = NONE, still: FloatArray = NONE, refinement: int = 1,
     ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
         """Return states (N, n) and forces (N, E) at the times of what acts, with laws at ports.
 
@@ -143,12 +134,12 @@ class FmuSystem:
             Forces, in rows (E,).
         start : (n,) ndarray
             State at the first time.
-        still : (J,) ndarray
-            Position of each law's port without forces.
         laws : Laws
             J internal forces.
         columns, numbers : (J,) ndarray of int
             Column of the displacement, and number of the force, of each law's port.
+        still : (J,) ndarray
+            Position of each law's port without forces.
         refinement : int
             Steps with laws are this many times smaller.
         """
@@ -186,6 +177,10 @@ class FmuSystem:
             actions=dict(zip(places, acts.T[numbers[law]], strict=True)),
         )  # fmt: skip
         return acts, modal, law
+
+
+def _not_zero(sizes: FloatArray) -> FloatArray:
+    return np.where(sizes == 0.0, 1.0, sizes)
 
 
 def _largest(matrix: FloatArray, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -231,13 +226,11 @@ def fmu_system(records: FloatArray, forces: int, step: float) -> FmuSystem | Non
         None if no system of at most `MOST_STATES` states shows the records within `FIT`.
     """
     count, columns, inputs = records.shape
-    size = np.max(np.abs(records[1:]), axis=(0, 2), keepdims=True)
-    size[size == 0.0] = 1.0
-    amount = np.max(np.abs(records[1:]) / size, axis=(0, 1))
-    amount[amount == 0.0] = 1.0
-    records = records / (size * amount)
-    mixing = np.random.default_rng(1).standard_normal((MIXTURES, columns))
-    seen, height = mixing @ records, min(HANKEL_ROWS, (count - 2) // 2)
+    size = _not_zero(np.max(np.abs(records[1:]), axis=(0, 2)))
+    amount = _not_zero(np.max(np.abs(records[1:]) / size[:, None], axis=(0, 1)))
+    records = records / (size[:, None] * amount)
+    seen = np.random.default_rng(1).standard_normal((MIXTURES, columns)) @ records
+    height = min(HANKEL_ROWS, (count - 2) // 2)
     width = min(HANKEL_COLUMNS, count - 2 - height)
     both = seen[1 + np.arange(height + 1)[:, None] + np.arange(width)].transpose(0, 2, 1, 3)
     both = both.reshape((height + 1) * MIXTURES, width * inputs)
@@ -246,28 +239,18 @@ def fmu_system(records: FloatArray, forces: int, step: float) -> FmuSystem | Non
         left, values, right = _largest(hankel, most + 16)
         if values[-1] <= 1e-13 * values[0]:
             break
-    if values[0] == 0.0:
-        return None
-    tried = 0
-    for threshold in (1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7):
-        order = int(np.sum(values > threshold * values[0]))
-        if order == tried or order > MOST_STATES:
-            continue
-        tried = order
+    goal = records[1:].transpose(0, 2, 1).reshape(-1, columns)
+    for order in dict.fromkeys(int(np.sum(values > least * values[0])) for least in THRESHOLDS):
         root = np.sqrt(values[:order])
         transition = (left[:, :order] / root).T @ shifted @ (right[:order].T / root)
-        if np.max(np.abs(np.linalg.eigvals(transition))) > 1.0 + 1e-9:
+        rates = np.linalg.eigvals(transition)
+        if not 0 < order <= MOST_STATES or np.max(np.abs(rates)) > 1.0 + 1e-9:
             continue
-        try:
-            drive = np.linalg.solve(transition, (root[:, None] * right[:order])[:, :inputs])
-        except np.linalg.LinAlgError:
-            continue
+        drive = np.linalg.lstsq(transition, (root[:, None] * right[:order])[:, :inputs])[0]
         states, power = drive[None], transition
         while len(states) < count:
             states, power = np.concatenate((states, power @ states)), power @ power
-        states = states[:count]
-        flat = states[1:].transpose(0, 2, 1).reshape(-1, order)
-        goal = records[1:].transpose(0, 2, 1).reshape(-1, columns)
+        flat = states[1:count].transpose(0, 2, 1).reshape(-1, order)
         unit = np.max(np.abs(flat), axis=0)
         rows = np.linalg.lstsq(flat / unit, goal, rcond=1e-14)[0].T / unit
         error = np.max(np.abs(goal - flat @ rows.T), axis=0)
@@ -275,7 +258,6 @@ def fmu_system(records: FloatArray, forces: int, step: float) -> FmuSystem | Non
             held, starts = np.split(drive * amount, [forces], axis=1)
             whole = np.block([[transition, held], [np.zeros((forces, order)), np.eye(forces)]])
             generator, push = np.split(_logarithm(whole)[:order] / step, [order], axis=1)
-            rows, first = rows * size[0], records[0] * size[0] * amount
-            starts = np.linalg.solve(transition, starts)
-            return FmuSystem(generator, push, rows, first[:, :forces] - rows @ held, starts)
+            rows, first = rows * size[:, None], records[0, :, :forces] * size[:, None] * amount[:forces]
+            return FmuSystem(generator, push, rows, first - rows @ held, np.linalg.solve(transition, starts))
     return None

@@ -289,13 +289,11 @@ class DesignSource(_Wing, StructureSource):
         check_model_patch(patch, self.wing.gauge_count, where)
         ask = strains_with_effects(self.wing, patch, arrays_for(self.wing_design, patch))
         force = scenario.asset.constant_load.get("tip_force", 0.0)
-        states, controls = model.states.coordinates, [control.values for control in scenario.control]
         try:
-            return np.array(
-                [
-                    asked_table(scenario.state_names, states, controls, partial(ask, e, force))
-                    for e in draws.values.tolist()
-                ]
-            )
+            tables = [
+                asked_table(scenario, model.states.coordinates, partial(ask, e, force))
+                for e in draws.values.tolist()
+            ]
         except UnacceptableValuesError as error:
             raise MissionInputError(f"the twin's model cannot carry {where}: {error}") from error
+        return np.array(tables)

@@ -294,7 +294,6 @@ class FmuSource(AssetSource):
         That holds for assets without memory.
         """
         scenario, load, rows = self._scenario, self.section.load, []
-        controls = [control.values for control in scenario.control]
         with self._session(self.binding(), self.parameters()) as session:
             chosen = self._observed(session.binding)
             for row, value in enumerate(draws.values):
@@ -302,9 +301,8 @@ class FmuSource(AssetSource):
                 session.reset({**self.parameters(), **others, draws.name: float(value)})
                 rows.append(
                     asked_table(
-                        scenario.state_names,
+                        scenario,
                         model.states.coordinates,
-                        controls,
                         lambda control, health: session.step(control, health, load).values[chosen],
                     )
                 )

@@ -33,8 +33,7 @@ from twin_master.mission.preparation import KNOWLEDGE_NAME
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Belief, Flight
-from twin_master.viewer.messages import Request, Teller, parse_request
-from twin_master.viewer.scene import LATEST, scene_of
+from twin_master.viewer.messages import LATEST, Request, Teller, scene_of
 from twin_master.workflow import fly as new_run
 
 TURNS = 50
@@ -263,7 +262,7 @@ def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
 )
 def test_a_request_of_another_form_is_refused(text):
     with pytest.raises(ValueError, match=r"for Request"):
-        parse_request(text)
+        Request.model_validate_json(text)
 
 
 def test_the_wing_stands_in_its_place(run):
