@@ -16,6 +16,7 @@ from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network.distributions import expect_controls, expect_shape
 from twin_master.network.quantity import QuantityModel
 from twin_master.network.sensor_kernels import log_densities, separated
+from twin_master.sentences import said
 
 _WORST_SHOWN = 3
 LARGEST = 1e140
@@ -109,7 +110,7 @@ class GaussianSensorModel(QuantityModel):
             enough = value > 0.0 if positive else value >= 0.0
             if value.shape not in ((), (self.sensor_count,)) or not np.all(np.isfinite(value) & enough):
                 raise InvalidModelError(
-                    f"expected one {what}, or one for each of {self.sensor_count} sensors, got {value}"
+                    said("network.one_or_each", what=what, sensors=self.sensor_count, value=value)
                 )
         if average not in ("outside", "inside"):
             raise InvalidModelError(f"expected average 'outside' or 'inside', got {average!r}")
@@ -155,9 +156,7 @@ class GaussianSensorModel(QuantityModel):
         expect_shape("sensor values", shape, *shape[:-1], self.sensor_count, error=InvalidObservationError)
         if np.any(np.isinf(observation)):
             where = tuple(int(i) for i in np.argwhere(np.isinf(observation))[0])
-            raise InvalidObservationError(
-                f"sensor value at {where} is infinite; expected a number, or NaN for a lost sensor"
-            )
+            raise InvalidObservationError(said("network.infinite", where=where))
         return observation
 
     def apart(self, observation: ArrayLike) -> tuple[Float, Float]:
@@ -328,7 +327,14 @@ def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequenc
             if given * 1e-6 <= reach:
                 advice = f"it is likely meant in microstrain: write `{key}_microstrain = {given:g}`"
         raise InvalidModelError(
-            f"`{key}` is {given:g} for sensor {sensor + 1}, and all that sensors of its unit ({unit}) can "
-            f"show by the twin's model lies between {least:.3g} and {largest:.3g}: such a sensor tells "
-            f"nothing; {advice}."
+            said(
+                "network.noise",
+                key=key,
+                given=given,
+                sensor=sensor + 1,
+                unit=unit,
+                least=least,
+                largest=largest,
+                advice=advice,
+            )
         )

@@ -28,6 +28,7 @@ from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.inference import Predicted, predict
 from twin_master.network.planner import BeliefPolicy, decision
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 
 _LARGEST = np.float64(1e150)
 """What is carried is below this, so that what follows from it are numbers, too."""
@@ -259,10 +260,7 @@ class Twin:
             As in `turn`; the twin is unchanged.
         """
         if not self.first_kept <= turn < self._turns:
-            raise IndexError(
-                f"turn {turn} cannot be revised: the twin keeps the turns from {self.first_kept} on and has "
-                f"seen {self._turns}"
-            )
+            raise IndexError(said("network.revised", turn=turn, first=self.first_kept, seen=self._turns))
         at = turn - self._turns + len(self._seen)
         index = self._seen[at].estimate.control_index if control is None else self._index_of(control)
         rows = [(np.array(observation, dtype=np.float64), index)]
@@ -370,10 +368,7 @@ class Twin:
         except (ArithmeticError, np.linalg.LinAlgError):
             held = False
         if not held:
-            raise InvalidObservationError(
-                f"twin {self.name!r}, step {turn}: the observation cannot be weighed, for beside what was "
-                "observed before its numbers leave no belief; check the sensors and the control in force"
-            )
+            raise InvalidObservationError(said("network.no_belief", name=self.name, turn=turn))
         return estimate
 
     def _index_of(self, control: int | str) -> int:

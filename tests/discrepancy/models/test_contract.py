@@ -1,6 +1,5 @@
 """The contract of a model, lumped, a wing, a structure, an FMU: what it says, reads and refuses."""
 
-import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from scipy.linalg import eigh
 from discrepancy.campaign.records import Hold, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
-from discrepancy.models.interface import Model
+from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.structures import StructureModel, WingModel
 from discrepancy.models.system_model import State, SystemModel
@@ -34,7 +33,7 @@ from tests.discrepancy.asking import trial as asked
 from tests.discrepancy.rigs import INPUTS, fmu_rig
 from tests.refusals import refused
 
-TABLE = tomllib.loads((INPUTS.folder / "kinds.toml").read_text())
+TABLE = INPUTS.table("kinds.toml")
 
 
 @dataclass
@@ -153,6 +152,27 @@ def test_a_coarse_force_does_between_its_samples_what_is_said(kind: Kind, hold: 
     assert (np.abs(straight - wanted).max() > 2e-2 * largest) == (hold is not Hold.LINEAR)
 
 
+@pytest.mark.parametrize("change", ["none", "spring", "drift"])
+def test_rates_are_derivatives(kind: Kind, change: str) -> None:
+    what = replace(kind.trial(TrialKind.RINGDOWN), time=0.003 / kind.pace * np.arange(3000))
+    outputs = [(kind.output, quantity) for quantity in Quantity.DISPLACEMENT.moving]
+    outputs += [(name, Quantity(quantity)) for name, quantity in kind.quantities.items() if quantity]
+    items = patch.ModelPatch(
+        tuple(
+            item
+            for name, item in (
+                ("spring", PowerStiffness(kind.ports[-1], 3e-2, 3.0, 0, 1e-2)),
+                ("drift", patch.StiffnessDrift(0.05 * kind.pace)),
+            )
+            if name == change and kind.model.supports(type(item))
+        )
+    )
+    found = kind.model.respond(what, tuple(outputs), items, Conditions(kind.means))
+    slope, seen_later = np.gradient(found.values, what.time, axis=0), slice(100, -5)  # what is left out fades
+    scale = np.abs(slope).max(axis=0)
+    np.testing.assert_allclose(found.rates[seen_later] / scale, slope[seen_later] / scale, atol=2e-3)
+
+
 @pytest.mark.parametrize(
     ("how", "said", "sentence"),
     [
@@ -198,8 +218,10 @@ def test_what_a_kind_cannot_do_is_refused(kind: Kind, how: TrialKind, said, item
         kind.seen(replace(kind.trial(how, force=np.ones(3)), **said), *items)
 
 
-FILES = ["two_masses", "rig"]
-ROWS = [*((name, *row) for name in FILES for row in INPUTS.refused(name)), *INPUTS.refused("rigs")]
+ROWS = [
+    *((name, *row) for name in ("two_masses", "rig") for row in INPUTS.refused(name)),
+    *INPUTS.refused("rigs"),
+]
 
 
 @pytest.mark.parametrize(("name", "old", "new", "sentence"), ROWS)
@@ -216,11 +238,13 @@ def test_a_wrong_file_is_refused_in_one_sentence(
 def test_a_missing_or_broken_file_is_refused(tmp_path: Path) -> None:
     broken = tmp_path / "broken.toml"
     broken.write_text("format = ")
-    for model, file, sentence in (
-        (LumpedModel, "four_mass_chain", "shipped are single_mass_rig, three_mass_chain"),
-        (FmuModel, fmu_rig(tmp_path, "absent.fmu"), r"absent\.fmu"),
-        *((model, tmp_path / "none.toml", "cannot be read") for model in (LumpedModel, FmuModel)),
-        *((model, broken, "not valid TOML") for model in (LumpedModel, FmuModel)),
+    for load, file, sentence in (
+        (LumpedModel.load, "four_mass_chain", "shipped are single_mass_rig, three_mass_chain"),
+        (FmuModel.load, fmu_rig(tmp_path, "absent.fmu"), r"absent\.fmu"),
+        (WingModel.of_calibration, "absent.nc", "cannot be used"),
+        (WingModel.of_design, "absent.toml", "cannot be read"),
+        *((model.load, tmp_path / "none.toml", "cannot be read") for model in (LumpedModel, FmuModel)),
+        *((model.load, broken, "not valid TOML") for model in (LumpedModel, FmuModel)),
     ):
         with pytest.raises(ModelError, match=sentence):
-            model.load(file)
+            load(file)

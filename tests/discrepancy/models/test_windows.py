@@ -95,31 +95,12 @@ def test_a_law_between_two_moments_against_a_general_integrator(item: Primitive,
     np.testing.assert_allclose(found, expected, atol=2e-4 * np.abs(expected).max())
 
 
-def test_the_response_follows_the_moment_smoothly() -> None:
-    given = trial(TrialKind.FORCED)
-    first, second = (
-        response(given, friction(0.9, 2.003 + h))[:, 0] - response(given, friction(0.9, 2.003 - h))[:, 0]
-        for h in (1e-3, 2e-3)
-    )
-    assert np.abs(first).max() > 1e-5
-    np.testing.assert_allclose(2.0 * first, second, atol=0.05 * np.abs(second).max())
-
-
 @pytest.mark.parametrize("kind", [TrialKind.FORCED, TrialKind.RINGDOWN])
 def test_without_edges_within_the_record_nothing_changes(kind: TrialKind) -> None:
     given, law = replace(trial(kind), begins=Start.SETTLED), BoucWen("slide", 60.0, 0.01, 1.5)
     own, other, open_ = Window("a trial"), Window("another", 1.0, 2.0), Window("another", 1.0)
     for windows, same in (((own,), (law,)), ((other,), ()), ((open_, own), (law,))):
         np.testing.assert_array_equal(response(given, replace(law, windows=windows)), response(given, *same))
-
-
-def test_before_a_window_and_long_after_it_the_model_is_as_it_was() -> None:
-    given, law = trial(TrialKind.FORCED), BoucWen("slide", 60.0, 0.01, 1.5)
-    windowed = replace(law, windows=(Window("a trial", 3.0, 4.0),))
-    plain, found = response(given, refinement=1), response(given, windowed)
-    before = TIME < 3.0
-    np.testing.assert_allclose(found[before], plain[before], atol=1e-9)
-    assert np.abs(found[~before] - plain[~before]).max() > 1e-3
 
 
 def test_sensors_are_wrong_within_their_windows_only() -> None:

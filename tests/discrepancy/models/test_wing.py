@@ -10,7 +10,6 @@ from scipy.linalg import eigh
 
 from calibration.result.file import save_calibration
 from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
-from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.structures import WingModel
 from fe.reduction.built_once import cache_folder
@@ -221,9 +220,3 @@ def test_the_posterior_of_a_calibration_is_the_prior(
     assert model.name == result.asset
     assert [item.mean for item in model.parameters] == pytest.approx(result.samples.mean(axis=0)[:5])
     assert [item.deviation for item in model.parameters] == pytest.approx(result.samples.std(axis=0)[:5])
-    for read, name, words in (
-        (WingModel.of_calibration, "absent.nc", "be used"),
-        (WingModel.of_design, "absent.toml", "be read"),
-    ):
-        with pytest.raises(ModelError, match=f"cannot {words}"):
-            read(tmp_path / name)
