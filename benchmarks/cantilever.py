@@ -21,7 +21,7 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.models.acting import Acting, Course, Shown, release_of
-from discrepancy.models.interface import Conditions, Model, Outputs, Response
+from discrepancy.models.interface import ACROSS, Conditions, Model, Outputs, Response
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.motion import motion_of
 from discrepancy.models.scales import PortScale, Scales
@@ -145,7 +145,7 @@ class Cantilever(Model):
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is."""
-        if output in GAUGES:
+        if output.removesuffix(ACROSS[0]).removesuffix(ACROSS[1]) in GAUGES:
             return Quantity.STRAIN
         return Quantity.DISPLACEMENT if output == "tip_displacement" else None
 
@@ -195,15 +195,13 @@ class Cantilever(Model):
 
     def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial."""
-        rows = np.array(
-            [SKIN * curvature_row(GAUGES[name]) if name in GAUGES else TIP for name, _ in outputs]
-        )
-        values, rates, torque = _motion(trial, rows, patch, conditions)
-        if not conditions.components:
-            return Response(values, rates)
-        gauge = np.array([name in GAUGES for name, _ in outputs])
-        shear = np.outer(torque, gauge) * 2.0 * SKIN / TORSIONAL_STIFFNESS
-        return Response(values, rates, -POISSON * values * gauge, shear)
+        across, along = ACROSS[0], {name: SKIN * curvature_row(place) for name, place in GAUGES.items()}
+        rows = along | {name + across: -POISSON * row for name, row in along.items()}
+        chosen = np.array([rows.get(name, TIP) for name, _ in outputs])
+        values, rates, torque = _motion(trial, chosen, patch, conditions)
+        sheared = [name.endswith(ACROSS[1]) for name, _ in outputs]
+        values[:, sheared] = torque[:, None] * 2.0 * SKIN / TORSIONAL_STIFFNESS
+        return Response(values, rates)
 
 
 def _motion(

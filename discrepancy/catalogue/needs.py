@@ -1,7 +1,6 @@
 """Where an effect may act and what it needs, by the words of its entry, and why it cannot be tested."""
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import isinf
 
@@ -9,11 +8,10 @@ import numpy as np
 
 from discrepancy.campaign.noise import MAINS, aliased
 from discrepancy.campaign.records import Channel, Quantity, Trial, TrialKind
-from discrepancy.errors import ModelError
-from discrepancy.models.interface import Conditions, Response
+from discrepancy.models.interface import ACROSS
 from discrepancy.sentences import SENTENCES, said
 from fe.runtime.motion import PLANFORM
-from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch, PortForce, Primitive
+from fe.runtime.patch import EVERY_CHANNEL, SENSORS, PortForce, Primitive
 
 from .entry import Setting
 
@@ -319,18 +317,12 @@ def _temperature(setting: Setting, entry: Entry) -> str | None:
 
 
 def _strain_across(setting: Setting, entry: Entry) -> str | None:
-    model, campaign = setting.model, setting.campaign
-    names = strain_channels(setting)
-    trial = next(trial for trial in trials(setting) if any(name in names for name in trial.channels))
-    channel = campaign.channels[next(name for name in trial.channels if name in names)]
-    means = [campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in model.parameters]
-    conditions = Conditions(np.array(means), health=trial.health, components=True)
-    given: Response | None = None
-    with suppress(ModelError):
-        given = model.respond(trial, ((channel.output, channel.quantity),), ModelPatch(), conditions)
-    if given is None or given.transverse is None or given.shear is None:
-        return said("needs.no_strain_across", model=model.name)
-    return None
+    outputs = [
+        setting.campaign.channels[name].output + part for name in strain_channels(setting) for part in ACROSS
+    ]
+    if all(map(setting.model.output_quantity, outputs)):
+        return None
+    return said("needs.no_strain_across", model=setting.model.name)
 
 
 def _has_force(setting: Setting) -> bool:

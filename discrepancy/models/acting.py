@@ -213,18 +213,18 @@ class Shown(NamedTuple):
     ----------
     rows : (4, N) ndarray
         Of z = (u, s) and its first three derivatives; a state is x = s'.
-    reaction : int, optional
-        Number of a drive whose force it shows instead.
     constant : float
         In it.
     courses : sequence of (float, Course), optional
-        In it, each with its factor; None but for what a controller gives.
+        In it, each with its factor; None but for the force of a drive or of a controller.
+    felt : (N,) ndarray, optional
+        Row along which forces of laws are in it, of a drive.
     """
 
     rows: FloatArray
-    reaction: int | None = None
     constant: float = 0.0
     courses: Sequence[tuple[float, Course | FormulaCourse]] | None = None
+    felt: FloatArray | None = None
 
     @classmethod
     def of(cls, row: FloatArray, order: int = 0, further: int = 0, states: int = 0) -> "Shown":
@@ -232,6 +232,11 @@ class Shown(NamedTuple):
         rows, n = np.zeros((4, len(row))), len(row) - states
         rows[order, :n], rows[further + 1, n:] = row[:n], row[n:]
         return cls(rows)
+
+
+def by_order(shown: Sequence[Shown], shapes: FloatArray) -> FloatArray:
+    """Return what outputs show of modal coordinates and their derivatives (4, C, M), in shapes (N, M)."""
+    return np.moveaxis(np.array([item.rows for item in shown]) @ shapes, 1, 0)
 
 
 def place_among(places: Sequence[str], place: Place, what: str, where: str = "a trial") -> str:

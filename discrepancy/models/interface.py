@@ -82,8 +82,6 @@ class Conditions:
         Stiffness losses z1, z2 of each row (dynamic trials: row 0 holds for all).
     offset : tuple of float
         Constants that the recorded inputs of a driven trial lack, in their order [SI]; empty: none.
-    components : bool
-        Whether `transverse` and `shear` are wanted.
     refinement : int
         Time steps are this many times smaller than usual, to check the integration.
     """
@@ -93,7 +91,6 @@ class Conditions:
     clock: tuple[float, float] = (0.0, 0.0)
     health: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
     offset: tuple[float, ...] = ()
-    components: bool = False
     refinement: int = 1
 
     def stamps(self, time: FloatArray) -> FloatArray:
@@ -116,15 +113,10 @@ class Response(NamedTuple):
         By output, SI units.
     rates : (N, C) ndarray or None
         Their time derivatives, for dynamic trials.
-    transverse, shear : (N, C) ndarray or None
-        Strain across the gauge's direction, and engineering shear strain, for strain outputs (zero for the
-        others); None unless asked for.
     """
 
     values: FloatArray
     rates: FloatArray | None = None
-    transverse: FloatArray | None = None
-    shear: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +153,9 @@ class PortedSystem:
 
 Outputs = tuple[tuple[str, Quantity], ...]
 """Outputs, and the quantity wanted of each."""
+ACROSS = ".transverse", ".shear"
+"""What follows the name of a strain in those across its gauge's direction: strain, and engineering shear
+strain."""
 NO_PATCH = ModelPatch()
 
 

@@ -7,18 +7,18 @@ ports the prescribed motion is a coordinate of its own, so heavy that they do no
 put right at every step. The wing, a structure on springs and a lumped rig are such systems.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
-from scipy.linalg import cho_factor, eigh, null_space
-from scipy.linalg.lapack import dpotrs
+from scipy.linalg import eigh, null_space
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Shown
-from discrepancy.models.interface import Memory, PortedSystem
+from discrepancy.models.acting import Shown, by_order
+from discrepancy.models.interface import PortedSystem
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, static_solution
@@ -27,16 +27,27 @@ HEAVY = 1e12
 """Mass of a prescribed coordinate over the largest of the system."""
 LEAST_PIVOT = 1e-9
 """A system whose equilibrium is determined worse than this has none of its own."""
-KEPT_ANSWERS = 16
-"""Loads whose answers a structure keeps: outputs and ports are often the same."""
 ROUNDING = 1e-10
 """Share of the largest entry below which what couples modes is rounding."""
 
 
-Flexibility = Callable[[FloatArray], FloatArray]
-"""What gives K^-1 loads, for loads (N,) or (N, k)."""
 Modes = tuple[FloatArray, FloatArray, int]
 """Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
+
+
+class Solved(Protocol):
+    """A structure whose modes are found in another way: a reduced one, or the patched wing."""
+
+    @property
+    def modes(self) -> Any:
+        """With their frequencies (M,) [Hz]."""
+
+    @property
+    def shapes(self) -> FloatArray:
+        """Mass-normalised (N, M)."""
+
+    def static(self, loads: FloatArray) -> FloatArray:
+        """Return K^-1 loads, for loads (N,) or (N, k)."""
 
 
 def _differs(matrix: FloatArray, other: FloatArray) -> bool:
@@ -69,10 +80,8 @@ class LinearSystem:
         Rows whose motion is prescribed.
     actions : mapping of str to (N,) ndarray
         Rows along which laws at ports act, where that is not how they see.
-    known : callable, optional
-        What returns its modes by `flexibility`, where they are known or found in another way.
-    compliance : (N, N) ndarray, optional
-        K^-1, where it is known.
+    solved : Solved, optional
+        What knows its modes and K^-1.
     """
 
     mass: FloatArray
@@ -85,8 +94,7 @@ class LinearSystem:
     states: int = 0
     drives: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     actions: Mapping[str, FloatArray] = field(default_factory=dict)
-    known: Callable[[Flexibility], Modes] | None = None
-    compliance: FloatArray | None = None
+    solved: Solved | None = None
 
     @property
     def displacements(self) -> int:
@@ -106,8 +114,9 @@ class LinearSystem:
     @cached_property
     def modes(self) -> Modes:
         """Its modes."""
-        if self.known is not None:
-            return self.known(self.flexibility)
+        if self.solved is not None:
+            frequency = 2.0 * np.pi * self.solved.modes.frequency
+            return frequency, np.ascontiguousarray(self.solved.shapes), len(frequency)
         n, most = self.displacements, self.mode_count
         mass, stiffness = self.mass[:n, :n], 0.5 * (self.stiffness[:n, :n] + self.stiffness[:n, :n].T)
         free = np.eye(n)
@@ -199,17 +208,18 @@ class LinearSystem:
     # ------------------------------------------------------------ rest
 
     @cached_property
-    def flexibility(self) -> Flexibility:
-        """What gives K^-1 loads of a structure that springs hold; raises `ModelError` if K holds not all."""
-        if self.compliance is not None:
-            return partial(np.matmul, self.compliance)
+    def _root(self) -> FloatArray:
+        """L^-1 of the stiffness L L^T."""
         try:
-            factor, lower = cho_factor(self.stiffness, check_finite=False)
+            return np.linalg.inv(np.linalg.cholesky(self.stiffness))
         except np.linalg.LinAlgError as cause:
             raise ModelError(f"The structure has no stiffness left in some direction ({cause}).") from cause
-        # the LAPACK routine itself: checks of its arguments would take ten times as long
-        known, solve = Memory(KEPT_ANSWERS), partial(dpotrs, factor, lower=lower)
-        return lambda loads: known.get((loads.shape, loads.tobytes()), lambda: np.asarray(solve(loads)[0]))
+
+    def flexibility(self, loads: FloatArray) -> FloatArray:
+        """Return K^-1 loads, (N,) or (N, k), where springs hold all; raises `ModelError` if they do not."""
+        if self.solved is not None:
+            return self.solved.static(loads)
+        return np.asarray(self._root.T @ (self._root @ loads))
 
     def residual(self, loads: FloatArray) -> FloatArray:
         """Return what the modes leave out of K^-1 loads, for loads (N,) or (N, k)."""
@@ -228,7 +238,8 @@ class LinearSystem:
         free, moving, force = len(self.angular_frequency), self.moving, loads @ self.shapes
         restoring = np.hstack((self.modal.whole[:free, :moving], self.modal.damping[:free, moving:free]))
         found = np.linalg.lstsq(restoring, force.T, rcond=LEAST_PIVOT)[0]
-        if np.max(np.abs(restoring @ found - force.T)) > 1e-6 * max(float(np.max(np.abs(force))), 1e-300):
+        left = np.max(np.abs(restoring @ found - force.T), initial=0.0)
+        if left > 1e-6 * np.max(np.abs(force), initial=1e-300):
             size = float(np.max(np.abs(restoring), initial=0.0))
             raise ModelError(
                 "the rig has no rest under what acts at the first sample (nothing holds it): say "
@@ -267,8 +278,7 @@ class LinearSystem:
         """
         rows, levels = self.port_rows(laws, time), np.eye(len(units)) if amounts is None else amounts
         rows[:, self.displacements :] = 0.0
-        found = self.resting(np.concatenate((units, rows)))
-        answers, flexible = found[: len(units)] + held, found[len(units) :]
+        answers, flexible = self.resting(units) + held, self.resting(rows)
         at_ports, compliance = answers @ rows.T, rows @ flexible.T
         if seen is not None:
             answers, flexible = answers @ seen.T, flexible @ seen.T
@@ -291,15 +301,6 @@ class LinearSystem:
         """Return what resists a drive's motion, its speed and its acceleration, on all unknowns (N,)."""
         return [matrix @ self.lift[:, number] for matrix in (self.stiffness, self.damping, self.mass)]
 
-    def by_order(self, shown: Sequence[Shown], shapes: FloatArray) -> FloatArray:
-        """Return what outputs show of modal coordinates and their derivatives (4, C, M), in shapes (N, M)."""
-        rows = np.array([item.rows for item in shown]).reshape(len(shown), 4, len(shapes))
-        for own, item in zip(rows, shown, strict=True):
-            if item.reaction is not None:
-                along = self.lift[:, item.reaction]
-                own[:3] = [along @ matrix for matrix in (self.stiffness, self.damping, self.mass)]
-        return np.moveaxis(rows @ shapes, 1, 0)
-
     def seen_by(self, shown: Sequence[Shown], shapes: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, in shapes (N, M) of what is free.
 
@@ -312,14 +313,14 @@ class LinearSystem:
         )
         force = np.zeros((len(ports), len(shown)))
         for number, item in enumerate(shown):
-            if item.reaction is not None:
-                force[:, number] = acts @ self.lift[:, item.reaction]
+            if item.felt is not None:
+                force[:, number] = acts @ item.felt
             elif self.truncated:
                 force[:, number] = -acts @ self.residual(item.rows[0])
         mass, *others = (shapes.T @ matrix @ shapes for matrix in (self.mass, self.damping, self.stiffness))
         sees, acts = sees @ shapes, acts @ shapes
         push, by_damping, by_stiffness = (np.linalg.solve(mass, item) for item in (acts.T, *others))
-        position, speed, acceleration, _ = self.by_order(shown, shapes)
+        position, speed, acceleration, _ = by_order(shown, shapes)
         count, moving, none = len(mass), self.moving, np.zeros((len(ports), len(mass)))
         generator = np.zeros((moving + count, moving + count))
         generator[:moving, moving : 2 * moving] = np.eye(moving)

@@ -12,7 +12,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray, Hold, Start
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown
+from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown, by_order
 from discrepancy.models.interface import Response
 from discrepancy.models.linear_system import LinearSystem
 from fe.compilation import compiled_kernel
@@ -111,27 +111,26 @@ class Motion:
         """Return what outputs show, and the rates; omitted modes are in what is not derived only."""
         system, moved = self.system, [self.q, self.velocity]
         values, rates = np.zeros((2, len(self.time), len(shown)))
-        by_order = system.by_order(shown, system.all_shapes)
-        asked = np.any(by_order, axis=(1, 2))
+        orders = by_order(shown, system.all_shapes)
+        asked = np.any(orders, axis=(1, 2))
         if asked[1:].any():
             moved.append(self.acceleration)
         if asked[2:].any():
             moved.append(np.gradient(self.acceleration, self.time, axis=0))
         for order in np.flatnonzero(asked):
-            values += moved[order] @ by_order[order].T
+            values += moved[order] @ orders[order].T
             if order < 3:
-                rates += moved[order + 1] @ by_order[order].T
+                rates += moved[order + 1] @ orders[order].T
         if system.truncated:
             values += self._left_out(np.array([item.rows[0] for item in shown]))
         for number, item in enumerate(shown):
             values[:, number] += item.constant
-            if item.reaction is not None:
-                along = system.lift[:, item.reaction]
-                values[:, number] -= self.acting.load_at(self.time, along[:, None])[:, 0]
-                values[:, number] += self.port_forces @ (self.laws.rows(system.acts, len(along)) @ along)
             for factor, course in item.courses or ():
                 values[:, number] += factor * course.at(self.time)
-            if item.reaction is not None or item.courses:
+            if item.felt is not None:
+                acts = self.laws.rows(system.acts, len(item.felt))
+                values[:, number] += self.port_forces @ (acts @ item.felt)
+            if item.courses or item.felt is not None:
                 rates[:, number] = np.gradient(values[:, number], self.time)
         return Response(values, rates)
 

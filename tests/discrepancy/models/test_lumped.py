@@ -195,7 +195,7 @@ def test_rates_are_derivatives(chain: LumpedModel) -> None:
 def test_a_point_mass_sits_between_places(chain: LumpedModel) -> None:
     row = np.array([0.0, 0.25, 0.75])
     wanted = np.sqrt(eigh(STIFFNESS, MASS + 0.3 * np.outer(row, row), eigvals_only=True))
-    state = State(np.ones(3), structure=patches.ModelPatch((patches.PointMass(0.3, 0.55),)))
+    state = State((1.0,) * 3, structure=patches.ModelPatch((patches.PointMass(0.3, 0.55),)))
     np.testing.assert_allclose(chain.system(state).angular_frequency, wanted, rtol=1e-10)
 
 
