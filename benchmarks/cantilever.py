@@ -20,7 +20,7 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.models.acting import Acting, Course, Shown, release_of
+from discrepancy.models.acting import Acting, Course, Load, Shown, release_of
 from discrepancy.models.interface import ACROSS, Conditions, Model, Outputs, Response
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.motion import motion_of
@@ -231,7 +231,7 @@ def _motion(
         if trial.kind is TrialKind.RINGDOWN:
             acting = replace(acting, release=(TIP, release_of(trial)), initial=conditions.initial)
         else:
-            acting = replace(acting, loads=[(row, Course.of(trial.time, force, trial.hold))])
+            acting = replace(acting, loads=[Load(row, Course.of(trial.time, force, trial.hold))])
         moved = motion_of(system, acting, laws, conditions.refinement)
         response = moved.seen([Shown.of(row) for row in rows])
         return response.values, response.rates, behind * force

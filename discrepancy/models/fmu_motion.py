@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting
+from discrepancy.models.acting import Acting, Load
 from discrepancy.models.fmu_pace import FmuPace, Motive
 from discrepancy.models.fmu_runs import Run, State
 from fe.compilation import compiled_kernel
@@ -59,7 +59,7 @@ class FmuMotion(FmuPace):
             return sampled(values, step, times, orders, orders)
         inputs, at = self._pushed(motive), [self.ports.index(name) for name in laws.ports]
         amounts, still = self._amounts(state, step, motive, linear=True), self._still(state, step)
-        loads = [] if motive.course is None else [(self._levers(motive), motive.course)]
+        loads = [] if motive.course is None else [Load(self._levers(motive), motive.course)]
         stamps, back = np.unique(np.append(np.maximum(times, 0.0), 0.0), return_inverse=True)
         even = np.ptp(np.diff(stamps[1:])) <= ALIKE * stamps[-1]
         if not even:  # as many lengths of steps as stamps would take long

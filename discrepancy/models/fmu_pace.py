@@ -11,7 +11,7 @@ from scipy.optimize import root_scalar
 
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Course
+from discrepancy.models.acting import Course, straight
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_runs import LINEAR, FmuRuns, Run, State
 from discrepancy.models.fmu_system import FmuSystem, fmu_system
@@ -189,7 +189,7 @@ class FmuPace(FmuRuns):
         state = state.having({name: amount for name, amount in amounts.items() if name not in self._none})
         if motive.course is None:
             return Run(state, step, steps, begin)
-        begins, ends = motive.course.ends(step * np.arange(steps + 1.0))
+        begins, ends = straight(motive.course.at, step * np.arange(steps + 1.0))
         begin |= {name: lever * float(motive.course.values[0]) for name, lever in motive.levers.items()}
         courses = {name: 0.5 * lever * (begins + ends) for name, lever in motive.levers.items()}
         return Run(state, step, steps, begin, courses)

@@ -17,7 +17,7 @@ from scipy.linalg import eigh, null_space
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Shown, by_order
+from discrepancy.models.acting import Acting, Shown, by_order
 from discrepancy.models.interface import PortedSystem
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
@@ -178,11 +178,13 @@ class LinearSystem:
     @cached_property
     def modal(self) -> ModalSystem:
         """What is free and the drives, with ports; what couples modes by rounding only does not."""
-        frequency, free = np.pad(self.angular_frequency, (0, len(self.drives))), self.free_shapes
-        damping, stiffness = (free.T @ matrix @ free for matrix in (self.damping, self.stiffness))
+        count, drives = len(self.angular_frequency), len(self.drives)
+        frequency, shapes = np.pad(self.angular_frequency, (0, drives)), self.all_shapes
+        damping, stiffness = (shapes.T @ matrix @ shapes for matrix in (self.damping, self.stiffness))
+        damping[count:] = stiffness[count:] = 0.0  # nothing moves a drive
         diagonal = np.diag(np.diag(damping))
-        damping = damping if _differs(damping, diagonal) else diagonal
-        loose = self.mode_count is None and _differs(stiffness, np.diag(frequency**2))
+        damping = damping if drives or _differs(damping, diagonal) else diagonal
+        loose = self.mode_count is None and (drives > 0 or _differs(stiffness, np.diag(frequency**2)))
         ports, actions = (
             {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
             for rows in (self.ports, self.acts if self.actions else {})
@@ -196,10 +198,17 @@ class LinearSystem:
             left_out = np.where((left_out > 1e-9 * all_of_it) & flexible, left_out, 0.0)  # less is rounding
         return ModalSystem(frequency, damping, ports, left_out, self.relaxation, whole, actions)
 
-    @property
-    def free_shapes(self) -> FloatArray:
-        """Shapes (N, M + P) of what is free, and nothing for the drives."""
-        return np.pad(self.shapes, ((0, 0), (0, len(self.drives))))
+    def forces(self, acting: Acting, time: FloatArray) -> FloatArray:
+        """Return the modal forces (T, M + P) by what acts at times, that on a drive by its acceleration."""
+        found = acting.load_at(time, self.all_shapes)
+        if acting.drives:
+            given, count = (
+                [drive.at(time, 2) for drive in acting.drives.values()],
+                len(self.angular_frequency),
+            )
+            found[:, :count] -= np.transpose(given) @ (self.lift.T @ self.mass @ self.shapes)
+            found[:, count:] = self.heaviness * np.transpose(given)
+        return found
 
     def port_rows(self, laws: Laws, time: float | None = None) -> FloatArray:
         """Return the rows (J, N) of the laws' ports, see `Laws.rows`."""
@@ -250,7 +259,8 @@ class LinearSystem:
     def static(
         self, units: FloatArray, laws: Laws = NO_LAWS, amounts: FloatArray | None = None,
         memory: FloatArray | None = None, before: FloatArray | None = None,
-        held: FloatArray | float = 0.0, seen: FloatArray | None = None, time: float | None = None,
+        held: FloatArray | float = 0.0, fixed: FloatArray | None = None, seen: FloatArray | None = None,
+        time: float | None = None,
     ) -> tuple[FloatArray, FloatArray | None]:  # fmt: skip
         """Return the rest (L, N) under load levels that follow one another from zero, and the laws' memory.
 
@@ -266,6 +276,8 @@ class LinearSystem:
             Of the laws, and the amounts (k,) where the first level is reached from; by default never loaded.
         held : (N,) ndarray, optional
             Where something holds the system.
+        fixed : (N,) ndarray, optional
+            Row of a point that laws do not move.
         seen : (C, N) ndarray, optional
             What these rows show (L, C) is returned instead.
         time : float, optional
@@ -279,6 +291,9 @@ class LinearSystem:
         rows, levels = self.port_rows(laws, time), np.eye(len(units)) if amounts is None else amounts
         rows[:, self.displacements :] = 0.0
         answers, flexible = self.resting(units) + held, self.resting(rows)
+        if fixed is not None:
+            own = self.resting(fixed[None])
+            flexible = flexible - np.outer(flexible @ fixed, own) / float(own[0] @ fixed)
         at_ports, compliance = answers @ rows.T, rows @ flexible.T
         if seen is not None:
             answers, flexible = answers @ seen.T, flexible @ seen.T
@@ -296,10 +311,6 @@ class LinearSystem:
     def acts(self) -> Mapping[str, FloatArray]:
         """Rows along which laws at all ports act."""
         return {**self.ports, **self.actions}
-
-    def resisting(self, number: int) -> list[FloatArray]:
-        """Return what resists a drive's motion, its speed and its acceleration, on all unknowns (N,)."""
-        return [matrix @ self.lift[:, number] for matrix in (self.stiffness, self.damping, self.mass)]
 
     def seen_by(self, shown: Sequence[Shown], shapes: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, in shapes (N, M) of what is free.

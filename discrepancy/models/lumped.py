@@ -71,7 +71,7 @@ class Loop(NamedTuple):
                 f"{trial.name!r} records its reference {item.name!r} as {item.quantity.value}."
             )
         course = Course.of(trial.time, item.values + offset, item.hold)
-        found: list[Load] = [(proportional * self.acts + self.integral, course)]
+        found = [Load(proportional * self.acts + self.integral, course)]
         if derivative != 0.0 and section.derivative_of == "error":
             if course.hold is Hold.ZERO_ORDER:
                 raise ModelError(
@@ -79,7 +79,7 @@ class Loop(NamedTuple):
                     f"the controller {section.name!r} cannot differentiate: say derivative_of = "
                     "'measurement' in the model, or hold = 'linear' in the campaign."
                 )
-            found.append((derivative * self.acts, course.slope))
+            found.append(Load(derivative * self.acts, course, 1))
         return found
 
 
@@ -179,7 +179,8 @@ class LumpedModel(DescribedModel, SystemModel):
         rig, time, description = self.rig(state), trial.time, self.description
         still = Course.of(time, np.zeros(len(time)), Hold.SMOOTH, 0)
         drives = {item.reaction: still for item in description.output if item.reaction is not None}
-        loads: list[Load] = [(rig.along(item, item.vector), Course.always(time)) for item in description.load]
+        always = Course.of(time, np.ones(len(time)))
+        loads = [Load(rig.along(item, item.vector), always) for item in description.load]
         recorded = self._recorded(case)
         for loop in rig.loops.values():
             loads += loop.loads(trial, recorded)
@@ -194,7 +195,7 @@ class LumpedModel(DescribedModel, SystemModel):
             change = LoadChange.of(patch)
             if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
                 values = change.changed(values, item.values)
-            loads.append((self._moved_row(rig, section, change), Course.of(time, values, item.hold)))
+            loads.append(Load(self._moved_row(rig, section, change), Course.of(time, values, item.hold)))
         for load in (item for item in patch if isinstance(item, PortLoad)):
             if load.port not in self.acts:
                 raise ModelError(
@@ -202,7 +203,7 @@ class LumpedModel(DescribedModel, SystemModel):
                     f"{', '.join(self.acts) or 'none'}."
                 )
             spans = tuple(window.span for window in load.windows)
-            loads.append((self.acts[load.port], FormulaCourse(course_of(load.force, load.kind), spans)))
+            loads.append(Load(self.acts[load.port], FormulaCourse(course_of(load.force, load.kind), spans)))
         return loads, drives
 
     def _recorded(self, case: Case) -> Recorded:
@@ -268,14 +269,12 @@ class LumpedModel(DescribedModel, SystemModel):
                 loop = self.rig(case.state).loops[item.controller]
                 along = loop.acts / float(loop.acts @ loop.acts)
                 given = [] if acting is None else loop.loads(case.trial, self._recorded(case))
-                found.append(
-                    Shown(loop.gives, courses=[(float(push @ along), course) for push, course in given])
-                )
+                found.append(Shown(loop.gives, courses=[(float(load.row @ along), load) for load in given]))
             elif item.reaction in drives:
                 system = self.system(case.state._replace(drives=tuple(drives)))
                 along = system.lift[:, drives.index(item.reaction)]
                 rows = [along @ matrix for matrix in (system.stiffness, system.damping, system.mass)]
-                courses = [(-float(push @ along), course) for push, course in loads]
+                courses = [(-float(load.row @ along), load) for load in loads]
                 found.append(Shown(np.array([*rows, 0.0 * along]), courses=courses, felt=along))
             else:
                 raise ModelError(

@@ -169,7 +169,7 @@ class StructureModel(SystemModel):
         """Return loads in a trial; in motion what always acts is in what is shown."""
         (loads, drives), trial = super().pushes(case), case.trial
         if not trial.is_dynamic:
-            loads.append((self._always(case.state), Course.always(trial.time)))
+            loads.append(Load(self._always(case.state), Course.of(trial.time, np.ones(len(trial.time)))))
         return loads, drives
 
     def made(self, state: State) -> LinearSystem:

@@ -116,7 +116,7 @@ class SystemModel(Model):
             rows = self.force_row(trial.load_place, state, loads)[None]
             amounts = [LoadChange.of(loads).changed(trial.force, trial.force)]
         courses = [Course.of(trial.time, values, trial.hold) for values in amounts]
-        return list(zip(rows, courses, strict=True)), {}
+        return list(map(Load, rows, courses)), {}
 
     @abstractmethod
     def shown(self, case: Case, outputs: Outputs, acting: Acting | None) -> list[Shown]:
