@@ -141,6 +141,8 @@ class Cantilever(Model):
     """The cantilever; outputs "tip_displacement" and "strain[0]" to "strain[2]", ports root, tip and span."""
 
     name = "cantilever"
+    ports = tuple(PORTS)
+    stations = 0.0, LENGTH
     parameters = (ParameterPrior("young_modulus_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 
     def output_quantity(self, output: str) -> Quantity | None:
@@ -152,14 +154,6 @@ class Cantilever(Model):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the cantilever can carry a primitive: it can carry all."""
         return True
-
-    def ports(self) -> tuple[str, ...]:
-        """Names of the ports."""
-        return tuple(PORTS)
-
-    def stations(self) -> tuple[float, float]:
-        """Root and tip [m]."""
-        return 0.0, LENGTH
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign."""

@@ -100,7 +100,7 @@ def state_ports(setting: Setting, entry: Entry = ANY) -> Names:
 def force_ports(setting: Setting, entry: Entry = ANY) -> Names:
     """Return the ports where forces act: those of `preferred` that the model has, else all."""
     flows, spread = state_ports(setting, entry), PLANFORM in setting.scales.ports
-    known = tuple(port for port in setting.model.ports() if port not in flows)
+    known = tuple(port for port in setting.model.ports if port not in flows)
     wanted = ["span" if name == PLANFORM and not spread else name for name in entry.preferred]
     return tuple(name for name in wanted if name in known or name == PLANFORM) or known
 
@@ -208,7 +208,7 @@ def _seen_lines(setting: Setting, entry: Entry = ANY) -> Names:
 
 
 PLACES: dict[str, Callable[[Setting, Entry], Names]] = {
-    "ports": lambda setting, entry: setting.model.ports(),
+    "ports": lambda setting, entry: setting.model.ports,
     "channels": _channels,
     "channels, or all": lambda setting, entry: _or_all(_channels(setting, entry)),
     "strain channels": strain_channels,
@@ -290,7 +290,7 @@ def _law(setting: Setting, entry: Entry) -> str | None:
     model = setting.model
     for primitive in entry.primitives:
         if primitive not in SENSORS and not model.supports(primitive):
-            no_port = issubclass(primitive, PortForce) and not model.ports()
+            no_port = issubclass(primitive, PortForce) and not model.ports
             what = NO_PORT if no_port else said("needs.cannot_carry", kind=primitive.kind)
             return said("needs.model", model=model.name, what=what)
     return None
@@ -303,7 +303,7 @@ def _place(setting: Setting, entry: Entry) -> str | None:
 
 
 def _port(setting: Setting, entry: Entry) -> str | None:
-    if not setting.model.ports():
+    if not setting.model.ports:
         return said("needs.model", model=setting.model.name, what=NO_PORT)
     return None if force_ports(setting) else said("needs.only_states", model=setting.model.name)
 
@@ -342,7 +342,7 @@ NEEDS: dict[str, Callable[[Setting, Entry], str | None]] = {
     "place": _place,
     "port": _port,
     "turning port": _met(turning_ports, "places.turning ports"),
-    "stations": _met(lambda setting: setting.model.stations() is not None, "needs.no_length"),
+    "stations": _met(lambda setting: setting.model.stations is not None, "needs.no_length"),
     "force": _met(_has_force, "needs.no_force"),
     "temperature": _temperature,
     "channel": _met(channels, "needs.no_channel"),

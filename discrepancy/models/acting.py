@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import isfinite, pi, sqrt
+from math import inf, isfinite, pi, sqrt
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -108,8 +108,9 @@ class FormulaCourse:
 
     def at(self, time: FloatArray, order: int = 0) -> FloatArray:
         """Return the values (N,) at times."""
-        inside = [(time >= begin) & (time < end) for begin, end in self.spans] or [True]
-        return np.any(inside, axis=0) * self.formula.course(time, {"pi": pi})
+        spans = self.spans or ((-inf, inf),)
+        inside = np.any([(time >= begin) & (time < end) for begin, end in spans], axis=0)
+        return np.where(inside, self.formula.course(time, {"pi": pi}), 0.0)
 
 
 class Load(NamedTuple):

@@ -75,6 +75,7 @@ class FmuModel(DescribedModel):
         self.fmu = fmu = FmuMotion(description, Path(folder))
         super().__init__(description, fmu.quantities)
         self.length, self.regions = description.scales.length, tuple(description.inputs.regions)
+        self.stations = None if self.length is None else (0.0, self.length)
         flies = description.inputs.load_factor is not None
         self.kinds = frozenset(TrialKind) - {TrialKind.DRIVEN, *(() if flies else (TrialKind.FLIGHT,))}
         self._keys = [fmu.parameter(item.variable or item.name) for item in description.parameter]
@@ -150,7 +151,7 @@ class FmuModel(DescribedModel):
             **campaign_sizes(campaign),
             ports={
                 port: PortScale(float(most) or 1.0, own[0], frequency, own[1])
-                for port, most, own in zip(self.ports(), largest, stiffness, strict=True)
+                for port, most, own in zip(self.ports, largest, stiffness, strict=True)
             },
         )
 
@@ -218,7 +219,7 @@ class FmuModel(DescribedModel):
         ModelError
             If the FMU is not linear, or its answers to forces at the ports do not tell its system.
         """
-        fmu, motive = self.fmu, Motive(self.ports(), record=record_of(trial))
+        fmu, motive = self.fmu, Motive(self.ports, record=record_of(trial))
         base, found = (
             fmu.system(self._state(self._asked(trial, conditions, self.patch)), fmu.usual(trial)[1], motive)
             for values in (self.prior_mean(), parameters)
@@ -232,7 +233,7 @@ class FmuModel(DescribedModel):
         found = found.in_state_of(base)
         (position, _), (speed, _) = (found.rows(fmu.x, order) for order in (0, 1))
         rows, at_once = found.rows(*self._read(outputs))
-        return PortedSystem(found.generator, self.ports(), found.push.T, position, speed, rows, at_once.T)
+        return PortedSystem(found.generator, self.ports, found.push.T, position, speed, rows, at_once.T)
 
     def port_motion(
         self, trial: Trial, conditions: Conditions, parts: int = 1
@@ -256,7 +257,7 @@ class FmuModel(DescribedModel):
                 raise ModelError(f"Of the two primitives {item.kind!r} {what} carries one ({effect}).")
             values = {"active": 1.0, **item.to_mapping()}
             settings |= {f"{effect}.{key}": float(value) for key, value in values.items() if key != "kind"}
-        laws = laws_of(rest.of(*INTERNAL_FORCES), self.ports())
+        laws = laws_of(rest.of(*INTERNAL_FORCES), self.ports)
         return Asked(trial, conditions, laws, settings, load)
 
     def _motive(self, asked: Asked) -> Motive:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
@@ -122,6 +122,8 @@ class LumpedModel(DescribedModel, SystemModel):
         self.port_rows = {item.name: padded(item.vector) for item in description.port}
         self.acts = {item.name: padded(item.acts or item.vector) for item in description.port}
         self._places = sorted(description.place, key=lambda place: place.station)
+        if self._places:
+            self.stations = self._places[0].station, self._places[-1].station
         self._inputs = {item.name: item for item in description.input}
         self._outputs = {item.name: item for item in description.output}
         self._rigs, self.systems = Memory(), Memory()
@@ -149,10 +151,6 @@ class LumpedModel(DescribedModel, SystemModel):
             PortLoad: bool(ports),
         }
         return carried.get(primitive, primitive in SENSORS)
-
-    def stations(self) -> tuple[float, float] | None:
-        """Return the least and largest station [m] of the places, None without places."""
-        return (self._places[0].station, self._places[-1].station) if self._places else None
 
     def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
         """Return none: health has no meaning here."""
@@ -287,19 +285,8 @@ class LumpedModel(DescribedModel, SystemModel):
 
     def own_laws(self, parameters: FloatArray) -> ModelPatch:
         """Return the laws of ports that it has as it is, each times its factor."""
-        factors = self._factors(parameters.tolist())
-        return ModelPatch(tuple(law.scaled(factors.get(law.name, 1.0)) for law in self.description.law))
-
-    @property
-    def has_law(self) -> bool:
-        """Whether it has a law of a port of its own, in its file or found."""
-        return bool(self.description.law) or super().has_law
-
-    def apart(self) -> tuple[Self, ModelPatch]:
-        """Return the linear model, and the laws that it has beside that, at the prior means."""
-        linear, laws = super().apart()
-        description = self.description.model_copy(update={"law": []})
-        return linear._changed(description=description), self.own_laws(self.prior_mean()) + laws
+        factors, laws = self._factors(parameters.tolist()), () if self.linear else self.description.law
+        return ModelPatch(tuple(law.scaled(factors.get(law.name, 1.0)) for law in laws))
 
     def port_units(self, port: str) -> tuple[str, str]:
         """Return the units of a force at a port and of what it acts on.

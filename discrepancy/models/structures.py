@@ -1,6 +1,6 @@
 """A structure as a model by its modes: any from a mesh or matrices, and the wing with its patches."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -111,7 +111,7 @@ class StructureModel(SystemModel):
             for name in model.displacements
             if np.abs(self._rows[name] - push).max() <= SAME * np.abs(push).max()
         }
-        self.port_names = tuple(self.port_rows)
+        self.ports = tuple(self.port_rows)
 
     def _at(self, state: State, controls: Mapping[str, float]) -> FloatArray:
         """Return the values that the structure is made at; controls that are left out are nominal."""
@@ -144,7 +144,7 @@ class StructureModel(SystemModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the structure can carry a primitive: sensors, laws at its ports, errors of its forces."""
         forces = primitive is changes.LoadGain and bool(self.forces)
-        return primitive in SENSORS or forces or (primitive in INTERNAL_FORCES and bool(self.port_names))
+        return primitive in SENSORS or forces or (primitive in INTERNAL_FORCES and bool(self.ports))
 
     def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
         """Return the load (n,) of 1 N of a force, or, where there is none, of the load factor.
@@ -184,7 +184,7 @@ class StructureModel(SystemModel):
 
 
 def _system(
-    structure: ReducedState | PatchedState, rayleigh: Sequence[float], ports: Mapping[str, FloatArray]
+    structure: ReducedState | PatchedState, rayleigh: Iterable[float], ports: Mapping[str, FloatArray]
 ) -> LinearSystem:
     """Return a structure with Rayleigh damping [1/s], [s] and rows of its ports."""
     alpha, beta = rayleigh
@@ -225,7 +225,8 @@ class WingModel(SystemModel):
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
         self.name, self.parameters = name, wing_priors(box, **prior)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
-        self.port_names, self._row = tuple(PORTS), cache(wing.output_row)
+        self.stations = 0.0, wing.span
+        self.ports, self._row = tuple(PORTS), cache(wing.output_row)
         self.systems = Memory(KEPT_SYSTEMS)
 
     @classmethod

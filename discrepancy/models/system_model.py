@@ -126,10 +126,6 @@ class SystemModel(Model):
         """Return the scales of forces that are spread over the structure, by the first mode (N,)."""
         return {}
 
-    def own_laws(self, parameters: FloatArray) -> ModelPatch:
-        """Return the laws of ports that it has as it is."""
-        return NO_PATCH
-
     # ------------------------------------------------------------ what all do alike
 
     def system(self, state: State) -> LinearSystem:
@@ -280,7 +276,7 @@ class SystemModel(Model):
         A structure that springs hold, which only forces move from rest, has scales of its own; for others
         what acts and moves is the measure.
         """
-        trials, parameters, names = campaign.trials, self.prior_mean(campaign), self.ports()
+        trials, parameters, names = campaign.trials, self.prior_mean(campaign), self.ports
         state = State(tuple(parameters.tolist()), (0.0,) * len(self.regions))
         system, bare = self.system(state), self.system(state._replace(closed=False))
         rows = np.array([self.port_rows[name] for name in names]).reshape(len(names), len(bare.mass))
@@ -318,7 +314,7 @@ class SystemModel(Model):
         found = dict(zip(names, ports.scales(stiff.tolist(), driven_only=driven_only), strict=True))
         return Scales(
             **{**sizes, "force": sizes["force"] or weight},
-            length=self.length or max(map(abs, self.stations() or (0.0,))) or 1.0,
+            length=self.length or max(map(abs, self.stations or (0.0,))) or 1.0,
             tip_stiffness=stiffness, modal_mass=mass, angular_frequency=frequency,
             ports=found | self.spread(found, shape),
         )  # fmt: skip

@@ -373,7 +373,7 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
     """
     tell("fitting the model as it is")
     none = fit(problem, Candidate(), problem.start(Candidate()))
-    if problem.model.has_law and absolute_gate(problem, none).passed is False:
+    if len(problem.model.apart()[1]) and absolute_gate(problem, none).passed is False:
         again = Beginnings(problem, tell, none.residuals).again(none)
         none = none if again is None else again
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)

@@ -99,7 +99,7 @@ def kind(request, coarse_patch_arrays, pushed_beam, foreign_fmu, tmp_path_factor
 
 def test_it_says_what_it_is_and_what_it_carries(kind: Kind) -> None:
     model = kind.model
-    assert (model.ports(), model.stations()) == (kind.ports, kind.stations and pytest.approx(kind.stations))
+    assert (model.ports, model.stations) == (kind.ports, kind.stations and pytest.approx(kind.stations))
     assert tuple(item.name for item in model.parameters) == kind.parameters
     assert all(item.low < item.mean < item.high for item in model.parameters)
     assert {name: model.output_quantity(name) for name in kind.quantities} == kind.quantities

@@ -71,7 +71,7 @@ def model(request: pytest.FixtureRequest, kinds: Kinds) -> Model:
 def test_it_is_the_structure_at_rest(model: Model, kinds: Kinds) -> None:
     """Static trials at other parameters and masses; without a recorded load factor there is no weight."""
     assert [parameter.name for parameter in model.parameters] == ["e", "pump"]
-    assert model.ports() == ("tip",)
+    assert model.ports == ("tip",)
     values, wanted = seen(model, TRIAL, OUTPUTS[:2], **at(1.04, 0.06)), []
     for force in TRIAL.force:
         chosen = {"e": 1.04, "pump": 0.06, "load_factor": 0.0, "push": float(force)}
