@@ -225,7 +225,7 @@ def _motion(
         if trial.kind is TrialKind.RINGDOWN:
             acting = replace(acting, release=(TIP, release_of(trial)), initial=conditions.initial)
         else:
-            acting = replace(acting, loads=[Load(row, Course.of(trial.time, force, trial.hold))])
+            acting = replace(acting, loads=[Load(row, Course(trial.time, force, trial.hold))])
         moved = motion_of(system, acting, laws, conditions.refinement)
         response = moved.seen([Shown.of(row) for row in rows])
         return response.values, response.rates, behind * force

@@ -11,13 +11,9 @@ from scipy.interpolate import CubicSpline, PPoly
 
 from discrepancy.campaign.records import FloatArray, Hold, Release, Start, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Memory, Place
+from discrepancy.models.interface import Place
 from fe.runtime.expression import Expression
 from fe.runtime.patch import LoadGain, LoadPlace, Primitive
-
-KEPT_COURSES, KEPT_TIMES = 64, 48
-"""Records whose courses are kept, and times at which each of them is: a search asks for the same ones."""
-_courses = Memory(KEPT_COURSES)
 
 DEFAULT_PLACE = "tip_load"
 """What a campaign says when it does not say where the force acts; a model with one input takes that one."""
@@ -34,8 +30,8 @@ class Course:
     ----------
     time, values : (N,) ndarray
         Its samples [s], [SI].
-    hold : Hold
-        Between them. A load keeps its values before the first and after the last.
+    hold : Hold, optional
+        Between them, linear unless it is said. A load keeps its values before the first and after the last.
     motion : int, optional
         What was recorded of a motion, which is `SMOOTH`: 0 displacement, 1 velocity, 2 acceleration; the
         latter two begin at zero displacement, and the last at zero velocity. None: it is a load.
@@ -43,18 +39,8 @@ class Course:
 
     time: FloatArray
     values: FloatArray
-    hold: Hold
+    hold: Hold | None = None
     motion: int | None = None
-    _known: Memory = field(default_factory=lambda: Memory(KEPT_TIMES), init=False, repr=False)
-
-    @staticmethod
-    def of(
-        time: FloatArray, values: FloatArray, hold: Hold | None = None, motion: int | None = None
-    ) -> "Course":
-        """Return the course of a record, the same one for the same record; linear unless it is said."""
-        known = hold or Hold.LINEAR
-        key = (known, motion, time.tobytes(), values.tobytes())
-        return _courses.get(key, lambda: Course(time, values, known, motion))
 
     edges: ClassVar[tuple[float, ...]] = ()
     """Moments at which it jumps between the stamps: none."""
@@ -67,19 +53,14 @@ class Course:
 
     def at(self, time: FloatArray, order: int = 0) -> FloatArray:
         """Return the values (N,) at times, or a derivative; where it jumps, that of just before."""
-        return self._known.get((order, time.tobytes()), lambda: self._at(time, order))
-
-    def _at(self, time: FloatArray, order: int) -> FloatArray:
         if self.hold is Hold.SMOOTH:
             inside = np.clip(time, self.time[0], self.time[-1]) if self.motion is None else time
             return np.asarray(self._spline(inside, order))
-        if self.hold is Hold.LINEAR and order == 0:
+        if self.hold is not Hold.ZERO_ORDER and order == 0:
             return np.asarray(np.interp(time, self.time, self.values))
-        held = (
-            self.values
-            if order == 0
-            else np.diff(self.values, append=self.values[-1]) / np.diff(self.time, append=np.inf)
-        )
+        held = self.values
+        if order:  # slopes of straight lines
+            held = np.diff(self.values, append=self.values[-1]) / np.diff(self.time, append=np.inf)
         row = np.searchsorted(self.time, time - 1e-9 * (self.time[-1] - self.time[0]) / len(self.time))
         return np.asarray(held[np.maximum(row - 1, 0)])
 

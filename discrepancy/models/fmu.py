@@ -265,7 +265,7 @@ class FmuModel(DescribedModel):
         (trial, conditions, laws, _, load), fmu = asked, self.fmu
         motive = Motive(tuple(dict.fromkeys(laws.ports)), record=record_of(trial))
         if trial.kind is not TrialKind.RINGDOWN:
-            course = Course.of(trial.time, load.changed(trial.force, trial.force), trial.hold)
+            course = Course(trial.time, load.changed(trial.force, trial.force), trial.hold)
             return motive._replace(levers=self._levers(asked), course=course)
         release = release_of(trial)
         if not fmu.release:

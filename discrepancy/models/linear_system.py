@@ -10,7 +10,6 @@ put right at every step. The wing, a structure on springs and a lumped rig are s
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Protocol
 
 import numpy as np
 from scipy.linalg import eigh, null_space
@@ -22,6 +21,8 @@ from discrepancy.models.interface import PortedSystem
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, static_solution
+from fe.runtime.patched_wing import PatchedState
+from fe.runtime.reduced import ReducedState
 
 HEAVY = 1e12
 """Mass of a prescribed coordinate over the largest of the system."""
@@ -33,21 +34,6 @@ ROUNDING = 1e-10
 
 Modes = tuple[FloatArray, FloatArray, int]
 """Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
-
-
-class Solved(Protocol):
-    """A structure whose modes are found in another way: a reduced one, or the patched wing."""
-
-    @property
-    def modes(self) -> Any:
-        """With their frequencies (M,) [Hz]."""
-
-    @property
-    def shapes(self) -> FloatArray:
-        """Mass-normalised (N, M)."""
-
-    def static(self, loads: FloatArray) -> FloatArray:
-        """Return K^-1 loads, for loads (N,) or (N, k)."""
 
 
 def _differs(matrix: FloatArray, other: FloatArray) -> bool:
@@ -80,8 +66,8 @@ class LinearSystem:
         Rows whose motion is prescribed.
     actions : mapping of str to (N,) ndarray
         Rows along which laws at ports act, where that is not how they see.
-    solved : Solved, optional
-        What knows its modes and K^-1.
+    solved : ReducedState or PatchedState, optional
+        The structure that it is, which knows its modes and K^-1.
     """
 
     mass: FloatArray
@@ -94,7 +80,7 @@ class LinearSystem:
     states: int = 0
     drives: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     actions: Mapping[str, FloatArray] = field(default_factory=dict)
-    solved: Solved | None = None
+    solved: ReducedState | PatchedState | None = None
 
     @property
     def displacements(self) -> int:

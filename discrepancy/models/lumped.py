@@ -70,7 +70,7 @@ class Loop(NamedTuple):
                 f"The controller {section.name!r} follows {section.quantity.value}, but the trial "
                 f"{trial.name!r} records its reference {item.name!r} as {item.quantity.value}."
             )
-        course = Course.of(trial.time, item.values + offset, item.hold)
+        course = Course(trial.time, item.values + offset, item.hold)
         found = [Load(proportional * self.acts + self.integral, course)]
         if derivative != 0.0 and section.derivative_of == "error":
             if course.hold is Hold.ZERO_ORDER:
@@ -175,9 +175,9 @@ class LumpedModel(DescribedModel, SystemModel):
         """
         trial, _, patch, state = case
         rig, time, description = self.rig(state), trial.time, self.description
-        still = Course.of(time, np.zeros(len(time)), Hold.SMOOTH, 0)
+        still = Course(time, np.zeros(len(time)), Hold.SMOOTH, 0)
         drives = {item.reaction: still for item in description.output if item.reaction is not None}
-        always = Course.of(time, np.ones(len(time)))
+        always = Course(time, np.ones(len(time)))
         loads = [Load(rig.along(item, item.vector), always) for item in description.load]
         recorded = self._recorded(case)
         for loop in rig.loops.values():
@@ -188,12 +188,12 @@ class LumpedModel(DescribedModel, SystemModel):
             values = item.values + offset
             if section.quantity.moving:
                 values = rig.factors.get(item.name, 1.0) * values
-                drives[item.name] = Course.of(time, values, Hold.SMOOTH, item.quantity.order)
+                drives[item.name] = Course(time, values, Hold.SMOOTH, item.quantity.order)
                 continue
             change = LoadChange.of(patch)
             if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
                 values = change.changed(values, item.values)
-            loads.append(Load(self._moved_row(rig, section, change), Course.of(time, values, item.hold)))
+            loads.append(Load(self._moved_row(rig, section, change), Course(time, values, item.hold)))
         for load in (item for item in patch if isinstance(item, PortLoad)):
             if load.port not in self.acts:
                 raise ModelError(

@@ -169,7 +169,7 @@ class StructureModel(SystemModel):
         """Return loads in a trial; in motion what always acts is in what is shown."""
         (loads, drives), trial = super().pushes(case), case.trial
         if not trial.is_dynamic:
-            loads.append(Load(self._always(case.state), Course.of(trial.time, np.ones(len(trial.time)))))
+            loads.append(Load(self._always(case.state), Course(trial.time, np.ones(len(trial.time)))))
         return loads, drives
 
     def made(self, state: State) -> LinearSystem:
@@ -230,13 +230,8 @@ class WingModel(SystemModel):
         self.systems = Memory(KEPT_SYSTEMS)
 
     @classmethod
-    def shipped(cls, progress: Progress | None = None) -> "WingModel":
-        """Return the shipped wing with the calibration that the documentation states."""
-        return cls.of_design(None, progress)
-
-    @classmethod
-    def of_design(cls, path: Path | str | None, progress: Progress | None = None) -> "WingModel":
-        """Return the wing of a design file, calibrated as the shipped wing is.
+    def of_design(cls, path: Path | str | None = None, progress: Progress | None = None) -> "WingModel":
+        """Return the wing of a design file, or the shipped one, calibrated as the documentation states.
 
         Raises
         ------

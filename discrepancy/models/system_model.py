@@ -115,7 +115,7 @@ class SystemModel(Model):
         else:
             rows = self.force_row(trial.load_place, state, loads)[None]
             amounts = [LoadChange.of(loads).changed(trial.force, trial.force)]
-        courses = [Course.of(trial.time, values, trial.hold) for values in amounts]
+        courses = [Course(trial.time, values, trial.hold) for values in amounts]
         return list(map(Load, rows, courses)), {}
 
     @abstractmethod

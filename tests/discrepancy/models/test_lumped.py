@@ -203,7 +203,7 @@ def test_omitted_modes_follow_slow_forces() -> None:
     # base excitation far below the second mode: with one mode and the residual the answer is nearly whole
     whole, one = (LinearSystem(MASS, VISCOUS, STIFFNESS, {"joint": JOINT}, count) for count in (None, 1))
     time = np.arange(500) * 0.01
-    acting = Acting(time, time, [Load(np.array([0.0, 1.0, 0.0]), Course.of(time, 1.0 - np.cos(4.0 * time)))])
+    acting = Acting(time, time, [Load(np.array([0.0, 1.0, 0.0]), Course(time, 1.0 - np.cos(4.0 * time)))])
     exact, found = (motion_of(system, acting, NO_LAWS).at(np.eye(3))[0] for system in (whole, one))
     scale, bare = np.max(np.abs(exact)), motion_of(one, acting, NO_LAWS).q @ one.shapes.T
     assert np.max(np.abs(exact - found)) < 2e-3 * scale
