@@ -299,7 +299,7 @@ HALVES = ("[[0.1, 0.0], [-0.1, 0.0]]", "[[0.0, 0.0], [0.0, 0.08]]")
 )
 def test_a_matrix_may_be_given_by_parts_alone(name: str, whole: str, parts: str) -> None:
     one, other = (
-        model_of(text).description.terms()
+        model_of(text).description.terms({})
         for text in (INPUTS.text(f"{name}.toml"), INPUTS.text(f"{name}.toml", (whole, "")) + parts)
     )
     for kind in ("mass", "stiffness", "capacity", "conductance"):
