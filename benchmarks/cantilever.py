@@ -141,7 +141,7 @@ class Cantilever(Model):
     """The cantilever; outputs "tip_displacement" and "strain[0]" to "strain[2]", ports root, tip and span."""
 
     name = "cantilever"
-    ports = tuple(PORTS)
+    ports, shows_ports = tuple(PORTS), False
     stations = 0.0, LENGTH
     parameters = (ParameterPrior("young_modulus_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 

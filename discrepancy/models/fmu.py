@@ -68,7 +68,6 @@ class FmuModel(DescribedModel):
     """
 
     holds_inputs: ClassVar[bool] = True
-    shows_ports: ClassVar[bool] = True
 
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
         self.description: FmuModelDescription = description

@@ -209,7 +209,7 @@ class Model(ABC):
     largest_force: float = np.inf
     holds_inputs: ClassVar[bool] = False
     follows_windows: ClassVar[bool] = False
-    shows_ports: ClassVar[bool] = False
+    shows_ports: ClassVar[bool] = True
     linear: bool = False
     _declared: tuple[ParameterPrior, ...] | None = None
     _kept: Memory | None = None

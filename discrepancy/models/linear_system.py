@@ -65,7 +65,7 @@ class LinearSystem:
     drives : (P, N) ndarray
         Rows whose motion is prescribed.
     actions : mapping of str to (N,) ndarray
-        Rows along which laws at ports act, where that is not how they see.
+        Rows along which laws at all ports act, where that is not how they see.
     solved : ReducedState or PatchedState, optional
         The structure that it is, which knows its modes and K^-1.
     """
@@ -173,7 +173,7 @@ class LinearSystem:
         loose = self.mode_count is None and (drives > 0 or _differs(stiffness, np.diag(frequency**2)))
         ports, actions = (
             {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
-            for rows in (self.ports, self.acts if self.actions else {})
+            for rows in (self.ports, self.acts)
         )
         whole, left_out = stiffness if loose else None, None
         if self.truncated and ports:
@@ -296,7 +296,7 @@ class LinearSystem:
     @property
     def acts(self) -> Mapping[str, FloatArray]:
         """Rows along which laws at all ports act."""
-        return {**self.ports, **self.actions}
+        return self.actions or self.ports
 
     def seen_by(self, shown: Sequence[Shown], shapes: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, in shapes (N, M) of what is free.

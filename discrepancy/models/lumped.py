@@ -1,6 +1,7 @@
 """A lumped linear structure as a model: masses, springs, dampers with named inputs, outputs and ports."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -11,7 +12,7 @@ from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInp
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, LoadChange, Shown, place_among
-from discrepancy.models.interface import EITHER, MOVES, NO_PATCH, TURNS, Memory, Outputs, Place
+from discrepancy.models.interface import EITHER, MOVES, NO_PATCH, TURNS, Outputs, Place
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.lumped_file import (
     BLOCKS,
@@ -30,6 +31,8 @@ from fe.runtime.state import Losses
 
 LEAST_STIFFNESS = 0.05
 """A temperature that leaves less than this share of the stiffness is refused."""
+KEPT = 256
+"""Systems that a model keeps."""
 MOST_MODES = 8
 """Modes that move of a structure on springs; the others follow without inertia."""
 
@@ -126,7 +129,7 @@ class LumpedModel(DescribedModel, SystemModel):
             self.stations = self._places[0].station, self._places[-1].station
         self._inputs = {item.name: item for item in description.input}
         self._outputs = {item.name: item for item in description.output}
-        self._rigs, self.systems = Memory(), Memory()
+        self._rig_of, self.system = lru_cache(KEPT)(self._rig), lru_cache(KEPT)(self.made)
 
     @classmethod
     def load(cls, path: Path | str) -> "LumpedModel":
@@ -321,8 +324,7 @@ class LumpedModel(DescribedModel, SystemModel):
 
     def rig(self, state: State) -> Rig:
         """Return the model at values of the parameters, a structure and a temperature."""
-        state = state._replace(drives=(), closed=True)
-        return self._rigs.get(state, lambda: self._rig(state))
+        return self._rig_of(state._replace(drives=(), closed=True))
 
     def _rig(self, state: State) -> Rig:
         description, n = self.description, self.description.size

@@ -75,7 +75,7 @@ class Motion:
             pull *= 1.0 + self.laws.rate * self.time[:, None]
         found = system.forces(self.acting, self.time) - pull - self.velocity @ modal.damping.T
         if len(self.laws):
-            found -= self.port_forces @ self.laws.rows(modal.actions or modal.ports, self.q.shape[1])
+            found -= self.port_forces @ self.laws.rows(modal.actions, self.q.shape[1])
         found[: self.held] = 0.0
         return found
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Load, Shown, place_among
-from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Memory, Outputs, Place
+from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Outputs, Place
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.scales import PortScale
 from discrepancy.models.system_model import Case, State, SystemModel
@@ -50,7 +50,7 @@ paper, its masses, and the damping of the joint posterior, whose spread holds th
 
 ROTATING_PORT = "root"
 KEPT_SYSTEMS = 64
-"""Systems of a wing that are kept, 2 MB each."""
+"""Systems that are kept, of a wing 2 MB each."""
 Prior = Mapping[str, tuple[float, float]]
 """Means and standard deviations of calibrated parameters, by the names of `STATE`."""
 Design = WingDesign | None
@@ -102,7 +102,7 @@ class StructureModel(SystemModel):
             **dict.fromkeys(model.accelerations, Quantity.ACCELERATION),
         }
         self._rows = dict(zip(self.quantities, (*outputs, *accelerations), strict=True))
-        self.systems = Memory()
+        self.system = lru_cache(KEPT_SYSTEMS)(self.made)
         mean = State(tuple(self.prior_mean().tolist()))
         along = [self._load(mean, force) for force in self.forces]
         self.port_rows = {
@@ -227,7 +227,7 @@ class WingModel(SystemModel):
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
         self.stations = 0.0, wing.span
         self.ports, self._row = tuple(PORTS), cache(wing.output_row)
-        self.systems = Memory(KEPT_SYSTEMS)
+        self.system = lru_cache(KEPT_SYSTEMS)(self.made)
 
     @classmethod
     def of_design(cls, path: Path | str | None = None, progress: Progress | None = None) -> "WingModel":

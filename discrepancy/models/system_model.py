@@ -1,10 +1,10 @@
 """A model by its matrices, a wing, a structure or a lumped rig: under patches, at rest and in motion."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import groupby
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, d
 from discrepancy.models.interface import (
     NO_PATCH,
     Conditions,
-    Memory,
     Model,
     Outputs,
     Place,
@@ -77,15 +76,14 @@ class SystemModel(Model):
         Rows of all ports where laws act.
     reference : str or None
         Place whose stiffness and modal mass are the natural ones; None: that of the first trial.
-    systems : Memory
-        What moves, by state.
+    system : callable
+        Gives what moves in a state: `made`, which is kept.
     """
 
     port_rows: Mapping[str, FloatArray]
     reference: str | None = None
     kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
-    shows_ports: ClassVar[bool] = True
-    systems: Memory
+    system: Callable[[State], LinearSystem]
 
     # ------------------------------------------------------------ what each says
 
@@ -127,10 +125,6 @@ class SystemModel(Model):
         return {}
 
     # ------------------------------------------------------------ what all do alike
-
-    def system(self, state: State) -> LinearSystem:
-        """Return what moves in a state."""
-        return self.systems.get(state, lambda: self.made(state))
 
     def laws(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> Laws:
         """Return the laws at its ports, its own and those of a patch."""

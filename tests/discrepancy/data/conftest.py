@@ -29,7 +29,7 @@ class Oscillator(Model):
     """m x'' + c x' + k x = f at rest or released; three gauges proportional to x; outputs x and gauges."""
 
     name = "single mass"
-    ports = ("x",)
+    ports, shows_ports = ("x",), False
     parameters = (ParameterPrior("stiffness_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 
     def output_quantity(self, output):
