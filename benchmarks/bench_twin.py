@@ -21,7 +21,6 @@ from twin_master.network.graphical_model import (
 from twin_master.network.inference import (
     filter_many,
     filter_sequence,
-    filter_step,
     known_control,
     predict,
     smooth,
@@ -129,7 +128,7 @@ def many_states() -> list[Measurement]:
     history = filter_sequence(model, control, rows)
 
     def step() -> None:
-        filter_step(model, history.log_filtered[-2], int(control[-2]), rows[-1])
+        filter_sequence(model, control[-1:], rows[-1:], (history.log_filtered[-2], int(control[-2])))
 
     def likelihood() -> None:
         sensors.log_likelihood(seen[-1], int(control[-1]))
@@ -173,7 +172,8 @@ def run() -> list[Measurement]:
 
     def online_step() -> None:
         likelihood = sensors.log_likelihood(observations[0, -1], int(control[-1]))
-        step = filter_step(model, history.log_filtered[-2], int(control[-2]), likelihood)
+        before = history.log_filtered[-2], int(control[-2])
+        step = filter_sequence(model, control[-1:], likelihood[None], before)[0]
         smooth(model, control, history.log_filtered)
         predict(model, step.filtered, int(control[-1]), plan.policy, HORIZON)
 

@@ -143,7 +143,7 @@ def problem_of(case: Case) -> Problem:
 def found_in(case: Case) -> FloatArray:
     """Return medians and ends of the 90 % intervals (C, 3) of all changes of a record [s]."""
     search = ForceSearch(problem_of(case))
-    one = search.rough(max(search.at, key=lambda name: search.at[name].evidence))
+    one = search.rough(max(search.at, key=lambda name: search.at[name].log_evidence))
     ((port, process),) = one.processes.items()
     return events(one.view, port, process).moments(0)
 

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.misfit import Misfit, find_misfit
 from benchmarks.seeds import fly_seeds, outcomes
 from fe.runtime.reduced import ReducedModel
 from reporting.progress import RichProgress
 from twin_master.assets.asset_source import AssetSource, PairedSource
-from twin_master.assets.mismatch import Misfit, find_misfit
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario

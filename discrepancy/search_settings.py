@@ -44,8 +44,10 @@ class SearchSettings:
     """Peaks of a spectrum that are tried."""
     starts: int = 2
     """Starts of the fit of each effect close to the truth."""
-    far_starts: int = 3
-    """The same far from it, where the screen ranks only roughly."""
+    far_starts: int = 2
+    """The same far from it, of the best on a grid."""
+    far_levels: tuple[int, ...] = (1, 5, 5, 5, 3)
+    """Levels of each parameter on it, by their number from none on."""
     few_places: int = 3
     """Effects with more places than this are those of single channels, which are linear in their size."""
     worth_fitting: float = 2.0
@@ -55,19 +57,17 @@ class SearchSettings:
     pairs_fitted: int = 8
     """Pairs that are fitted of all that are screened."""
 
-    # ---------------------------------------------------------------- rough fits by chord steps
-    chord_steps: int = 8
-    """Steps with the derivatives of the fit without effect."""
-    delivered: float = 0.7
-    """Share of the screened gain that chord steps must reach; else shared unknowns move far."""
+    # ---------------------------------------------------------------- rough fits
+    rough_steps: int = 8
+    """Steps of fits that begin where a screen leads."""
     out_of_reach: float = 36.0
-    """Chord steps end where they have no prospect to come within this of the best: three times `close`."""
+    """They end where they have no prospect to come within this of the best: three times `close`."""
 
     # ---------------------------------------------------------------- exact fits
     close: float = 12.0
-    """Candidates within this log evidence of the best are fitted exactly: chord steps err by less."""
+    """Candidates within this log evidence of the best are fitted exactly: few steps err by less."""
     close_share: float = 0.5
-    """The same as a share of what the best gained: far from the truth chord steps rank only roughly."""
+    """The same as a share of what the best gained: far from the truth few steps rank only roughly."""
     exact_fits: int = 4
     """Candidates of a scan that are fitted exactly at most."""
     gained_again: float = 5.0
@@ -94,37 +94,14 @@ class SearchSettings:
     """Gain of log evidence from which a neighbour is the better optimum."""
     rounds: int = 5
     """How often one neighbour leads to the next."""
-    shape_iterations: int = 40
-    """Steps of a fit with a free shape, whose valleys are long."""
 
     # ---------------------------------------------------------------- far from the truth
     far: float = 1.5
     """Chi-square per sample above which a fit is far from the truth."""
     strained: float = 4.0
     """Prior deviations beyond which a shared unknown says the same."""
-    beginning: float = 4.0
-    """Periods of the first mode that are fitted before the whole record: phases have not slipped yet."""
-    telling: float = 100.0
-    """Excess of the sum of squares [sigma^2] by which a gap has begun: until then the model is right, and a
-    record that ended there would tell nothing of any effect."""
-    least_samples: int = 60
-    """Samples that a beginning has at least."""
-    promising: float = 0.3
-    """Effects go on whose screened gain is at least this share of the best one's."""
-    least_promising: int = 5
-    """At least so many go on; the others too if none of these fits."""
-    short_steps: int = 12
-    """Steps on the beginnings before candidates are compared."""
-    far_steps: int = 6
-    """Steps on whole records from there."""
     far_fits: int = 6
-    """Single effects that go on from the beginnings to whole records."""
-    far_extensions: int = 4
-    """Longer sets that do."""
-    related_levels: tuple[int, ...] = (0, 5, 5, 5, 3)
-    """Levels of each parameter, by their number from none on, at which relatives of an effect are tried."""
-    related_starts: int = 2
-    """Of these, how many begin a fit."""
+    """Sets along the missing force that are fitted to the readings."""
 
     # ---------------------------------------------------------------- named by the missing force
     followed: float = 25.0

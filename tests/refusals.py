@@ -36,7 +36,10 @@ class Inputs:
             text = text.replace(old, new, 1)
         return text
 
+    def table(self, name: str) -> dict[str, Any]:
+        """Return the content of a TOML file."""
+        return tomllib.loads(self.text(name))
+
     def refused(self, table: str) -> list[tuple[Any, ...]]:
         """Return the rows of a table."""
-        tables = tomllib.loads((self.folder / "refused.toml").read_text(encoding="utf-8"))
-        return [tuple(row) for row in tables[table]]
+        return [tuple(row) for row in self.table("refused.toml")[table]]

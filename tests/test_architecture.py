@@ -48,8 +48,8 @@ ROOMS = {
         "virtual_wing", "paper", "wing",
     ),
     "twin_master": (
-        "errors", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library", "mission",
-        "store", "report", "viewer", "workflow", "watch", "scenario_check", "fleet", "environment",
+        "errors", "sentences", "seeds", "scenario", "run_folder", "network", "learning", "assets", "library",
+        "mission", "store", "report", "viewer", "workflow", "watch", "scenario_check", "fleet", "environment",
         "command", "plan_command", "watch_command", "view_command", "__main__",
     ),
     "discrepancy": (

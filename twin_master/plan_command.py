@@ -11,6 +11,7 @@ import typer
 from reporting import terminal
 from twin_master.command import Calibration, Seed
 from twin_master.errors import MissionInputError
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     import numpy as np
@@ -117,8 +118,13 @@ def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
     for name in names:
         if name not in (*titles, *inspecting):
             raise MissionInputError(
-                f"--value-of names an action that inspects ({', '.join(inspecting) or 'there is none'}) or a "
-                f"gauge ({titles[0]} to {titles[-1]}), and `{name}` came."
+                said(
+                    "plan_command.value_of",
+                    inspecting=", ".join(inspecting) or "there is none",
+                    first=titles[0],
+                    last=titles[-1],
+                    name=name,
+                )
             )
     given, count = scenario.observation.standard_deviation, scenario.observation.count
     each = given if isinstance(given, tuple) else (given,) * count
@@ -197,9 +203,7 @@ def design(
     titles = _titles(knowledge.scenario)
     wanted = titles if among is None else tuple(among.split(","))
     if not {*wanted} <= {*titles} or len({*wanted}) < len(wanted):
-        raise MissionInputError(
-            f"--among names different sensors ({titles[0]} to {titles[-1]}), and `{among}` came."
-        )
+        raise MissionInputError(said("plan_command.among", first=titles[0], last=titles[-1], among=among))
     pool, readings = [titles.index(name) for name in wanted], drawn_readings(knowledge)
     found = chosen_sensors(readings, pool, sensors)
     names = [titles[sensor] for sensor in found.sensors]

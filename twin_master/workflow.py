@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reporting.arrays import Float
 from reporting.files import atomic_write_text
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import hash_file, hash_record
-from twin_master.assets.asset_source import AssetSource, calibrated_with
-from twin_master.assets.mismatch import Misfit, find_misfit
+from twin_master.assets.asset_source import AssetSource, calibrated_with, shown_without_noise
 from twin_master.assets.resolution import Overrides, asset_source, given_overrides, resolve_scenario
 from twin_master.errors import NotResumableError
 from twin_master.mission import loop
@@ -198,7 +198,7 @@ def _known(
     config: Mapping[str, Any],
     scenario: Scenario,
     source: AssetSource,
-    policy: NDArray[np.float64] | BeliefPolicy | None,
+    policy: Float | BeliefPolicy | None,
     progress: Progress,
 ) -> Knowledge:
     """Return what the twin knows before its flight, and keep it."""
@@ -217,7 +217,7 @@ def _known(
     return knowledge
 
 
-def _given_policy(folder: Path, hashes: dict[str, str]) -> NDArray[np.float64] | BeliefPolicy | None:
+def _given_policy(folder: Path, hashes: dict[str, str]) -> Float | BeliefPolicy | None:
     """Return the policy that a run folder keeps, its hash noted, or None where it was planned."""
     path = folder / POLICY_NAME
     if not path.is_file():
@@ -276,13 +276,15 @@ def _fly(
         return MissionResult(scenario, knowledge, flight, truth, asset.units)
 
 
-def _misfit(knowledge: Knowledge, source: AssetSource) -> Misfit | None:
-    """Return by how much the twin's model differs from the asset, where they are known to differ."""
+def _misfit(knowledge: Knowledge, source: AssetSource) -> Float | None:
+    """Return by which shares (S, U, G) predictions and asset differ, where their models are known to."""
     # An asset with damage of its own cannot be asked at a state of the twin's choice.
     if not source.origin.differ or knowledge.scenario.truth.kind == "asset":
         return None
     with closing(source.open()) as asset:
-        return find_misfit(knowledge.scenario, knowledge.model, knowledge.sensor_model, asset)
+        shown = shown_without_noise(knowledge.scenario, knowledge.model.states.coordinates, asset)
+    shown[shown == 0.0] = np.nan
+    return np.asarray((knowledge.sensor_model.mean - shown) / shown)
 
 
 def _field_writer(source: AssetSource, result: MissionResult) -> Callable[[Path], object]:

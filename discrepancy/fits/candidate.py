@@ -198,7 +198,7 @@ class State:
     sums : (channels,) ndarray
         Sum of squared residuals by channel.
     linearisations : tuple of Linearisation
-        At the point (or older, after chord steps).
+        At the point.
     """
 
     point: Point

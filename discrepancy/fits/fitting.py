@@ -1,7 +1,7 @@
 """Fit of a candidate: maximum of the posterior by Levenberg-Marquardt, and its Laplace evidence.
 
-The derivatives by what all hypotheses share
-change little with an effect; away from the end they may be those of the fit without effect (chord steps).
+The derivatives by what all hypotheses share change little with an effect: a fit may begin with those of the
+fit that it extends.
 """
 
 from dataclasses import dataclass, field, replace
@@ -25,7 +25,7 @@ STALLED = 1
 WHOLE_STEP, LARGEST_DAMPING = 1e-2, 1.0
 """Damping below which a step is nearly that of Gauss and Newton, and above which it is a mere trial."""
 STEP_SHARES = (1.0, 0.3)
-"""Shares of a step that are tried before the damping grows; chord steps are rough and try the first only."""
+"""Shares of a step that are tried before the damping grows."""
 CREEPING, NEAR_END = 0.2, 30.0
 """Derivatives are renewed where a step promises less than `NEAR_END` [nat], but more than this share of what
 the one before it promised: close to the end, promises should fall fast."""
@@ -89,8 +89,8 @@ def fit(
     candidate: Candidate,
     start: Point,
     *,
-    base: State | None = None,
-    iterations: int = 20,
+    known: tuple[Linearisation, ...] | None = None,
+    iterations: int = 60,
     evidence: bool = True,
     local_only: bool = False,
     give_up: float | None = None,
@@ -105,8 +105,8 @@ def fit(
         What may act.
     start : Point
         Where to begin.
-    base : State, optional
-        Chord steps: the model is evaluated at the base's shared and local unknowns only.
+    known : tuple of Linearisation, optional
+        Derivatives by shared and local unknowns that are near enough to begin with.
     iterations : int
         Largest number of steps.
     evidence : bool
@@ -122,15 +122,15 @@ def fit(
         If the model gives numbers that are not finite at the start, or none of which a curvature can be made.
     """
     # without evidence the step needs a direction only: one side is half the work
-    descent = _Descent(problem, candidate, base, local_only, central=evidence)
+    descent = _Descent(problem, candidate, local_only, central=evidence)
     damping = 1e-3
-    state = descent.state(_bounded(start))
+    state = descent.state(_bounded(start), known=known)
     if not np.isfinite(state.objective):
         raise FitError(
             f"The model gives values that are not finite for {candidate.identifiers or ('no effect',)}; "
             "check the ranges of its parameters."
         )
-    converged, fresh, before, stalled = False, True, np.inf, 0
+    converged, fresh, before, stalled = False, known is None, np.inf, 0
     for _ in range(iterations):
         step, promised = descent.step(state, damping)
         if not fresh and CREEPING * before < promised < NEAR_END:
@@ -148,8 +148,8 @@ def fit(
         if following is not None:
             gain = state.objective - following.objective
             damping = max(damping * (0.1 if gain > 0.5 * promised else 0.5), 1e-9)
-            state, fresh = following, base is not None
-            if gain < 0.7 * promised and base is None:  # derivatives have grown old
+            state, fresh = following, False
+            if gain < 0.7 * promised:  # derivatives have grown old
                 state, fresh = descent.state(state.point), True
             if give_up is not None and damping < WHOLE_STEP and state.objective - 2.0 * promised > give_up:
                 break
@@ -185,7 +185,7 @@ def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
     ModelError
         If the structure cannot carry the effects.
     """
-    return _Descent(problem, candidate, None, False).state(_bounded(point), derivatives=False).objective
+    return _Descent(problem, candidate, False).state(_bounded(point), derivatives=False).objective
 
 
 @dataclass
@@ -194,7 +194,6 @@ class _Descent:
 
     problem: Problem
     candidate: Candidate
-    base: State | None
     local_only: bool
     central: bool = True
     deviation: FloatArray | None = None  # (E,) of the effect parameters, once known
@@ -208,7 +207,7 @@ class _Descent:
         residuals = []
         for number in range(len(problem.trials)):
             part = problem.linearise(
-                number, point, self.candidate, self.base, derivatives=derivatives,
+                number, point, self.candidate, derivatives=derivatives,
                 known=None if known is None else known[number], effect_steps=self.deviation,
                 central=self.central,
             )  # fmt: skip
@@ -251,7 +250,7 @@ class _Descent:
         second step with the same derivatives by the nuisances leads back to the bottom (the second-order
         correction of Transtrum and Sethna 2012, arXiv:1201.5885, with the whole step as difference).
         """
-        for share in STEP_SHARES if self.base is None else STEP_SHARES[:1]:
+        for share in STEP_SHARES:
             try:
                 ahead = _ahead(self.candidate, state.point, step, share)
                 proposal = self.state(ahead, derivatives=False)

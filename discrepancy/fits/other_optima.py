@@ -105,6 +105,4 @@ def free_shape(
     terms[number] = Term(effect, terms[number].place, free_shape=True)
     parts[number] = np.append(parts[number], [item.prior.normal(item.canonical) for item in effect.shape])
     start = replace(named.point, effect=np.concatenate(parts))
-    return attempt(
-        problem, Candidate(tuple(terms)), start, iterations=SEARCH.shape_iterations, give_up=give_up
-    )
+    return attempt(problem, Candidate(tuple(terms)), start, give_up=give_up)

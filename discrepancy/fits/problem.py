@@ -20,7 +20,7 @@ from discrepancy.models.interface import Memory, Model
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
-from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Candidate, Linearisation, Point, State, moved
+from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Candidate, Linearisation, Point, moved
 from .trial_data import GlobalUnknowns, TrialData, TrialDerivatives, global_unknowns, stand_in
 
 KEPT = 2000
@@ -172,7 +172,6 @@ class Problem:
         number: int,
         point: Point,
         candidate: Candidate,
-        base: State | None = None,
         *,
         derivatives: bool = True,
         known: Linearisation | None = None,
@@ -189,9 +188,6 @@ class Problem:
             Where.
         candidate : Candidate
             Effects that act.
-        base : State, optional
-            With it, only the effect is evaluated, at the base's shared and local unknowns; their own steps
-            are added to first order (chord).
         derivatives : bool
             False: the response only.
         known : Linearisation, optional
@@ -201,7 +197,7 @@ class Problem:
             prior's, average over the kinks of friction and hysteresis and do not reach beyond where the
             parameters may lie.
         central : bool
-            Whether derivatives by effect parameters are central differences; never so with a base.
+            Whether derivatives by effect parameters are central differences.
 
         Notes
         -----
@@ -212,16 +208,8 @@ class Problem:
         data = self.trials[number]
         kind = data.trial.kind
         patch = candidate.patch(self.setting, point.effect) if kind in candidate.acts_on else ModelPatch()
-        where = point if base is None else base.point
-        shared, local = where.shared, where.local[number]
-        at_base, _ = self.response(number, shared, local, patch)
-        response = at_base
-        if base is not None:
-            there = base.linearisations[number]
-            move = (point.shared - shared)[: len(there.parameters)]
-            response = response + np.tensordot(move, there.parameters, 1)
-            response += np.tensordot((point.local[number] - local)[data.unknowns.zeros :], there.local, 1)
-            known = there
+        shared, local = point.shared, point.local[number]
+        response, _ = self.response(number, shared, local, patch)
         if known is not None:
             parameters, by_local = known.parameters, known.local
         elif derivatives:
@@ -234,12 +222,11 @@ class Problem:
             steps = np.clip(effect_steps, LEAST_STEP, PARAMETER_STEP)
         for k in range(candidate.size):
             if kind in candidate.acting(k):
-                sides = (1.0, -1.0) if central and base is None else (1.0,)
                 ends = []
-                for side in sides:
+                for side in (1.0, -1.0) if central else (1.0,):
                     patched = candidate.patch(self.setting, moved(point.effect, k, side * steps[k]))
                     ends.append(self.response(number, shared, local, patched)[0])
-                other, width = (ends[1], 2.0) if len(ends) == 2 else (at_base, 1.0)
+                other, width = (ends[1], 2.0) if central else (response, 1.0)
                 effect[k] = (ends[0] - other) / (width * steps[k])
         return Linearisation(response, parameters, by_local, effect)
 

@@ -5,7 +5,7 @@ A gain of half a thousandth is a nuisance of instruments, not a cause.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from math import isnan
+from math import isnan, nan
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,7 +60,7 @@ class Conclusion:
         problem = found.problem
         places = sum(np.log(len(term.effect.places(problem.setting))) for term in best.candidate.terms)
         rows = [(found.best_of(names), probability) for names, probability in probabilities.items()]
-        told = tuple(hypothesis(problem, item, p, *sizes(problem, item)) for item, p in rows)
+        told = tuple(hypothesis(problem, item, p) for item, p in rows)
         names = [effect.identifier for effect in found.effects]
         factor = best.log_evidence - places - found.nothing.log_evidence
         return cls(found, float(factor), told, inclusion(rows, names))
@@ -110,17 +110,13 @@ def inclusion(rows: Sequence[tuple[Hypothetic, float]], names: Iterable[str]) ->
     return {name: sum(probability for own, probability in held if name in own) for name in names}
 
 
-def hypothesis(
-    problem: Problem, item: Hypothetic, probability: float, evidence: float, chi_square: float, freedom: float
-) -> Hypothesis:
-    """Return the record of a hypothesis."""
+def hypothesis(problem: Problem, item: Hypothetic, probability: float) -> Hypothesis:
+    """Return the record of a hypothesis; along the missing force no readings are compared."""
     effects, parameters = named_effects(problem, item), calibrated_parameters(problem, item)
-    return Hypothesis(effects, evidence, probability, chi_square, freedom, parameters)
-
-
-def sizes(problem: Problem, item: CandidateFit) -> tuple[float, float, float]:
-    """Return log evidence [nat], chi^2 of the readings and its degrees of freedom."""
-    return item.log_evidence, item.chi_square, float(problem.counts.sum() - item.spent.sum())
+    chi_square, freedom = nan, nan
+    if isinstance(item, CandidateFit):
+        chi_square, freedom = item.chi_square, float(problem.counts.sum() - item.spent.sum())
+    return Hypothesis(effects, item.log_evidence, probability, chi_square, freedom, parameters)
 
 
 def named_effects(problem: Problem, found: Hypothetic) -> tuple[NamedEffect, ...]:

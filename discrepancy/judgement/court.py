@@ -1,40 +1,44 @@
 """Hypotheses before a court: which may be named, what speaks against the others.
 
-Where no simulation leaves noise, hypotheses are compared in one of two ways (`comparison`). Each tells the
-evidence of a hypothesis, and the share that it is of what is missing, in trials that were fitted and in those
-that were not.
+Where no simulation leaves noise, hypotheses are compared by their readings, or along the missing force
+(`court_of_force`). Each has evidence, and is a share of what is missing, in trials that were fitted and in
+those that were not.
 """
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Generic, TypeVar
+from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
 from scipy.stats import chi2
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.fits.candidate import Candidate, Key, Term
-from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.gates import ABSOLUTE_LEVEL
+from discrepancy.fits.candidate import Candidate, Key, Point, Term
+from discrepancy.fits.fitting import CandidateFit, attempt
+from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate
+from discrepancy.fits.other_optima import free_shape
+from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.shares import Share
-from discrepancy.search.hypotheses import acts_within
+from discrepancy.location.residuals import ResidualSet
+from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, Share
+from discrepancy.search.honest_evidence import noise_levels, refitted
+from discrepancy.search.hypotheses import acts_within, are_related
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 
 from .conclusion import Hypothetic
+from .consistency_gate import consistency_gate, sizes_by_trial
+from .proof import held_out_gate
 
 COUNTER = -0.1
 """Share below which trials in which a law has hardly any force speak against it all the same."""
-H = TypeVar("H", bound=Hypothetic)
 
 
-class Court(ABC, Generic[H]):
-    """Hypotheses that are compared in one way, with the share that each is of what is missing.
+class Court:
+    """Hypotheses as whole simulations, each fitted under what the best of them leaves.
 
     Parameters
     ----------
@@ -51,75 +55,131 @@ class Court(ABC, Generic[H]):
         Whether there are trials that were not fitted.
     """
 
-    least_end: float
-    has_held_out: bool
+    least_end = SEARCH.least_share
 
     def __init__(self, problem: Problem, found: Search) -> None:
         self.problem, self.found = problem, found
-        self._shares: dict[tuple[int, bool], tuple[H, Share]] = {}
-        self._followed: dict[Key, H | None] = {}
+        self.has_held_out = bool(problem.campaign.held_out)
+        self._shares: dict[tuple[int, bool], tuple[Any, Share]] = {}
+        self._followed: dict[Key, Any] = {}
+        self._sets: dict[int, tuple[CandidateFit, ResidualSet]] = {}
+        self._free: dict[Key, CandidateFit] = {}
 
     # ---------------------------------------------------------------- how they are compared
 
     @property
-    @abstractmethod
-    def ranked(self) -> Sequence[H]:
-        """Hypotheses, the most probable first."""
+    def nothing(self) -> Any:
+        """The hypothesis without an effect."""
+        return self.found.nothing
 
-    @abstractmethod
-    def score(self, item: H) -> float:
+    def score(self, item: Any) -> float:
         """Return ln (evidence times prior) [nat]."""
-
-    @abstractmethod
-    def sizes(self, item: H) -> tuple[float, float, float]:
-        """Return log evidence [nat], chi^2 of the readings and its degrees of freedom; nan: not known."""
-
-    @abstractmethod
-    def gain(self, item: H) -> float:
-        """Return the log evidence over no effect at all [nat]."""
-
-    @abstractmethod
-    def share_of(self, item: H, *, held_out: bool) -> Share:
-        """Return the share that a hypothesis is of what is missing."""
-
-    @abstractmethod
-    def followed(self, candidate: Candidate, effect: FloatArray) -> H | None:
-        """Return a further hypothesis, begun at values (E,) of its unknowns; None: it cannot be."""
-
-    @abstractmethod
-    def freed(self, item: H) -> H | None:
-        """Return a single law with a shape of its own, where that was compared."""
-
-    @abstractmethod
-    def gate(self, item: H) -> Gate:
-        """Return how well the simulation beside a name leaves noise alone."""
-
-    @abstractmethod
-    def fitted(self, item: H) -> CandidateFit:
-        """Return the simulation that stands for a hypothesis."""
-
-    @abstractmethod
-    def left(self, item: H, share: Share) -> str:
-        """Return in words what is left beside a hypothesis."""
-
-    def beside(self, item: H) -> str:
-        """Return what else speaks against a name; empty: nothing."""
-        return ""
+        return self.found.score(item)
 
     def gap(self) -> str:
         """Return what is seen of what is missing, in one sentence; empty: nothing."""
         return ""
 
+    @property
+    def ranked(self) -> Sequence[Any]:
+        """Hypotheses, the most probable first."""
+        return sorted(self.found.all().values(), key=lambda item: -self.found.score(item))
+
+    def residuals(self, item: Any) -> ResidualSet:
+        """Return fitted and held-out trials beside their predictions."""
+        if id(item) not in self._sets:
+            self._sets[id(item)] = item, residual_set(self.problem, item, sensitivities=False)
+        return self._sets[id(item)][1]
+
+    @cached_property
+    def _noise(self) -> Mapping[str, float]:
+        levels = noise_levels(self.problem, self.found.best())
+        return dict(zip(self.problem.channel_names, levels.tolist(), strict=True))
+
+    def share_of(self, item: Any, *, held_out: bool) -> Share:
+        """Return the share of the gap that a hypothesis closes; sizes are over the noise."""
+        sets = [self.residuals(one) for one in (self.found.none, item)]
+        pairs = zip(*([i for i in one.trials if i.trial.held_out is held_out] for one in sets), strict=True)
+        rows, trials = [], 0
+        for first, second in pairs:
+            scale = np.array([self._noise[name] for name in first.trial.channels])
+            count, trials = len(first.used), trials + 1
+            blocks = min(WINDOWS, max(1, count // SHORTEST)) if first.trial.is_dynamic else 1
+            squares = [np.where(one.used, one.standardised, 0.0) ** 2 for one in (first, second)]
+            for part in np.array_split(np.arange(count), blocks):
+                level = float((first.used[part] * scale).sum())
+                rows.append((float(squares[0][part].sum()), float(squares[1][part].sum()), level))
+        before, after, noise = np.array(rows).T
+        left, whole = (float(np.sqrt(max(one.sum() / noise.sum() - 1.0, 0.0))) for one in (after, before))
+        return Share(before, after, noise, held_out, trials, left, whole, OF_READINGS, tested=True)
+
+    def followed(self, candidate: Candidate, effect: FloatArray) -> Any:
+        """Return a further hypothesis, begun at values (E,) of its unknowns; None: it cannot be."""
+        none = self.found.none
+        found = self.found.exact.get(candidate.key)
+        if found is None:
+            found = attempt(self.problem, candidate, Point(none.point.shared, none.point.local, effect))
+        return None if found is None else refitted(self.problem, self.found.wide or self.problem, found)
+
+    def add_families(self) -> None:
+        """Compare the best law, and those easily taken for it, with shapes of their own too."""
+        best = self.found.best()
+        if len(best.candidate.terms) != 1 or not self.acts(best.candidate.terms[0]):
+            return
+        (own,) = best.candidate.terms
+        singles: dict[tuple[str, str], CandidateFit] = {}
+        for item in (*self.found.rough.values(), *self.found.exact.values()):
+            (term, *others) = item.candidate.terms or (None,)
+            if term is None or others or term.free_shape or not term.effect.shape or not self.acts(term):
+                continue
+            if term == own or are_related(term.effect, own.effect):
+                key = (term.effect.family, term.place)
+                singles[key] = max(singles.get(key, item), item, key=self.found.score)
+        joined = dict(self.found.judged)
+        for item in singles.values():
+            free = free_shape(self.problem, item, 0)
+            free = None if free is None else refitted(self.problem, self.found.wide or self.problem, free)
+            if free is not None:
+                self._free[item.candidate.key] = free
+                if free.log_evidence > best.log_evidence + SHAPE_GAIN:
+                    joined[free.candidate.key] = free
+        self.found.judged = joined
+
+    def freed(self, item: Any) -> Any:
+        """Return a single law with a shape of its own, where that was compared."""
+        return item if item.candidate.is_family else self._free.get(item.candidate.key)
+
+    def gate(self, item: Any) -> Gate:
+        """Return how well the simulation of a hypothesis leaves noise alone."""
+        return absolute_gate(self.problem, item)
+
+    def beside(self, item: Any) -> str:
+        """Return what else speaks against a name: sizes that follow the trial, a gate that noise fails."""
+        following = [one.sentence() for one in sizes_by_trial(self.problem, item) if one.follows]
+        if following or item.remainder is not None:
+            return " ".join(following)
+        gates: list[Gate] = [consistency_gate(self.problem, item), held_out_gate(self.residuals(item))]
+        return next((gate.reason for gate in gates if gate.passed is False), "")
+
+    def fitted(self, item: Any) -> CandidateFit:
+        """Return the simulation that stands for a hypothesis: itself."""
+        found: CandidateFit = item
+        return found
+
+    def left(self, item: Any, share: Share) -> str:
+        """Return in words what is left beside a hypothesis."""
+        return said("verdict.left_of_readings" if share.left > 0.0 else "verdict.nothing_left", share=share)
+
     # ---------------------------------------------------------------- who may be named
 
-    def share(self, item: H, *, held_out: bool) -> Share:
+    def share(self, item: Any, *, held_out: bool) -> Share:
         """Return the share that a hypothesis is of what is missing."""
         key = (id(item), held_out)
         if key not in self._shares:
             self._shares[key] = item, self.share_of(item, held_out=held_out)
         return self._shares[key][1]
 
-    def told(self, item: H) -> Share:
+    def told(self, item: Any) -> Share:
         """Return the share that counts: in trials not fitted, if there are any that can test it."""
         if self.has_held_out:
             outside = self.share(item, held_out=True)
@@ -127,7 +187,7 @@ class Court(ABC, Generic[H]):
                 return outside
         return self.share(item, held_out=False)
 
-    def against(self, item: H) -> str:
+    def against(self, item: Any) -> str:
         """Return why a hypothesis is no name; empty where nothing speaks against it."""
         if not any(map(self.acts, item.candidate.terms)):
             return said("against.readings")
@@ -146,7 +206,7 @@ class Court(ABC, Generic[H]):
                 return said("against.beside_priors", what=what)
         return self.beside(item)
 
-    def _survives(self, item: H, least: float) -> bool:
+    def _survives(self, item: Any, least: float) -> bool:
         """Whether trials that were not fitted bear a hypothesis out, or have no force by which they could."""
         outside = self.share(item, held_out=True)
         return not _is_little(outside, least) if outside.tested else outside.value > COUNTER
@@ -156,12 +216,12 @@ class Court(ABC, Generic[H]):
         return acts_within(term.effect, self.problem.setting)
 
     @cached_property
-    def contenders(self) -> list[H]:
+    def contenders(self) -> list[Any]:
         """Hypotheses that data do not exclude and nothing speaks against, most probable first.
 
         Errors of the readings beside laws take up what is left, whatever it is: they are no part of a name.
         """
-        found: dict[Key, tuple[H, float]] = {}
+        found: dict[Key, tuple[Any, float]] = {}
         for item in self.ranked:
             core = self._core(item)
             if core is not None and core.candidate.key not in found and not self.against(core):
@@ -169,14 +229,14 @@ class Court(ABC, Generic[H]):
         best = max((score for _, score in found.values()), default=0.0)
         return [item for item, score in found.values() if score > best - SEARCH.contenders]
 
-    def _core(self, item: H) -> H | None:
+    def _core(self, item: Any) -> Any:
         """Return a hypothesis without errors of the readings beside its laws; None without an effect."""
         acts = [self.acts(term) for term in item.candidate.terms]
         if all(acts) or not any(acts):
             return item if acts else None
         return self._with(item, [number for number, within in enumerate(acts) if within])
 
-    def _with(self, item: H, kept: Sequence[int]) -> H | None:
+    def _with(self, item: Any, kept: Sequence[int]) -> Any:
         """Return a hypothesis with some of its effects only."""
         candidate, values = item.candidate.some(kept, item.effect)
         key = candidate.key
@@ -187,7 +247,7 @@ class Court(ABC, Generic[H]):
             self._followed[key] = self.followed(candidate, values)
         return self._followed[key]
 
-    def slimmed(self, best: H) -> H:
+    def slimmed(self, best: Any) -> Any:
         """Return the simplest hypothesis that is as much of the missing force."""
         own, count = families(best), len(best.candidate.terms)
         singles = [self._with(best, [number]) for number in range(count)] if count > 1 else []
@@ -202,7 +262,7 @@ class Court(ABC, Generic[H]):
         ]  # fmt: skip
         return min(simpler, key=lambda item: (_freedom(item), -self.score(item)), default=best)
 
-    def probability(self, item: H) -> float:
+    def probability(self, item: Any) -> float:
         """Return the probability of a hypothesis with all that hold its effects or their families."""
         kept = [
             one for one in self.ranked if not one.candidate.terms or one is item or not self._refuted(one)
@@ -213,16 +273,16 @@ class Court(ABC, Generic[H]):
             return 0.0
         return float(np.exp(logsumexp(scores[holds]) - logsumexp(scores)))
 
-    def _refuted(self, item: H) -> bool:
+    def _refuted(self, item: Any) -> bool:
         """Whether trials show that a hypothesis is not what is missing."""
         if self.share(item, held_out=False).interval[1] < SEARCH.least_share:
             return True
         return self.has_held_out and not self._survives(item, 0.0)
 
-    def rivals(self, best: H) -> list[H]:
+    def rivals(self, best: Any) -> list[Any]:
         """Return other names that neither evidence nor trials tell from the best one."""
         own, share = families(best), self.told(best)
-        found: list[H] = []
+        found: list[Any] = []
         for item in self.contenders:
             same = names(item) == names(best) or (families(item) == own and item.candidate.is_family)
             if same or names(item) > names(best) or len(item.candidate.terms) > len(best.candidate.terms):

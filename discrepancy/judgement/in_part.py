@@ -23,10 +23,10 @@ from discrepancy.sentences import said
 from discrepancy.verdict import ExplainedShare, RemainderEstimate, Verdict, VerdictKind
 from reporting.words import capital, counted, listing
 
-from .comparison import ByForce, ByReadings
 from .conclusion import (
     UNSTATED_GAIN,
     Conclusion,
+    Hypothetic,
     Outcome,
     below_limit,
     effects_text,
@@ -39,7 +39,8 @@ from .conclusion import (
     small_terms,
 )
 from .consistency_gate import consistency_gate
-from .court import Court, H, names, part, percent
+from .court import Court, names, part, percent
+from .court_of_force import ByForce
 from .proof import held_out_gate
 
 LEAST_SHOWN = 0.1
@@ -65,10 +66,10 @@ def judged_in_part(problem: Problem, found: Search, first: Verdict) -> Outcome:
     Outcome
         As `naming.name` returns it; the fit is that of the best hypothesis for an unexplained gap too.
     """
-    if found.force is not None:
+    if found.force is not None and found.forces:
         return _verdict_of(ByForce(problem, found, found.force), first)
     weigh_with_remainders(found)
-    court = ByReadings(problem, found)
+    court = Court(problem, found)
     coloured = _beside_coloured_noise(court)
     if coloured is not None:
         return coloured
@@ -89,7 +90,7 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
     fit : CandidateFit
         Of the set that was named.
     """
-    court = ByReadings(problem, found)
+    court = Court(problem, found)
     small = small_terms(problem, fit, unstated=UNSTATED_GAIN)
     terms, one_channel = fit.candidate.terms, is_one_driven_channel(problem)
     kept = {
@@ -115,7 +116,7 @@ def without_sliver(problem: Problem, found: Search, first: Verdict, fit: Candida
     return Outcome(first, found, fit)
 
 
-def _beside_coloured_noise(court: ByReadings) -> Outcome | None:
+def _beside_coloured_noise(court: Court) -> Outcome | None:
     """Return the verdict where all that is left is the colour of the noise, as its records have it."""
     problem, found = court.problem, court.found
     nothing, best = found.nothing, found.best()
@@ -145,7 +146,7 @@ def _is_coloured(item: CandidateFit) -> bool:
     return item.remainder is not None and item.remainder.is_noise
 
 
-def _verdict_of(court: Court[H], first: Verdict) -> Outcome:
+def _verdict_of(court: Court, first: Verdict) -> Outcome:
     """Return the verdict of a court."""
     if not court.contenders:
         return _unexplained(court, first)
@@ -156,12 +157,12 @@ def _verdict_of(court: Court[H], first: Verdict) -> Outcome:
         return _group(court, members, probability)
     if len(members) > SEARCH.largest_group:
         return _unexplained(court, first, best, court.probability(best), len(members) - 1)
-    if probability < SEARCH.sure or court.gain(best) < SEARCH.bayes_factor:
+    if probability < SEARCH.sure or best.log_evidence - court.nothing.log_evidence < SEARCH.bayes_factor:
         return _unexplained(court, first, best, probability)
     return _in_part(court, best, probability)
 
 
-def _in_part(court: Court[H], best: H, probability: float) -> Outcome:
+def _in_part(court: Court, best: Hypothetic, probability: float) -> Outcome:
     """Return the verdict that names a hypothesis in part."""
     effects, share = named_effects(court.problem, best), court.told(best)
     family = ", ".join(sorted({t.effect.family for t in best.candidate.terms if t.free_shape}))
@@ -177,7 +178,7 @@ def _in_part(court: Court[H], best: H, probability: float) -> Outcome:
     return _outcome(court, VerdictKind.NAMED_IN_PART, sentence, probability, best, [best], **more)
 
 
-def _group(court: Court[H], members: Sequence[H], probability: float) -> Outcome:
+def _group(court: Court, members: Sequence[Hypothetic], probability: float) -> Outcome:
     """Return the verdict that one of several hypotheses is what is missing, what they share first."""
     share, effects = court.told(members[0]), [named_effects(court.problem, item) for item in members]
     rows = zip(members, effects, strict=True)
@@ -196,7 +197,7 @@ def _group(court: Court[H], members: Sequence[H], probability: float) -> Outcome
 
 
 def _unexplained(
-    court: Court[H], first: Verdict, close: H | None = None, probability: float = 0.0, rivals: int = 0
+    court: Court, first: Verdict, close: Hypothetic | None = None, probability: float = 0.0, rivals: int = 0
 ) -> Outcome:
     """Return the verdict that a force is missing which has no name: how large, and what orders it.
 
@@ -224,8 +225,8 @@ def _unexplained(
 
 
 def _outcome(
-    court: Court[H], kind: VerdictKind, sentence: str, probability: float, stands: H | None,
-    first: Sequence[H], **more: Any,
+    court: Court, kind: VerdictKind, sentence: str, probability: float, stands: Hypothetic | None,
+    first: Sequence[Hypothetic], **more: Any,
 ) -> Outcome:  # fmt: skip
     """Return a verdict with all hypotheses, some of them `first`, and the one that stands for it."""
     problem, ranked = court.problem, list(court.ranked)
@@ -237,16 +238,16 @@ def _outcome(
         key=lambda row: (not any(row[0] is item for item in first), -row[1]),
     )
     identifiers = dict.fromkeys(name for item, _ in rows for name in plain_names(item.candidate.identifiers))
-    told = tuple(hypothesis(problem, item, p, *court.sizes(item)) for item, p in rows[:MOST_TOLD])
+    told = tuple(hypothesis(problem, item, p) for item, p in rows[:MOST_TOLD])
     fit = court.found.none if stands is None else court.fitted(stands)
-    gain = court.gain(ranked[0] if stands is None else stands)
+    gain = (stands or ranked[0]).log_evidence - court.nothing.log_evidence
     more["explained"] = None if stands is None else explained_share(court.told(stands))
     more["remainders"] = remainder_estimates(problem, fit)
     conclusion = Conclusion(court.found, gain, told, inclusion(rows, identifiers))
     return conclusion.outcome(kind, sentence, probability, fit, **more)
 
 
-def _shape(court: Court[H], best: H) -> str:
+def _shape(court: Court, best: Hypothetic) -> str:
     """Return the sentence on the free shape of one law, unless trials not fitted speak against it."""
     (term, *others) = best.candidate.terms
     free = None if others else court.freed(best)

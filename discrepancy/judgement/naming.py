@@ -317,14 +317,15 @@ def name(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -
     """
     found = search(problem, effects, tell)
     first = _named(problem, found)
-    if found.force is None or first.verdict.kind is not VerdictKind.UNEXPLAINED:
+    if not found.forces or first.verdict.kind is not VerdictKind.UNEXPLAINED:
         return first
     tell("nothing follows the missing force: comparing whole simulations")
     again = attempt(problem, Candidate(), found.none.point)  # time steps may be finer by now
     second = Search(problem, found.effects, again or found.none, tell=tell)
+    second.force = found.force
     second.run()
     other = _named(problem, second)
-    second.force, second.forces = found.force, found.forces
+    second.forces = found.forces
     named = other.verdict.kind is VerdictKind.NAMED_IN_PART and any(_acts(problem, other.fit))
     # held-out trials alone give no name: most of the gap is to be closed where it was fitted
     count = float(problem.counts.sum())
@@ -356,7 +357,7 @@ def _named(problem: Problem, found: Search) -> Outcome:
         return without_sliver(problem, found, verdict, fit) if alone is None else alone
     failed = {gate.name for gate in verdict.gates if gate.passed is False}
     open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
-    open_group = verdict.kind is VerdictKind.GROUP and found.force is not None
+    open_group = verdict.kind is VerdictKind.GROUP and bool(found.forces)
     misfits = bool(failed & {"absolute fit", "held-out trials"})
     if open_group or (not stands and (misfits or verdict.kind in open_kinds)):
         return judged_in_part(problem, found, verdict)
@@ -369,7 +370,7 @@ def _without_readings(problem: Problem, found: Search, verdict: Verdict, fit: Ca
     Where laws are nearly all of the missing force, such an error takes up what is left, whatever it is.
     """
     acts = _acts(problem, fit)
-    if found.force is None or all(acts) or not any(acts):
+    if not found.forces or all(acts) or not any(acts):
         return None
     other = judged_in_part(problem, found, verdict)
     in_part, share = other.verdict.kind is VerdictKind.NAMED_IN_PART, other.verdict.explained

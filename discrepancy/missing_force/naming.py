@@ -67,7 +67,7 @@ class Explained:
         Their unknowns, standard normal before.
     processes : mapping of int to Process
         Missing forces beside them, by the numbers of their ports.
-    evidence : float
+    log_evidence : float
         [nat], with the prior of the processes.
     view : View
         Trials and columns.
@@ -82,7 +82,7 @@ class Explained:
     candidate: Candidate
     effect: FloatArray
     processes: Processes
-    evidence: float
+    log_evidence: float
     view: View
     solution: Solution
     local: Sequence[FloatArray]
@@ -181,7 +181,7 @@ class ForceSearch:
     def _together(self) -> Explained:
         """Return missing forces at all ports at once, or at those that matter most if they are many."""
         best = self.best()
-        ranked = sorted(self.at.values(), key=lambda item: -item.evidence)[:MOST_PORTS]
+        ranked = sorted(self.at.values(), key=lambda item: -item.log_evidence)[:MOST_PORTS]
         if len(ranked) == 1:
             return best
         begin = dict(best.processes)
@@ -196,7 +196,7 @@ class ForceSearch:
 
     def best(self) -> Explained:
         """Return the missing force of the largest evidence."""
-        return max(self.at.values(), key=lambda item: item.evidence)
+        return max(self.at.values(), key=lambda item: item.log_evidence)
 
     def about(self, ports: Iterable[int]) -> dict[int, Process]:
         """Return missing forces at ports as they may be before any reading."""
@@ -277,7 +277,7 @@ class ForceSearch:
 
     def score(self, found: Explained, count: int) -> float:
         """Return ln (evidence times prior) of a hypothesis [nat], `count` effects being looked for."""
-        return found.evidence + log_prior(found.candidate, count, self.problem.setting)
+        return found.log_evidence + log_prior(found.candidate, count, self.problem.setting)
 
     def _ranked(self, found: Mapping[Key, Explained], count: int) -> list[Explained]:
         return sorted(found.values(), key=lambda item: -self.score(item, count))
@@ -368,9 +368,9 @@ class ForceSearch:
             far = np.where(np.abs(step) > SETTLED, step, 0.0)
             if far.any():  # a value that it cannot reach is not its own
                 loss = 0.5 * float(far @ np.linalg.lstsq(found.effect_covariance, far, rcond=None)[0])
-                found = replace(found, evidence=found.evidence - loss)
+                found = replace(found, log_evidence=found.log_evidence - loss)
             # along the motion of its base, which follows the readings, a hypothesis looks better than it is
-            if best is None or turn == 1 or found.evidence > best.evidence:
+            if best is None or turn == 1 or found.log_evidence > best.log_evidence:
                 best = found
             if settled:
                 break

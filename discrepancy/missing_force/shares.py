@@ -310,7 +310,7 @@ def missing_force(search: ForceSearch, found: Explained) -> MissingForce | None:
     if it acts at one port.
     """
     nothing = max(of_nothing(one) for one in search.at.values())
-    evidence = {name: one.evidence - nothing for name, one in search.at.items()}
+    evidence = {name: one.log_evidence - nothing for name, one in search.at.items()}
     if max(evidence.values()) < GROUND:
         return None
     laws = {term.place for term in found.candidate.terms if term.place in search.ports}

@@ -63,13 +63,13 @@ def gap_windows(
 def _of_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
     """Return when a force is missing at the port, or the reading, that tells most."""
     search = ForceSearch(problem)
-    port = max(search.at, key=lambda name: search.at[name].evidence)
+    port = max(search.at, key=lambda name: search.at[name].log_evidence)
     laws = [number for number, term in enumerate(fit.candidate.terms) if term.place == port]
     law = search.followed(search.at[port], *fit.candidate.some(laws, fit.effect)) if laws else None
     number, found = _most_telling(search.ports.index(port), search.rough(port))
-    if found.evidence < of_nothing(found) + GROUND:
+    if found.log_evidence < of_nothing(found) + GROUND:
         return ()
-    best = events(found.view, number, found.processes[number], -np.inf if law is None else law.evidence)
+    best = events(found.view, number, found.processes[number], -np.inf if law is None else law.log_evidence)
     shown = []
     for trial, motion in zip(found.view.trials, found.motions, strict=True):
         force = motion.forces[number]
@@ -93,7 +93,7 @@ def residual_windows(
     for item, series in zip(residuals.trials, white, strict=True):
         if item.trial.kind in kinds and item.used.any() and len(series) > 1:
             one, pattern = of_series(item.trial.name, item.trial.time, series, item.used)
-            if one.evidence < of_nothing(one) + GROUND:
+            if one.log_evidence < of_nothing(one) + GROUND:
                 continue
             best = events(one.view, 0, one.processes[0])
             shown = one.motions[0].forces[0][:, None] * pattern
@@ -114,7 +114,7 @@ def _most_telling(port: int, at: Explained) -> tuple[int, Explained]:
             for size, time in product(READING_SIZES, READING_TIMES)
         ]
         about = max(processes, key=lambda item: on_reading.solve(item).evidence)
-        if on_reading.solve(about).evidence > best[1].evidence:
+        if on_reading.solve(about).evidence > best[1].log_evidence:
             best = 0, seen(on_reading, about, [about])
     return best
 

@@ -1,11 +1,12 @@
 """An FMU as a model, described by a TOML file: which variables are parameters, inputs, outputs and ports."""
 
 from pathlib import Path
-from typing import ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from discrepancy.campaign.records import Quantity
+from discrepancy.models.acting import DEFAULT_PLACE
 from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
 from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
 from reporting.section import Name, Number, Positive
@@ -13,6 +14,13 @@ from scenarios import binding_files
 
 CARRIED = tuple(item.kind for item in (*STRUCTURE, *LOADS, StiffnessDrift))
 """Kinds of primitives that an FMU can carry as its own parameters."""
+
+
+Forces = Annotated[
+    dict[Name, Name],
+    BeforeValidator(lambda given: {DEFAULT_PLACE: given} if isinstance(given, str) else given),
+]
+"""Force inputs by load place, or the only one."""
 
 
 class Inputs(Section):
@@ -34,7 +42,7 @@ class Inputs(Section):
         Moment [N m] that a force gives when it acts a metre further outboard, or aft.
     """
 
-    force: Name | dict[Name, Name] | None = None
+    force: Forces = Field(default_factory=dict)
     load_factor: Name | None = None
     temperature: Name | None = None
     temperature_reference: Number | None = None
@@ -49,13 +57,6 @@ class Inputs(Section):
         """Inputs of stiffness losses by damage region."""
         usual = {"z1": self.z1, "z2": self.z2}
         return {name: value for name, value in usual.items() if value is not None} | self.health
-
-    @property
-    def forces(self) -> dict[str, str]:
-        """Force inputs by load place."""
-        if self.force is None:
-            return {}
-        return {"tip_load": self.force} if isinstance(self.force, str) else dict(self.force)
 
 
 class Rest(Section):
@@ -120,10 +121,14 @@ class ReleaseOf(Section):
         return self
 
 
+Variable = Annotated[Name, Field(default_factory=lambda known: known.get("name", ""))]
+"""A variable of the FMU, of the same name where none is said."""
+
+
 class OutputOf(NamedSection):
     """`[[output]]`: what a channel's `output` names; `{a..b}` stands for all numbers from a to b."""
 
-    variable: Name | None = None
+    variable: Variable
     quantity: Quantity = Quantity.DISPLACEMENT
 
 
@@ -145,7 +150,7 @@ class PortOf(NamedSection):
 class VariableParameter(ParameterSection):
     """`[[parameter]]`: a calibrated parameter that is a variable of the FMU."""
 
-    variable: Name | None = None
+    variable: Variable
 
 
 class ScalesOf(Section):

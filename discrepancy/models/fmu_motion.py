@@ -1,12 +1,13 @@
-"""Motion of an FMU, laws at its ports: that of its system where it is linear, step by step where it is not.
+"""Motion and rest of an FMU, laws at its ports: that of its system where it is linear, else step by step.
 
 Stepped with an FMU, the force of the laws is held over each step. In it a port moves as a mass would under
 what accelerates it besides: what its speed answers to a force is measured beforehand, and the laws act on
 that mass as they do on any structure. Second order in the step.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from math import ceil
+from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -14,7 +15,8 @@ from scipy.interpolate import CubicSpline
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Load
-from discrepancy.models.fmu_pace import FmuPace, Motive
+from discrepancy.models.fmu_file import FmuModelDescription
+from discrepancy.models.fmu_pace import LINEAR, RECORD, Case, FmuPace
 from discrepancy.models.fmu_runs import Run, State
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import PLACE
@@ -36,11 +38,16 @@ Sampled = tuple[FloatArray, FloatArray]
 class FmuMotion(FmuPace):
     """Rest and motion of an FMU with laws at its ports."""
 
+    def __init__(self, description: FmuModelDescription, folder: Path) -> None:
+        super().__init__(description, folder)
+        self._refinements = dict[Hashable, tuple[int, float]]()
+        self._adds = dict[tuple[str, ...], bool]()  # whether the rest under some inputs is that of a system
+
     # ------------------------------------------------------------ motion
 
     def motion(
-        self, trial: Trial, times: FloatArray, state: State, motive: Motive, laws: Laws,
-        columns: Sequence[int], orders: Sequence[int], refinement: int,
+        self, case: Case, trial: Trial, times: FloatArray, laws: Laws, columns: Sequence[int],
+        orders: Sequence[int], refinement: int,
     ) -> Sampled:  # fmt: skip
         """Return columns of the outputs at times (N,), derived so many times, and their rates.
 
@@ -50,84 +57,83 @@ class FmuMotion(FmuPace):
             If the FMU refuses; or, where it is stepped, if a port has no velocity, or the steps do not
             converge.
         """
-        _, step = self.usual(trial)
-        system, end = self.system(state, step, motive), max(float(times[-1]), float(trial.time[-1]))
-        if system is None:
+        system, end = self.system(case), max(float(times[-1]), float(trial.time[-1]))
+        at, derived = [self.ports.index(name) for name in laws.ports], np.array(orders) > 0
+        seen = np.array([self.x[port] for port in at], dtype=np.int64)
+        numbers = np.array([case.inputs.index(self.forces[port]) for port in at], dtype=np.int64)
+        if system is None or system.jumps(seen, numbers):
             # a little longer, so that a clock that is being fitted does not ask for another run
             end += trial.interval * (times[-1] != trial.time[-1])
-            values, step = self._stepped(trial, end, state, motive, laws, columns, refinement)
+            values, step = self._stepped(case, trial, end, laws, columns, refinement)
             return sampled(values, step, times, orders, orders)
-        inputs, at = self._pushed(motive), [self.ports.index(name) for name in laws.ports]
-        amounts, still = self._amounts(state, step, motive, linear=True), self._still(state, step)
-        loads = [] if motive.course is None else [Load(self._levers(motive), motive.course)]
+        amounts, still = self._amounts(case, linear=True), self._still(case)
         stamps, back = np.unique(np.append(np.maximum(times, 0.0), 0.0), return_inverse=True)
         even = np.ptp(np.diff(stamps[1:])) <= ALIKE * stamps[-1]
         if not even:  # as many lengths of steps as stamps would take long
-            stamps = step * np.arange(ceil(end / step - 1e-6) + 1.0)
+            stamps = case.step * np.arange(ceil(end / case.step - 1e-6) + 1.0)
+        loads = [] if case.course is None else [Load(case.lever, case.course)]
         states, forces = system.motion(
-            Acting(trial.time, stamps, loads), self._start(system, motive, amounts),
-            still[self._x[at]], laws, self._x[at],
-            np.array([inputs.index(self.forces[port]) for port in at], dtype=np.int64), refinement,
+            Acting(trial.time, stamps, loads), self._start(system, case, amounts), laws, seen, numbers,
+            still[seen], refinement,
         )  # fmt: skip
         rows, at_once = system.rows(columns, orders)
-        values = states @ rows.T + forces @ at_once.T + np.where(np.array(orders) > 0, 0.0, still[columns])
-        if motive.starts:  # the force that holds it until then may be seen at once
-            held = [self._released(state, step, motive, name)[0] * amount for name, amount in amounts.items()]
-            values[0] = np.where(np.array(orders) > 0, values[0], (still + sum(held))[columns])
+        values = states @ rows.T + forces @ at_once.T + np.where(derived, 0.0, still[columns])
+        if case.starts:  # the force that holds it until then may be seen at once
+            held = [self._answer(case, name, released=True)[0] * amount for name, amount in amounts.items()]
+            values[0] = np.where(derived, values[0], (still + sum(held))[columns])
         if not even:
-            return sampled(values, step, times, orders, [0] * len(columns))
+            return sampled(values, case.step, times, orders, [0] * len(columns))
         rates = (states @ system.generator.T + forces @ system.push.T) @ rows.T
         if at_once.any():
             rates += np.gradient(forces, stamps, axis=0) @ at_once.T
         values, rates = values[back[:-1]], rates[back[:-1]]
-        values[np.ix_(times < 0.0, np.array(orders) > 0)] = rates[times < 0.0] = 0.0
+        values[np.ix_(times < 0.0, derived)] = rates[times < 0.0] = 0.0
         return values, rates
 
     def _stepped(
-        self, trial: Trial, end: float, state: State, motive: Motive, laws: Laws, columns: Sequence[int],
-        refinement: int,
-    ) -> tuple[FloatArray, float]:  # fmt: skip
+        self, case: Case, trial: Trial, end: float, laws: Laws, columns: Sequence[int], refinement: int
+    ) -> tuple[FloatArray, float]:
         """Return outputs (K, L) of the FMU stepped with the laws beside it, and the step [s]."""
-        fixed, usual = self.description.motion.step, self.usual(trial)[1]
-        amounts = self._amounts(state, usual, motive, linear=False)
-        whole = usual if motive.course is None else 0.5 * usual  # inputs are held over steps
+        fixed, amounts, parts = self.description.motion.step, self._amounts(case, linear=False), 1
+        whole = case.step if case.course is None else 0.5 * case.step  # inputs are held over steps
 
         def moved(parts: int) -> FloatArray:
             step = fixed or whole / parts
-            run = self._run(state, step, ceil(end / step - 1e-6), motive, amounts)
+            run = self._run(case._replace(step=step, record=ceil(end / step - 1e-6)), amounts)
             if len(laws):
                 with np.errstate(all="ignore"):  # an unstable coupling grows beyond all numbers
                     return self._beside(run, laws)
-            given = tuple((name, values.tobytes()) for name, values in run.courses.items())
-            key = (*run[:3], tuple(run.begin.items()), given)
-            return self.remembered(key, lambda: self.followed(run))
+            given = (values.tobytes() for values in run.courses.values())
+            return self.remembered((*run[:3], *run.begin.items(), *given), lambda: self.followed(run))
 
-        parts = 1
         if len(laws) and fixed is None:
-            watched = [*columns, *self.x]
-            parts = self._parts_for(laws, trial, watched, whole, lambda parts: moved(parts)[::parts, watched])
+            # an accelerometer that nobody reads would ask for steps many times smaller
+            watched = sorted({*columns, *self.x})
+            key = (*watched, trial.kind, trial.interval)
+            parts = self._parts_for(laws, key, whole, lambda parts: moved(parts)[::parts, watched])
         parts *= refinement
         return moved(parts)[:, columns], fixed or whole / parts
 
     def _beside(self, run: Run, laws: Laws) -> FloatArray:
         """Return the outputs (K, C) of a run with laws at the ports."""
         at = [self.ports.index(name) for name in dict.fromkeys(laws.ports)]
-        x, v, count = [self.x[port] for port in at], [self.v[port] for port in at], len(at)
+        ports, names, x, v = zip(
+            *((self.ports[port], self.forces[port], self.x[port], self.v[port]) for port in at), strict=True
+        )
         if min(v) < 0:
             raise ModelError(
-                f"The FMU model {self.description.name!r} is not linear, so its port "
-                f"{self.ports[at[v.index(-1)]]!r} needs a velocity output; name it in [[port]]."
+                f"The FMU model {self.description.name!r} is not linear, or the speed of a port jumps with a "
+                f"force, so its port {ports[v.index(-1)]!r} needs a velocity output; name it in [[port]]."
             )
-        names, h = [self.forces[port] for port in at], run.step
+        count, h = len(at), run.step
         one = run._replace(steps=1, courses={name: course[:1] for name, course in run.courses.items()})
         free = self.followed(one)
         pushes = ({name: one.courses.get(name, 0.0) + np.full(1, self.size(name))} for name in names)
         kicked = (self.followed(one._replace(courses={**one.courses, **push})) for push in pushes)
         sizes = np.array([self.size(name) for name in names])
         gain = np.stack([item[1, v] - free[1, v] for item in kicked], axis=1) / sizes
-        ports, unit = [self.ports[port] for port in at], np.eye(count)
         modal = ModalSystem(
-            np.zeros(count), np.zeros((count, count)), dict(zip(ports, unit, strict=True)),
+            np.zeros(count), np.zeros((count, count)), dict(zip(ports, np.eye(count), strict=True)),
             actions=dict(zip(ports, gain.T / h, strict=True)),
         )  # fmt: skip
         none = np.zeros((1, count))
@@ -146,9 +152,9 @@ class FmuMotion(FmuPace):
         values, acts = [first], np.column_stack([*courses.values()])
         pushed = [list(courses).index(name) for name in names]
         for number, row in enumerate(acts):
-            speed = values[-1][v]
+            speed = values[-1][v,]
             push = (speed - before + taken) / h
-            moving.q[:], moving.v[:] = values[-1][x], speed
+            moving.q[:], moving.v[:] = values[-1][x,], speed
             go.push[:] = np.concatenate((0.5 * h * h * push, h * push))
             go.begin[:] = go.end[:] = push
             moving.memory[friction, PLACE] = rows[friction] @ moving.q  # where it holds the port
@@ -159,18 +165,15 @@ class FmuMotion(FmuPace):
             row[pushed] -= np.linalg.solve(gain, taken)
             if not np.isfinite(row).all():
                 return np.full((len(acts) + 1, len(first)), np.nan)
-            values.append(self.one_step(asset, dict(zip(courses, row.tolist(), strict=True))))
+            with self.refusals():
+                values.append(asset.step(load=dict(zip(courses, row.tolist(), strict=True))).values)
         return np.array(values)
 
-    def _parts_for(
-        self, laws: Laws, trial: Trial, watched: Sequence[int], step: float,
-        moved: Callable[[int], FloatArray],
-    ) -> int:  # fmt: skip
+    def _parts_for(self, laws: Laws, key: Hashable, step: float, moved: Callable[[int], FloatArray]) -> int:
         """Return into how many parts steps [s] are divided for laws.
 
-        Steps are halved until that changes nothing that is watched by more than `CONVERGED` of its largest
-        motion (rms); what was enough is kept for laws of this kind up to twice as strong. An accelerometer
-        that nobody reads would ask for steps many times smaller.
+        Steps are halved until that changes nothing that moves by more than `CONVERGED` of its largest motion
+        (rms); what was enough is kept for laws of this kind up to twice as strong.
 
         Raises
         ------
@@ -179,23 +182,22 @@ class FmuMotion(FmuPace):
         """
         strength = float(np.max(np.abs(laws.values[:, 0])))
         exponents = np.round(np.clip(laws.values[:, 1:3], -9.0, 9.0), 1)  # roughness asks for short steps
-        kinds = laws.ports, laws.numbers.tobytes(), exponents.tobytes()
-        key = (tuple(sorted(set(watched))), trial.kind, trial.interval, *kinds)
+        key = (key, laws.ports, laws.numbers.tobytes(), exponents.tobytes())
         parts, tried = self._refinements.get(key, (1, 0.0))
         if strength <= 2.0 * tried:
             return parts
-        coarse = moved(parts)
+        fine = moved(parts)
         while parts <= MOST_REFINEMENT:
-            fine = moved(2 * parts)
+            coarse, fine = fine, moved(2 * parts)
             rows = min(len(fine), len(coarse))
             with np.errstate(all="ignore"):
-                size = np.max(np.abs(fine[:rows] - fine[:rows].mean(axis=0)), axis=0)
+                size = np.max(np.abs(fine - fine.mean(axis=0)), axis=0)
                 difference = np.sqrt(np.mean((coarse[:rows] - fine[:rows]) ** 2, axis=0))
-                change = float(np.max(difference / np.where(size > 0.0, size, np.inf)))
-            if np.isfinite(difference).all() and change <= CONVERGED:
+                change = float(np.max(difference / np.where(size == 0.0, np.inf, size)))
+            if change <= CONVERGED:
                 self._refinements[key] = (parts, strength)
                 return parts
-            parts, coarse = 2 * parts, fine
+            parts *= 2
         raise ModelError(
             f"The internal force at {', '.join(dict.fromkeys(laws.ports))} does not converge in the "
             f"co-simulation with the FMU model {self.description.name!r}: halving steps of "
@@ -205,36 +207,49 @@ class FmuMotion(FmuPace):
 
     # ------------------------------------------------------------ rest
 
-    def flexibility(self, state: State, ports: Sequence[int]) -> FloatArray:
-        """Return the displacements (P, P) of ports at rest under unit forces at each."""
-        if not ports:  # loads of zero may be outside of what the FMU takes
-            return np.zeros((0, 0))
-        loads = [{}, *({self.forces[port]: self.size(self.forces[port])} for port in ports)]
-        columns = [self.x[port] for port in ports]
-        found = np.array([self.rest([state], [load])[0, columns] for load in loads])
-        sizes = np.array([self.size(self.forces[port]) for port in ports])
-        return np.asarray((found[1:] - found[0]).T / sizes)
+    def rest(self, states: Sequence[State], loads: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the outputs (L, C) at rest in states that differ in inputs, under more (L,) on some of them.
 
-    def stiffness(self, state: State, step: float, record: int) -> list[tuple[float, float]] | None:
-        """Return the stiffness of the first mode and the one at rest at each port [N/m or N m/rad].
-
-        None if the FMU is not linear.
+        Where the FMU has to come to rest and is linear, what loads add is that of its system.
         """
-        system, found = (
-            self.system(state, step, Motive(tuple(self.ports), record=record)),
-            list[tuple[float, float]](),
-        )
-        if system is None:
-            return None
-        for number, column in enumerate(self.x):
-            at_rest = 1.0 / float(system.gain[column, number])
-            frequency, shape = system.most_flexible(column, number) or (1.0, 0.0)
-            of_mode = shape / frequency**2
-            found.append((at_rest if of_mode * at_rest < 1e-6 else 1.0 / of_mode, at_rest))
-        return found
+        if not self.description.static.settle:
+            return self.resting(states, loads)
+        names = tuple(sorted(name for name, values in loads.items() if np.any(values)))
+        rows = np.array([loads[name] for name in names]).reshape(-1, len(states)).T
+        order = np.argsort(-np.abs(rows).sum(axis=1), kind="stable")  # the largest load says whether it is
+        found = {row: self._rested(states[row], rows[row], names) for row in order.tolist()}
+        return np.array([found[row] for row in range(len(states))])
+
+    def _rested(self, state: State, amounts: FloatArray, names: tuple[str, ...]) -> FloatArray:
+        """Return the outputs (C,) when a motion has come to rest under amounts (E,) on some inputs."""
+
+        def asked(amounts: FloatArray) -> FloatArray:
+            loads, key = dict(zip(names, amounts[:, None], strict=True)), (state, names, amounts.tobytes())
+            return self.remembered(key, lambda: self.resting([state], loads)[0])
+
+        case = Case(state, self.description.static.step, RECORD, names, at_rest=True)
+        if self._adds.get(names) is False or (system := self.system(case)) is None:
+            return asked(amounts)
+        zero, moved = asked(0.0 * amounts), system.gain @ amounts
+        if names not in self._adds:
+            passing = [np.max(np.abs(self._answer(case, name)), axis=0) for name in names]
+            allowed = LINEAR * (np.abs(moved) + np.abs(amounts) @ passing)
+            self._adds[names] = bool(np.all(np.abs(asked(amounts) - zero - moved) <= allowed))
+        return np.asarray(zero + moved) if self._adds[names] else asked(amounts)
+
+    def flexibility(self, state: State) -> FloatArray:
+        """Return the displacements (P, P) of ports at rest under unit forces at each."""
+        if not self.ports:  # loads of zero may be outside of what the FMU takes
+            return np.zeros((0, 0))
+        pushes = np.diag([self.size(name) for name in self.forces])
+        loads = dict.fromkeys(self.forces, np.zeros(len(pushes) + 1))
+        for name, push in zip(self.forces, pushes, strict=True):
+            loads[name] = loads[name] + np.append(0.0, push)
+        found = self.rest([state] * (len(pushes) + 1), loads)[:, self.x]
+        return np.asarray((found[1:] - found[0]).T / np.diag(pushes))
 
     def at_rest(
-        self, states: Sequence[State], loads: Sequence[Mapping[str, float]], laws: Laws, trial: str
+        self, states: Sequence[State], loads: Mapping[str, FloatArray], laws: Laws, trial: str
     ) -> FloatArray:
         """Return the outputs (L, C) where laws follow the load path; the FMU itself is asked at the end.
 
@@ -245,26 +260,23 @@ class FmuMotion(FmuPace):
         """
         try:
             values = self.rest(states, loads)
-        except ModelError as cause:
-            if len(loads) == 1:
-                raise
-            for number, (state, load) in enumerate(zip(states, loads, strict=True), start=1):
+        except ModelError:
+            for row, state in enumerate(states):
                 try:
-                    self.rest([state], [load])
+                    self.rest([state], {name: values[row : row + 1] for name, values in loads.items()})
                 except ModelError as own:
-                    raise ModelError(f"The trial {trial!r}, row {number} of its table: {own}") from own
-            raise cause
+                    raise ModelError(f"The trial {trial!r}, row {row + 1} of its table: {own}") from own
+            raise
         if not len(laws):
             return values
         at = [self.ports.index(name) for name in laws.ports]
-        columns, compliance = [self.x[port] for port in at], self.flexibility(states[0], at)
+        columns, compliance = [self.x[port] for port in at], self.flexibility(states[0])[np.ix_(at, at)]
         linear = values[:, columns]
         for _ in range(STATIC_ITERATIONS):
             forces = static_solution(laws, linear, compliance, kernel=compiled_kernel()).forces
-            given = [dict(load) for load in loads]
-            for row, pulls in zip(given, forces.tolist(), strict=True):
-                for port, pull in zip(at, pulls, strict=True):
-                    row[self.forces[port]] = row.get(self.forces[port], 0.0) - pull
+            given = dict(loads)
+            for port, pull in zip(at, forces.T, strict=True):
+                given[self.forces[port]] = given.get(self.forces[port], 0.0) - pull
             values = self.rest(states, given)
             # where the FMU is not linear, the law is solved again about the points that were reached
             again = values[:, columns] + forces @ compliance.T

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 from warnings import catch_warnings, simplefilter
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import logm
-from scipy.signal import cont2discrete
 
 from discrepancy.campaign.records import FloatArray, Hold
 from discrepancy.models.acting import SMOOTH_PARTS, Acting, straight
@@ -14,9 +15,11 @@ from discrepancy.models.interface import Memory
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import Laws
+from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.stepwise import Begin, advance, steps_under, substeps
 
+NONE: Any = np.zeros(0, dtype=np.int64)
+ComplexArray = NDArray[np.complex128]
 KEPT = 16
 """Lengths of steps, and sets of ports, that a system keeps."""
 MOST_STATES = 40
@@ -26,8 +29,12 @@ HANKEL_ROWS, MIXTURES = 64, 3
 HANKEL_COLUMNS = 160
 INDEPENDENT = 1e5
 """Condition up to which eigenvectors give the logarithm of a matrix, 20 times faster than `logm`."""
+THRESHOLDS = 10.0 ** np.arange(-12, -6)
+"""Shares of the largest singular value below which one is rounding, one after the other."""
 FIT = 1e-7
 """Largest error of a linear system against the record that it is made of, as a share of the record."""
+JUMP = 1e-2
+"""Share of a port's speed that may come at once with a force: a solver of coarse steps shows a little."""
 ROUNDING = 1e-9
 """Share of the displacement at rest below which what a force moves at once is rounding."""
 
@@ -58,8 +65,7 @@ class FmuSystem:
         parameters, wherever its modes go.
         """
         mine, others = (np.vstack((item.outputs, item.outputs @ item.generator)) for item in (self, base))
-        size = np.linalg.norm(others, axis=1, keepdims=True)
-        size[size == 0.0] = 1.0
+        size = _not_zero(np.linalg.norm(others, axis=1, keepdims=True))
         way = np.linalg.lstsq(mine / size, others / size, rcond=None)[0]
         back = np.linalg.inv(way)
         return FmuSystem(
@@ -71,10 +77,8 @@ class FmuSystem:
         row, at_once = self.outputs[columns], self.direct[columns]
         for times in (0, 1):
             further = np.broadcast_to(orders, len(columns))[:, None] > times
-            row, at_once = (
-                np.where(further, row @ self.generator, row),
-                np.where(further, row @ self.push, at_once),
-            )
+            at_once = np.where(further, row @ self.push, at_once)
+            row = np.where(further, row @ self.generator, row)
         return row, at_once
 
     def at_rest(self, forces: FloatArray) -> FloatArray:
@@ -86,35 +90,38 @@ class FmuSystem:
         """Outputs (C, E) at rest under unit forces."""
         return np.asarray(self.direct + self.outputs @ self.at_rest(np.eye(self.push.shape[1])))
 
+    def _residues(self, column: int, number: int) -> tuple[ComplexArray, ComplexArray]:
+        """Return the rates (n,) [1/s] of the modes, and the residues of an output's answer to a force."""
+        rates, shapes = self._kept.get("modes", lambda: np.linalg.eig(self.generator))
+        into = np.linalg.solve(shapes, self.push[:, number].astype(complex))
+        return rates, (self.outputs[column] @ shapes) * into
+
     def most_flexible(self, column: int, number: int) -> tuple[float, float] | None:
         """Return the mode that gives an output the most at rest under a force; None if none vibrates.
 
-        Its angular frequency [rad/s], and the squared shape that both see [1/kg].
+        Its angular frequency [rad/s], and its flexibility between the two [m/N].
         """
-        rates, shapes = np.linalg.eig(self.generator)
-        into = np.linalg.solve(shapes, self.push[:, number].astype(complex))
-        residues = (self.outputs[column] @ shapes) * into
-        found = [
-            (float(abs(rate)), float(abs(2.0 * rate.imag * residue)))
-            for rate, residue in zip(rates, residues, strict=True)
-            if rate.imag > 1e-9 * abs(rate)
-        ]
-        return max(found, key=lambda mode: mode[1] / mode[0] ** 2, default=None)
+        rates, residues = self._residues(column, number)
+        frequency, vibrating = np.abs(rates), rates.imag > 1e-9 * np.abs(rates)
+        flexible = np.where(vibrating, np.abs(2.0 * rates.imag * residues) / frequency**2, 0.0)
+        best = int(np.argmax(flexible))
+        return (float(frequency[best]), float(flexible[best])) if vibrating.any() else None
+
+    def stiffness(self, column: int, number: int) -> tuple[float, float]:
+        """Return the stiffness of the most flexible mode between output and force, and that at rest [N/m]."""
+        at_rest, mode = 1.0 / float(self.gain[column, number]), self.most_flexible(column, number)
+        return (at_rest if mode is None or mode[1] * at_rest < 1e-6 else 1.0 / mode[1]), at_rest
+
+    def jumps(self, columns: IntArray, numbers: IntArray) -> bool:
+        """Whether the speed of an output jumps with its force, so that laws there find no mass."""
+        found = (self._residues(*pair)[1] for pair in zip(columns, numbers, strict=True))
+        return any(abs(item.sum()) > JUMP * np.abs(item).sum() for item in found)
 
     # ------------------------------------------------------------ motion
 
-    def stepped(self, start: FloatArray, forces: FloatArray, step: float) -> FloatArray:
-        """Return the outputs (N + 1, C) from a state under forces (N, E) held over steps [s]."""
-        system = self.generator, self.push, self.outputs, self.direct
-        transition, drive = self._kept.get(step, lambda: cont2discrete(system, step)[:2])
-        states = np.vstack((start, forces @ drive.T))
-        for k in range(len(forces)):
-            states[k + 1] += transition @ states[k]
-        return np.asarray(states @ self.outputs.T + np.vstack((forces[:1], forces)) @ self.direct.T)
-
     def motion(
-        self, acting: Acting, start: FloatArray, still: FloatArray, laws: Laws, columns: IntArray,
-        numbers: IntArray, refinement: int,
+        self, acting: Acting, start: FloatArray, laws: Laws = NO_LAWS, columns: IntArray = NONE,
+        numbers: IntArray = NONE, still: FloatArray = NONE, refinement: int = 1,
     ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
         """Return states (N, n) and forces (N, E) at the times of what acts, with laws at ports.
 
@@ -127,12 +134,12 @@ class FmuSystem:
             Forces, in rows (E,).
         start : (n,) ndarray
             State at the first time.
-        still : (J,) ndarray
-            Position of each law's port without forces.
         laws : Laws
             J internal forces.
         columns, numbers : (J,) ndarray of int
             Column of the displacement, and number of the force, of each law's port.
+        still : (J,) ndarray
+            Position of each law's port without forces.
         refinement : int
             Steps with laws are this many times smaller.
         """
@@ -170,6 +177,10 @@ class FmuSystem:
             actions=dict(zip(places, acts.T[numbers[law]], strict=True)),
         )  # fmt: skip
         return acts, modal, law
+
+
+def _not_zero(sizes: FloatArray) -> FloatArray:
+    return np.where(sizes == 0.0, 1.0, sizes)
 
 
 def _largest(matrix: FloatArray, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -215,13 +226,11 @@ def fmu_system(records: FloatArray, forces: int, step: float) -> FmuSystem | Non
         None if no system of at most `MOST_STATES` states shows the records within `FIT`.
     """
     count, columns, inputs = records.shape
-    size = np.max(np.abs(records[1:]), axis=(0, 2), keepdims=True)
-    size[size == 0.0] = 1.0
-    amount = np.max(np.abs(records[1:]) / size, axis=(0, 1))
-    amount[amount == 0.0] = 1.0
-    records = records / (size * amount)
-    mixing = np.random.default_rng(1).standard_normal((MIXTURES, columns))
-    seen, height = mixing @ records, min(HANKEL_ROWS, (count - 2) // 2)
+    size = _not_zero(np.max(np.abs(records[1:]), axis=(0, 2)))
+    amount = _not_zero(np.max(np.abs(records[1:]) / size[:, None], axis=(0, 1)))
+    records = records / (size[:, None] * amount)
+    seen = np.random.default_rng(1).standard_normal((MIXTURES, columns)) @ records
+    height = min(HANKEL_ROWS, (count - 2) // 2)
     width = min(HANKEL_COLUMNS, count - 2 - height)
     both = seen[1 + np.arange(height + 1)[:, None] + np.arange(width)].transpose(0, 2, 1, 3)
     both = both.reshape((height + 1) * MIXTURES, width * inputs)
@@ -230,28 +239,18 @@ def fmu_system(records: FloatArray, forces: int, step: float) -> FmuSystem | Non
         left, values, right = _largest(hankel, most + 16)
         if values[-1] <= 1e-13 * values[0]:
             break
-    if values[0] == 0.0:
-        return None
-    tried = 0
-    for threshold in (1e-12, 1e-11, 1e-10, 1e-9, 1e-8, 1e-7):
-        order = int(np.sum(values > threshold * values[0]))
-        if order == tried or order > MOST_STATES:
-            continue
-        tried = order
+    goal = records[1:].transpose(0, 2, 1).reshape(-1, columns)
+    for order in dict.fromkeys(int(np.sum(values > least * values[0])) for least in THRESHOLDS):
         root = np.sqrt(values[:order])
         transition = (left[:, :order] / root).T @ shifted @ (right[:order].T / root)
-        if np.max(np.abs(np.linalg.eigvals(transition))) > 1.0 + 1e-9:
+        rates = np.linalg.eigvals(transition)
+        if not 0 < order <= MOST_STATES or np.max(np.abs(rates)) > 1.0 + 1e-9:
             continue
-        try:
-            drive = np.linalg.solve(transition, (root[:, None] * right[:order])[:, :inputs])
-        except np.linalg.LinAlgError:
-            continue
+        drive = np.linalg.lstsq(transition, (root[:, None] * right[:order])[:, :inputs])[0]
         states, power = drive[None], transition
         while len(states) < count:
             states, power = np.concatenate((states, power @ states)), power @ power
-        states = states[:count]
-        flat = states[1:].transpose(0, 2, 1).reshape(-1, order)
-        goal = records[1:].transpose(0, 2, 1).reshape(-1, columns)
+        flat = states[1:count].transpose(0, 2, 1).reshape(-1, order)
         unit = np.max(np.abs(flat), axis=0)
         rows = np.linalg.lstsq(flat / unit, goal, rcond=1e-14)[0].T / unit
         error = np.max(np.abs(goal - flat @ rows.T), axis=0)
@@ -259,7 +258,6 @@ def fmu_system(records: FloatArray, forces: int, step: float) -> FmuSystem | Non
             held, starts = np.split(drive * amount, [forces], axis=1)
             whole = np.block([[transition, held], [np.zeros((forces, order)), np.eye(forces)]])
             generator, push = np.split(_logarithm(whole)[:order] / step, [order], axis=1)
-            rows, first = rows * size[0], records[0] * size[0] * amount
-            starts = np.linalg.solve(transition, starts)
-            return FmuSystem(generator, push, rows, first[:, :forces] - rows @ held, starts)
+            rows, first = rows * size[:, None], records[0, :, :forces] * size[:, None] * amount[:forces]
+            return FmuSystem(generator, push, rows, first - rows @ held, np.linalg.solve(transition, starts))
     return None

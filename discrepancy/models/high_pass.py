@@ -3,7 +3,7 @@
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.signal import fftconvolve
 from scipy.special import hyp1f1, rgamma
 
 from discrepancy.campaign.records import FloatArray
@@ -18,28 +18,21 @@ FAR, TERMS = 700.0, 10
 def filtered_record(
     item: HighPass, record: SensorRecord, signal: FloatArray, slope: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Pass columns (N, C) of a record, and their rates, through a filter.
-
-    Where sampling is uneven, on an even grid and back.
-    """
+    """Pass columns (N, C) of a record, and their rates, through a filter, on an even grid and back."""
     time, tau = record.time, item.time_constant
-    count = max(len(time) - 1, 1)
-    interval = float(time[-1] - time[0]) / count
-    even = len(time) < 3 or bool(np.max(np.abs(np.diff(time) - interval)) <= 2e-3 * interval)
-    if not even:  # on a grid twice as fine as the usual step, and back
-        count = int(np.ceil(2.0 * float(time[-1] - time[0]) / float(np.median(np.diff(time)))))
-        interval = float(time[-1] - time[0]) / count
-        grid = np.linspace(time[0], time[-1], count + 1)
-        signal, slope = _at(grid, time, signal), _at(grid, time, slope)
+    count, span, steps = max(len(time) - 1, 1), float(time[-1] - time[0]), np.diff(time)
+    if count > 1 and np.max(np.abs(steps - span / count)) > 2e-3 * span / count:
+        count = int(np.ceil(2.0 * span / np.median(steps)))  # a grid twice as fine as the usual step
+    grid, interval = np.linspace(time[0], time[-1], count + 1), span / count
+    signal, slope = _at(grid, time, signal), _at(grid, time, slope)
     held = signal[0] if record.kind == "ringdown" else np.zeros(signal.shape[1])
     shown = high_pass(signal, interval, tau, item.order, held)
-    if item.order in (1.0, 2.0):  # each stage obeys y' = x' - y / tau
-        if item.order == 2.0:
-            slope = slope - high_pass(signal, interval, tau, 1.0, held) / tau
-        slope = slope - shown / tau
+    if item.order == int(item.order):  # each stage obeys y' = x' - y / tau
+        for order in range(1, int(item.order) + 1):
+            slope = slope - high_pass(signal, interval, tau, order, held) / tau
     else:
-        slope = high_pass(slope, interval, tau, item.order, np.zeros(len(held)))
-    return (shown, slope) if even else (_at(time, grid, shown), _at(time, grid, slope))
+        slope = high_pass(slope, interval, tau, item.order, 0.0)
+    return _at(time, grid, shown), _at(time, grid, slope)
 
 
 def _at(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
@@ -88,32 +81,24 @@ def high_pass(
     count = len(signal)
     if count == 0:
         return np.array(signal, dtype=np.float64)
-    step, spectrum, length = _kernel(count, interval / time_constant, float(order))
-    shape = signal.shape
-    rows = np.ascontiguousarray(np.asarray(signal, dtype=np.float64).reshape(count, -1).T)
-    increments = np.zeros((len(rows), count))
-    np.subtract(rows[:, 1:], rows[:, :-1], out=increments[:, 1:])
-    output = np.fft.irfft(np.fft.rfft(increments, length) * spectrum, length)[:, :count].T
+    step, ramp = _kernel(count, interval / time_constant, float(order))
+    rows = np.asarray(signal, dtype=np.float64).reshape(count, -1)
+    output = fftconvolve(np.diff(rows, axis=0, prepend=rows[:1]), ramp[:, None], axes=0)[:count]
     if held is not None:
-        jump = rows[:, 0] - np.broadcast_to(held, shape[1:]).reshape(-1)
-        if np.any(jump):
-            output = output + step[:, np.newaxis] * jump
-    return output.reshape(shape)
+        jump = rows[0] - np.broadcast_to(held, np.shape(signal)[1:]).reshape(-1)
+        output = output + step[:, None] * jump
+    return np.asarray(output.reshape(np.shape(signal)))
 
 
 @lru_cache(maxsize=32)
-def _kernel(count: int, ratio: float, order: float) -> tuple[FloatArray, NDArray[np.complex128], int]:
-    """Return step response, spectrum of the ramp's kernel and the length of the transform.
+def _kernel(count: int, ratio: float, order: float) -> tuple[FloatArray, FloatArray]:
+    """Return the responses (N,) to a unit step and to a unit increment that is spread over one interval.
 
-    `ratio` is the sampling interval over tau. Entry k of the kernel is what is left, k samples later, of a
-    unit increment that was spread over one interval: the mean of the step response over that interval.
+    `ratio` is the sampling interval over tau. Entry k of the second is what is left, k samples later, of the
+    increment: the mean of the step response over that interval.
     """
     u: FloatArray = ratio * np.arange(count + 1, dtype=np.float64)
-    integral = u * _confluent(order, 2, u)
-    ramp = np.diff(integral) / ratio
-    step = _confluent(order, 1, u[:-1])
-    length = 1 << (2 * count - 1).bit_length()
-    return step, np.fft.rfft(ramp, length), length
+    return _confluent(order, 1, u[:-1]), np.diff(u * _confluent(order, 2, u)) / ratio
 
 
 def _confluent(order: float, second: int, u: FloatArray) -> FloatArray:

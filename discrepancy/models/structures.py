@@ -212,8 +212,7 @@ class WingModel(SystemModel):
     Notes
     -----
     Load places are "tip_load" or (y [m], chord fraction). Outputs are strain[k], strain[k].transverse and
-    strain[k].shear across it, tip_displacement,
-    load_point_displacement and displacement[y, x].
+    strain[k].shear across it, tip_displacement, load_point_displacement and displacement[y, x].
     """
 
     reference = LOAD_PLACE

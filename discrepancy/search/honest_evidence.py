@@ -11,6 +11,7 @@ have none.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -34,8 +35,6 @@ LIKE_RECORD = 3.0
 """Deviations within which the correlation of a noise record is that of what is left."""
 LEAST_WHITE = 1e-12
 """Least share of what is left that is taken for noise where none is recorded."""
-STEPS = 12
-"""Steps of a hypothesis under the wider noise."""
 
 
 def left_by(problem: Problem, found: CandidateFit) -> Remainder:
@@ -99,7 +98,7 @@ def widened(problem: Problem, remainder: Remainder) -> Problem:
     return problem.widened(remainder.factor) if remainder.acts else problem
 
 
-def refitted(problem: Problem, wide: Problem, found: CandidateFit, steps: int = STEPS) -> CandidateFit | None:
+def refitted(problem: Problem, wide: Problem, found: CandidateFit, **options: Any) -> CandidateFit | None:
     """Return a hypothesis at its maximum under a wider noise, with evidence and covariance of that.
 
     All else of it is told against the recorded noise, with what it leaves. None where it cannot be fitted so:
@@ -107,7 +106,7 @@ def refitted(problem: Problem, wide: Problem, found: CandidateFit, steps: int = 
     """
     if wide is problem:
         return found
-    again = attempt(wide, found.candidate, found.point, iterations=steps)
+    again = attempt(wide, found.candidate, found.point, **options)
     here = None if again is None else attempt(problem, found.candidate, again.point, iterations=0)
     if again is None or here is None:
         return None
@@ -201,7 +200,7 @@ def _add(judged: dict[Key, CandidateFit], found: Search, wide: Problem, item: Ca
     """Add a hypothesis under a wider noise, if it can be fitted so; no effect at all as it stands if not."""
     again = refitted(found.problem, wide, item)
     if again is None and not item.candidate.terms:
-        again = refitted(found.problem, wide, item, steps=0)
+        again = refitted(found.problem, wide, item, iterations=0)
     if again is not None:
         judged[item.candidate.key] = again
 

@@ -19,6 +19,7 @@ from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.missing_force.hypotheses import log_prior
+from discrepancy.missing_force.naming import Explained
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import SENSORS, MicroSlip
 
@@ -80,7 +81,7 @@ class Hypotheses:
         """Return ln of the prior probability of a candidate at its places."""
         return log_prior(candidate, len(self.effects), self.problem.setting)
 
-    def score(self, found: CandidateFit) -> float:
+    def score(self, found: CandidateFit | Explained) -> float:
         """Return ln (evidence times prior), up to a constant."""
         return found.log_evidence + self.log_prior(found.candidate)
 

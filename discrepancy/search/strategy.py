@@ -1,16 +1,20 @@
 """The search for the set of effects that explains a campaign: screen, fit, add, take away, try pairs."""
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import product
 
 import numpy as np
+from scipy.special import ndtri
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
-from discrepancy.errors import ModelError
-from discrepancy.fits.candidate import Candidate, Point
-from discrepancy.fits.fitting import CandidateFit, attempt, fit
+from discrepancy.errors import DiscrepancyError, ModelError
+from discrepancy.fits.candidate import Candidate, Point, Term
+from discrepancy.fits.fitting import CandidateFit, attempt, fit, objective
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
 from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
 from discrepancy.fits.problem import Problem
@@ -19,8 +23,10 @@ from discrepancy.missing_force.hypotheses import sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
 
-from .growing_records import Beginnings
-from .hypotheses import Hypotheses, Tell, acts_within, are_related, each, in_silence, pairs, slips, starts
+from .hypotheses import Hypotheses, Tell, acts_within, each, in_silence, pairs, slips, starts
+
+Start = tuple[Candidate, Point]
+Starts = list[Start]
 
 
 @dataclass
@@ -29,29 +35,31 @@ class Search(Hypotheses):
 
     Attributes
     ----------
-    beginnings : Beginnings
-        For fits far from the truth.
     longest : int
         Number of effects of the longest set that was the best one.
+    forces : list of Explained
+        Sets of effects along the missing force, if they were compared so, the most probable first.
     """
 
-    beginnings: Beginnings = field(init=False)
     longest: int = field(init=False, default=0)
-    force: ForceSearch | None = field(init=False, default=None)
     forces: list[Explained] = field(init=False, default_factory=list)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._begin_anew()
-
-    def _begin_anew(self) -> None:
-        """Take the beginnings of records as the problem is now."""
-        self.beginnings = Beginnings(self.problem, self.tell, self.none.residuals)
+    @cached_property
+    def force(self) -> ForceSearch | None:
+        """The missing forces of the trials in motion, where they can be seen."""
+        if not sees_forces(self.problem):
+            return None
+        self.tell("looking for the missing force")
+        try:
+            return ForceSearch(self.problem)
+        except (ModelError, np.linalg.LinAlgError) as cause:
+            self.tell(f"the missing force cannot be seen: {cause}")
+            return None
 
     def screened(self, base: CandidateFit, effects: Iterable[Effect]) -> dict[str, list[Change]]:
         """Return for each effect its most promising changes, best first, at different places or values."""
         screen, found = Screen(self.problem, base), {}
-        for effect in each(self.tell, tuple(effects), lambda one: f"screening {_beside(one, base)}"):
+        for effect in each(self.tell, tuple(effects), lambda one: f"screening {one.identifier}"):
             found[effect.identifier] = starts(screen, effect)
         if not base.candidate.terms:
             self.promised |= {
@@ -62,8 +70,8 @@ class Search(Hypotheses):
     def scan(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
         """Fit every effect roughly in addition to those of `base`; return the best of each, best first.
 
-        Close to the truth one linearisation serves all (chord steps). Far from it phases slip over a long
-        record, so that the beginnings of the records are fitted first, and the whole ones from there.
+        Fits begin where a screen at the base leads; far from the truth, where phases slip over a record and
+        nothing is linear, where the missing force does.
         """
         effects = near = tuple(effects)
         if self._misfits(base):  # what acts on readings only turns no phases
@@ -71,7 +79,7 @@ class Search(Hypotheses):
         found = self._scan_near(base, near)
         explained = any(absolute_gate(self.problem, item).passed for item in found)
         if self._misfits(base) or (self._far(base) and not explained):
-            found += self.beginnings.scan(base, effects)
+            found += self._scan_far(base, [one for one in effects if acts_within(one, self.problem.setting)])
         best: dict[tuple[str, ...], CandidateFit] = {}
         for item in sorted(found, key=self.score):
             self.keep(item, exact=False)
@@ -88,44 +96,51 @@ class Search(Hypotheses):
         return base.chi_square > SEARCH.far * float(self.problem.counts.sum())
 
     def _scan_near(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
-        found = []
+        """Fit effects from where a screen at a base leads."""
         least = SEARCH.worth_adding if base.candidate.terms else SEARCH.worth_fitting
-        ranked = [changes for changes in self.screened(base, effects).values() if changes]
+        ranked = [
+            chosen for changes in self.screened(base, effects).values()
+            if (chosen := [change for change in changes if change.gain >= least])
+        ]  # fmt: skip
         ranked.sort(key=lambda changes: -max(change.gain for change in changes))
-        enough = SEARCH.promising * max((change.gain for change in ranked[0]), default=0.0) if ranked else 0.0
-        prospect = base.objective - (least if base.candidate.terms else 0.0)
-        for changes in each(self.tell, ranked, lambda row: f"fitting {_beside(row[0].term.effect, base)}"):
+        starts = [[_beside(base, change.term, rescaled(change)) for change in row] for row in ranked]
+        return self._best_of(starts, base, least if base.candidate.terms else 0.0)
+
+    def _scan_far(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
+        """Fit effects from the best of a grid of their parameters, nuisances as the missing force has them.
+
+        Those of a wrong model are far off and make a bad start; beside a force that is free they are where
+        they belong. Where no force is seen they are as expected before the data.
+        """
+        there = self._unbiased(base)
+        starts = [_tried(self.problem, there, effect) for effect in effects]
+        return self._best_of([row for row in starts if row], there, 0.0)
+
+    def _unbiased(self, base: CandidateFit) -> CandidateFit:
+        """Return a base with its nuisances where they are beside a missing force."""
+        point = self.problem.start(base.candidate)
+        if self.force is not None:
+            along = self.force.whole
+            if base.candidate.terms:
+                along = self.force.followed(along, base.candidate, base.effect) or along
+            point = self.force.whole_point(along)
+        return replace(base, point=replace(point, effect=base.effect), linearisations=())
+
+    def _best_of(self, starts: Sequence[Starts], base: CandidateFit, worth: float) -> list[CandidateFit]:
+        """Fit each effect by few steps from its starts beside a base; return the best of each."""
+        found, prospect = [], base.objective - worth
+        for row in each(self.tell, starts, lambda row: f"fitting {row[0][0].words}"):
             fits: list[CandidateFit] = []
-            for change in changes:
-                if change.gain < least:
-                    continue
-                candidate = base.candidate.plus(change.term)
-                rough = self.roughly(base, candidate, rescaled(change), give_up=prospect)
-                if rough is None:  # the best scale is more than the structure can carry
-                    continue
-                delivered = base.objective - rough.objective
-                reached = max((base.objective - item.objective for item in fits), default=0.0)
-                if change.gain >= enough and max(delivered, reached) < SEARCH.delivered * change.gain:
-                    rough = self._followed(rough, base, rescaled(change))
-                fits.append(rough)
-                prospect = min(prospect, rough.objective + SEARCH.out_of_reach)
-            if fits:
-                found.append(max(fits, key=self.score))
+            for candidate, start in row:
+                rough = attempt(
+                    self.problem, candidate, start, known=base.linearisations or None,
+                    iterations=SEARCH.rough_steps, give_up=prospect,
+                )  # fmt: skip
+                if rough is not None:  # else it is more than the structure can carry
+                    fits.append(rough)
+                    prospect = min(prospect, rough.objective + SEARCH.out_of_reach)
+            found += [max(fits, key=self.score)] if fits else []
         return found
-
-    def _followed(self, rough: CandidateFit, base: CandidateFit, added: FloatArray) -> CandidateFit:
-        """Fit anew where chord steps did not reach what the screen promised: shared unknowns move far."""
-        start = Point(base.point.shared, base.point.local, np.concatenate((base.point.effect, added)))
-        again = attempt(self.problem, rough.candidate, start, iterations=SEARCH.short_steps)
-        return rough if again is None else max(rough, again, key=self.score)
-
-    def roughly(
-        self, base: CandidateFit, candidate: Candidate, added: FloatArray, *, give_up: float | None = None
-    ) -> CandidateFit | None:
-        """Fit a candidate by chord steps from a base, None where it cannot; see `fit` for `give_up`."""
-        start = Point(base.point.shared, base.point.local, np.concatenate((base.point.effect, added)))
-        steps = SEARCH.chord_steps
-        return attempt(self.problem, candidate, start, base=base, iterations=steps, give_up=give_up)
 
     def exactly(self, rough: CandidateFit) -> CandidateFit:
         """Fit a candidate to convergence from a rough fit, and keep it."""
@@ -135,7 +150,7 @@ class Search(Hypotheses):
         found = self.exact.get(key)
         if found is None or found.log_evidence < rough.log_evidence - SEARCH.gained_again:
             again = attempt(self.problem, rough.candidate, rough.point)
-            # chord steps may have led to where the structure cannot follow
+            # few steps may have led to where the structure cannot follow
             self.keep(rough if again is None else again, exact=True)
         return self.exact[key]
 
@@ -144,7 +159,7 @@ class Search(Hypotheses):
         if not rough:
             return []
         top = self.score(rough[0])
-        # far from the truth, chord steps rank only roughly
+        # far from the truth, few steps rank only roughly
         margin = max(SEARCH.close, SEARCH.close_share * (top - floor))
         chosen = [item for item in rough[: SEARCH.exact_fits] if self.score(item) > max(top - margin, floor)]
         found = []
@@ -162,8 +177,6 @@ class Search(Hypotheses):
         name in place of one that is free.
         """
         self.singles()
-        if self._misfits(self.none) and absolute_gate(self.problem, self.best()).passed is False:
-            self.relatives()
         self.settle()
         self.families()
         self.settle()
@@ -186,16 +199,10 @@ class Search(Hypotheses):
 
     def by_force(self) -> bool:
         """Fit the sets of effects that follow the missing force best; False where that is not seen."""
-        if not sees_forces(self.problem) or not all(data.trial.is_dynamic for data in self.problem.trials):
+        force = self.force
+        if force is None or not all(data.trial.is_dynamic for data in self.problem.trials):
             return False
-        self.tell("looking for the missing force")
-        try:
-            force = ForceSearch(self.problem)
-            self.forces = force.name(self.effects)
-        except (ModelError, np.linalg.LinAlgError) as cause:
-            self.tell(f"the missing force cannot be seen: {cause}")
-            return False
-        self.force = force
+        self.forces = force.name(self.effects)
         # beside another law a shape of its own would imitate nearly anything
         able = [one for one in self.forces if len(one.candidate.terms) == 1 or not one.candidate.is_family]
         able = [one for one in able if one.candidate.terms]
@@ -235,18 +242,6 @@ class Search(Hypotheses):
                 break  # a third effect is looked for only where two nearly do
             current = self._extended(current)
 
-    def relatives(self) -> None:
-        """Fit effects that are easily taken for the best one, from where it stands."""
-        best = self.best()
-        if len(best.candidate.terms) != 1:
-            return
-        (term,) = best.candidate.terms
-        related = [effect for effect in self.effects if are_related(effect, term.effect)]
-        for item in self.beginnings.related(best, related):
-            self.keep(item, exact=False)
-            if self.score(item) > self.score(best) - SEARCH.close:
-                self.exactly(item)
-
     def families(self) -> None:
         """Fit the free-shape families of single effects that come close, and keep those that fit.
 
@@ -284,7 +279,6 @@ class Search(Hypotheses):
             and solver_share(self.problem, self.best()) > SEARCH.solver_share
         ):
             self.problem.refinement *= 2
-            self._begin_anew()
             ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))[: SEARCH.refitted]
             self._fit_again([item for item in ranked if item.candidate.terms])
 
@@ -295,7 +289,6 @@ class Search(Hypotheses):
             return
         ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))
         self.problem.setting = replace(setting, joint_elements=SEARCH.fine_joint)
-        self._begin_anew()
         self._fit_again([item for item in ranked if slips(self.problem, item)][: SEARCH.refitted])
         if slips(self.problem, self.best()):
             self.keep(around(self.problem, self.best()), exact=True)
@@ -319,25 +312,16 @@ class Search(Hypotheses):
 
     def fit_pairs(self) -> None:
         """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
-        begun = self.beginnings.screen(self.none) if self._far(self.none) else None
-        screen = begun or Screen(self.problem, self.none)
+        screen = Screen(self.problem, self.none)
         changes = {effect.identifier: starts(screen, effect) for effect in self.effects}
         ranked = sorted(pairs(changes, screen.sign), key=lambda item: item[0])[: SEARCH.pairs_fitted]
-        rough: list[CandidateFit] = []
-        words = "fitting the pair {1.term.effect.identifier} and {2.term.effect.identifier}"
-        for _, first, second in each(self.tell, ranked, lambda pair: words.format(*pair)):
+        begun = []
+        for _, first, second in ranked:
             candidate = Candidate((first.term, second.term))
-            if candidate.key in self.exact:
-                continue
-            start = np.concatenate((rescaled(first), rescaled(second)))
-            if begun is None:
-                found = self.roughly(self.none, candidate, start)
-            else:
-                found = self.beginnings.shortly(begun.fit, candidate, start)
-            if found is not None:
-                rough.append(found)
-        if begun is not None:
-            rough = self.beginnings.whole(rough, self.none.objective)
+            effect = np.concatenate((rescaled(first), rescaled(second)))
+            if candidate.key not in self.exact:
+                begun.append([(candidate, replace(self.none.point, effect=effect))])
+        rough = self._best_of(begun, self.none, 0.0)
         for item in rough:
             self.keep(item, exact=False)
         rough.sort(key=lambda item: -self.score(item))
@@ -373,17 +357,36 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
     """
     tell("fitting the model as it is")
     none = fit(problem, Candidate(), problem.start(Candidate()))
-    if len(problem.model.apart()[1]) and absolute_gate(problem, none).passed is False:
-        again = Beginnings(problem, tell, none.residuals).again(none)
-        none = none if again is None else again
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
     usable = (*usable, *in_events(usable, problem.setting))
     found = Search(problem, usable, none, tell=tell)
+    if len(problem.model.apart()[1]) and found.force is not None and found.unexplained():
+        # a law of its own, as dry friction that ends a motion, has many optima
+        again = attempt(problem, Candidate(), found.force.whole_point(found.force.whole))
+        if again is not None and again.objective < none.objective - SEARCH.worth_fitting:
+            found = Search(problem, usable, again, tell=tell)
     if not found.by_force():
         found.run()
     return found
 
 
-def _beside(effect: Effect, base: CandidateFit) -> str:
-    """Return an effect, and what a fit has already, for a line of progress."""
-    return " beside ".join(filter(None, (effect.identifier, base.candidate.words)))
+def _beside(base: CandidateFit, term: Term, values: FloatArray) -> Start:
+    """Return a base with one more effect, and where a fit of it begins."""
+    effect = np.concatenate((base.effect, values))
+    return base.candidate.plus(term), replace(base.point, effect=effect)
+
+
+def _tried(problem: Problem, base: CandidateFit, effect: Effect) -> Starts:
+    """Return the most promising points of a grid of an effect's parameters, beside a base."""
+    found = []
+    for place in effect.places(problem.setting):
+        term = Term(effect, place)
+        known, size = SEARCH.far_levels, len(term.parameters)
+        count = known[min(size, len(known) - 1)]
+        levels = ndtri((np.arange(count) + 0.5) / max(count, 1))
+        for values in product(levels, repeat=size):
+            candidate, start = _beside(base, term, np.array(values))
+            with suppress(DiscrepancyError):  # more than the structure can carry
+                found.append((objective(problem, candidate, start), candidate, start))
+    found.sort(key=lambda row: row[0])
+    return [row[1:] for row in found[: SEARCH.far_starts]]

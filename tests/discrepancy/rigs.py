@@ -1,7 +1,7 @@
 """Simulated campaigns of the single-mass rig, and sensitivities of fits."""
 
 import tomllib
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from discrepancy.document import Origin
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import LumpedDescription
 from discrepancy.sources.examples import example_campaign, plan_for
-from fe.runtime.patch import ModelPatch
+from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive
 from reporting.provenance import collect_provenance
 from tests.refusals import Inputs
 
@@ -33,6 +33,28 @@ def fmu_rig(folder: Path, fmu: object, *changes: tuple[str, str]) -> Path:
     path = folder / "rig.toml"
     path.write_text(INPUTS.text("rig.toml", ("{fmu}", str(fmu)), *changes), encoding="utf-8")
     return path
+
+
+USUAL = {"velocity_exponent": 0, "displacement_exponent": 0, "reference_velocity": 1.0} | {
+    "reference_displacement": 1.0, "side": 0,
+}  # fmt: skip
+
+
+def laws(port: str, stiffness: float, amplitude: float, speed: float) -> dict[str, tuple[Primitive, ...]]:
+    """Return the laws of a port in `laws.toml`, by name, at its stiffness, amplitude and speed [SI]."""
+    force = stiffness * amplitude
+    units = {
+        "coefficient": force, "slip_force": force, "stiffness": stiffness, "half_width": amplitude,
+        "yield_displacement": amplitude, "reference_displacement": amplitude, "reference_velocity": speed,
+    }  # fmt: skip
+
+    def made(kind: str, **given: Any) -> Primitive:
+        known = {item.name for item in fields(PRIMITIVES[kind])}
+        values = {name: value for name, value in (USUAL | given).items() if name in known}
+        return PRIMITIVES[kind](**{"port": port} | {k: v * units.get(k, 1) for k, v in values.items()})
+
+    rows = INPUTS.table("laws.toml")[port]
+    return {name: tuple(made(**law) for law in several) for name, several in rows.items()}
 
 
 def one_mass(**terms: Any) -> LumpedModel:

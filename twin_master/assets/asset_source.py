@@ -7,15 +7,17 @@ A mission knows a source only by `AssetSource`. What a user may name stands in t
 names end in `_source`: each holds the tables of its kinds and what is made of them.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fmu_asset.errors import FmuCallError
+from reporting.arrays import Float
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
@@ -24,11 +26,10 @@ from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -89,10 +90,6 @@ class Asset:
         """Let go of what the asset holds."""
 
 
-Told = Callable[[Mapping[str, float], Mapping[str, float]], Float]
-"""Returns what is shown (G,) under control inputs in a state, both by name."""
-
-
 class StatelessAsset(Asset):
     """An asset whose observation depends on nothing but the control and the health of the step.
 
@@ -111,12 +108,24 @@ class StatelessAsset(Asset):
 
 
 def asked_table(
-    names: Sequence[str], states: Float, controls: Iterable[Mapping[str, float]], ask: Told
+    scenario: Scenario, states: Float, ask: Callable[[Mapping[str, float], Mapping[str, float]], Float]
 ) -> Float:
-    """Ask what is shown in every state (S, F) of named factors under every control: (S, U, G)."""
-    settings = list(controls)
-    rows = (dict(zip(names, levels, strict=True)) for levels in states.tolist())
-    return np.array([[ask(values, health) for values in settings] for health in rows])
+    """Ask what is shown under every control in every state (S, F), both by name: (S, U, G)."""
+    rows = (dict(zip(scenario.state_names, levels, strict=True)) for levels in states.tolist())
+    return np.array([[ask(control.values, health) for control in scenario.control] for health in rows])
+
+
+def shown_without_noise(scenario: Scenario, states: Float, asset: Asset) -> Float:
+    """Ask an asset as it is in all states (S, F) and controls: (S, U, G), NaN where it refuses."""
+    start = asset.save_state()
+
+    def ask(control: Mapping[str, float], health: Mapping[str, float]) -> Float:
+        asset.restore_state(start)  # an asset with hidden effects may remember
+        with suppress(FmuCallError):
+            return asset.step(control, health).values
+        return np.full(scenario.observation.count, np.nan)
+
+    return asked_table(scenario, states, ask)
 
 
 @dataclass(frozen=True)
@@ -362,10 +371,7 @@ class WatchedSource:
     def __getattr__(self, name: str) -> NoReturn:
         if name.startswith("__"):
             raise AttributeError(name)
-        raise MissionInputError(
-            "this scenario has no `[asset]`: it is for a real one, whose observations `uav-twin watch` takes "
-            "in, and its `belief` must be a model of its own."
-        )
+        raise MissionInputError(said("assets.no_asset"))
 
 
 FLOWN_DESIGN_HASH = "flown_design"

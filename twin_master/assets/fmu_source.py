@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from fmu_asset.archive.fmu_file import packed_design_hash
@@ -14,6 +13,7 @@ from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError
 from fmu_asset.folders import scratch_folder
+from reporting.arrays import Float
 from reporting.progress import Progress
 from reporting.provenance import hash_file
 from twin_master.assets.asset_source import (
@@ -39,6 +39,7 @@ from twin_master.scenario.asset import AssetSection
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Flag, Name, Number, Positive
 from twin_master.seeds import generator
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from fmu_asset.coupling.asset import CoupledAsset
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
     Session = FmiAsset | CoupledAsset
     """One FMU, or several as one, with the same face."""
 
-Float = NDArray[np.float64]
 
 FMU_COPY = "asset/asset.fmu"
 LARGEST_SEED = 2**31 - 1
@@ -266,10 +266,7 @@ class FmuSource(AssetSource):
             own = [f"{name} = {mean:.6g}" for name, mean in means.items() if name not in section.parameters]
             if not own:
                 raise
-            raise MissionInputError(
-                f"{error} The calibration has {', '.join(own)}: give one of what is flown, or name the "
-                "parameter in `asset.parameters`."
-            ) from error
+            raise MissionInputError(said("assets.calibrated", error=error, own=", ".join(own))) from error
         self._observed(binding)
         self._inner_roles(binding)
 
@@ -295,7 +292,6 @@ class FmuSource(AssetSource):
         That holds for assets without memory.
         """
         scenario, load, rows = self._scenario, self.section.load, []
-        controls = [control.values for control in scenario.control]
         with self._session(self.binding(), self.parameters()) as session:
             chosen = self._observed(session.binding)
             for row, value in enumerate(draws.values):
@@ -303,9 +299,8 @@ class FmuSource(AssetSource):
                 session.reset({**self.parameters(), **others, draws.name: float(value)})
                 rows.append(
                     asked_table(
-                        scenario.state_names,
+                        scenario,
                         model.states.coordinates,
-                        controls,
                         lambda control, health: session.step(control, health, load).values[chosen],
                     )
                 )
@@ -315,12 +310,11 @@ class FmuSource(AssetSource):
         """Return where a role stands among the observations of the binding, in the units of the scenario."""
         role = role or self._scenario.observation.role
         chosen = self._slice(binding, role)
-        bound, said = binding.observation[role].units, self._scenario.observation.sensor_units
-        for number, (there, here) in enumerate(zip(bound, said, strict=True), 1):
+        bound, given = binding.observation[role].units, self._scenario.observation.sensor_units
+        for number, (there, here) in enumerate(zip(bound, given, strict=True), 1):
             if there != here != "1":
                 raise MissionInputError(
-                    f"the binding {binding.name} gives value {number} of `{role}` in {there}, and "
-                    f"`observation.unit` of the scenario says {here}: write the same unit in both."
+                    said("assets.unit", name=binding.name, number=number, role=role, there=there, here=here)
                 )
         return chosen
 
@@ -329,8 +323,13 @@ class FmuSource(AssetSource):
         chosen = binding.observation_slice(role)
         if chosen.stop - chosen.start != expected:
             raise MissionInputError(
-                f"the binding {binding.name} observes {chosen.stop - chosen.start} values of `{role}`, and "
-                f"the scenario expects {expected}."
+                said(
+                    "assets.width",
+                    name=binding.name,
+                    count=chosen.stop - chosen.start,
+                    role=role,
+                    expected=expected,
+                )
             )
         return chosen
 
@@ -346,10 +345,7 @@ class FmuSource(AssetSource):
         if truth.kind != "asset":
             return None
         if isinstance(self._scenario.belief, AssetBelief):
-            raise MissionInputError(
-                "an asset that carries its own damage cannot be asked what the twin should expect of each "
-                "state: name a model for the twin in the table `belief`."
-            )
+            raise MissionInputError(said("assets.own_damage"))
         rows = [("monitor", truth.state.values(), binding.monitor)]
         check_names("`truth.state` names the", f"the binding {binding.name}", rows)
         return InnerRoles(

@@ -5,15 +5,15 @@ grid of damage states, two controls and thirty draws of Young's modulus. It serv
 and as an asset whose state may lie between the levels of the grid.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
+from reporting.arrays import Float
 from reporting.json_file import read_json
 from reporting.progress import Progress
 from reporting.provenance import hash_file
@@ -28,8 +28,7 @@ from twin_master.errors import (
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
 from twin_master.scenario.asset import AssetSection, BeliefSection
 from twin_master.scenario.schema import Scenario
-
-Float = NDArray[np.float64]
+from twin_master.sentences import said
 
 FILE_NAME = "UAVconfig.json"
 """Name of the file in the authors' repository UAV-Digital-Twin."""
@@ -58,10 +57,6 @@ class StrainLibrary:
         Strain of each draw, joint state, control and gauge.
     strain : (S, U, G) dimensionless
         The entry "mean": the solution at e = 1.0073, not the average of the draws.
-    discount : float
-        gamma of the authors' planning problem.
-    worsening_probability : dict of str to float
-        Probability of each control to worsen a region by one level in a step.
     """
 
     states: StateSpace
@@ -69,15 +64,13 @@ class StrainLibrary:
     young_modulus_factor: Float
     strain_per_draw: Float
     strain: Float
-    discount: float
-    worsening_probability: Mapping[str, float]
 
     @property
     def gauge_count(self) -> int:
         """Number G of gauges."""
         return int(self.strain.shape[-1])
 
-    def strain_at(self, stiffness_loss: ArrayLike, control_index: int) -> Float:
+    def strain_at(self, stiffness_loss: Sequence[float], control_index: int) -> Float:
         """Return the strain of a damage state between the levels, as an asset would have it.
 
         Multilinear in the stiffness losses, from the entry "mean".
@@ -96,29 +89,18 @@ class StrainLibrary:
         Raises
         ------
         InvalidStrainLibraryError
-            If the state lies outside the levels, or there is no such control.
+            The state lies outside the levels.
         """
-        loss = np.asarray(stiffness_loss, dtype=np.float64)
-        if loss.shape != (len(self.states.factors),) or not 0 <= control_index < len(self.controls):
-            raise InvalidStrainLibraryError(
-                f"expected one stiffness loss for each of {', '.join(self.states.names)} and a control index "
-                f"below {len(self.controls)}, got shape {loss.shape} and control {control_index}"
-            )
-        values = self.strain.reshape(*self.states.shape, *self.strain.shape[1:])[..., control_index, :]
-        for factor, value in zip(self.states.factors, loss, strict=True):
-            levels = np.asarray(factor.levels)
-            if not levels[0] <= value <= levels[-1]:
+        from scipy.interpolate import interpn
+
+        levels = [factor.levels for factor in self.states.factors]
+        for name, known, value in zip(self.states.names, levels, stiffness_loss, strict=True):
+            if not known[0] <= value <= known[-1]:
                 raise InvalidStrainLibraryError(
-                    f"the strain library covers {factor.name} from {levels[0]:g} to {levels[-1]:g}, "
-                    f"got {value:g}"
+                    said("assets.covers", name=name, low=known[0], high=known[-1], value=value)
                 )
-            upper = min(int(np.searchsorted(levels, value, side="right")), len(levels) - 1)
-            lower = max(upper - 1, 0)
-            width = levels[upper] - levels[lower]
-            share = (value - levels[lower]) / width if width > 0.0 else 0.0
-            values = (1.0 - share) * values[lower] + share * values[upper]
-        result: Float = np.array(values, dtype=np.float64)
-        return result
+        grid = self.strain[:, control_index].reshape(*self.states.shape, -1)
+        return np.asarray(interpn(levels, grid, np.array(stiffness_loss))[0])
 
 
 def load_strain_library(path: str | Path) -> StrainLibrary:
@@ -142,22 +124,18 @@ def load_strain_library(path: str | Path) -> StrainLibrary:
         return _arranged(content)
     except KeyError as error:
         raise InvalidStrainLibraryError(
-            f"the strain library {file} lacks the entry {error}; is it the file {FILE_NAME} as published?"
+            said("assets.lacks", file=file, error=error, file_name=FILE_NAME)
         ) from error
     except (TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InvalidStrainLibraryError(
-            f"the strain library {file} is not in the published format: {error}"
-        ) from error
+        raise InvalidStrainLibraryError(said("assets.unread", file=file, error=error)) from error
 
 
 def _arranged(content: Mapping[str, Any]) -> StrainLibrary:
     levels = content["states"]
     if len(levels) != len(REGION_NAMES):
-        raise ValueError(
-            f"expected the levels of {len(REGION_NAMES)} regions under 'states', got {len(levels)}"
-        )
+        raise ValueError(said("assets.regions", regions=len(REGION_NAMES), came=len(levels)))
     controls = tuple(str(control) for control in content["controls"])
-    observations, probabilities = content["observations"], content["transition_probabilities"]
+    observations = content["observations"]
     first = observations[str(levels[0][0])][str(levels[1][0])][controls[0]]
     draws = [key for key in first if key != "mean"]
     gauges = len(first["mean"])
@@ -179,8 +157,6 @@ def _arranged(content: Mapping[str, Any]) -> StrainLibrary:
         young_modulus_factor=np.array([float(draw) for draw in draws]),
         strain_per_draw=table[1:],
         strain=table[0],
-        discount=float(content["gamma"]),
-        worsening_probability={control: float(probabilities[control]) for control in controls},
     )
 
 
@@ -208,10 +184,7 @@ class StrainLibrarySection(AssetSection):
         """
         if self.file is None:
             raise MissionInputError(
-                f"the scenario {scenario.mission.name} flies the strain library of the paper's authors, "
-                f"which does not come with this program: clone their public repository UAV-Digital-Twin "
-                f"({REPOSITORY}) and name its file {FILE_NAME} by `--strain-library FILE`, or as "
-                f"`asset.file` in a copy of the scenario."
+                said("assets.authors", name=scenario.mission.name, repository=REPOSITORY, file_name=FILE_NAME)
             )
         return _read(scenario, Path(self.file), compared=self.differs_from(scenario.belief))
 
@@ -240,9 +213,7 @@ class StrainLibraryBelief(BeliefSection):
             The library is missing, damaged or does not fit the scenario.
         """
         if not scenario.asset.is_fmu:
-            raise MissionInputError(
-                "a strain library flies, and the twin is to believe one: set `belief.kind` to `asset`."
-            )
+            raise MissionInputError(said("assets.believed"))
         return _read(scenario, Path(self.file), compared=True)
 
 
@@ -262,9 +233,13 @@ class StrainLibrarySource(AssetSource):
         self._control_index = [library.controls.index(name) for name in scenario.control_names]
         if scenario.observation.count != library.gauge_count or scenario.state_names != library.states.names:
             raise MissingObservationModelError(
-                f"the strain library has {library.gauge_count} gauges and the states "
-                f"{', '.join(library.states.names)}, and the scenario asks for {scenario.observation.count} "
-                f"and {', '.join(scenario.state_names)}."
+                said(
+                    "assets.gauges",
+                    gauges=library.gauge_count,
+                    own=", ".join(library.states.names),
+                    count=scenario.observation.count,
+                    names=", ".join(scenario.state_names),
+                )
             )
 
     def _make(self, progress: Progress) -> dict[str, str]:
@@ -319,7 +294,6 @@ def _read(scenario: Scenario, path: Path, *, compared: bool) -> StrainLibrarySou
             continue
         if given is not None and abs(given - expected) > _TOLERANCE:
             raise MissingObservationModelError(
-                f"the strain library flies the control {control.name} at load factor {expected:g}, and the "
-                f"scenario gives the model of the design {given:g}: set `load_factor` to {expected:g}."
+                said("assets.load_factor", name=control.name, expected=expected, given=given)
             )
     return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)

@@ -1,13 +1,12 @@
-"""A structure from a mesh: its file, reduced and packed as the asset, or believed as a model."""
+"""A structure from a mesh or matrices: its file, reduced and packed as the asset, or believed as a model."""
 
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, ClassVar, Literal
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from fe.reduction.settings import StructureSettings
+from fe.structure.tables import StructureDesign
 from fmu_asset.door.binding import Binding
 from reporting.files import atomic_write_text
 from reporting.progress import Progress
@@ -20,18 +19,25 @@ from twin_master.assets.asset_source import (
     AssetSource,
 )
 from twin_master.assets.fmu_source import FmuSection, FmuSource
-from twin_master.assets.parameter import calibrated_means, check_calibration
-from twin_master.assets.reduced_model import RecordedStructure, ReducedModelSource
+from twin_master.assets.parameter import (
+    SAME_NAMES,
+    calibrated_means,
+    check_calibration,
+)
+from twin_master.assets.reduced_model import (
+    RecordedStructure,
+    ReducedModelSource,
+)
 from twin_master.errors import MissingObservationModelError, MissionInputError, check_names
 from twin_master.scenario.asset import BeliefSection, FileSection
 from twin_master.scenario.observation import ROLE
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
-    from fe.structure.tables import StructureDesign
+    from fe.runtime.reduced import ReducedModel
 
-FLOWN_COPY = "asset/flown/structure.toml"
-MODEL_COPY = "asset/model/structure.toml"
+FLOWN_COPY, MODEL_COPY = "asset/flown/structure.toml", "asset/model/structure.toml"
 FIELD_NAME = "structure.vtu"
 
 
@@ -56,11 +62,7 @@ class StructureFiles(FileSection):
         design = load_structure(file)
         for inner in map(PurePosixPath, design.files):
             if inner.is_absolute() or ".." in inner.parts:
-                raise MissionInputError(
-                    f"the {design.what} {inner} of {file} does not lie beside it, and a run keeps copies of "
-                    f"both: move the {design.what} into the folder of the structure file, and name it without"
-                    " its folder."
-                )
+                raise MissionInputError(said("assets.beside", what=design.what, inner=inner, file=file))
             found[f"{PurePosixPath(copy).parent}/{inner}"] = file.parent / inner
         return found
 
@@ -87,10 +89,7 @@ class StructureSection(StructureFiles, FmuSection):
             There is none.
         """
         if not self.binding:
-            raise MissionInputError(
-                "the binding of the structure is needed as a file here: write it by `uav-twin structure fmu "
-                "FILE --binding NAME`, and name it as `asset.binding`."
-            )
+            raise MissionInputError(said("assets.binding"))
         return super().binding_path
 
     def source(self, scenario: Scenario) -> "StructureFmuSource":
@@ -111,28 +110,65 @@ class StructureBelief(StructureFiles, BeliefSection):
         return StructureSource(scenario, section=self)
 
 
-class _Structure(AssetSource):
+class NamedStructure(AssetSource):
     """A structure that a scenario names, and whether the scenario speaks of what it has."""
 
-    copy: ClassVar[str]
-    """Where the copy of its file stands in a run folder."""
+    section: Any
+    advice: ClassVar[Mapping[str, str]] = {
+        "calibration": SAME_NAMES,
+        "parameter": "give it in a table [[parameter]]",
+        "state": "",
+        "static_test": "the calibration source `static_test` is for wings: of a structure give `file`, or "
+        "`normal` or `fixed` with `mean`.",
+    }
+    """What to do about names that it does not have, and about a source of calibrations that it cannot."""
 
     @property
     def file(self) -> Path:
         """Its file, where it is given, or its copy once kept."""
-        return self.path(self.copy)
+        return self.path(self.section.copies()["structure"])
 
     @cached_property
-    def design(self) -> "StructureDesign":
-        """Its description."""
+    def design(self) -> StructureDesign:
+        """By name what can be chosen of it, commanded and read."""
         from fe.structure.design import load_structure
 
         return load_structure(self.file)
 
     @property
+    def where(self) -> str:
+        """What has these names, in words."""
+        return f"the structure {self.design.name}"
+
+    @property
     def words(self) -> str:
         """The FMU or model with its name."""
-        return f"{self.label} of the structure {self.design.name}"
+        return f"{self.label} of {self.where}"
+
+    @property
+    def hash(self) -> str:
+        """SHA-256 of its design."""
+        from fe.structure.design import structure_hash
+
+        return structure_hash(self.design, self.file.parent)
+
+    @property
+    def parameter_names(self) -> list[str]:
+        """What may be calibrated."""
+        free = [part.name for part in self.design.mass if part.free]
+        return [part.name for part in self.design.parameter] + free
+
+    def reduced(self, progress: Progress) -> "ReducedModel":
+        """Return the reduced model, from the cache if it is there."""
+        from fe.reduction.model_cache import reduced_structure
+
+        return reduced_structure(self.file, progress=progress)
+
+    def check_model(self) -> None:
+        """Look at what the reduced model is made of, as far as that takes no time."""
+        from fe.reduction.model_cache import check_structure
+
+        check_structure(self.file)
 
     def parameters(self) -> dict[str, float]:
         """Return what it is drawn with, by name; what is not among them is nominal."""
@@ -161,9 +197,7 @@ class _Structure(AssetSource):
             return 0
         count, most = self._scenario.observation.count, StructureSettings.mode_count
         if count > most:
-            raise MissionInputError(
-                f"a structure tells its first {most} frequencies, and {count} are observed."
-            )
+            raise MissionInputError(said("assets.frequencies", most=most, count=count))
         return count
 
     def _check_observed(self) -> None:
@@ -188,40 +222,33 @@ class _Structure(AssetSource):
             most = StructureSettings.mode_count
             if max(modes.places) >= most:
                 raise MissingObservationModelError(
-                    f"a structure tells its first {most} modes, and mode {max(modes.places) + 1} is observed."
+                    said("assets.modes", most=most, number=max(modes.places) + 1)
                 )
         advice = f"give it in a table [[{table}]]"
         check_names("the scenario has the", where, [row], MissingObservationModelError, advice)
         if observation.count != known[role]:
             raise MissingObservationModelError(
-                f"{where} has {known[role]} sensors of `{role}`, and the scenario expects "
-                f"{observation.count}."
+                said("assets.sensors", where=where, has=known[role], role=role, count=observation.count)
             )
         titles, own = [*observation.titles], names.get(role, [])
         if titles != own and sorted(titles) == sorted(own):
             raise MissionInputError(
-                f"`observation.titles` are {', '.join(titles)}, and {where} has these sensors in the order "
-                f"{', '.join(own)}: give the titles in that order."
+                said("assets.titles", titles=", ".join(titles), where=where, own=", ".join(own))
             )
 
     def _check_parameter(self, *, believed: bool) -> None:
         """Refuse a calibration that the structure cannot have; raises `MissionInputError`."""
-        from fe.structure.design import structure_hash
-
-        calibration, design = self._scenario.calibration, self.design
-        if calibration.source == "static_test":
-            raise MissionInputError(
-                "the calibration source `static_test` is for wings: of a structure give `file`, or `normal` "
-                "or `fixed` with `mean`."
-            )
-        known = [part.name for part in design.parameter]
-        known += [part.name for part in design.mass if part.free]
+        calibration, design, known = self._scenario.calibration, self.design, self.parameter_names
+        if refusal := self.advice.get(calibration.source):
+            raise MissionInputError(refusal)
         ranges = {part.name: part.range for part in (*design.parameter, *design.mass)}
-        found = structure_hash(design, self.file.parent) if believed else ""
-        where = f"the structure {design.name}"
-        check_calibration(calibration, known, where, ranges=ranges, design_hash=found)
+        check_calibration(
+            calibration, known, self.where, ranges=ranges, design_hash=self.hash if believed else "",
+            advice=self.advice["calibration"],
+        )  # fmt: skip
         rows = [("parameter", [calibration.parameter], known)]
-        check_names("the scenario calibrates the", where, rows, advice="give it in a table [[parameter]]")
+        error = MissingObservationModelError if believed else MissionInputError
+        check_names("the scenario calibrates the", self.where, rows, error, self.advice["parameter"])
 
     def _check_ranges(self, parameters: Mapping[str, float]) -> None:
         """Refuse levels, controls and `parameters` outside the ranges; raises `MissionInputError`.
@@ -238,20 +265,31 @@ class _Structure(AssetSource):
             for control in scenario.control
             for name, value in control.values.items()
         ]
+        if scenario.truth.kind == "scripted":
+            given += [
+                (f"{name} that `truth.gains` give in {scenario.mission.step_name} {step}", name, value)
+                for step, state in enumerate(scenario.scripted_history().tolist())
+                for name, value in zip(scenario.state_names, state, strict=True)
+            ]
         for what, name, value in given:
             low, high = ranges.get(name, (value, value))
             if not low <= value <= high:
                 raise MissionInputError(
-                    f"the {what} is {value:g}, but the structure {design.name} gives {name} the range "
-                    f"{low:g} to {high:g}; give a value inside, or widen the range in the structure file."
+                    said(
+                        "assets.outside",
+                        what=what,
+                        value=value,
+                        where=self.where,
+                        name=name,
+                        low=low,
+                        high=high,
+                    )
                 )
 
 
-class StructureFmuSource(_Structure, FmuSource):
+class StructureFmuSource(NamedStructure, FmuSource):
     """The FMU that is packed of a structure."""
 
-    section: StructureSection
-    copy = FLOWN_COPY
     parameters = FmuSource.parameters
 
     def binding(self) -> Binding:
@@ -276,40 +314,28 @@ class StructureFmuSource(_Structure, FmuSource):
         return slice(0)
 
     def _fitted(self, binding: Binding, folder: Path) -> Binding:
-        from fe.reduction.model_cache import check_structure
-
         if not self.section.binding:  # under a binding of one's own the names may be others
             self._check_ranges(self.section.parameters)
-            self._check_history()
-        check_structure(self.file)
+        self.check_model()
         return binding
-
-    def _check_history(self) -> None:
-        """Refuse a scripted truth beyond the ranges of the damage regions; raises `MissionInputError`."""
-        scenario, history = self._scenario, self._scenario.scripted_history()
-        largest = {part.name: part.largest_loss for part in self.design.damage}
-        for name, loss in zip(scenario.state_names, history.T, strict=True):  # each is a region
-            outside = np.flatnonzero((loss < -1e-9) | (loss > largest[name] + 1e-9))
-            if outside.size:
-                raise MissionInputError(
-                    f"`truth.gains` bring {name} to {loss[outside[0]]:.6g} in {scenario.mission.step_name} "
-                    f"{outside[0]}, but the structure {self.design.name} gives it the range 0 to "
-                    f"{largest[name]:g}; give smaller gains, or another `largest_loss` in its file."
-                )
 
     def _make(self, progress: Progress) -> dict[str, str]:
         """Reduce the structure and pack the FMU."""
-        from fe.reduction.model_cache import reduced_structure
-        from fmu_asset.packing.structure_fmu import build_fmu
         from fmu_asset.structures.binding import structure_binding_text
 
-        self.model = reduced_structure(self.file, progress=progress)
+        self.model = self.reduced(progress)
         if not self.path(BINDING_COPY).exists():
             text = structure_binding_text(self.design, self._frequencies())
             atomic_write_text(self.path(BINDING_COPY), text)
         with progress.stage("Packing the FMU"):
-            build_fmu(self.model, self.fmu_path(), kind=self.section.packed, replace=True)
+            self._pack(progress)
         return {FLOWN_DESIGN_HASH: self.model.design_hash, "fmu": hash_file(self.fmu_path())}
+
+    def _pack(self, progress: Progress) -> None:
+        from fmu_asset.packing.structure_fmu import build_fmu
+
+        assert self.model is not None
+        build_fmu(self.model, self.fmu_path(), kind=self.section.packed, replace=True)
 
     def open(self) -> Asset:
         """Return the FMU at its start; where modes are observed, in motion with an identification behind."""
@@ -319,24 +345,21 @@ class StructureFmuSource(_Structure, FmuSource):
         return RecordedStructure(self._scenario, self.model, self._session, self.binding(), self.parameters())
 
 
-class StructureSource(_Structure, ReducedModelSource):
+class StructureSource(NamedStructure, ReducedModelSource):
     """The reduced model of a structure as what is believed."""
 
     label = "reduced model"
-    copy = MODEL_COPY
 
     def check(self) -> None:
-        """Read the structure file without building anything.
+        """Read the file without building anything.
 
         Raises
         ------
         MissionInputError, FiniteElementError
             A file cannot be read or is wrong, or the mesh does not hold what the structure names.
         MissingObservationModelError
-            The scenario's states, controls or sensors are not those of the structure.
+            The scenario's states, controls, sensors or calibrated parameter are not those of the structure.
         """
-        from fe.reduction.model_cache import check_structure
-
         self.files()
         design, scenario = self.design, self._scenario
         self._check_parameter(believed=True)
@@ -344,16 +367,14 @@ class StructureSource(_Structure, ReducedModelSource):
             ("state", scenario.state_names, [part.name for part in design.damage]),
             ("control input", scenario.control[0].values, [part.name for part in design.control]),
         )
-        where = f"the model of the structure {design.name}"
-        check_names("the scenario has the", where, rows, MissingObservationModelError)
+        advice, error = self.advice["state"], MissingObservationModelError
+        check_names("the scenario has the", self.where, rows, error, advice)
         self._check_observed()
         self._check_ranges({})
-        check_structure(self.file)
+        self.check_model()
 
     def _make(self, progress: Progress) -> dict[str, str]:
-        from fe.reduction.model_cache import reduced_structure
-
-        self.model = reduced_structure(self.file, progress=progress)
+        self.model = self.reduced(progress)
         return super()._make(progress)
 
     @property

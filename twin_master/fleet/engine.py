@@ -16,6 +16,7 @@ from reporting.progress import Progress
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Member
 from twin_master.fleet.shard import ShardResult, fly_shard, program_version
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -122,9 +123,7 @@ def _by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown]:
         elif error is not None:
             raise error
         elif future.status != "finished":
-            raise FleetError(
-                "the scheduler was lost: what was flown is kept, repeat the command to go on from there."
-            )
+            raise FleetError(said("fleet.lost"))
         else:
             result: ShardResult = future.result()
             _check_version({result.version})
@@ -136,10 +135,7 @@ def _by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown]:
 
 def _check_version(versions: set[str]) -> None:
     if versions - {program_version()}:
-        raise FleetError(
-            "a worker of the cluster runs another version of this program, of Python or of a package that "
-            "numbers depend on: install the same lock file there. What was flown before is kept."
-        )
+        raise FleetError(said("fleet.version"))
 
 
 @contextmanager
@@ -161,16 +157,10 @@ def _client(engine: Engine) -> "Iterator[Client]":
             try:
                 client = Client(engine.cluster, timeout=CONNECTING)
             except (OSError, TimeoutError, ValueError) as error:
-                raise FleetError(
-                    f"no Dask scheduler answers at {engine.cluster}: start one with `dask scheduler` "
-                    "and give the address that it prints."
-                ) from error
+                raise FleetError(said("fleet.scheduler", cluster=engine.cluster)) from error
             with client:
                 if not client.nthreads():
-                    raise FleetError(
-                        f"the scheduler at {engine.cluster} has no workers: start some with `dask worker "
-                        f"{engine.cluster}`."
-                    )
+                    raise FleetError(said("fleet.workers", cluster=engine.cluster))
                 yield client
             return
         with (

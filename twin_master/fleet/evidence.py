@@ -4,7 +4,7 @@ Twins are independent given what they share, so that the log evidence of a fleet
 in any order, shard by shard. What the twins decided takes no part, for they decided by what they had seen.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -83,7 +83,6 @@ class Worsening:
     worsens: Float
     stays: Float
     prior: Float
-    keys: tuple[tuple[str, str | None], ...] = field(default=())
 
     @classmethod
     def of(cls, scenario: Scenario) -> "Worsening":
@@ -120,7 +119,7 @@ class Worsening:
                 can = before[factor] < shape[factor] - 1
                 stays[:, k] += here & can & (after[factor] == before[factor])
         names = tuple(control if name is None else f"{control}, {name}" for control, name in keys)
-        return cls(names, np.array(assumed), start, source, worsens, stays, model.prior, tuple(keys))
+        return cls(names, np.array(assumed), start, source, worsens, stays, model.prior)
 
     def probability(self, points: Float) -> Float:
         """Return the entries of the lists (P, non-zeros) for probabilities (P, K) between 0 and 1."""

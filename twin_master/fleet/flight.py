@@ -30,6 +30,7 @@ from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prep
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.watch.feeds import file_feed
 
 if TYPE_CHECKING:
@@ -236,31 +237,20 @@ def _check(fleet: Fleet) -> None:
 
 def _check_group(group: Group, scenario: Scenario) -> None:
     if scenario.observation.role == "modes":
-        raise FleetError(
-            'a fleet keeps values alone, and `role = "modes"` observes each turn with its own covariance: '
-            "fly the scenario with `uav-twin run`."
-        )
+        raise FleetError(said("fleet.modes"))
     if group.observations:
         names = {member.name for member in group.members}
         if not names:
-            raise FleetError(
-                f"no recording fits {group.observations}; what is still to come is watched by `fleet watch`."
-            )
+            raise FleetError(said("fleet.recording", observations=group.observations))
         if len(names) < len(group.members):
             raise FleetError("two recordings have the same name, and it names the asset.")
         return
     one_life = scenario.truth.kind == "asset" and not getattr(scenario.asset, "seeds", ())
     if one_life and len(group.scenarios) < len(group.members):
-        raise FleetError(
-            "the damage and noise of this asset are its own, so that every seed would fly the same life: "
-            "name its seeds in `asset.seeds`, or fly the scenario with --seed."
-        )
+        raise FleetError(said("fleet.one_life"))
     unknown = sorted({*group.spreads} - {"young_modulus_factor"})
     if flies_model(scenario) and unknown:
-        raise FleetError(
-            f"`parameters` names {', '.join(unknown)}, and the model of a wing knows only "
-            "young_modulus_factor."
-        )
+        raise FleetError(said("fleet.parameters", names=", ".join(unknown)))
     if flies_model(scenario):
         _check_truth(group, scenario)
     if sizes_of(scenario) != sizes_of(group.scenarios[0]):
@@ -287,8 +277,16 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
         outside = values[(values < low - 1e-12) | (values > high + 1e-12)]
         if len(outside):
             raise FleetError(
-                f"the true {what} of {len(outside)} of {len(values)} {of} is outside of {low:g} to {high:g}, "
-                f"where the model holds, such as {outside[0]:.4g}: let it vary less, or fly FMUs."
+                said(
+                    "fleet.outside",
+                    what=what,
+                    count=len(outside),
+                    number=len(values),
+                    of=of,
+                    low=low,
+                    high=high,
+                    example=outside[0],
+                )
             )
 
 

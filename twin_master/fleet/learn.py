@@ -14,12 +14,13 @@ from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import FleetError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import GROUPS, fleet_config, source_of
-from twin_master.fleet.posterior import POINTS, Grid, Line, Shared, narrowed, population, refined, shared
+from twin_master.fleet.posterior import POINTS, Grid, Line, narrowed, population, refined, shared
 from twin_master.fleet.reading import noticed
 from twin_master.fleet.store import has_flown, open_group
 from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -35,75 +36,32 @@ NODES, NODE_DEVIATIONS = 61, 6.0
 
 
 @dataclass(frozen=True)
-class GroupLessons:
-    """What the twins of one group teach.
+class _Lessons:
+    """What the twins of one group teach, as far as no other group takes part.
 
     Attributes
     ----------
     name : str
-    twins, unexplained, alarmed : int
-        How many taught, how many were left out because no probability explains what they saw, and how many of
-        all raised an alarm.
     worsening : Worsening
         The probabilities and what was assumed of them.
     grid : Grid
         Their likelihood.
-    noise : Line
-        Factor on the assumed standard deviation of the sensors.
-    parameter : str
-        That is calibrated.
-    population : tuple of Line or None
-        Mean and spread of it over the assets, SI; None where its calibration is fixed.
     flown : frozenset of str
         The controls under which a turn was followed by another.
+    counts, figures : dict
+        Of the record, before and behind the probabilities.
     """
 
     name: str
-    twins: int
-    unexplained: int
-    alarmed: int
     worsening: Worsening
     grid: Grid
-    noise: Line
-    parameter: str
-    population: tuple[Line, Line] | None
     flown: frozenset[str]
+    counts: dict[str, int]
+    figures: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class FleetLessons:
-    """What a fleet teaches.
-
-    Attributes
-    ----------
-    groups : tuple of GroupLessons
-    shared : Shared or None
-        Groups under a distribution that they share; None for one group, or for groups of other controls.
-    source : dict
-        Where it comes from.
-    scenarios : dict of str to Scenario
-        Of each group.
-    """
-
-    groups: tuple[GroupLessons, ...]
-    shared: Shared | None
-    source: dict[str, Any]
-    scenarios: dict[str, Scenario]
-
-    def probabilities(self, group: int) -> tuple[Line, ...]:
-        """Return the posterior of each probability of a group, under what the groups share."""
-        return self.groups[group].grid.marginals if self.shared is None else self.shared.groups[group]
-
-    def flown(self, group: int) -> tuple[bool, ...]:
-        """Return whether anything can be learnt of each probability of a group."""
-        own = self.groups[group]
-        sharing = [own] if self.shared is None else self.groups
-        known = frozenset[str]().union(*(each.flown for each in sharing))
-        return tuple(control in known for control, _ in own.worsening.keys)
-
-
-def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> FleetLessons:
-    """Learn from the store of a fleet, which may still grow.
+def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Return the record of what the store of a fleet teaches, see `learn_from_fleet`; it may still grow.
 
     The prior of each probability is uniform; that of several groups is a Beta distribution which they share.
 
@@ -114,27 +72,46 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> Flee
     """
     folder, progress = Path(folder), progress or SilentProgress()
     config = fleet_config(folder)
-    found, scenarios = [], {}
+    found: list[_Lessons] = []
     records = config["fleet"]["groups"]
     with progress.stage("Learning", total=len(records), unit="groups") as stage:
         for record in records:
-            scenarios[record["name"]] = Scenario.model_validate(record["scenarios"][0])
-            lessons = _group_lessons(folder, record)
-            if lessons is not None:
-                found.append(lessons)
+            found += _lessons(folder, record)
             stage.advance()
     if not found:
         raise FleetError(f"{folder} holds no twin that has flown to its end: fly the fleet first.")
-    alike = len({lessons.worsening.names for lessons in found}) == 1 and len(found[0].worsening.names) <= 2
+    names = found[0].worsening.names
+    alike = {lessons.worsening.names for lessons in found} == {names} and len(names) <= 2
+    together = shared([lessons.grid for lessons in found]) if alike and len(found) > 1 else None
+    lines = [lessons.grid.marginals for lessons in found] if together is None else together.groups
+    everywhere = frozenset[str]().union(*(lessons.flown for lessons in found if together is not None))
+    groups = {}
+    for lessons, own in zip(found, lines, strict=True):
+        told = zip(lessons.worsening.names, lessons.worsening.assumed.tolist(), own, strict=True)
+        probability = {
+            name: {
+                "assumed": assumed,
+                "flown": name.partition(", ")[0] in lessons.flown | everywhere,
+                **line.figures,
+            }
+            for name, assumed, line in told
+        }
+        groups[lessons.name] = {**lessons.counts, "probability": probability, **lessons.figures}
     source = {
         "fleet": config["fleet"]["name"],
         "seed": config["fleet"]["seed"],
-        "twins": sum(lessons.twins for lessons in found),
+        "twins": sum(lessons.counts["twins"] for lessons in found),
         "config": hash_record({key: config[key] for key in ("kind", "format", "fleet")}),
         "program": config["provenance"]["versions"].get("uav-twin", ""),
     }
-    together = shared([lessons.grid for lessons in found]) if alike and len(found) > 1 else None
-    return FleetLessons(tuple(found), together, source, scenarios)
+    result: dict[str, Any] = {"source": source, "groups": groups}
+    if together is not None:
+        titles = "mean", "standard_deviation", "log10_concentration", "log10_concentration_standard_deviation"
+        pairs = zip(names, together.mean, together.concentration, strict=True)
+        result["shared"] = {
+            name: dict(zip(titles, (*mean, *size), strict=True)) for name, mean, size in pairs
+        }
+    return result
 
 
 @dataclass(frozen=True)
@@ -149,12 +126,12 @@ class _Seen:
     controls: frozenset[str]
 
 
-def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
+def _lessons(folder: Path, record: dict[str, Any]) -> Iterator[_Lessons]:
     """Learn the noise first, for what else is learnt rests on it, then the rates, then the population."""
     group = open_group(folder, record["name"])
     parts = list(_seen(folder, record, group))
     if not parts:
-        return None
+        return
     worsening = Worsening.of(parts[0].knowledge.scenario)
     nodes = _nodes(parts)
     noise = _noise(parts[0], worsening, nodes)
@@ -170,8 +147,7 @@ def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
 
     if len(worsening.names) > max(POINTS):
         raise FleetError(
-            f"group {record['name']} has {len(worsening.names)} probabilities to worsen, and {max(POINTS)} "
-            "are learnt together at most: fly fewer controls, or let factors share a probability."
+            said("fleet.probabilities", group=record["name"], count=len(worsening.names), most=max(POINTS))
         )
     explained = [np.isfinite(own[:, 0]) for own in evidence(worsening.assumed.clip(1e-3, 0.9)[None])]
 
@@ -183,22 +159,19 @@ def _group_lessons(folder: Path, record: dict[str, Any]) -> GroupLessons | None:
     learnt = np.array([marginal.mean for marginal in grid.marginals])
     twins = sum(int(kept.sum()) for kept in explained)
     if not twins:
-        raise FleetError(
-            f"no state of the twins explains what was observed in group {record['name']}: nothing can be "
-            "learnt of it; look at its model and its noise."
-        )
-    own = None
+        raise FleetError(said("fleet.unexplained", group=record["name"]))
+    figures: dict[str, Any] = {"noise_factor": noise.figures}
     if nodes is not None:
         at_nodes = _noisier(models[0], 1.0, nodes)
         each = node_evidence(worsening, learnt, at_nodes, parts[0].observed, parts[0].control)
-        own = population(nodes.values, each, parts[0].knowledge.draws.standard_deviation)
+        draws = parts[0].knowledge.draws
+        mean, spread = population(nodes.values, each, draws.standard_deviation)
+        figures["population"] = {"parameter": draws.name, "mean": mean.figures, "spread": spread.figures}
     left_out = sum(len(kept) for kept in explained) - twins
-    parameter = parts[0].knowledge.draws.name
-    flown = frozenset[str]().union(*(part.controls for part in parts))
     alarmed = int(np.sum(noticed(group, "alarm")[has_flown(group["status"].values)] > 0))
-    return GroupLessons(
-        record["name"], twins, left_out, alarmed, worsening, grid, noise, parameter, own, flown
-    )
+    counts = {"twins": twins, "left_out": left_out, "alarmed": alarmed}
+    flown = frozenset[str]().union(*(part.controls for part in parts))
+    yield _Lessons(record["name"], worsening, grid, flown, counts, figures)
 
 
 def _seen(folder: Path, record: dict[str, Any], group: "xr.Dataset") -> Iterator[_Seen]:

@@ -1,5 +1,6 @@
 """What a fleet has learnt, for people and as `learnt.toml`, with which a scenario is flown."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,11 @@ from reporting.files import atomic_write_text
 from reporting.progress import Progress
 from reporting.toml_file import toml_text
 from reporting.words import counted
-from twin_master.fleet.learn import FleetLessons, learn_fleet
-from twin_master.fleet.posterior import Line
+from twin_master.fleet.flight import fleet_config
+from twin_master.fleet.learn import learn_fleet
 from twin_master.run_folder import to_json
 
+_Told = Mapping[str, Any]
 LESSONS_NAME = "learnt.json"
 """In the folder of a fleet: what was learnt from it, for its report."""
 HEADING = """\
@@ -45,89 +47,54 @@ def learn_from_fleet(
     RunFolderExistsError, FleetError
         There is no fleet, nothing has flown, or its transitions cannot be learnt.
     """
-    lessons = learn_fleet(folder, progress=progress)
-    write_learnt(Path(out), lessons)
-    record = lessons_record(lessons)
+    record = learn_fleet(folder, progress=progress)
+    write_learnt(Path(out), Path(folder), record)
     atomic_write_text(Path(folder) / LESSONS_NAME, to_json(record))
     return record
 
 
-def write_learnt(path: Path, lessons: FleetLessons) -> Path:
+def write_learnt(path: Path, folder: Path, record: Mapping[str, Any]) -> Path:
     """Write what takes the place of the tables of a scenario, whole: for a new asset, and for each group.
 
     A new asset has the means that the groups share, and the population of the parameter over the largest
-    group. Figures are in SI.
+    group. Figures are in SI; what was assumed of the sensors stands in the folder of the fleet.
     """
-    own = [[marginal.mean for marginal in lessons.probabilities(n)] for n in range(len(lessons.groups))]
-    largest = max(range(len(own)), key=lambda number: lessons.groups[number].twins)
-    means = own[largest] if lessons.shared is None else [mean for mean, _ in lessons.shared.mean]
-    content = {"format": 1, "source": lessons.source} | _tables(lessons, largest, means)
-    if len(own) > 1:
-        named = zip(lessons.groups, own, strict=True)
-        content["group"] = {group.name: _tables(lessons, n, mean) for n, (group, mean) in enumerate(named)}
+    groups = record["groups"]
+    scenarios = {told["name"]: told["scenarios"][0] for told in fleet_config(folder)["fleet"]["groups"]}
+    tables = {name: _tables(group, group["probability"], scenarios[name]) for name, group in groups.items()}
+    largest = max(groups, key=lambda name: groups[name]["twins"])
+    means = record.get("shared", groups[largest]["probability"])
+    new = _tables(groups[largest], means, scenarios[largest])
+    content: dict[str, Any] = {"format": 1, "source": record["source"]} | new
+    if len(groups) > 1:
+        content["group"] = tables
     return atomic_write_text(path, HEADING + toml_text(content))
 
 
-def _tables(lessons: FleetLessons, number: int, means: list[float]) -> dict[str, Any]:
-    group = lessons.groups[number]
+def _tables(
+    group: Mapping[str, Any], means: Mapping[str, Any], scenario: Mapping[str, Any]
+) -> dict[str, Any]:
     probability: dict[str, Any] = {}
-    assumptions = group.worsening.assumed.tolist()
-    told = zip(group.worsening.keys, means, assumptions, lessons.flown(number), strict=True)
-    for (control, factor), learnt, assumed, flown in told:
-        mean = learnt if flown else assumed  # of a control that never flew nothing was learnt
-        if factor is None:
-            probability[control] = mean
-        else:
+    for name, told in group["probability"].items():
+        # of a control that never flew nothing was learnt
+        mean = means[name]["mean"] if told["flown"] else told["assumed"]
+        control, _, factor = name.partition(", ")
+        if factor:
             probability.setdefault(control, {})[factor] = mean
-    noise = np.asarray(lessons.scenarios[group.name].observation.standard_deviation) * group.noise.mean
+        else:
+            probability[control] = mean
+    noise = np.asarray(scenario["observation"]["standard_deviation"]) * group["noise_factor"]["mean"]
     tables: dict[str, Any] = {
         "transition": {"probability": probability},
         "observation": {"standard_deviation": noise.tolist()},
     }
-    if group.population is not None:
-        middle, spread = group.population
-        total = np.linalg.norm([spread.mean, spread.standard_deviation, middle.standard_deviation])
+    if learnt := group.get("population"):
+        middle, spread = learnt["mean"], learnt["spread"]
+        total = np.linalg.norm([spread["mean"], spread["standard_deviation"], middle["standard_deviation"]])
         tables["calibration"] = {
-            "parameter": group.parameter, "mean": middle.mean, "standard_deviation": float(total)
+            "parameter": learnt["parameter"], "mean": middle["mean"], "standard_deviation": float(total)
         }  # fmt: skip
     return tables
-
-
-def lessons_record(lessons: FleetLessons) -> dict[str, Any]:
-    """Return what was learnt beside what was assumed, for JSON and the report."""
-    groups = {}
-    for number, group in enumerate(lessons.groups):
-        told = zip(
-            group.worsening.names, group.worsening.assumed.tolist(), lessons.flown(number),
-            lessons.probabilities(number), strict=True,
-        )  # fmt: skip
-        found: dict[str, Any] = {
-            "twins": group.twins, "left_out": group.unexplained, "alarmed": group.alarmed,
-            "probability": {
-                name: {"assumed": assumed, "flown": flown, **_figures(marginal)}
-                for name, assumed, flown, marginal in told
-            },
-            "noise_factor": _figures(group.noise),
-        }  # fmt: skip
-        if group.population is not None:
-            mean, spread = map(_figures, group.population)
-            found["population"] = {"parameter": group.parameter, "mean": mean, "spread": spread}
-        groups[group.name] = found
-    record: dict[str, Any] = {"source": lessons.source, "groups": groups}
-    if lessons.shared is not None:
-        names = lessons.groups[0].worsening.names
-        pairs = zip(names, lessons.shared.mean, lessons.shared.concentration, strict=True)
-        titles = "mean", "standard_deviation", "log10_concentration", "log10_concentration_standard_deviation"
-        record["shared"] = {
-            name: dict(zip(titles, (*mean, *size), strict=True)) for name, mean, size in pairs
-        }
-    return record
-
-
-def _figures(marginal: Line) -> dict[str, float]:
-    low, high = marginal.interval()
-    deviation = marginal.standard_deviation
-    return {"mean": marginal.mean, "standard_deviation": deviation, "lower_95": low, "upper_95": high}
 
 
 def lesson_rows(record: dict[str, Any]) -> list[tuple[str, ...]]:

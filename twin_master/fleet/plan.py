@@ -20,6 +20,7 @@ from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Count, Flag, Name, NotNegative, Number, Probability, Section, Seed
 from twin_master.seeds import generator
+from twin_master.sentences import said
 from twin_master.watch.broker import is_broker
 from twin_master.watch.feeds import Fed
 
@@ -69,10 +70,7 @@ class GroupSection(Section):
     def _check(self) -> Self:
         kinds = self.count, self.fmus, self.calibrations, self.observations
         if sum(given is not None for given in kinds) != 1:
-            raise ValueError(
-                f"the group `{self.name}` needs one of `count`, `fmus`, `calibrations` and `observations`, "
-                "which say how many assets it has"
-            )
+            raise ValueError(said("fleet.members", name=self.name))
         return self
 
 
@@ -218,10 +216,7 @@ def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
             groups.append(_group(section, path.resolve().parent, head.seed))
             rationed = groups[-1].scenarios[0].planner.inspections_a_turn is not None
             if rationed and (len(groups[-1].members) > head.shard or len(groups[-1].scenarios) > 1):
-                raise FleetError(
-                    f"`inspections_a_turn` is shared by assets of one scenario in one shard: let `shard` be "
-                    f"{len(groups[-1].members)} or more, and give no pattern of files"
-                )
+                raise FleetError(said("fleet.shared", members=len(groups[-1].members)))
         except TwinMasterError as error:
             wrong.append(f"group {section.name}: {error}")
     if wrong:

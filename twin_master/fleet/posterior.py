@@ -68,6 +68,13 @@ class Line:
         """Standard deviation of the figure."""
         return float(np.sqrt(self.weight @ (self.of(self.x) - self.mean) ** 2))
 
+    @property
+    def figures(self) -> dict[str, float]:
+        """Mean, standard deviation and central 95 % interval."""
+        low, high = self.interval()
+        moments = {"mean": self.mean, "standard_deviation": self.standard_deviation}
+        return moments | {"lower_95": low, "upper_95": high}
+
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
         """Return the bounds of the central interval, by the cubic through the log density."""
         from scipy.interpolate import CubicSpline

@@ -21,6 +21,7 @@ from twin_master.fleet.store import written
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.watch.broker import broker_of, is_broker
 from twin_master.watch.feeds import Fed, file_feed
 from twin_master.watch.folder import Watch
@@ -267,9 +268,7 @@ class _Files:
     def __init__(self, fleet: FleetWatch, group: Group, follow: bool) -> None:
         self._fleet, self._group, self._follow = fleet, group, follow
         if not follow and not recordings(group.observations):
-            raise FleetError(
-                f"no recording fits {group.observations}; what is still to come is waited for with --follow."
-            )
+            raise FleetError(said("fleet.follow", observations=group.observations))
         self._assets: dict[Path, WatchedAsset | None] = {}
         self._owner: dict[str, Path] = {}
         self._searched = -SEARCH_SECONDS

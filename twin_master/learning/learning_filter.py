@@ -26,6 +26,7 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import log_forecast, smooth_many
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import TransitionModel
+from twin_master.sentences import said
 
 _NORMAL = 1.6448536269514722
 """Half-width of the central 90 % of a normal distribution, in standard deviations."""
@@ -113,15 +114,11 @@ class LearningFilter:
         name: str = "twin",
     ) -> None:
         if sensor_model.averages_inside:
-            raise InvalidModelError(
-                "learning needs the average over the draws outside the product over the sensors: inside, "
-                "each sensor has a parameter of its own"
-            )
+            raise InvalidModelError(said("learning.inside", what="learning"))
         moves = transitions or [model.transition]
         if len(moves) != len(priors.transition_factors):
             raise InvalidModelError(
-                f"expected one transition table for each of {len(priors.transition_factors)} factors, "
-                f"got {len(moves)}"
+                said("learning.tables", factors=len(priors.transition_factors), tables=len(moves))
             )
         self.model, self.sensor_model, self._name = model, sensor_model, name
         self.priors = priors

@@ -29,6 +29,7 @@ from twin_master.network.inference import smooth
 from twin_master.network.kernels import move_rows
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.tables import MOST_DRAWS, Noticing
+from twin_master.sentences import said
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -83,10 +84,7 @@ class WatchfulEstimator:
         words: Words | None = None,
     ) -> None:
         if sensor_model.averages_inside:
-            raise InvalidModelError(
-                "noticing needs the average over the draws outside the product over the sensors: inside, "
-                "each sensor has a parameter of its own"
-            )
+            raise InvalidModelError(said("learning.inside", what="noticing"))
         self._inner, self._sensor_model, self.model = inner, sensor_model, inner.model
         self._settings = settings = settings or Noticing()
         self._words = words or Words()
@@ -96,9 +94,13 @@ class WatchfulEstimator:
         self._shape = (sensors, len(_GAINS), len(places), states)
         if np.prod(self._shape, dtype=float) > _LARGEST:
             raise InvalidModelError(
-                f"noticing keeps a belief over {states} states and {len(places)} draws for each of "
-                f"{sensors * len(_GAINS)} faults of gauges, which are more than {_LARGEST} numbers: take "
-                "fewer levels or state factors, or leave out `notice`"
+                said(
+                    "learning.faults",
+                    states=states,
+                    draws=len(places),
+                    faults=sensors * len(_GAINS),
+                    most=_LARGEST,
+                )
             )
         # A model that takes the place of another, as one that was taught, begins without suspicion.
         digest = sha256(b"2" + np.ascontiguousarray(table).tobytes()).digest()

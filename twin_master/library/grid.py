@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuInputError, FmuOutputError
 from twin_master.errors import InvalidObservationLibraryError
+from twin_master.sentences import said
 
 Float = NDArray[np.float64]
 
@@ -201,13 +202,23 @@ class GridSampler:
         shown = f"{self._sensor(worst)} = {before[worst]:.9g}"
         if steps:
             raise InvalidObservationLibraryError(
-                f"the FMU {self._grid.fmu} has not settled after {steps} steps: at {self._name(index)} it "
-                f"shows {shown}, and as many steps later {again[worst]:.9g}. Give a larger --settle."
+                said(
+                    "library.unsettled",
+                    fmu=self._grid.fmu,
+                    steps=steps,
+                    place=self._name(index),
+                    shown=shown,
+                    later=again[worst],
+                )
             )
         raise InvalidObservationLibraryError(
-            f"the FMU {self._grid.fmu} remembers earlier steps: at {self._name(index)} it shows {shown} and, "
-            f"on a later visit, {again[worst]:.9g}. Give --settle STEPS, in which it settles from a fresh "
-            "start at each point."
+            said(
+                "library.remembers",
+                fmu=self._grid.fmu,
+                place=self._name(index),
+                shown=shown,
+                later=again[worst],
+            )
         )
 
     def _sensor(self, sensor: int) -> str:

@@ -20,6 +20,7 @@ from twin_master.errors import InvalidObservationLibraryError
 from twin_master.library.grid import STEP_TIMEOUT, SamplingGrid
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.scenario.section import LARGEST_COUNT
+from twin_master.sentences import said
 
 _ROLES = ("health", "control", "load", "parameter")
 
@@ -47,8 +48,7 @@ def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tu
         if not equals or not places:
             known = ", ".join(f"{role}.{key}" for role in _ROLES for key in tables[role])
             raise InvalidObservationLibraryError(
-                f"--grid must be NAME=VALUES with a name of the binding {binding.name} ({known}), and {text} "
-                "came."
+                said("library.grid", name=binding.name, known=known, text=text)
             )
         if len(places) > 1:
             full = " or ".join(f"{role}.{key}" for role, key in places)
@@ -70,10 +70,7 @@ def _values(text: str, values: str) -> tuple[float, ...]:
         if not all(math.isfinite(number) for number in numbers):
             raise ValueError
     except ValueError:
-        raise InvalidObservationLibraryError(
-            f"--grid must give numbers, as 0,0.2,0.4 or as FIRST:LAST:COUNT with a count of 1 to "
-            f"{LARGEST_COUNT}, and {text} came."
-        ) from None
+        raise InvalidObservationLibraryError(said("library.numbers", most=LARGEST_COUNT, text=text)) from None
     return tuple(numbers)
 
 
@@ -98,23 +95,19 @@ def grid_of_fmu(
     if role is None:
         if len(binding.observation) != 1:
             raise InvalidObservationLibraryError(
-                f"the binding {binding.name} observes {', '.join(binding.observation)}: say which one by "
-                "--role."
+                said("library.role", name=binding.name, known=", ".join(binding.observation))
             )
         role = next(iter(binding.observation))
     swept = [name for name, values in given["parameter"].items() if len(values) > 1]
     if len(swept) > 1:
-        raise InvalidObservationLibraryError(
-            f"a library has one uncertain parameter, and {', '.join(swept)} came with several values."
-        )
+        raise InvalidObservationLibraryError(said("library.one_parameter", names=", ".join(swept)))
     parameter = swept[0] if swept else ""
     inputs = given["control"]
     controls = {}
     combinations = math.prod(len(values) for values in inputs.values())
     if combinations > LARGEST_COUNT:
         raise InvalidObservationLibraryError(
-            f"the values of {', '.join(inputs)} make {combinations} controls, and a library holds at most "
-            f"{LARGEST_COUNT}: give fewer values."
+            said("library.controls", inputs=", ".join(inputs), combinations=combinations, most=LARGEST_COUNT)
         )
     for values in itertools.product(*inputs.values()):
         setting = dict(zip(inputs, values, strict=True))
@@ -138,7 +131,7 @@ def _single(role: str, given: dict[str, tuple[float, ...]]) -> dict[str, float]:
     for name, values in given.items():
         if len(values) > 1:
             raise InvalidObservationLibraryError(
-                f"the {role} {name} can have one value, and {len(values)} came."
+                said("library.single", role=role, name=name, number=len(values))
             )
     return {name: values[0] for name, values in given.items()}
 
@@ -168,8 +161,7 @@ def grid_of_scenario(
     flown = scenario.asset.source(scenario)
     if not isinstance(flown, FmuSource) or isinstance(flown, SeveralSource):
         raise InvalidObservationLibraryError(
-            f"the scenario {scenario.mission.name} flies an asset of the kind `{scenario.asset.kind}`, and "
-            "one FMU can be sampled."
+            said("library.kind", name=scenario.mission.name, kind=scenario.asset.kind)
         )
     believed = scenario.belief.source(scenario, flown)
     source = flown if believed is flown else PairedSource(flown, believed)
@@ -181,10 +173,7 @@ def grid_of_scenario(
     states = {factor.name: factor.levels for factor in scenario.state} | given.pop("health")
     swept = given.pop("parameter")
     if any(given.values()) or {*swept} - {draws.name}:
-        raise InvalidObservationLibraryError(
-            f"with a scenario --grid gives states and the uncertain parameter {draws.name}; the rest is said "
-            "by the scenario."
-        )
+        raise InvalidObservationLibraryError(said("library.scenario", name=draws.name))
     fixed = {name: value for name, value in flown.parameters().items() if name != draws.name}
     return SamplingGrid(
         fmu=str(folder / FMU_COPY),

@@ -37,6 +37,7 @@ from twin_master.assets.library_source import (
 from twin_master.errors import InvalidObservationLibraryError, TwinMasterError, check_names
 from twin_master.library.grid import Float, GridSampler, SamplingGrid
 from twin_master.network.memory import NUMBER, check_fits
+from twin_master.sentences import said
 
 PLAN_NAME = "grid.json"
 _COPIES = 3  # of what was sampled: the blocks, all of them, and the library
@@ -127,9 +128,7 @@ def sample_library(
     folder = _prepare_folder(out, record, resume=resume, replace_existing=replace_existing)
     lock = lock_folder(folder)
     if lock is None:
-        raise InvalidObservationLibraryError(
-            f"another process is sampling into {folder}: wait for it to end."
-        )
+        raise InvalidObservationLibraryError(said("library.locked", folder=folder))
     try:
         remove_leftovers(folder)
         found = _read_blocks(grid, folder)
@@ -199,15 +198,10 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
     check_names("the grid has the", f"the binding {binding.name}", rows, InvalidObservationLibraryError)
     binding.observation_slice(grid.role)
     if not grid.states or not grid.controls or not grid.draws:
-        raise InvalidObservationLibraryError(
-            "a grid needs at least one state and one control with values: give --grid NAME=VALUES for them."
-        )
+        raise InvalidObservationLibraryError(said("library.bare"))
     taken = sorted({*grid.states} & {*RESERVED})
     if taken:
-        raise InvalidObservationLibraryError(
-            f"a state cannot be called {taken[0]} in an observation library: give it another name in the "
-            "binding."
-        )
+        raise InvalidObservationLibraryError(said("library.reserved", name=taken[0]))
     for name, levels in grid.states.items():
         if any(b <= a for a, b in itertools.pairwise(levels)):
             raise InvalidObservationLibraryError(f"the levels of {name} must increase, and {levels} came.")
@@ -231,9 +225,7 @@ def _record(grid: SamplingGrid) -> dict[str, Any]:
 
 def _prepare_folder(out: Path, record: dict[str, Any], *, resume: bool, replace_existing: bool) -> Path:
     if out.suffix != ".nc":
-        raise InvalidObservationLibraryError(
-            f"an observation library must have the suffix .nc, and {out} was given."
-        )
+        raise InvalidObservationLibraryError(said("library.suffix", out=out))
     folder = blocks_folder(out)
     plan = folder / PLAN_NAME
     if replace_existing:
@@ -243,15 +235,11 @@ def _prepare_folder(out: Path, record: dict[str, Any], *, resume: bool, replace_
     text = json.dumps(record, indent=1) + "\n"  # the order of the states matters
     if folder.exists():
         if not resume:
-            raise InvalidObservationLibraryError(
-                f"{folder} holds the finished blocks of an interrupted sampling: give --resume to go on with "
-                "them, or --replace to begin anew."
-            )
+            raise InvalidObservationLibraryError(said("library.interrupted", folder=folder))
         kept = plan.read_bytes() if plan.is_file() else b""
         if kept and kept != text.encode("utf-8"):
             raise InvalidObservationLibraryError(
-                f"{folder} holds blocks of another FMU, binding, grid or version ({_difference(kept, record)}"
-                "): give --replace to begin anew."
+                said("library.another", folder=folder, what=_difference(kept, record))
             )
         if kept:
             return folder

@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from reporting.arrays import Float
 from reporting.files import synchronise, write_error
 from twin_master.errors import NotResumableError
 from twin_master.mission.turns import Happened, Reading, Turn
-
-Float = NDArray[np.float64]
+from twin_master.sentences import said
 
 JOURNAL_NAME = "journal.jsonl"
 _DIGEST = 64
@@ -206,10 +206,7 @@ def records_of(
         if begin:
             yield record, begin, begin + len(line)
         elif header is not None and line != header:
-            raise NotResumableError(
-                f"the journal {path} belongs to another configuration than the config.json beside it: "
-                "begin again with --replace."
-            )
+            raise NotResumableError(said("mission.journal", path=path))
         begin += len(line)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from calibration.errors import CalibrationError
 from fe.runtime.errors import FiniteElementError
 from fmu_asset.errors import FmuError
+from reporting.arrays import Float, Index
 from twin_master.assets.asset_source import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
 from twin_master.mission.loop import ended_sentence, fly
@@ -29,9 +30,6 @@ from twin_master.mission.turns import History
 from twin_master.network.estimator import Notice
 from twin_master.network.inference import filter_many
 from twin_master.network.planner import decision, rationed
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 IN_FLIGHT = (TwinMasterError, FmuError, FiniteElementError, CalibrationError, OSError)
 """What may end the flight of one asset, and not that of the others."""

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from twin_master.network.estimator import Carried, Notice, Suspicion
 from twin_master.network.twin import Twin, TwinTurn
-
-Float = NDArray[np.float64]
 
 
 class Happened(NamedTuple):

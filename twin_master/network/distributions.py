@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
 from twin_master.errors import InvalidDistributionError, InvalidModelError, TwinMasterError
+from twin_master.sentences import said
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of a probability distribution from one."""
@@ -29,9 +30,7 @@ def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
     """
     matrix = np.array(rows, dtype=np.float64, order="C")
     if matrix.ndim == 0 or matrix.size == 0:
-        raise InvalidDistributionError(
-            f"{name}: expected rows of probabilities, got an array of shape {matrix.shape}"
-        )
+        raise InvalidDistributionError(said("network.no_rows", name=name, shape=matrix.shape))
     for bad, reason in (
         (~np.isfinite(matrix).all(axis=-1), "holds a value that is not finite"),
         ((matrix < 0.0).any(axis=-1), "holds a negative probability"),
@@ -42,8 +41,14 @@ def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
             row = matrix[where]
             label = f"row {where[0] if len(where) == 1 else where}" if where else "the distribution"
             raise InvalidDistributionError(
-                f"{name}: {label} {reason} (sum {row.sum():.15g}, smallest {row.min():.6g}); "
-                "every row must be non-negative and sum to one within 1e-12"
+                said(
+                    "network.no_distribution",
+                    name=name,
+                    label=label,
+                    reason=reason,
+                    total=row.sum(),
+                    least=row.min(),
+                )
             )
     matrix.setflags(write=False)
     return matrix

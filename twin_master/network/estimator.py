@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from reporting.arrays import Float
 from twin_master.errors import ImpossibleObservation
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.inference import filter_step, smooth
+from twin_master.network.inference import filter_sequence, smooth
 
 
 class SensorModel(Protocol):
@@ -239,10 +239,9 @@ class ExactFilter:
     def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
         """Advance the belief to turn t and correct it by an observation, see `Estimator.turn`."""
         likelihood = self._sensor_model.log_likelihood(observation, control_index)
-        log_before = None if before is None else before.arrays["log_filtered"]
-        control_before = None if before is None else before.control_index
+        followed = None if before is None else (before.arrays["log_filtered"], before.control_index)
         try:
-            step = filter_step(self.model, log_before, control_before, likelihood)
+            step = filter_sequence(self.model, [control_index], likelihood[None], followed)[0]
         except ImpossibleObservation:
             own = getattr(self._sensor_model, "worst_residuals", None)
             worst = None if own is None else own(observation, control_index)

@@ -16,6 +16,7 @@ from reporting.words import brief
 from twin_master.errors import InvalidModelError
 from twin_master.network.distributions import distribution, expect_shape, stochastic_matrix
 from twin_master.network.transition import TransitionModel
+from twin_master.sentences import said
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,7 @@ class Factor:
         if not self.name:
             raise InvalidModelError("a factor of the state space needs a name, got an empty one")
         if not levels or not np.all(np.isfinite(levels)) or np.any(np.diff(levels) <= 0.0):
-            raise InvalidModelError(
-                f"factor {self.name!r}: expected one or more finite, strictly increasing levels, got {levels}"
-            )
+            raise InvalidModelError(said("network.levels", name=self.name, levels=levels))
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,7 @@ class StateSpace:
         object.__setattr__(self, "factors", tuple(self.factors))
         names = [factor.name for factor in self.factors]
         if not names or len(set(names)) != len(names):
-            raise InvalidModelError(
-                f"a state space needs one or more factors with different names, got {names}"
-            )
+            raise InvalidModelError(said("network.factors", names=names))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -103,7 +100,7 @@ class StateSpace:
             best = int(distance.argmin())
             if not distance[best] <= 1e-9:
                 raise InvalidModelError(
-                    f"{value} is no level of factor {factor.name!r}; its levels are {factor.levels}"
+                    said("network.no_level", value=value, name=factor.name, levels=factor.levels)
                 )
             indices.append(best)
         return int(np.ravel_multi_index(indices, self.shape))
@@ -188,9 +185,7 @@ class GraphicalModel:
     def __post_init__(self) -> None:
         object.__setattr__(self, "controls", tuple(self.controls))
         if not self.controls or len(set(self.controls)) != len(self.controls):
-            raise InvalidModelError(
-                f"expected one or more controls with different names, got {self.controls}"
-            )
+            raise InvalidModelError(said("network.controls", controls=self.controls))
         size = self.states.size
         object.__setattr__(self, "prior", distribution(self.prior, size=size, name="prior"))
         expect_shape("a transition", self.transition.shape, len(self.controls), size, size)
@@ -225,8 +220,12 @@ class GraphicalModel:
         for control, rows in given.items():
             if set(rows) != set(levels):
                 raise InvalidModelError(
-                    f"{control}: expected one table for each of the factors {', '.join(levels)}, got "
-                    f"{', '.join(rows) or 'none'}"
+                    said(
+                        "network.tables",
+                        control=control,
+                        levels=", ".join(levels),
+                        rows=", ".join(rows) or "none",
+                    )
                 )
         joint: Float = np.ones(1)
         for factor in states.factors:
@@ -271,9 +270,7 @@ def worsening_table(level_count: int, probability: float) -> Float:
         Probability to worsen by one level in one step, in [0, 1].
     """
     if level_count < 1 or not 0.0 <= probability <= 1.0:
-        raise InvalidModelError(
-            f"expected one or more levels and a probability in [0, 1], got {level_count} and {probability}"
-        )
+        raise InvalidModelError(said("network.worsening", levels=level_count, probability=probability))
     table = np.diag(np.full(level_count, 1.0 - probability))
     table += np.diag(np.full(level_count - 1, probability), 1)
     table[-1, -1] = 1.0
@@ -292,11 +289,7 @@ def leaving_table(table: Float, factor: float) -> Float:
     result = factor * np.where(np.eye(len(table), dtype=bool), 0.0, table)
     stay = 1.0 - result.sum(axis=1)
     if np.any(stay < 0.0):
-        raise InvalidModelError(
-            f"a factor of {factor:g} on the transition probabilities makes the probability to leave a level "
-            f"{1.0 - float(stay.min()):g}, and at most 1 is possible: take "
-            "smaller `learning.transition_factors`"
-        )
+        raise InvalidModelError(said("network.leaving", factor=factor, leaving=1.0 - float(stay.min())))
     return np.asarray(result + np.diag(stay), dtype=np.float64)
 
 
@@ -304,7 +297,5 @@ def deterministic_policy(control_index: ArrayLike, control_count: int) -> Float:
     """Return the policy (S, U) that gives each state the control of its index (S,)."""
     index = np.asarray(control_index)
     if index.ndim != 1 or index.dtype.kind not in "iu" or np.any((index < 0) | (index >= control_count)):
-        raise InvalidModelError(
-            f"expected one control index between 0 and {control_count - 1} for each state, got {index}"
-        )
+        raise InvalidModelError(said("network.control_of_state", last=control_count - 1, index=index))
     return stochastic_matrix(np.eye(control_count)[index], name="policy[state]")

@@ -12,6 +12,7 @@ from twin_master.errors import InvalidObservationError
 from twin_master.network.sensor_kernels import LOG_ROOT_TWO_PI
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.observation import row_width
+from twin_master.sentences import said
 
 
 def packed_row(values: Float, covariance: Float) -> Float:
@@ -38,7 +39,7 @@ class IdentifiedSensorModel(GaussianSensorModel):
         covariance = np.zeros((count, count))
         if len(row) not in (count, row_width(count)) or np.isinf(row).any():
             raise InvalidObservationError(
-                f"expected {count} finite values, or {row_width(count)} with their covariance, got {len(row)}"
+                said("network.covariance", count=count, width=row_width(count), came=len(row))
             )
         covariance[np.tril_indices(count)] = np.nan_to_num(row[count:]) if len(row) > count else 0.0
         covariance += np.tril(covariance, -1).T
@@ -55,9 +56,7 @@ class IdentifiedSensorModel(GaussianSensorModel):
         try:
             factor = np.linalg.cholesky(total)
         except np.linalg.LinAlgError:
-            raise InvalidObservationError(
-                "the covariance of the observation is not positive definite"
-            ) from None
+            raise InvalidObservationError(said("network.not_definite")) from None
         residual = values[seen] - self.value_per_draw[:, :, control_index, seen]  # (E, S, G)
         white = np.linalg.solve(factor, residual.transpose(1, 2, 0))  # (S, G, E)
         scale = np.log(np.einsum("sgg->sg", factor)).sum(axis=1) + seen.size * LOG_ROOT_TWO_PI

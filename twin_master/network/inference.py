@@ -134,52 +134,13 @@ def smooth_many(transition: TransitionModel, control: Index, filtered: Float, lo
     return smoothed
 
 
-def filter_step(
-    model: GraphicalModel,
-    previous_log_filtered: ArrayLike | None,
-    previous_control_index: int | None,
-    log_likelihood: ArrayLike,
-) -> Filtered:
-    """Assimilate one observation: Kapteyn et al. 2021, eqs. (2), (28)-(31).
-
-    Parameters
-    ----------
-    model : GraphicalModel
-    previous_log_filtered : (S,) or None
-        `log_filtered` of the step before; None at the first step, which starts from the prior.
-    previous_control_index : int or None
-        Control u_{t-1} that was in force in the step before; None at the first step.
-    log_likelihood : (S,)
-        log p(o_t | D_t, u_t), zeros when nothing was observed.
-
-    Raises
-    ------
-    ImpossibleObservation
-        If the observation has probability zero wherever the belief has support.
-    InvalidModelError, InvalidObservationError
-        If shapes do not fit, or a log-likelihood is NaN or plus infinity.
-    """
-    if (previous_log_filtered is None) != (previous_control_index is None):
-        raise InvalidModelError(
-            "the previous belief and the previous control go together: give both or neither"
-        )
-    control = _checked_controls(model, previous_control_index or 0)
-    rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
-    before: tuple[Any, ...] = (model.log_prior,)
-    if previous_log_filtered is not None:
-        before = _checked_rows(model, control, previous_log_filtered, what="previous log belief"), control
-    found, failed = filter_many(model, control[None, None], rows[None, None], *before)
-    if failed[0] >= 0:
-        raise ImpossibleObservation("twin", 0)
-    return found[0, 0]
-
-
 def filter_sequence(
     model: GraphicalModel,
     control_index: ArrayLike,
     log_likelihood: ArrayLike,
+    before: tuple[Float, int] | None = None,
 ) -> Filtered:
-    """Filter a whole sequence: Kapteyn et al. 2021, eqs. (2), (28)-(31).
+    """Filter a whole sequence, or a part of one: Kapteyn et al. 2021, eqs. (2), (28)-(31).
 
     Parameters
     ----------
@@ -188,16 +149,21 @@ def filter_sequence(
         Control u_t in force in each step.
     log_likelihood : (T, S)
         log p(o_t | D_t, u_t), a row of zeros where nothing was observed.
+    before : tuple of (S,) and int, optional
+        `log_filtered` of the step before the first, and the control that was in force then; without it the
+        first step starts from the prior.
 
     Raises
     ------
-    ImpossibleObservation, InvalidModelError, InvalidObservationError
-        As `filter_step`.
+    ImpossibleObservation
+        If an observation has probability zero wherever the belief has support.
+    InvalidModelError, InvalidObservationError
+        If shapes do not fit, or a log-likelihood is NaN or plus infinity.
     """
     control = _checked_controls(model, control_index)
     expect_shape("controls", control.shape, control.size)
     rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
-    found, failed = filter_many(model, control[None], rows[None], model.log_prior)
+    found, failed = filter_many(model, control[None], rows[None], *(before or (model.log_prior,)))
     if failed[0] >= 0:
         raise ImpossibleObservation("twin", int(failed[0]))
     return found[0]
@@ -212,7 +178,7 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
     control_index : (T,)
         Control u_t in force in each step.
     log_filtered : (T, S)
-        As `filter_sequence`, or as the rows that `filter_step` gave one by one.
+        As `filter_sequence` gives them, at once or one by one.
 
     Raises
     ------

@@ -9,6 +9,7 @@ from reporting.arrays import Float, Index
 from twin_master.errors import InvalidObservationError
 from twin_master.network.sensor_kernels import LOG_ROOT_TWO_PI
 from twin_master.network.sensor_model import GaussianSensorModel
+from twin_master.sentences import said
 
 
 class InspectedSensorModel(GaussianSensorModel):
@@ -59,8 +60,9 @@ class InspectedSensorModel(GaussianSensorModel):
             return gauges, np.zeros((*read.shape[:-1], self.state_count))
         if read.shape[-1] != self.reading.shape[1] or np.isinf(read).any():
             raise InvalidObservationError(
-                f"expected {count} finite values, or {count + self.reading.shape[1]} with the readings of "
-                f"inspections, got {rows.shape[-1]}"
+                said(
+                    "network.readings", count=count, width=count + self.reading.shape[1], came=rows.shape[-1]
+                )
             )
         residual = (read[..., None, :] - self.reading) / self.reading_deviation
         density = -0.5 * residual**2 - np.log(self.reading_deviation) - LOG_ROOT_TWO_PI

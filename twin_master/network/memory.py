@@ -6,6 +6,7 @@ from math import prod
 from reporting.memory import memory_left
 from twin_master.errors import InvalidModelError
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 
 NUMBER = 8
 """Bytes of a number."""
@@ -36,8 +37,13 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
     if needed > there:
         listed = ", ".join(f"{_gigabytes(size)} for {what}" for what, size in parts.items())
         raise InvalidModelError(
-            f"this does not fit in memory: {listed}, together {_gigabytes(needed)}, and "
-            f"{_gigabytes(there)} are left: {advice}."
+            said(
+                "network.memory",
+                listed=listed,
+                needed=_gigabytes(needed),
+                there=_gigabytes(there),
+                advice=advice,
+            )
         )
 
 

@@ -13,6 +13,7 @@ from twin_master.network.distributions import expect_shape, stochastic_matrix
 from twin_master.network.graphical_model import deterministic_policy
 from twin_master.network.kernels import sweep
 from twin_master.network.transition import TransitionModel
+from twin_master.sentences import said
 
 
 @dataclass(frozen=True)
@@ -42,13 +43,9 @@ class BeliefPolicy:
         try:
             vectors, control = arrays[f"{prefix}vectors"], arrays[f"{prefix}control"]
         except KeyError as error:
-            raise PlanningError(
-                f"a policy on the belief has `vectors` and `control`: {error} is missing"
-            ) from None
+            raise PlanningError(said("network.policy", error=error)) from None
         if vectors.ndim != 2 or control.shape != vectors.shape[:1] or control.dtype.kind not in "iu":
-            raise PlanningError(
-                f"expected vectors (N, S) and a control for each, got {vectors.shape} and {control.shape}"
-            )
+            raise PlanningError(said("network.vectors", vectors=vectors.shape, controls=control.shape))
         return cls(np.asarray(vectors, dtype=np.float64), np.asarray(control, dtype=np.int64))
 
     def value(self, belief: ArrayLike) -> Float:
@@ -171,15 +168,10 @@ def _checked(
     expect_shape("rewards", rewards.shape, *transition.shape[1::-1], error=PlanningError)
     if not np.all(np.isfinite(rewards)):
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(rewards))[0])
-        raise PlanningError(
-            f"reward at (state, control) {where} is {rewards[where]}; expected finite rewards"
-        )
+        raise PlanningError(said("network.reward", where=where, reward=rewards[where]))
     factors = np.asarray(discount, dtype=np.float64)
     if factors.shape not in ((), rewards.shape[1:]) or not np.all((factors >= 0.0) & (factors < 1.0)):
-        raise PlanningError(
-            f"expected a discount factor in [0, 1), or one for each of {rewards.shape[1]} controls, "
-            f"got {factors}"
-        )
+        raise PlanningError(said("network.discount", controls=rewards.shape[1], factors=factors))
     return transition, rewards, np.broadcast_to(factors, rewards.shape[1:])
 
 
@@ -235,10 +227,7 @@ def value_iteration(
         model.backward_lists, rewards, factors.copy(), limit, max_iterations, value, action_value
     )
     if change > limit:
-        raise PlanningError(
-            f"value iteration still changes by {change:.3g} after {max_iterations} sweeps with discount "
-            f"{largest}; allow more sweeps or a larger tolerance"
-        )
+        raise PlanningError(said("network.sweeps", change=change, sweeps=max_iterations, largest=largest))
     tie = 2.0 * max(tolerance * scale, limit / (1.0 - largest))
     best = action_value.max(axis=1, keepdims=True)
     control_index = np.argmax(action_value >= best - tie, axis=1).astype(np.int64)

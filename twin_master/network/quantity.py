@@ -14,6 +14,7 @@ from fe.compilation import compiled
 from reporting.arrays import Float, Index
 from twin_master.errors import InvalidModelError
 from twin_master.network.distributions import distribution, expect_shape
+from twin_master.sentences import said
 
 TIE = 1e-12
 """A cumulative probability reaches a level when it misses it by no more than this (rounding of the sum)."""
@@ -75,9 +76,7 @@ class QuantityModel:
             raise InvalidModelError(f"expected one value or more, got the shape {values.shape}")
         if not np.all(np.isfinite(values)):
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(values))[0])
-            raise InvalidModelError(
-                f"value at (draw, state, control, sensor) {where} is {values[where]}; expected finite values"
-            )
+            raise InvalidModelError(said("network.value", where=where, value=values[where]))
         values.setflags(write=False)
         self.value_per_draw: Float = values
         self.draw_count, self.state_count, self.control_count, self.sensor_count = values.shape

@@ -14,6 +14,7 @@ from reporting.arrays import Float, Index
 from twin_master.errors import InvalidModelError
 from twin_master.network.distributions import expect_shape
 from twin_master.network.quantity import QuantityModel
+from twin_master.sentences import said
 
 
 def health_reward(value: ArrayLike, limit: ArrayLike) -> Float:
@@ -117,8 +118,12 @@ class RewardModel:
         normaliser = settings.control_normaliser or (1.0,) * len(settings.control_reward)
         if not len(settings.control_reward) == len(normaliser) == quantity.control_count:
             raise InvalidModelError(
-                f"expected a control reward and a normaliser for each of {quantity.control_count} controls, "
-                f"got {len(settings.control_reward)} and {len(normaliser)}"
+                said(
+                    "network.rewards",
+                    controls=quantity.control_count,
+                    rewards=len(settings.control_reward),
+                    normalisers=len(normaliser),
+                )
             )
         if true_per_draw is not None:
             shape = quantity.value_per_draw.shape

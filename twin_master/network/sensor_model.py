@@ -1,4 +1,4 @@
-"""Gaussian sensors: likelihood of what they show, residuals, and the posterior predictive check.
+"""Gaussian sensors: likelihood of what they show, and residuals.
 
 Kapteyn et al. 2021, eqs. (30) and (32).
 """
@@ -9,7 +9,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtr
 
 from reporting.arrays import Float, Index
 from reporting.words import brief
@@ -17,43 +16,13 @@ from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network.distributions import expect_controls, expect_shape
 from twin_master.network.quantity import QuantityModel
 from twin_master.network.sensor_kernels import log_densities, separated
+from twin_master.sentences import said
 
 _WORST_SHOWN = 3
 LARGEST = 1e140
 """Its square is still a number."""
 LEAST_LEFT = 1e-12
 """What rounding leaves of the share of a sensor that alone tells where in the interval the truth is."""
-
-
-@dataclass(frozen=True)
-class PredictiveCheck:
-    """What a belief says about an observation, beside the observation.
-
-    Attributes
-    ----------
-    mean, standard_deviation : (..., G)
-        Of p(o_g), sensor noise and model error included, SI.
-    residual : (..., G) dimensionless
-        (observation - mean) / standard deviation; NaN where the sensor is lost.
-    probability_integral_transform : (..., G) dimensionless
-        p(o_g <= observation): uniform in [0, 1] if the model holds; NaN where the sensor is lost.
-    """
-
-    mean: Float
-    standard_deviation: Float
-    residual: Float
-    probability_integral_transform: Float
-
-    def coverage(self, probability: float = 0.95) -> Float:
-        """Return for each sensor the share of observations inside the central interval: (..., G) -> (G,).
-
-        A sensor that never reports gets NaN.
-        """
-        transform = self.probability_integral_transform.reshape(-1, self.mean.shape[-1])
-        seen = ~np.isnan(transform)
-        inside = np.abs(transform - 0.5) <= 0.5 * probability
-        count = seen.sum(axis=0)
-        return np.asarray(np.where(count > 0, inside.sum(axis=0) / np.maximum(count, 1), np.nan))
 
 
 @dataclass(frozen=True)
@@ -141,7 +110,7 @@ class GaussianSensorModel(QuantityModel):
             enough = value > 0.0 if positive else value >= 0.0
             if value.shape not in ((), (self.sensor_count,)) or not np.all(np.isfinite(value) & enough):
                 raise InvalidModelError(
-                    f"expected one {what}, or one for each of {self.sensor_count} sensors, got {value}"
+                    said("network.one_or_each", what=what, sensors=self.sensor_count, value=value)
                 )
         if average not in ("outside", "inside"):
             raise InvalidModelError(f"expected average 'outside' or 'inside', got {average!r}")
@@ -187,9 +156,7 @@ class GaussianSensorModel(QuantityModel):
         expect_shape("sensor values", shape, *shape[:-1], self.sensor_count, error=InvalidObservationError)
         if np.any(np.isinf(observation)):
             where = tuple(int(i) for i in np.argwhere(np.isinf(observation))[0])
-            raise InvalidObservationError(
-                f"sensor value at {where} is infinite; expected a number, or NaN for a lost sensor"
-            )
+            raise InvalidObservationError(said("network.infinite", where=where))
         return observation
 
     def apart(self, observation: ArrayLike) -> tuple[Float, Float]:
@@ -217,7 +184,7 @@ class GaussianSensorModel(QuantityModel):
         Parameters
         ----------
         observation : (G,)
-            SI; NaN where the sensor is lost. If all are lost the result is zero: see `observed_count`.
+            SI; NaN where the sensor is lost. If all are lost the result is zero.
         control_index : int
             Control in force.
 
@@ -323,41 +290,6 @@ class GaussianSensorModel(QuantityModel):
             np.sqrt(np.tensordot(self.weights(joint), self.total_standard_deviation**2, axes=2))
         )
 
-    def observed_count(self, observations: ArrayLike) -> Index:
-        """Return how many sensors report: (..., G) -> (...). Zero flags a step that follows the dynamics."""
-        return np.asarray(np.sum(~np.isnan(self.checked(observations)), axis=-1))
-
-    def predictive_check(self, joint: ArrayLike, observation: ArrayLike) -> PredictiveCheck:
-        """Compare observations with what beliefs predict for them.
-
-        Parameters
-        ----------
-        joint : (..., S, U)
-            p(D, U); for an honest check the belief before the observation (`forecast`).
-        observation : (..., G)
-            SI; NaN where the sensor is lost.
-        """
-        observation = self.checked(observation)
-        mean, spread = self.moments(joint)
-        expect_shape("observations", observation.shape, *mean.shape)
-        weights = self.weights(joint).reshape(-1, self.state_count, self.control_count)
-        deviation = np.sqrt(spread**2 + self.noise(joint) ** 2)
-        rows = observation.reshape(-1, self.sensor_count)
-        transform = np.empty_like(rows)
-        for row, (weight, seen) in enumerate(zip(weights, rows, strict=True)):
-            state, control = np.nonzero(weight)
-            below = ndtr(
-                (seen - self.value_per_draw[:, state, control])
-                / self.total_standard_deviation[state, control]
-            )
-            transform[row] = np.einsum("e,p,epg->g", self.draw_weight, weight[state, control], below)
-        return PredictiveCheck(
-            mean=mean,
-            standard_deviation=deviation,
-            residual=(observation - mean) / deviation,
-            probability_integral_transform=transform.reshape(observation.shape),
-        )
-
 
 def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequence[str]) -> None:
     """Check that the noise of no sensor hides all that the sensors of its unit can show.
@@ -395,7 +327,14 @@ def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequenc
             if given * 1e-6 <= reach:
                 advice = f"it is likely meant in microstrain: write `{key}_microstrain = {given:g}`"
         raise InvalidModelError(
-            f"`{key}` is {given:g} for sensor {sensor + 1}, and all that sensors of its unit ({unit}) can "
-            f"show by the twin's model lies between {least:.3g} and {largest:.3g}: such a sensor tells "
-            f"nothing; {advice}."
+            said(
+                "network.noise",
+                key=key,
+                given=given,
+                sensor=sensor + 1,
+                unit=unit,
+                least=least,
+                largest=largest,
+                advice=advice,
+            )
         )

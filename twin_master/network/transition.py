@@ -18,6 +18,7 @@ from twin_master.errors import InvalidModelError
 from twin_master.network.distributions import expect_shape, stochastic_matrix
 from twin_master.network.kernels import Lists
 from twin_master.network.memory import TRANSITION_COPIES, check_fits, transition_bytes
+from twin_master.sentences import said
 
 JOINT_NON_ZEROS = 512
 """Non-zero transitions of a control up to which one table is used: it is applied in some microseconds."""
@@ -63,9 +64,7 @@ class TransitionModel:
         for block in checked:
             expect_shape("a transition", block.shape, "controls", block.shape[-1], block.shape[-1])
         if len({len(block) for block in checked}) != 1:
-            raise InvalidModelError(
-                f"transition: every block needs the same controls, got {[len(block) for block in checked]}"
-            )
+            raise InvalidModelError(said("network.blocks", counts=[len(block) for block in checked]))
         object.__setattr__(self, "blocks", checked)
 
     @classmethod
@@ -91,10 +90,7 @@ class TransitionModel:
         ]
         shapes = {tuple(table.shape for table in row) for row in checked}
         if len(shapes) != 1 or not all(shapes) or any(s != s[:1] * 2 for row in shapes for s in row):
-            raise InvalidModelError(
-                "expected for every control a square table for each factor, of the same states, got shapes "
-                f"{sorted(shapes)}"
-            )
+            raise InvalidModelError(said("network.squares", shapes=sorted(shapes)))
         return cls(tuple(_grouped([np.stack(factor) for factor in zip(*checked, strict=True)])))
 
     @property

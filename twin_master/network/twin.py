@@ -1,7 +1,7 @@
 """The twin: it is shown observations and the control in force, and says what to do; it holds no truth."""
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -28,6 +28,7 @@ from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.inference import Predicted, predict
 from twin_master.network.planner import BeliefPolicy, decision
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 
 _LARGEST = np.float64(1e150)
 """What is carried is below this, so that what follows from it are numbers, too."""
@@ -230,11 +231,7 @@ class Twin:
         """
         given = np.array(observation, dtype=np.float64)
         index = self._proposed if control is None else self._index_of(control)
-        before = self._seen[-1].estimate if self._seen else None
-        estimate = self._estimate(before, given, index, self._turns)
-        self._seen.append(_Seen(given, estimate.carried))
-        self._turns += 1
-        return self._decided(estimate)
+        return self._assimilated(len(self._seen), [(given, index)])
 
     def revise(self, turn: int, observation: ArrayLike, control: int | str | None = None) -> TwinTurn:
         """Put an observation that came late in its place, and filter anew from there.
@@ -263,25 +260,26 @@ class Twin:
             As in `turn`; the twin is unchanged.
         """
         if not self.first_kept <= turn < self._turns:
-            raise IndexError(
-                f"turn {turn} cannot be revised: the twin keeps the turns from {self.first_kept} on and has "
-                f"seen {self._turns}"
-            )
-        offset = self._turns - len(self._seen)
-        at = turn - offset
+            raise IndexError(said("network.revised", turn=turn, first=self.first_kept, seen=self._turns))
+        at = turn - self._turns + len(self._seen)
         index = self._seen[at].estimate.control_index if control is None else self._index_of(control)
         rows = [(np.array(observation, dtype=np.float64), index)]
         rows += [(seen.observation, seen.estimate.control_index) for seen in list(self._seen)[at + 1 :]]
+        return self._assimilated(at, rows)
+
+    def _assimilated(self, at: int, rows: Sequence[tuple[Float, int]]) -> TwinTurn:
+        """Filter observations under their controls from a place of what is kept on, and decide."""
+        first, anew, notices = self._turns - len(self._seen) + at, list[_Seen](), list[Notice]()
         before = self._seen[at - 1].estimate if at else None
-        anew: list[_Seen] = []
-        notices: list[Notice] = []
-        for number, (given, in_force) in enumerate(rows, start=turn):
+        for number, (given, in_force) in enumerate(rows, start=first):
             estimate = self._estimate(before, given, in_force, number)
             before = estimate.carried
             anew.append(_Seen(given, before))
             notices += estimate.notices
-        for position, seen in enumerate(anew, start=at):
-            self._seen[position] = seen
+        for _ in range(len(self._seen) - at):
+            self._seen.pop()
+        self._seen.extend(anew)
+        self._turns = first + len(rows)
         return self._decided(replace(estimate, notices=tuple(notices)))
 
     def observed(self, turn: int) -> Float:
@@ -370,10 +368,7 @@ class Twin:
         except (ArithmeticError, np.linalg.LinAlgError):
             held = False
         if not held:
-            raise InvalidObservationError(
-                f"twin {self.name!r}, step {turn}: the observation cannot be weighed, for beside what was "
-                "observed before its numbers leave no belief; check the sensors and the control in force"
-            )
+            raise InvalidObservationError(said("network.no_belief", name=self.name, turn=turn))
         return estimate
 
     def _index_of(self, control: int | str) -> int:

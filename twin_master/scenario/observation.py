@@ -17,6 +17,7 @@ from twin_master.scenario.section import (
     Section,
     check_one_or_each,
 )
+from twin_master.sentences import said
 
 Float = NDArray[np.float64]
 
@@ -56,15 +57,9 @@ class ModesSection(Section):
         if any(after[0] < before[1] for before, after in pairwise(ordered)):
             raise ValueError("`observation.modes.bands` overlap: a mode in both would be observed twice")
         if self.numbers and len(self.numbers) != len(self.bands):
-            raise ValueError(
-                f"`observation.modes.numbers` gives {len(self.numbers)} modes, and there are "
-                f"{len(self.bands)} bands"
-            )
+            raise ValueError(said("scenario.mode_numbers", numbers=len(self.numbers), bands=len(self.bands)))
         if not self.columns:
-            raise ValueError(
-                "`observation.modes.standard_deviation` names what is observed: one or more of frequency, "
-                "damping_ratio and, with two accelerometers or more, shape"
-            )
+            raise ValueError(said("scenario.mode_features"))
         return self
 
     @property
@@ -163,9 +158,7 @@ class ObservationSection(Section):
         if not isinstance(table, Mapping):
             return table
         if (table.get("role") == ROLE) != (table.get("modes") is not None):
-            raise ValueError(
-                f"the role `{ROLE}` needs the table `observation.modes`, and that needs the role"
-            )
+            raise ValueError(said("scenario.role_of_modes", role=ROLE))
         if table.get("modes") is None:
             return table
         modes = ModesSection.model_validate(table["modes"])

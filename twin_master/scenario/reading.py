@@ -17,6 +17,7 @@ from twin_master.errors import ScenarioError, UnknownScenarioError
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import GAINS, MOST_DRAWS, NUMBERS_BY_DEFAULT, Noticing
+from twin_master.sentences import said
 
 _OF_SEVERAL = ("component", "connection", "algorithm", "iterations", "tolerance")
 _OF_FMUS = ("binding", "isolated", "step_timeout", "parameters", "load", "seeds")
@@ -84,9 +85,7 @@ def find_scenario(name: str) -> Path:
     path = Path(name)
     if path.is_file():
         return path
-    raise UnknownScenarioError(
-        f"There is no scenario `{name}`: give the path of a TOML file or one of {', '.join(shipped)}."
-    )
+    raise UnknownScenarioError(said("scenario.unknown", name=name, shipped=", ".join(shipped)))
 
 
 def load_scenario(name_or_path: str | Path) -> LoadedScenario:

@@ -40,6 +40,7 @@ from twin_master.scenario.tables import (
     WatchSection,
     with_actions,
 )
+from twin_master.sentences import said
 
 LARGEST_STRAIN_NOISE = 0.1
 """Standard deviation of a strain gauge beyond which a unit was forgotten [1]."""
@@ -94,13 +95,10 @@ class StateFactor(Section):
             raise ValueError(f"`levels` of state `{self.name}` must increase, and {short(self.levels)} came")
         if len(self.prior) != len(self.levels):
             raise ValueError(
-                f"`prior` of state `{self.name}` must hold one probability for each of its "
-                f"{len(self.levels)} levels, and {len(self.prior)} came"
+                said("scenario.prior", name=self.name, levels=len(self.levels), prior=len(self.prior))
             )
         if abs(sum(self.prior) - 1.0) > ROW_SUM_TOLERANCE:
-            raise ValueError(
-                f"`prior` of state `{self.name}` must sum to 1, and sums to {sum(self.prior):.12g}"
-            )
+            raise ValueError(said("scenario.prior_sum", name=self.name, total=sum(self.prior)))
         return self
 
     @property
@@ -310,8 +308,13 @@ class Scenario(Section):
         for control in self.control:
             if set(control.values) != roles:
                 raise ValueError(
-                    f"every control must give a value to the same inputs: `{controls[0]}` gives "
-                    f"{short(sorted(roles))} and `{control.name}` gives {short(sorted(control.values))}"
+                    said(
+                        "scenario.inputs",
+                        first=controls[0],
+                        roles=short(sorted(roles)),
+                        name=control.name,
+                        values=short(sorted(control.values)),
+                    )
                 )
         check_known(self.mission.first_control, controls, "mission.first_control", "control")
         check_same(self.rewards.control, controls, "rewards.control", "control")
@@ -320,17 +323,11 @@ class Scenario(Section):
         if norm is not None:
             check_known(norm, tuple(sorted(roles)), "rewards.normalise_error_by", "control input")
             if any(control.values[norm] <= 0.0 for control in self.control):
-                raise ValueError(
-                    f"`rewards.normalise_error_by` divides by `{norm}`, which must be positive in every "
-                    "control"
-                )
+                raise ValueError(said("scenario.normaliser", norm=norm))
         self.transition.check(self.control_names, {factor.name: len(factor.levels) for factor in self.state})
         true = self.truth.probability
         if true and (self.truth.kind, self.transition.kind) != ("random_growth", "independent_worsening"):
-            raise ValueError(
-                "`truth.probability` belongs to the kind `random_growth`, and to transitions of the kind "
-                "`independent_worsening`"
-            )
+            raise ValueError(said("scenario.true_probability"))
         if true:
             check_same(true, controls, "truth.probability", "control")
         self._check_actions()
@@ -341,9 +338,7 @@ class Scenario(Section):
                 raise ValueError(f"`reference` gives `{name}` more than once: keep one of them")
         if self.truth.kind == "asset":
             if not self.asset.is_fmu:
-                raise ValueError(
-                    f"`truth.kind` `asset` needs an FMU, and the kind of the asset is `{self.asset.kind}`"
-                )
+                raise ValueError(said("scenario.needs_fmu", kind=self.asset.kind))
             check_same(self.truth.state, states, "truth.state", "state")
         if self.truth.kind == "random_growth" and self.truth.gains:
             raise ValueError("`truth.gains` belongs to the kind `scripted`, and the kind is `random_growth`")
@@ -354,8 +349,7 @@ class Scenario(Section):
         for fault in self.truth.sensor_faults:
             if fault.sensors != "all" and max(fault.sensors) > self.observation.count:
                 raise ValueError(
-                    f"`truth.sensor_faults.sensors` counts from 1 to {self.observation.count}, "
-                    f"and {max(fault.sensors)} came"
+                    said("scenario.faults", count=self.observation.count, came=max(fault.sensors))
                 )
         return self
 
@@ -365,19 +359,11 @@ class Scenario(Section):
             for state in (*action.inspects, *action.repairs):
                 check_known(state, self.state_names, f"action.{action.name}", "state")
             if action.repairs and self.truth.kind != "random_growth" and self.asset.kind != WATCHED_KIND:
-                raise ValueError(
-                    f"action `{action.name}` repairs, which a truth of the kind `random_growth` follows, and "
-                    f"the kind is `{self.truth.kind}`"
-                )
+                raise ValueError(said("scenario.repairs", name=action.name, kind=self.truth.kind))
         if self.readings and self.observation.modes is not None:
-            raise ValueError(
-                "`observation.modes` does not go together with actions that inspect: leave one of them out"
-            )
+            raise ValueError(said("scenario.modes_inspected"))
         if self.planner.inspections_a_turn is not None and (self.learning or self.notice):
-            raise ValueError(
-                "`planner.inspections_a_turn` is for assets that fly side by side, and twins with `learning`"
-                " or `notice` fly alone: leave one of them out"
-            )
+            raise ValueError(said("scenario.inspections"))
 
     def _check_modes(self) -> None:
         modes, record = self.observation.modes, self.truth.record
@@ -387,33 +373,30 @@ class Scenario(Section):
             return
         for name in ("learning", "notice"):
             if getattr(self, name) is not None:
-                raise ValueError(
-                    f"`{name}` does not take observations with a covariance of their own: leave it out"
-                )
+                raise ValueError(said("scenario.covariance", name=name))
         if self.observation.average_over_draws == "inside":
             raise ValueError("modes are averaged over the draws `outside`: leave out `average_over_draws`")
         if self.asset.kind == WATCHED_KIND:
             return
         if record is None:
-            raise ValueError(
-                "the role `modes` needs `truth.record`, which says how the record of a turn is made"
-            )
+            raise ValueError(said("scenario.record"))
         check_known(
             record.input, tuple(sorted(self.control[0].values)), "truth.record.input", "control input"
         )
         if modes.bands[-1][1] > 0.5 * record.sampling_rate:
             raise ValueError(
-                f"`truth.record.sampling_rate` {record.sampling_rate:g} shows nothing above "
-                f"{0.5 * record.sampling_rate:g} Hz, and a band ends at {modes.bands[-1][1]:g} Hz"
+                said(
+                    "scenario.sampling_rate",
+                    rate=record.sampling_rate,
+                    highest=0.5 * record.sampling_rate,
+                    band=modes.bands[-1][1],
+                )
             )
 
     def _check_sensors(self) -> None:
         count, chosen = self.observation.count, self.rewards.health_sensors
         if chosen != "all" and (max(chosen) > count or len(set(chosen)) != len(chosen)):
-            raise ValueError(
-                f"`rewards.health_sensors` must name different sensors from 1 to {count}, and "
-                f"{short(chosen)} came"
-            )
+            raise ValueError(said("scenario.health_sensors", count=count, chosen=short(chosen)))
         limited = count if chosen == "all" else len(chosen)
         check_one_or_each("rewards.health_limit", self.rewards.health_limit, limited)
         check_one_or_each("rewards.error_scale", self.rewards.error_scale, count)
@@ -421,10 +404,7 @@ class Scenario(Section):
             self.learning.check_sensors(count)
         for table in ("learning", "notice"):
             if getattr(self, table) is not None and self.observation.average_over_draws == "inside":
-                raise ValueError(
-                    f"`{table}` needs `observation.average_over_draws` `outside`: inside, each sensor has a "
-                    "parameter of its own"
-                )
+                raise ValueError(said("scenario.inside", table=table))
         check_one_or_each("truth.noise.standard_deviation", self.truth.noise.standard_deviation, count)
         for key, noise in (("observation", self.observation), ("truth.noise", self.truth.noise)):
             self._check_strain_noise(f"{key}.standard_deviation", noise.standard_deviation)
@@ -438,6 +418,5 @@ class Scenario(Section):
         for unit, given in zip(units, each, strict=True):
             if unit == "1" and given > LARGEST_STRAIN_NOISE:
                 raise ValueError(
-                    f"`{key}` is {given:g} as a strain, and no gauge is off by {LARGEST_STRAIN_NOISE:g}: "
-                    f"for microstrain write `{key}_microstrain = {given:g}`"
+                    said("scenario.strain_noise", key=key, given=given, most=LARGEST_STRAIN_NOISE)
                 )

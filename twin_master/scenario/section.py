@@ -7,6 +7,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from reporting.section import shown
+from twin_master.sentences import said
 
 UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 1.0e6}
 
@@ -61,9 +62,7 @@ def _check_percent(key: object, value: object) -> None:
 def check_one_or_each(key: str, value: object, count: int) -> None:
     """Check that what may be given for each sensor is given once, or once for each of `count` of them."""
     if isinstance(value, tuple) and len(value) != count:
-        raise ValueError(
-            f"`{key}` must be one value, or one for each of the {count} sensors, and {len(value)} came"
-        )
+        raise ValueError(said("scenario.one_or_each", key=key, count=count, came=len(value)))
 
 
 def _wrong_key(

@@ -24,6 +24,7 @@ from twin_master.scenario.section import (
     check_same,
     short,
 )
+from twin_master.sentences import said
 
 ROW_SUM_TOLERANCE = 1e-12
 """Largest departure of the sum of probabilities from one, as the graphical model has it."""
@@ -73,15 +74,10 @@ class Transition(Section):
             for state, size in levels.items():
                 table = tables[state]
                 if len(table) != size or any(len(row) != size for row in table):
-                    raise ValueError(
-                        f"`transition.tables.{name}.{state}` must be {size} rows of {size} probabilities"
-                    )
+                    raise ValueError(said("scenario.table_size", name=name, state=state, size=size))
                 worst = max(abs(sum(row) - 1.0) for row in table)
                 if worst > ROW_SUM_TOLERANCE:
-                    raise ValueError(
-                        f"each row of `transition.tables.{name}.{state}` must sum to 1, one misses it by "
-                        f"{worst:.3g}"
-                    )
+                    raise ValueError(said("scenario.table_sum", name=name, state=state, worst=worst))
 
 
 class Span(Section):
@@ -154,17 +150,11 @@ class TruthSection(Section):
     def _check(self) -> Self:
         if self.record is not None:
             if self.kind == "asset" or self.sensor_faults or self.noise.standard_deviation:
-                raise ValueError(
-                    "with `truth.record` the noise is that of the record (`truth.record.noise`), and the "
-                    "truth the scenario's: leave out `truth.noise`, `truth.sensor_faults`, the kind `asset`"
-                )
+                raise ValueError(said("scenario.record_noise"))
             return self
         if self.kind == "asset":
             if self.gains or self.sensor_faults or self.noise.standard_deviation:
-                raise ValueError(
-                    "the kind `asset` leaves damage, noise and faults to the asset: leave out `truth.gains`, "
-                    "`truth.noise` and `truth.sensor_faults`"
-                )
+                raise ValueError(said("scenario.asset_truth"))
         elif self.state or self.observation or self.received:
             raise ValueError("`state`, `observation` and `received` of `truth` belong to the kind `asset`")
         elif "noise" not in self.model_fields_set:
@@ -196,16 +186,10 @@ class Action(Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if bool(self.inspects) != (self.standard_deviation is not None):
-            raise ValueError(
-                f"action `{self.name}`: `inspects` and `standard_deviation` go together: the states that are "
-                "read, and how well"
-            )
+            raise ValueError(said("scenario.inspects", name=self.name))
         check_one_or_each("action.standard_deviation", self.standard_deviation, len(self.inspects))
         if not (self.inspects or self.repairs or self.ends):
-            raise ValueError(
-                f"action `{self.name}` does nothing that its control does not: give `inspects`, `repairs` or "
-                "`ends`"
-            )
+            raise ValueError(said("scenario.idle_action", name=self.name))
         return self
 
     @property

@@ -9,17 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from reporting.words import capital, parameter_title
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import Truth
 from twin_master.mission.turns import History
 from twin_master.network.estimator import Learnt
 from twin_master.scenario.schema import Scenario
-
-Float = NDArray[np.float64]
-
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
 """What is kept of each posterior; the last two bound the central 90 % interval."""

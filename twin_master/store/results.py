@@ -17,9 +17,6 @@ from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, MissionResult
 
-Float = NDArray[np.float64]
-
-
 Words = Mapping[str, str]
 _NONE: Words = MappingProxyType({})
 Entry = tuple[str, NDArray[Any], Words]

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.arrays import Float, Index
 from reporting.words import parameter_title
-from twin_master.assets.mismatch import Misfit
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
 from twin_master.scenario.schema import (
     FALLBACK_FIGURES,
@@ -19,9 +19,6 @@ from twin_master.scenario.schema import (
 )
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import MissionResult, printed_learnt, titles_of
-
-Float = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 _TOLERANCE = 1e-9
 _CHANGES_SAID = 3
@@ -143,7 +140,7 @@ def filtered_rms_error(model: GraphicalModel, filtered: Float, true_state: Float
     return np.asarray(np.sqrt(np.mean(error**2, axis=0)))
 
 
-def summarise(result: MissionResult, reward_mean: Float, misfit: Misfit | None = None) -> tuple[Figure, ...]:
+def summarise(result: MissionResult, reward_mean: Float, misfit: Float | None = None) -> tuple[Figure, ...]:
     """Return the figures of a mission; all of them are the same for the same seed.
 
     Parameters
@@ -153,7 +150,8 @@ def summarise(result: MissionResult, reward_mean: Float, misfit: Misfit | None =
     reward_mean : (T, R)
         Mean rewards under the filtered belief.
     misfit
-        Of the twin's model, where the asset is known to be another one.
+        Of the twin's model, (S, U, G), a share of what the asset shows, NaN where it shows nothing; where the
+        asset is known to be another one.
     """
     scenario, flight = result.scenario, result.flight
     step = scenario.mission.step_name
@@ -168,9 +166,13 @@ def summarise(result: MissionResult, reward_mean: Float, misfit: Misfit | None =
     figures += _learnt_figures(result)
     figures += _sensor_figures(flight.observed, step)
     if misfit is not None:
-        value, sensor = misfit.largest
-        rms = "misfit of the twin's model, rms over sensors and states"
-        shares = (rms, misfit.rms), (f"largest misfit, at sensor {sensor + 1}", value)
+        worst = np.nanmax(np.abs(misfit), axis=(0, 1))
+        sensor = int(np.nanargmax(worst))
+        told_rms = (
+            "misfit of the twin's model, rms over sensors and states",
+            float(np.sqrt(np.nanmean(misfit**2))),
+        )
+        shares = told_rms, (f"largest misfit, at sensor {sensor + 1}", float(worst[sensor]))
         for key, (title, share) in zip(MISFIT_FIGURES, shares, strict=True):
             figures.append(Figure(key, title, 100.0 * share, "%"))
     bound = flight.monitors.get("strain_error_bound")

@@ -7,6 +7,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_file, atomic_write_text
 from reporting.folders import restore_folder
@@ -15,7 +16,6 @@ from reporting.json_file import read_json
 from reporting.netcdf import read_groups
 from reporting.provenance import hash_record
 from twin_master.assets.asset_source import FlownAndBelieved
-from twin_master.assets.mismatch import Misfit
 from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.run_folder import FIELD_NAME, read_config, to_json
 from twin_master.store.mission_result import MissionResult, learnt_record
@@ -97,7 +97,7 @@ def store_flight(
     steps: int,
     figures: Sequence[Figure] = (),
     attributes: Mapping[str, Any] | None = None,
-    misfit: Misfit | None = None,
+    misfit: Float | None = None,
     write_field: Callable[[Path], object] | None = None,
 ) -> Callable[[], "DataTree"]:
     """Write all that a run or a watch leaves beside its report; return what gives its tree.

@@ -9,27 +9,24 @@ from array import array
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import Expected, expected_of
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
-from twin_master.network.estimator import Learnt, Notice
+from twin_master.network.estimator import Learnt
 from twin_master.network.inference import known_control, predict
 from twin_master.run_folder import PICTURE, VERDICT, read_config
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
-
-Float = NDArray[np.float64]
 
 TURNS_AT_ONCE = 200
 """Turns that are read before the viewers are answered again."""
@@ -37,124 +34,12 @@ TURNS_KEPT = 512
 """Turns in memory, those read last: more than two pages show at once."""
 
 
+Record = dict[str, Any]
+"""What a line of the journal says."""
+
+
 class BegunAnewError(LookupError):
     """Another flight has taken the place of the one that is looked at."""
-
-
-@dataclass(frozen=True)
-class SeenTurn:
-    """What a line of the journal says.
-
-    Attributes
-    ----------
-    turn : int
-        The turn that the twin was at.
-    observation_turn : int
-        The turn that was observed; an earlier one where the observation came late.
-    control_index : int
-        Control in force in the turn that was observed.
-    observed : (G,)
-        What the sensors said, SI; NaN where lost.
-    truth : (K,) or None
-        True state, SI; None where nobody knows it.
-    filtered : (S,)
-        Belief about the turn that the twin was at.
-    decision_probability : (U,)
-        What its next control was decided by.
-    learnt : dict of str to Learnt
-        Posterior of what is learnt.
-    notices : tuple of Notice
-        What the operator was told.
-    """
-
-    turn: int
-    observation_turn: int
-    control_index: int
-    observed: Float
-    truth: Float | None
-    filtered: Float
-    decision_probability: Float
-    learnt: Mapping[str, Learnt]
-    notices: tuple[Notice, ...]
-
-    @classmethod
-    def of(cls, record: Mapping[str, Any]) -> "SeenTurn":
-        """Return what a record of the journal says."""
-        return cls(
-            turn=record["turn"],
-            observation_turn=record.get("observation_turn", record["turn"]),
-            control_index=record["control_index"],
-            observed=array_of(record["observed"]),
-            truth=array_of(record["state"]) if "state" in record else None,
-            filtered=array_of(record["filtered"]),
-            decision_probability=array_of(record["decision_probability"]),
-            learnt={name: Learnt(**learnt) for name, learnt in record.get("learnt", {}).items()},
-            notices=_notices(record),
-        )
-
-
-def _notices(record: Mapping[str, Any]) -> tuple[Notice, ...]:
-    return tuple(Notice(**notice) for notice in record.get("notices", ()))
-
-
-class GrowingJournal:
-    """A journal that grows; each call of `news` gives the records that were added since the last.
-
-    Parameters
-    ----------
-    folder : Path
-        The run folder; the journal need not be there yet.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / JOURNAL_NAME
-        self._end = self._file_number = 0
-
-    def begun_anew(self) -> bool:
-        """Return whether another file took the place of the one read, or lines were taken back.
-
-        What was read is then forgotten, and `news` begins with the first line.
-        """
-        try:
-            found = self._path.stat()
-        except FileNotFoundError:
-            return False
-        if found.st_size >= self._end and self._file_number in (0, found.st_ino):
-            return False
-        self._end = self._file_number = 0
-        return True
-
-    def news(self, most: int) -> list[tuple[int, dict[str, Any]]]:
-        """Return whole new records, at most so many, and where each begins, in bytes, see `read`.
-
-        Raises
-        ------
-        NotResumableError
-            A line was changed.
-        """
-        found: list[tuple[int, dict[str, Any]]] = []
-        if not self._path.is_file() or self._path.stat().st_size == self._end:
-            return found
-        with suppress(FileNotFoundError), self._path.open("rb") as file:
-            self._file_number = os.fstat(file.fileno()).st_ino
-            for record, begin, end in islice(records_of(file, self._path, self._end), most):
-                found.append((begin, record))
-                self._end = end
-        return found
-
-    def read(self, places: Sequence[int]) -> list[SeenTurn] | None:
-        """Return the turns told by records that were news; None where the journal was begun anew since.
-
-        Raises
-        ------
-        NotResumableError
-            A line was changed.
-        """
-        with suppress(FileNotFoundError), self._path.open("rb") as file:
-            if os.fstat(file.fileno()).st_ino != self._file_number:
-                return None
-            return [SeenTurn.of(next(records_of(file, self._path, place))[0]) for place in places]
-        return None
 
 
 class Belief(NamedTuple):
@@ -224,11 +109,11 @@ class Flight:
         self.scenario: Scenario = parse_scenario(config["scenario"], str(folder))
         self._knowledge_of = self._kept_at()
         self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
-        self._journal = GrowingJournal(folder)
+        self._path, self._end, self._file_number = folder / JOURNAL_NAME, 0, 0
         # Where in the journal stand belief and observation of each turn; in memory are those last read.
         self._believed, self._observed = array("q"), array("q")
-        self._kept: OrderedDict[int, SeenTurn] = OrderedDict()
-        self._told: dict[int, tuple[Notice, ...]] = {}  # behind a turn, where none came
+        self._kept: OrderedDict[int, Record] = OrderedDict()
+        self._told: dict[int, list[Record]] = {}  # notices behind a turn, where none came
         self.pictures: list[Picture] = []
         self.number = 0
 
@@ -245,8 +130,9 @@ class Flight:
         RunFolderError
             The journal was changed.
         """
-        changed = self._journal.begun_anew()
+        changed = self._begun_anew()
         if changed:
+            self._end = self._file_number = 0
             self._believed, self._observed = array("q"), array("q")
             self._kept.clear()
             self._told.clear()
@@ -257,25 +143,50 @@ class Flight:
             self.knowledge = kept_knowledge(self.folder, self.scenario)
             self.number += 1
             changed = True
-        news = self._journal.news(TURNS_AT_ONCE)
+        news = self._news()
         for place, record in news:
             if "filtered" not in record:
                 self._take_in(record)
-                continue
-            seen = SeenTurn.of(record)
-            if seen.turn == self.turns:
+            elif record["turn"] == self.turns:
                 self._believed.append(place)
                 self._observed.append(place)
-                self._keep(seen.turn, seen)
+                self._keep(record["turn"], record)
             else:
-                self._revise(seen, place)
+                self._revise(record, place)
         return changed or bool(news)
+
+    def _begun_anew(self) -> bool:
+        """Return whether another file took the place of the journal, or lines were taken back."""
+        try:
+            found = self._path.stat()
+        except FileNotFoundError:
+            return False
+        return found.st_size < self._end or self._file_number not in (0, found.st_ino)
+
+    def _news(self) -> list[tuple[int, Record]]:
+        """Return whole new records, at most `TURNS_AT_ONCE`, and where each begins, in bytes."""
+        found: list[tuple[int, Record]] = []
+        if not self._path.is_file() or self._path.stat().st_size == self._end:
+            return found
+        with suppress(FileNotFoundError), self._path.open("rb") as file:
+            self._file_number = os.fstat(file.fileno()).st_ino
+            for record, begin, end in islice(records_of(file, self._path, self._end), TURNS_AT_ONCE):
+                found.append((begin, record))
+                self._end = end
+        return found
+
+    def _read(self, places: Sequence[int]) -> list[Record]:
+        """Return records that were news; `BegunAnewError` where the journal was begun anew since."""
+        with suppress(FileNotFoundError), self._path.open("rb") as file:
+            if os.fstat(file.fileno()).st_ino == self._file_number:
+                return [next(records_of(file, self._path, place))[0] for place in places]
+        raise BegunAnewError
 
     def _take_in(self, record: Mapping[str, Any]) -> None:
         """Take in what a watch noted where no turn came: notices, a verdict, a model that was adopted."""
         turn = max(self.turns - 1, 0)
-        if notices := _notices(record):
-            self._told[turn] = self._told.get(turn, ()) + notices
+        if notices := record.get("notices"):
+            self._told[turn] = self._told.get(turn, []) + notices
             self.number += 1
         verdict = record.get("model", {}).get("verdict", record.get("verdict", {}).get("folder", ""))
         if verdict and (found := _picture(turn, self.folder / verdict)):
@@ -290,73 +201,75 @@ class Flight:
             return None
         return found.st_ino, found.st_mtime_ns
 
-    def _revise(self, seen: SeenTurn, place: int) -> None:
+    def _revise(self, record: Record, place: int) -> None:
         """Take in an observation that came late: it stands in its turn, and the last belief has changed."""
-        if not 0 <= seen.observation_turn <= seen.turn == self.turns - 1:
+        turn = int(record["turn"])
+        observed = int(record.get("observation_turn", turn))
+        if not 0 <= observed <= turn == self.turns - 1:
             raise RunFolderError(
-                f"the journal in {self.folder} tells {self.scenario.mission.step_name} {seen.turn} where "
+                f"the journal in {self.folder} tells {self.scenario.mission.step_name} {turn} where "
                 f"{self.turns} was expected: it is of another version."
             )
-        self._believed[-1] = self._observed[seen.observation_turn] = place
-        self._kept.pop(seen.turn, None)
-        self._kept.pop(seen.observation_turn, None)
+        self._believed[-1] = self._observed[observed] = place
+        self._kept.pop(turn, None)
+        self._kept.pop(observed, None)
         self.number += 1
 
-    def _keep(self, turn: int, seen: SeenTurn) -> None:
-        self._kept[turn] = seen
+    def _keep(self, turn: int, record: Record) -> None:
+        self._kept[turn] = record
         if len(self._kept) > TURNS_KEPT:
             self._kept.popitem(last=False)
 
-    def seen(self, first: int, end: int) -> list[SeenTurn]:
-        """Return the turns first..end - 1.
+    def seen(self, first: int, end: int) -> list[Record]:
+        """Return what the journal says of the turns first..end - 1.
+
+        An observation that came late stands, with its control, in the line of its own turn.
 
         Raises
         ------
         BegunAnewError
             Another flight has taken the place of this one; `update` tells it.
         """
-        missing = [turn for turn in range(first, end) if turn not in self._kept]
-        believed = self._journal.read([self._believed[turn] for turn in missing])
-        late = [n for n, turn in enumerate(missing) if self._observed[turn] != self._believed[turn]]
-        observed = self._journal.read([self._observed[missing[n]] for n in late])
-        if believed is None or observed is None:
-            raise BegunAnewError
-        for n, own in zip(late, observed, strict=True):
-            believed[n] = replace(believed[n], observed=own.observed, control_index=own.control_index)
         found = {turn: self._kept[turn] for turn in range(first, end) if turn in self._kept}
-        for turn, seen in zip(missing, believed, strict=True):
-            found[turn] = seen
-            self._keep(turn, seen)
+        missing = [turn for turn in range(first, end) if turn not in found]
+        late = [turn for turn in missing if self._observed[turn] != self._believed[turn]]
+        found |= zip(missing, self._read([self._believed[turn] for turn in missing]), strict=True)
+        for turn, own in zip(late, self._read([self._observed[turn] for turn in late]), strict=True):
+            found[turn] = found[turn] | {name: own[name] for name in ("observed", "control_index")}
+        for turn in missing:
+            self._keep(turn, found[turn])
         for turn in found.keys() & self._told.keys():
-            found[turn] = replace(found[turn], notices=found[turn].notices + self._told[turn])
+            found[turn] = found[turn] | {"notices": found[turn].get("notices", []) + self._told[turn]}
         return [found[turn] for turn in range(first, end)]
 
     def observed(self, first: int, end: int) -> Float:
         """Return what the sensors said in turns first..end - 1: (n, G), SI; NaN where lost."""
         sensors = self.scenario.observation.count
-        return np.array([turn.observed[:sensors] for turn in self.seen(first, end)])
+        return np.array([array_of(turn["observed"][:sensors]) for turn in self.seen(first, end)])
 
     def truth(self, first: int, end: int) -> Float:
         """Return the true state of turns first..end - 1: (n, K), SI; NaN where nobody knows it."""
         unknown = np.full(len(self.scenario.state), np.nan)
-        return np.array([unknown if turn.truth is None else turn.truth for turn in self.seen(first, end)])
+        return np.array(
+            [array_of(turn["state"]) if "state" in turn else unknown for turn in self.seen(first, end)]
+        )
 
     def believed(self, first: int, end: int) -> Belief:
         """Return what the twin believed of each of the turns first..end - 1 when it was flown."""
         turns = self.seen(first, end)
         joint = known_control(
-            np.array([turn.filtered for turn in turns]),
-            [turn.control_index for turn in turns],
+            np.array([turn["filtered"] for turn in turns]),
+            [turn["control_index"] for turn in turns],
             len(self.knowledge.model.controls),
         )
-        decided = np.array([turn.decision_probability for turn in turns])
+        decided = np.array([turn["decision_probability"] for turn in turns])
         observed = self.observed(first, end)
         if self.knowledge.expectation is None or not turns:
             return self._belief(joint, observed, decided)
         parts = []
         for turn, own, seen in zip(turns, joint, observed, strict=True):
-            u = slice(turn.control_index, turn.control_index + 1)
-            parts.append(self.knowledge.expectation.of_marginals(turn.learnt, own[None, :, u], u, seen))
+            u = slice(turn["control_index"], turn["control_index"] + 1)
+            parts.append(self.knowledge.expectation.of_marginals(_learnt(turn), own[None, :, u], u, seen))
         together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
         return Belief(joint.sum(axis=-1), Expected(**together), decided)
 
@@ -364,18 +277,21 @@ class Flight:
         """Return what the twin expected after a turn of the H turns to come."""
         model, plan = self.knowledge.model, self.knowledge.plan
         seen = self.seen(turn, turn + 1)[0]
-        coming = predict(
-            model, seen.filtered, seen.control_index, plan.policy, self.scenario.mission.prediction_steps
-        )
+        horizon, filtered = self.scenario.mission.prediction_steps, array_of(seen["filtered"])
+        coming = predict(model, filtered, seen["control_index"], plan.policy, horizon)
         if self.knowledge.expectation is None:
             return self._belief(coming.joint, None, coming.control_probability)
-        expected = self.knowledge.expectation.of_marginals(seen.learnt, coming.joint, slice(None), None)
+        expected = self.knowledge.expectation.of_marginals(_learnt(seen), coming.joint, slice(None), None)
         return Belief(coming.joint.sum(axis=-1), expected, coming.control_probability)
 
     def _belief(self, joint: Float, observed: Float | None, control_probability: Float) -> Belief:
         known = self.knowledge
         expected = expected_of(known.sensor_model, known.rewards, joint, observed, quantiles=False)
         return Belief(joint.sum(axis=-1), expected, control_probability)
+
+
+def _learnt(record: Record) -> dict[str, Learnt]:
+    return {name: Learnt(**learnt) for name, learnt in record.get("learnt", {}).items()}
 
 
 def is_prepared(folder: Path) -> bool:

@@ -18,8 +18,7 @@ from reporting.errors import ReportingError
 from reporting.page import script_source
 from twin_master.errors import TwinMasterError, ViewError
 from twin_master.viewer.flight import Flight
-from twin_master.viewer.messages import Request, Teller, parse_request
-from twin_master.viewer.scene import page_html, scene_of
+from twin_master.viewer.messages import Request, Teller, page_html, scene_of
 
 ADDRESS = "127.0.0.1"
 POLL_MILLISECONDS = 15.0
@@ -86,7 +85,7 @@ class _Turns(WebSocketHandler):
 
     def on_message(self, message: str | bytes) -> None:
         try:
-            self._viewers.ask(self, parse_request(message))
+            self._viewers.ask(self, Request.model_validate_json(message))
         except ValueError as error:
             self.close(1003, str(error)[:100])
 

@@ -1,15 +1,14 @@
 """Messages from files, recorded or growing, from standard input, and from a program."""
 
 import csv
-import io
 import json
+import math
 import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
-from select import select
 from typing import IO, Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.growing import GrowingFile, Place, found, rotated
+from twin_master.watch.growing import GrowingFile, Pipe, Place, found, rotated
 from twin_master.watch.intake import MISSING, LiveFeed
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 
@@ -112,19 +111,17 @@ class CsvFeed(_FileFeed):
         """Return the rows behind a place."""
         with suppress(MissionInputError):
             self._read_header(found(self._path, place, follow=self._follow) or self._path)
-        stream, before = GrowingFile(self._path, place, follow=self._follow), 0
-        with io.BufferedReader(stream) as file:
-            for line in _lines(file, follow=self._follow):
-                if line is None:
-                    yield None, ""
-                    continue
-                if stream.cut:
-                    yield Refused(_CUT.format(self._path.name, stream.cut)), ""
-                    stream.cut = 0
-                first, before = stream.begins(before), file.tell()
-                self.place = stream.place(before)
-                if not (first and self._is_header(line)):
-                    yield self._message(line), shown(line)
+        stream = GrowingFile(self._path, place, follow=self._follow)
+        for line in stream:
+            if line is None:
+                yield None, ""
+                continue
+            if stream.cut:
+                yield Refused(_CUT.format(self._path.name, stream.cut)), ""
+                stream.cut = 0
+            self.place = stream.place
+            if not (stream.begins and self._is_header(line)):
+                yield self._message(line), shown(line)
 
     def _is_header(self, line: bytes | Refused) -> bool:
         with suppress(MissionInputError, ValueError):
@@ -139,24 +136,19 @@ class CsvFeed(_FileFeed):
             cells = _cells(line)
         except ValueError as error:
             return Refused(f"it is no line of CSV: {str(error)[:80]}")
-        try:
-            if len(cells) != len(self._names):
-                return Refused(f"{len(self._names)} cells are expected, and {len(cells)} came")
-            return self._row(cells)
-        except Refused as refusal:
-            return refusal
-        except (ValueError, OverflowError) as error:
-            return Refused(f"a cell is no number: {str(error)[:80]}")
-
-    def _row(self, cells: list[str]) -> Message:
+        if len(cells) != len(self._names):
+            return Refused(f"{len(self._names)} cells are expected, and {len(cells)} came")
         record: dict[str, object] = {
             name: cell for name, cell in zip(self._names, cells, strict=True) if cell
         }
-        for name, reader in (("control", str), ("turn", _whole), ("time", float)):
-            if name in record:
-                cell = str(record[name])
-                record[name] = None if cell.lower() in _LOST else reader(cell)
-        return self._reader.read(record)
+        try:
+            for name, reader in (("control", str), ("turn", _whole), ("time", float)):
+                if name in record:
+                    cell = str(record[name])
+                    record[name] = None if cell.lower() in _LOST else reader(cell)
+        except (ValueError, OverflowError) as error:
+            return Refused(f"a cell is no number: {str(error)[:80]}")
+        return parsed(self._reader, record)
 
 
 class RunFeed:
@@ -233,15 +225,17 @@ class FolderFeed(_FileFeed):
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return the observations behind a place."""
         stream = GrowingFile(self._path, place)
-        with io.BufferedReader(stream) as file:
-            while (line := file.readline()).endswith(b"\n"):
-                record, self.place = whole_record(line), stream.place(file.tell())
-                if record is None:
-                    with self._path.open("rb") as journal:
-                        number = journal.read(self.place["read"]).count(b"\n")
-                    yield Refused(f"line {number} of {self._path.name} was changed or is damaged"), ""
-                elif _came(record):
-                    yield self._message(record), f"turn {record.get('turn')}"
+        stream.longest = math.inf
+        for line in stream:
+            if not isinstance(line, bytes) or not line.endswith(b"\n"):
+                return  # cut off by a kill
+            record, self.place = whole_record(line), stream.place
+            if record is None:
+                with self._path.open("rb") as journal:
+                    number = journal.read(self.place["read"]).count(b"\n")
+                yield Refused(f"line {number} of {self._path.name} was changed or is damaged"), ""
+            elif _came(record):
+                yield self._message(record), f"turn {record.get('turn')}"
 
     def _message(self, record: Mapping[str, Any]) -> Message | Refused:
         try:
@@ -268,28 +262,8 @@ class JsonLinesFeed(LiveFeed):
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return what comes; where silence is to be noticed, None while nothing does."""
         stream = self._stream or sys.stdin.buffer
-        for line in _lines(_Pipe(stream) if self._looks else stream):
+        for line in Pipe(stream, looks=self._looks):
             yield (None, "") if line is None else (parsed(self._reader, line), shown(line))
-
-
-class _Pipe:
-    """A stream that is not waited for: its lines are None while nothing has come."""
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._descriptor, self._came, self._ended = stream.fileno(), b"", False
-
-    def readline(self, most: int) -> bytes | None:
-        """Return a line, or a piece of so many bytes; nothing at the end."""
-        if b"\n" not in self._came and len(self._came) < most and not self._ended:
-            if not select([self._descriptor], [], [], 0.0)[0]:
-                return None
-            self._came += (piece := os.read(self._descriptor, 65_536))
-            self._ended = not piece
-        end = self._came.find(b"\n", 0, most) + 1
-        if not end and not self._ended and len(self._came) < most:
-            return None
-        line, self._came = self._came[: end or most], self._came[end or most :]
-        return line
 
 
 class MappingFeed(LiveFeed):
@@ -341,31 +315,6 @@ def file_feed(path: Path, scenario: Scenario, *, follow: bool = False) -> CsvFee
 
 def _is_netcdf(path: Path) -> bool:
     return path.suffix.lower() == ".nc"
-
-
-def _lines(file: "IO[bytes] | _Pipe", *, follow: bool = False) -> Iterator[bytes | Refused | None]:
-    """Return whole lines; one that is too long is skipped in pieces, and the rest of a file is a line.
-
-    A file that is followed has no last line: None stands for nothing new, each time that it is asked.
-    """
-    part = b""
-    too_long = False
-    while True:
-        piece = file.readline(LARGEST_MESSAGE + 1)
-        if not piece:
-            if follow or piece is None:
-                yield None
-                continue
-            if part and not too_long:
-                yield part
-            return
-        ended = piece.endswith(b"\n")
-        part = b"" if too_long else part + piece
-        if len(part) > LARGEST_MESSAGE:
-            too_long, part = True, b""
-        if ended:
-            yield Refused(f"a message has at most {LARGEST_MESSAGE} bytes") if too_long else part
-            part, too_long = b"", False
 
 
 def _whole(cell: str) -> int:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
@@ -31,9 +31,8 @@ from twin_master.network.twin import Twin
 from twin_master.run_folder import PATCH, PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.results import groups_of
 from twin_master.store.summary import Figure
-from twin_master.store.writing import store_flight, tree_of
+from twin_master.store.writing import store_flight
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping, listening
 from twin_master.watch.keeping import Keeper, Standing
 from twin_master.watch.teaching import (
@@ -50,7 +49,7 @@ from twin_master.watch.teaching import (
 from twin_master.watch.trial import CANNOT, Outcome, judged, patched_model
 
 if TYPE_CHECKING:
-    import xarray as xr
+    pass
 
 STORED_TURNS = 1_000
 """The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
@@ -58,12 +57,8 @@ FLUSH_SECONDS = 1.0
 """Of a recorded file, which is read again after a power failure; live turns are flushed one by one."""
 
 
-@dataclass(frozen=True)
-class Patched:
-    """A patch of the twin's model, and the turn from which on it is believed."""
-
-    file: Path
-    from_turn: int
+Patched = tuple[Path, int]
+"""A patch of the twin's model, and the turn from which on it is believed."""
 
 
 class Watch:
@@ -186,7 +181,7 @@ class Watch:
         with JournalFile(self.folder, self._hash, seconds) as self._journal:
             self._take_up()
             if patched is not None:
-                self._patch(patched)
+                self._patch(*patched)
             found, last = replay(self._path, self.models, self.scenario.watch.lag)
             intake.restore(last.get("intake"))
             if last:
@@ -234,15 +229,15 @@ class Watch:
             judged, self._path, self._journal.size, self.scenario, models, patch, from_turn, compared
         )
 
-    def _patch(self, patched: Patched) -> None:
+    def _patch(self, file: Path, first: int) -> None:
         """Believe a patch that is given from a turn on."""
         turns = last_turn(self._path)[0] + 1
-        if not turns or not 0 <= patched.from_turn <= turns:
+        if not turns or not 0 <= first <= turns:
             raise MissionInputError(
                 f"--from-turn names one of the {turns} turns watched so far, or the next one."
             )
-        outcome = self.trial(patched.file, patched.from_turn)(progress=self._progress)
-        self.adopt(outcome, None, self._kept_verdict(patched.file.parent))
+        outcome = self.trial(file, first)(progress=self._progress)
+        self.adopt(outcome, None, self._kept_verdict(file.parent))
 
     def _kept_verdict(self, found: Path) -> str:
         """Keep the missing force that a verdict shows, for viewers; return where, empty without one."""
@@ -318,11 +313,6 @@ class Watch:
         found, _ = replay(self._path, self.models, None, first_turn=first)
         flight = replace(found.behind(first - found.first_turn), notices=self.told(first))
         return MissionResult(self.scenario, self.models[-1].knowledge, flight)
-
-    @property
-    def tree(self) -> "xr.DataTree":
-        """The last turns as `open_run` returns them, without a file."""
-        return tree_of(groups_of(self.result(last_turn(self._path)[0] + 1, STORED_TURNS)), {})
 
     def told(self, first: int) -> list[tuple[int, Notice]]:
         """Return what the operator was told in the turns from `first` on, each sentence once.

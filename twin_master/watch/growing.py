@@ -3,15 +3,16 @@
 import io
 import os
 import re
-from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from functools import lru_cache
 from glob import escape
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from select import select
+from typing import IO, Any
+
+from twin_master.watch.message import LARGEST_MESSAGE, Refused
 
 Place = Mapping[str, Any]
 """Where a feed stands behind a message, as JSON: in a file the hash of its `beginning`, and bytes `read`."""
@@ -20,6 +21,8 @@ RECOGNISED_BY = 9
 """First lines of a file by which it is known again, also under another name."""
 _LONGEST = 1_000_000
 """Bytes of these at most."""
+_PIECE = 65_536
+"""Bytes that are read at once."""
 _NUMBER, _DATE = re.compile(r"\.\d{1,6}"), re.compile(r"[.-]\d{4}-?\d\d-?\d\d[\d_-]*")
 
 
@@ -64,89 +67,144 @@ def _hash(beginning: bytes) -> str:
     return sha256(beginning).hexdigest()
 
 
-@dataclass
-class _Piece:
-    """A file within the stream: at which byte of the stream, and of its own, it was begun; how it begins."""
+class Lines:
+    """Whole lines of what comes in pieces; what is too long is refused, and the rest at the end is a line.
 
-    start: int
-    position: int
-    beginning: bytes
+    Attributes
+    ----------
+    left : int
+        Bytes of the last piece behind the last line.
+    first : bool
+        Whether the last line began with its piece.
+    """
+
+    longest: float = LARGEST_MESSAGE
+    left, first = 0, False
+
+    def pieces(self) -> Iterator[bytes | None]:
+        """Return what comes: None where nothing has come yet; nothing, `b""`, where no line goes on."""
+        raise NotImplementedError
+
+    def __iter__(self) -> Iterator[bytes | Refused | None]:
+        line: bytes | Refused = b""
+        for came in self.pieces():
+            if came is None:
+                yield None
+                continue
+            if not came and line:
+                self.first = False
+                yield line
+                line = b""
+            self.left = len(came)
+            for piece in io.BytesIO(came):
+                self.first = self.left == len(came) and not line
+                self.left -= len(piece)
+                if isinstance(line, bytes) and len(line := line + piece) > self.longest:
+                    line = Refused(f"a message has at most {self.longest} bytes")
+                if piece.endswith(b"\n"):
+                    yield line
+                    line = b""
+        if isinstance(line, bytes) and line:
+            yield line
 
 
-class GrowingFile(io.RawIOBase):
-    """A file; where it is followed, with those that take its name, as one stream without end.
+class Pipe(Lines):
+    """Lines of a stream; one that `looks` is not waited for while nothing has come."""
 
-    A file that was renamed is read to its end once there is something in the next one: its writer has left it
-    then. What was not read of a file that was copied and cut is read from the copy.
+    def __init__(self, stream: IO[bytes], *, looks: bool) -> None:
+        self._stream, self._looks = stream, looks
+
+    def pieces(self) -> Iterator[bytes | None]:
+        """Return what comes until the stream ends."""
+        came: bytes | None = None
+        while came != b"":
+            silent = self._looks and not select([self._stream], [], [], 0.0)[0]
+            came = None if silent else self._stream.read1(_PIECE)  # type: ignore[attr-defined]
+            if came != b"":
+                yield came
+
+
+class GrowingFile(Lines):
+    """A file of lines, from a place in it on; one that is followed has no end.
 
     Parameters
     ----------
     path : Path
-    place : mapping or None
-        Behind which it begins; at the begin of the file where that is not found.
+    place : mapping, optional
+        Where to begin; at the beginning of the file where it is not of this one.
     follow : bool
+        Go on in the files that take the place of this one. A file that was renamed is read to its end, then
+        those that came after it; a copy of one that was cut is read to its end, then the file again.
 
     Attributes
     ----------
     cut : int
-        Where a file was cut of which there is no copy, in bytes; 0 where none was.
+        Bytes read of a file that was cut, and of which no copy was found; to be set to 0 by who tells it.
     """
 
     def __init__(self, path: Path, place: Place | None = None, *, follow: bool = False) -> None:
-        super().__init__()
         self._path, self._follow = path, follow
-        self._length, self.cut = 0, 0
-        self._whole, self._torn, self._copied = True, False, False
-        self._pieces: deque[_Piece] = deque()
+        self.cut, self._copied = 0, False
         self._open((found(path, place, follow=follow) or path).open("rb", buffering=0), place)
 
     def _open(self, file: io.FileIO, place: Place | None) -> None:
-        """Go on with a file: behind a place, if it is in there."""
         position = place["read"] if place is not None and _holds(file, place, self._follow) else 0
-        self._file = file
-        self._file.seek(0)
-        beginning = self._file.read(min(position, _LONGEST))
-        self._file.seek(position)
-        self._pieces.append(_Piece(self._length, position - self._torn, _beginning(beginning)))
+        file.seek(0)
+        self._beginning = _beginning(file.read(min(position, _LONGEST)))
+        file.seek(position)
+        self._file, self._read, self.left = file, position, 0
 
-    def readable(self) -> bool:
-        """Return that it can be read."""
-        return True
+    @property
+    def place(self) -> Place:
+        """Where the last line ends."""
+        read = self._read - self.left
+        return {"beginning": _hash(_beginning(self._beginning[:read])), "read": read}
 
-    def tell(self) -> int:
-        """Return the bytes of the stream so far."""
-        return self._length
+    @property
+    def begins(self) -> bool:
+        """Whether the last line is the first of a file."""
+        return self.first and self._begun
 
-    def readinto(self, buffer: Any) -> int:
-        """Read what there is; 0 where there is nothing yet."""
-        if self._torn:  # no line goes on in the next file
-            buffer[:1], self._torn = b"\n", False
-            self._length += 1
-            return 1
-        count = self._file.readinto(buffer) or 0
-        if self._follow and self._was_cut():
-            place = self._place(self._pieces[-1], self._length)
-            copy = found(self._path, place, follow=True)
-            self.cut = 0 if copy else place["read"]
-            file = (copy or self._path).open("rb", buffering=0)
-            return self._go_on(file, buffer, copied=copy is not None)
-        following = self._following() if self._follow and not count else None
-        if following is not None:
-            count = self._file.readinto(buffer) or 0  # the last that its writer has left
-            if not count:
-                return self._go_on(following, buffer)
-            following.close()
-        if count:
-            self._whole = buffer[count - 1] == ord("\n")
-            self._length += count
-            piece = self._pieces[-1]
-            if piece.beginning.count(b"\n") < RECOGNISED_BY and len(piece.beginning) < _LONGEST:
-                piece.beginning = _beginning(piece.beginning + bytes(buffer[:count]))
-        return count
+    def pieces(self) -> Iterator[bytes | None]:
+        """Return what has come; a file that another one takes the place of is read to its end before."""
+        try:
+            while True:
+                self.left, place = 0, self.place
+                came = self._file.read(_PIECE)
+                if self._follow and self._was_cut():
+                    copy = found(self._path, place, follow=True)
+                    self.cut = 0 if copy else place["read"]
+                    file = (copy or self._path).open("rb", buffering=0)
+                    yield from self._go_on(file, place, copied=copy is not None)
+                    continue
+                following = self._following() if self._follow and not came else None
+                if following is not None:
+                    came = self._file.read(_PIECE)  # the last that its writer has left
+                    if not came:
+                        yield from self._go_on(following, place)
+                        continue
+                    following.close()
+                if came and self._beginning.count(b"\n") < RECOGNISED_BY and len(self._beginning) < _LONGEST:
+                    self._beginning = _beginning(self._beginning + came)
+                if not came and not self._follow:
+                    return
+                self._begun, self._read = place["read"] == 0, self._file.tell()
+                yield came or None
+        finally:
+            self._file.close()
+
+    def _go_on(self, file: io.FileIO, place: Place, *, copied: bool = False) -> Iterator[bytes]:
+        """Read another file; a line goes on there only where it is, or follows, a copy of this one."""
+        joined = self._copied or copied
+        self._file.close()
+        self._open(file, place)
+        self._copied = copied
+        if not joined:
+            yield b""
 
     def _was_cut(self) -> bool:
         """Return whether the file is not any more what was read of it, also where it has grown again."""
-        at, beginning = self._file.tell(), self._pieces[-1].beginning
+        at, beginning = self._file.tell(), self._beginning
         self._file.seek(0)
         same = self._file.read(len(beginning)) == beginning
         self._file.seek(at)
@@ -173,30 +231,3 @@ class GrowingFile(io.RawIOBase):
 
     def _listed(self) -> dict[Path, int]:
         return {file: file.stat().st_ino for file in (*rotated(self._path), self._path)}
-
-    def _go_on(self, file: io.FileIO, buffer: Any, *, copied: bool = False) -> int:
-        """Read on in another file; a line goes on only into a copy, and from there into what was cut."""
-        self._torn = not (self._whole or self._copied or copied)
-        self._file.close()
-        self._open(file, self._place(self._pieces[-1], self._length))
-        self._copied = copied
-        return self.readinto(buffer)
-
-    def begins(self, offset: int) -> bool:
-        """Return whether a file begins at a byte of the stream."""
-        return any(piece.position + offset == piece.start for piece in self._pieces)
-
-    def place(self, offset: int) -> Place:
-        """Return the place behind a byte of the stream; those before it are not asked for any more."""
-        while len(self._pieces) > 1 and self._pieces[1].start < offset:
-            self._pieces.popleft()
-        return self._place(self._pieces[0], offset)
-
-    def _place(self, piece: _Piece, offset: int) -> Place:
-        read = piece.position + offset - piece.start
-        return {"beginning": _hash(_beginning(piece.beginning[:read])), "read": read}
-
-    def close(self) -> None:
-        """Let go of the file."""
-        self._file.close()
-        super().close()

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from reporting.files import atomic_write_text, write_error
 from twin_master.errors import TwinMasterError
 from twin_master.learning.setup import words_of
@@ -24,9 +24,6 @@ from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
 from twin_master.watch.growing import Place
 from twin_master.watch.message import Message, Refused
-
-Float = NDArray[np.float64]
-
 
 REJECTED_NAME = "rejected.jsonl"
 REJECTED_KEPT = 10_000

@@ -12,14 +12,12 @@ from difflib import get_close_matches
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from reporting.arrays import Float
 from reporting.json_file import parse_json
 from reporting.words import listing
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
-
-Float = NDArray[np.float64]
 
 LARGEST_MESSAGE = 1_000_000
 """Bytes of a message; a larger one is refused unread."""

@@ -27,7 +27,7 @@ from twin_master.store.writing import SUMMARY_NAME
 from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.broker import Broker, broker_of, is_broker
 from twin_master.watch.feeds import JsonLinesFeed, MappingFeed, file_feed
-from twin_master.watch.folder import STORED_TURNS, Patched, Watch
+from twin_master.watch.folder import STORED_TURNS, Watch
 from twin_master.watch.intake import Counts, Feed
 from twin_master.watch.mqtt import BEGIN_ANEW, CLIENT_SUFFIX, MqttFeed
 from twin_master.watch.teaching import Search, check_teachable
@@ -248,7 +248,7 @@ def watch(
     loaded = scenario if isinstance(scenario, LoadedScenario | None) else load_scenario(scenario)
     given, progress = given_overrides(overrides), progress or SilentProgress()
     authority = None if ca_file is None else Path(ca_file)
-    patch = None if model_patch is None or from_turn is None else Patched(Path(model_patch), from_turn)
+    patch = None if model_patch is None or from_turn is None else (Path(model_patch), from_turn)
     if (model_patch, from_turn) != (None, None) and (patch is None or not resume):
         raise MissionInputError("--model-patch and --from-turn go together, with --resume.")
     if loaded is not None:

@@ -48,7 +48,7 @@ def changed(problem, *, record=None, size=None, shift=0.0, place="middle", fligh
 
 def asked(problem, term=kit.OFFSET):
     """Return the fit of a term, the directions beside it and their tests."""
-    found = kit.fitted(problem, term, iterations=40)
+    found = kit.fitted(problem, term)
     along = directions(problem, found)
     return found, along, score_tests(problem, found, along)
 

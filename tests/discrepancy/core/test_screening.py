@@ -26,7 +26,7 @@ from . import kit
 def screened():
     """Problem, fit without effect, screen, two linear effects (wide priors) with their changes."""
     problem = kit.closed_problem(seed=12, effect=0.12)
-    none = kit.fitted(problem, iterations=40)
+    none = kit.fitted(problem)
     screen = Screen(problem, none)
     terms = (
         Term(kit.offset_effect(deviation=10.0), "y1"),
@@ -65,7 +65,7 @@ def test_pairs_are_fitted_together_and_one_change_is_no_pair(screened):
     problem, none, screen, terms, changes = screened
     options = {change.term.effect.identifier: [change] for change in changes}
     ((misfit, first, second),) = list(pairs(options, screen.sign))
-    found = kit.fitted(problem, *terms, iterations=40)
+    found = kit.fitted(problem, *terms)
     assert none.objective - found.objective == pytest.approx(-misfit, rel=0.02, abs=0.05)
     start = np.concatenate((rescaled(first), rescaled(second)))
     np.testing.assert_allclose(start, found.point.effect, rtol=0.03, atol=1e-3)
@@ -76,7 +76,7 @@ def test_gain_is_what_a_fit_achieves(screened):
     """For a linear effect with a wide prior the screen is the fit."""
     problem, none, _, terms, changes = screened
     for term, change in zip(terms, changes, strict=True):
-        found = kit.fitted(problem, term, iterations=40)
+        found = kit.fitted(problem, term)
         prior = 0.5 * float(found.point.effect @ found.point.effect)
         assert none.objective - found.objective + prior == pytest.approx(change.gain, rel=0.02, abs=0.03)
         assert rescaled(change)[0] == pytest.approx(found.point.effect[0], rel=0.02, abs=1e-4)
@@ -87,7 +87,7 @@ def test_noise_unknown_to_the_record_counts_by_what_is_left():
     sizes = []
     for noise in (kit.NOISE, None):
         problem = kit.closed_problem(seed=13, effect=0.12, noise=noise)
-        none = kit.fitted(problem, iterations=40)
+        none = kit.fitted(problem)
         sizes.append(next(iter(Screen(problem, none).changes(kit.OFFSET))).size)
         if noise:  # sizes agree in units of what is left
             left = none.sums[0] / (problem.counts[0] - none.spent[0])
@@ -211,7 +211,7 @@ RIPPLES = 200.0
 
 def test_the_misfit_rises_by_the_covariance_where_all_is_linear():
     problem = kit.closed_problem(seed=3, effect=0.2)
-    found = kit.fitted(problem, kit.OFFSET, iterations=40)
+    found = kit.fitted(problem, kit.OFFSET)
     screen = Screen(problem, found, record_noise=False)
     (centre,), deviation = found.point.effect, float(np.sqrt(found.effect_covariance[0, 0]))
     for steps in (-2.0, 0.5, 1.0):
@@ -235,10 +235,10 @@ def rippled(steepest):
 
 def test_intervals_are_as_wide_as_the_posterior_behind_ripples():
     problem = kit.closed_problem(seed=3, effect=0.2)
-    smooth = kit.fitted(problem, kit.OFFSET, iterations=40)
+    smooth = kit.fitted(problem, kit.OFFSET)
     (course,) = named_effects(problem, smooth)[0].parameters
     candidate = Candidate((Term(rippled(course.value), "y1"),))
-    found = fit(problem, candidate, smooth.point, iterations=40)
+    found = fit(problem, candidate, smooth.point)
     drawn = with_draws(problem, found)
     (narrow,) = named_effects(problem, found)[0].parameters
     (wide,) = named_effects(problem, drawn)[0].parameters

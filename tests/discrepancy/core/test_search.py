@@ -21,46 +21,14 @@ from discrepancy.fits.screening import Screen
 from discrepancy.judgement.separability import _distance
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe
-from discrepancy.search.growing_records import Beginnings, gap_row
 from discrepancy.search.honest_evidence import left_by, refitted, widened
-from discrepancy.search.hypotheses import are_related
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.runtime.patch import ModelPatch, PowerStiffness
-from tests.discrepancy.rigs import FEW, measured
+from tests.discrepancy.rigs import measured
 from tests.refusals import Inputs
 
 from . import kit
-
-
-@pytest.mark.parametrize(
-    ("hidden", "values", "taken"),
-    [
-        ("joint_micro_slip", {"stiffness_share": 0.3, "slip_ratio": 0.2}, "bouc_wen_hysteresis"),
-        pytest.param(
-            "bouc_wen_hysteresis", {"stiffness_share": 0.3, "yield_ratio": 0.3}, "joint_micro_slip",
-            marks=pytest.mark.long,
-        ),
-    ],
-)  # fmt: skip
-def test_a_relative_is_reached_from_what_is_taken_for_it(hidden, values, taken):
-    problem = kit.BENCH.problem(3, kit.BENCH.patch(hidden, values, "joint"))
-    right, wrong = kit.chosen(hidden, taken)
-
-    def near(effect, scaled):
-        candidate = Candidate((Term(effect, "joint"),))
-        start = replace(problem.start(candidate), effect=np.array(scaled))
-        return fit(problem, candidate, start, iterations=40)
-
-    best = near(right, [item.prior.normal(values[item.name]) for item in right.parameters])
-    imitation = near(wrong, [0.0] * 2)
-    assert imitation.objective > best.objective + 20.0
-    related = [effect for effect in kit.CATALOGUE if are_related(effect, wrong)]
-    assert right in related
-    assert wrong not in related
-    first = min(Beginnings(problem).related(imitation, related), key=lambda item: item.objective)
-    assert first.candidate.identifiers == (hidden,)
-    assert first.objective == pytest.approx(best.objective, abs=0.1)
 
 
 @pytest.mark.parametrize("place", [0.8, 1.2, 1.8])
@@ -96,14 +64,6 @@ def test_a_mass_is_found_on_the_other_side_of_an_antinode(place):
     deviation = np.sqrt(np.diag(found.effect_covariance))
     assert np.all(np.abs(found.point.effect - truth) < 2.0 * deviation)
     assert elsewhere(problem, right) is right
-
-
-def test_a_record_is_followed_until_its_gap_has_begun():
-    residual = np.random.default_rng(1).standard_normal((500, 2))
-    residual[:40] = 0.0  # blanks
-    assert gap_row(residual) == 500
-    residual[300:, 1] += 6.0
-    assert 300 <= gap_row(residual) <= 305
 
 
 """Mass and place, in prior deviations."""
@@ -167,11 +127,6 @@ def test_what_a_model_can_follow_only_while_it_is_small(problem):
         screen.change(term, np.array([1.1]))
     assert last.size > 0.0
     assert _distance(screen, last, [last]) == pytest.approx(0.0, abs=1e-5 * last.size)
-    # nothing is sought beside a base that the beginnings cannot follow
-    base = replace(none, candidate=Candidate((softening(-1.0, 0.01),)))
-    base = replace(base, point=replace(none.point, effect=np.array([4.0])))
-    assert Beginnings(problem).screen(none) is not None
-    assert Beginnings(problem).scan(base, FEW) == []
 
 
 def test_a_search_tells_what_could_not_be_fitted_and_goes_on(tmp_path):

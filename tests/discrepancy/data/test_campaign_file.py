@@ -210,10 +210,11 @@ def campaigns(draw):
             )
         )  # fmt: skip
     text = st.text(st.characters(codec="utf-8", exclude_categories=("Cs",)), max_size=20)
+    read = dict.fromkeys(name for trial in trials for name in trial.input_names)
     return Campaign(
         draw(text), channels, tuple(trials), draw(st.floats(-273.15, 1e3)),
         {draw(names): (draw(finite), draw(positive))}, "",
-        tuple(draw(st.lists(text, max_size=2))),
+        tuple(draw(st.lists(text, max_size=2))), draw(st.sampled_from([{}, {"one": (*channels, *read)}])),
     )  # fmt: skip
 
 

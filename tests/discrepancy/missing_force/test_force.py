@@ -110,14 +110,14 @@ def problem_of(folder, number):
 def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, number, effect, port):
     problem = problem_of(tmp_path, number)
     search = ForceSearch(problem)
-    assert max(search.at, key=lambda name: search.at[name].evidence) == port
+    assert max(search.at, key=lambda name: search.at[name].log_evidence) == port
     ranked = [item for item in search.name(available(problem)) if len(item.candidate.terms) == 1]
     (term,) = ranked[0].candidate.terms
     assert (term.effect.identifier, term.place) == (effect, port)
     families = {ranked[0].candidate.terms[0].effect.family}
     second = next(item for item in ranked if item.candidate.terms[0].effect.family not in families)
-    assert ranked[0].evidence > second.evidence + 10.0
-    assert ranked[0].evidence > search.whole.evidence + 10.0
+    assert ranked[0].log_evidence > second.log_evidence + 10.0
+    assert ranked[0].log_evidence > search.whole.log_evidence + 10.0
     share = ForceShares(search).of(ranked[0], held_out=False)
     assert share.value > 0.85
     assert share.interval[0] <= share.value <= share.interval[1]
@@ -192,7 +192,7 @@ def assert_alike(campaign, one, other, share):
         next(iter(ForceSearch(Problem(campaign, item, Setting(campaign, item, scales))).at.values()))
         for item in (one, other)
     )
-    assert second.evidence == pytest.approx(first.evidence, abs=0.5)
+    assert second.log_evidence == pytest.approx(first.log_evidence, abs=0.5)
     for a, b in zip(first.motions, second.motions, strict=True):
         force, other = a.forces[0], b.forces[0]
         every = len(force) // 200
@@ -275,7 +275,7 @@ def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path):
     search = ForceSearch(problem)
     found = [search.followed(search.whole, Candidate((term,)), start)
              for _, term, start in search.screened(search.whole, available(problem))[:12]]  # fmt: skip
-    best, *_ = sorted((item for item in found if item is not None), key=lambda item: -item.evidence)
+    best, *_ = sorted((item for item in found if item is not None), key=lambda item: -item.log_evidence)
     (term,) = best.candidate.terms
     assert term.effect.identifier == "coulomb_friction"
     (friction,) = best.candidate.patch(problem.setting, best.effect)
@@ -313,7 +313,7 @@ def test_the_missing_force_does_not_depend_on_where_it_is_linear_about():
     candidate = Candidate((Term(FRICTION, "joint"),))
     there = fit(problem, candidate, problem.start(candidate)).point
     one, other = (ForceSearch(problem, about).at["joint"] for about in (None, there))
-    assert one.evidence == pytest.approx(other.evidence, abs=40.0)  # of 15,000 readings
+    assert one.log_evidence == pytest.approx(other.log_evidence, abs=40.0)  # of 15,000 readings
 
 
 def test_a_force_is_ordered_by_the_variable_that_it_is_a_function_of():

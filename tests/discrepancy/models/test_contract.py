@@ -1,19 +1,22 @@
 """The contract of a model, lumped, a wing, a structure, an FMU: what it says, reads and refuses."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from scipy.linalg import eigh
 
 from discrepancy.campaign.records import Hold, Quantity, Release, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
-from discrepancy.models.interface import Model
+from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.structures import SHIPPED_PRIOR, StructureModel, WingModel
+from discrepancy.models.structures import StructureModel, WingModel
+from discrepancy.models.system_model import State, SystemModel
 from fe.runtime import patch
 from fe.runtime.laws import LAWS
 from fe.runtime.patch import (
@@ -25,24 +28,31 @@ from fe.runtime.patch import (
     PowerDamping,
     PowerStiffness,
 )
-from tests.discrepancy.asking import seen
+from tests.discrepancy.asking import FloatArray, campaign, seen
 from tests.discrepancy.asking import trial as asked
-from tests.discrepancy.rigs import fmu_rig
+from tests.discrepancy.rigs import INPUTS, fmu_rig
+from tests.refusals import refused
+
+TABLE = INPUTS.table("kinds.toml")
 
 
 @dataclass
 class Kind:
-    """A kind of model: an instance, a place of its loads, an output, a pace, what it is to say of itself."""
+    """A kind of model: an instance, and its row of `kinds.toml`."""
 
     model: Model
     place: str
     output: str
     pace: float
-    ports: tuple[str, ...]
-    stations: tuple[float, ...] | None
-    parameters: tuple[str, ...]
-    quantities: dict[str, Quantity | None]
-    carried: set[str] = field(default_factory=set)
+    ports: list[str]
+    stations: list[float]
+    parameters: list[str]
+    quantities: dict[str, str]
+    carried: list[str]
+
+    @property
+    def means(self) -> FloatArray:
+        return np.array([parameter.mean for parameter in self.model.parameters])
 
     def trial(self, kind: TrialKind, **said: Any) -> Trial:
         time = 0.005 * np.arange(len(next(iter(said.values()))) if said else 60)
@@ -50,60 +60,61 @@ class Kind:
         return asked(kind, time, **{"load_place": self.place, "run": "A", **release, **said})
 
     def seen(self, what: Trial, *items: Any, **given: Any) -> Any:
-        means = np.array([parameter.mean for parameter in self.model.parameters])
         outputs = given.pop("outputs", {self.output: self.model.output_quantity(self.output)})
-        return seen(self.model, what, outputs, *items, **{"parameters": means} | given)
+        return seen(self.model, what, outputs, *items, **{"parameters": self.means} | given)
 
 
-SENSED = {
-    "sensor_gain", "sensor_drift", "channel_offset", "sensor_rotation", "thermal_strain", "high_pass",
-    "clock", "logger_clock", "line", "decaying_line", "run_offset",
-}  # fmt: skip
-FMU = SENSED | {law.kind for law in LAWS} | {"load_gain"}
-LUMPED = FMU | {
-    "port_load", "point_mass", "root_compliance", "modulus_temperature", "stiffness_drift", "load_place",
-}  # fmt: skip
-
-
-@pytest.fixture(scope="module", params=["lumped", "wing", "structure", "FMU"])
+@pytest.fixture(scope="module", params=TABLE["kind"])
 def kind(request, coarse_patch_arrays, pushed_beam, foreign_fmu, tmp_path_factory) -> Iterator[Kind]:
-    if request.param == "lumped":
-        quantities: dict[str, Quantity | None] = {"base_strain": Quantity.STRAIN, "nothing": None}
-        chain = LumpedModel.load("three_mass_chain")
-        names = tuple(item.name for item in chain.parameters)
-        yield Kind(chain, "end", "x1", 28.0, ("joint", "end"), (0.2, 0.6), names, quantities, LUMPED)
-    elif request.param == "structure":
-        quantities = {"g1": Quantity.STRAIN, "shake": Quantity.ACCELERATION, "z1": None}
-        yield Kind(
-            StructureModel(pushed_beam[1]), "push", "tip", 2e3, ("tip",), None, ("e", "pump"), quantities,
-            FMU | {"stiffness_drift"},
-        )  # fmt: skip
-    elif request.param == "wing":
-        quantities = {
-            "strain[3]": Quantity.STRAIN,
-            "strain[77]": None,
-            "displacement[0.5, 0.3]": Quantity.DISPLACEMENT,
-        }
-        yield Kind(
-            WingModel(coarse_patch_arrays), "tip_load", "tip_displacement", 18.0 * np.pi,
-            ("root", "tip", "span"), (0.0, 1.828), tuple(SHIPPED_PRIOR), quantities,
-            set(PRIMITIVES) - {"port_load"},
-        )  # fmt: skip
-    else:
-        model = FmuModel.load(fmu_rig(tmp_path_factory.mktemp("rig"), foreign_fmu("rig2")))
-        quantities = {"leaf_strain": Quantity.STRAIN, "slide.position": None}
-        names = ("stiffness_factor", "damping_factor")
-        yield Kind(model, "mass", "displacement", 28.0, ("slide",), (0.0, 0.4), names, quantities, FMU)
-        model.close()
+    made = {
+        "lumped": lambda: LumpedModel.load("three_mass_chain"),
+        "structure": lambda: StructureModel(pushed_beam[1]),
+        "wing": lambda: WingModel(coarse_patch_arrays),
+        "FMU": lambda: FmuModel.load(fmu_rig(tmp_path_factory.mktemp("rig"), foreign_fmu("rig2"))),
+    }
+    found = Kind(made[request.param](), **TABLE["kind"][request.param])
+    yield found
+    if isinstance(found.model, FmuModel):
+        found.model.close()
 
 
 def test_it_says_what_it_is_and_what_it_carries(kind: Kind) -> None:
-    model = kind.model
-    assert (model.ports, model.stations) == (kind.ports, kind.stations and pytest.approx(kind.stations))
-    assert tuple(item.name for item in model.parameters) == kind.parameters
+    model, groups = kind.model, {"laws": [law.kind for law in LAWS]}
+    carried = [name for item in kind.carried for name in groups.get(item, [item])]
+    assert model.ports == tuple(kind.ports)
+    assert list(model.stations or ()) == pytest.approx(kind.stations)
+    assert [item.name for item in model.parameters] == kind.parameters
     assert all(item.low < item.mean < item.high for item in model.parameters)
-    assert {name: model.output_quantity(name) for name in kind.quantities} == kind.quantities
-    assert {name for name, primitive in PRIMITIVES.items() if model.supports(primitive)} == kind.carried
+    shown = {name: model.output_quantity(name) for name in kind.quantities}
+    assert {name: quantity.value if quantity else "" for name, quantity in shown.items()} == kind.quantities
+    supported = {name for name, primitive in PRIMITIVES.items() if model.supports(primitive)}
+    assert supported == {*carried, *TABLE["sensors"]}
+
+
+@pytest.mark.parametrize("kind", ["lumped", "wing", "FMU"], indirect=True)
+def test_scales_are_those_of_stiffness_and_mass_and_of_what_acts(kind: Kind) -> None:
+    model = kind.model
+    stiffness, mass, row, rows = np.full((1, 1), 1974.0), np.full((1, 1), 2.0), np.ones(1), [np.ones(1)]
+    if isinstance(model, SystemModel):
+        state = State(tuple(kind.means), (0.0,) * len(model.regions))
+        stiffness, mass = (getattr(model.system(state), name) for name in ("stiffness", "mass"))
+        row, rows = model.force_row(kind.place, state), [model.port_rows[name] for name in kind.ports]
+    loads = kind.trial(TrialKind.STATIC, force=np.array([1.0, -6.0]))
+    found = model.scales(campaign(loads, replace(kind.trial(TrialKind.RINGDOWN), start=100.0)))
+    (square,), shape = eigh(stiffness, mass, subset_by_index=[0, 0])
+    held, near = np.linalg.solve(stiffness, row), 1e-5 if isinstance(model, WingModel) else 1e-7
+    wanted = {
+        "tip_stiffness": 1.0 / (row @ held), "modal_mass": float(row @ shape[:, 0]) ** -2,
+        "angular_frequency": np.sqrt(square), "force": 6.0, "duration": 59 * 0.005,
+        "campaign_time": 100.0 + 59 * 0.005, "length": kind.stations[-1],
+    }  # fmt: skip
+    assert {name: getattr(found, name) for name in wanted} == pytest.approx(wanted, rel=near)
+    for name, port in zip(kind.ports, rows, strict=True):
+        moved, own = abs(port @ held) * max(6.0, 0.02 / float(row @ held)), found.ports[name]
+        assert (own.displacement, own.stiffness) == pytest.approx(
+            (moved, square / float(port @ shape[:, 0]) ** 2), rel=near
+        )
+        assert own.mean_power(3.0) == 1.0
 
 
 @pytest.mark.parametrize("how", [TrialKind.RINGDOWN, TrialKind.STATIC])
@@ -139,6 +150,18 @@ def test_a_coarse_force_does_between_its_samples_what_is_said(kind: Kind, hold: 
     # the fine record of what is held goes up within its first interval
     assert np.abs(found - wanted).max() < (5e-3 if hold is Hold.ZERO_ORDER else 1e-4) * largest
     assert (np.abs(straight - wanted).max() > 2e-2 * largest) == (hold is not Hold.LINEAR)
+
+
+@pytest.mark.parametrize("law", [(), (3e-2,)])
+def test_rates_are_derivatives(kind: Kind, law: tuple[float, ...]) -> None:
+    what = replace(kind.trial(TrialKind.RINGDOWN), time=0.003 / kind.pace * np.arange(3000))
+    outputs = [(kind.output, quantity) for quantity in Quantity.DISPLACEMENT.moving]
+    outputs += [(name, Quantity(quantity)) for name, quantity in kind.quantities.items() if quantity]
+    items = patch.ModelPatch(tuple(PowerStiffness(kind.ports[-1], size, 3.0, 0, 1e-2) for size in law))
+    found = kind.model.respond(what, tuple(outputs), items, Conditions(kind.means))
+    slope, seen_later = np.gradient(found.values, what.time, axis=0), slice(100, -5)  # what is left out fades
+    scale = np.abs(slope).max(axis=0)
+    np.testing.assert_allclose(found.rates[seen_later] / scale, slope[seen_later] / scale, atol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -184,3 +207,33 @@ def test_what_cannot_be_answered_is_refused_in_a_sentence(kind: Kind, how, said,
 def test_what_a_kind_cannot_do_is_refused(kind: Kind, how: TrialKind, said, items, sentence: str) -> None:
     with pytest.raises(ModelError, match=sentence):
         kind.seen(replace(kind.trial(how, force=np.ones(3)), **said), *items)
+
+
+FILES = ["two_masses", "rig"]
+ROWS = [*((name, *row) for name in FILES for row in INPUTS.refused(name)), *INPUTS.refused("rigs")]
+
+
+@pytest.mark.parametrize(("name", "old", "new", "sentence"), ROWS)
+def test_a_wrong_file_is_refused_in_one_sentence(
+    tmp_path: Path, foreign_fmu, name: str, old: str, new: str, sentence: str
+) -> None:
+    file = tmp_path / "model.toml"
+    changes = [("{fmu}", str(foreign_fmu("rig2")))] * (name == "rig")
+    file.write_text(INPUTS.text(f"{name}.toml", *changes, (old, new)))
+    with refused(ModelError, sentence if name == "rig" else f"model.toml.*({sentence})"):
+        (FmuModel if name == "rig" else LumpedModel).load(file)
+
+
+def test_a_missing_or_broken_file_is_refused(tmp_path: Path) -> None:
+    broken = tmp_path / "broken.toml"
+    broken.write_text("format = ")
+    for load, file, sentence in (
+        (LumpedModel.load, "four_mass_chain", "shipped are single_mass_rig, three_mass_chain"),
+        (FmuModel.load, fmu_rig(tmp_path, "absent.fmu"), r"absent\.fmu"),
+        (WingModel.of_calibration, "absent.nc", "cannot be used"),
+        (WingModel.of_design, "absent.toml", "cannot be read"),
+        *((model.load, tmp_path / "none.toml", "cannot be read") for model in (LumpedModel, FmuModel)),
+        *((model.load, broken, "not valid TOML") for model in (LumpedModel, FmuModel)),
+    ):
+        with pytest.raises(ModelError, match=sentence):
+            load(file)

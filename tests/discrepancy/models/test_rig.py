@@ -99,7 +99,7 @@ def test_a_motor_couples_displacements_and_states() -> None:
 
 def test_an_unknown_begin_takes_any_state() -> None:
     time, model = uneven(50, 0.01), rig("falling_body")
-    read = {"channels": ("h",), "values": (3.0 - 2.0 * time)[:, None], "used": np.ones((50, 1), bool)}
+    read = {"channels": ("h",), "values": (3.0 - 2.0 * time)[:, None]}
     what = trial(time, begins=Start.UNKNOWN, **read)
     sizes = model.initial_sizes(campaign(what, h=Channel("h", Quantity.DISPLACEMENT, "height", None)), what)
     assert sizes.shape == (2,)
@@ -175,7 +175,7 @@ def test_friction_is_nothing_where_a_drive_begins_at_rest() -> None:
 def test_a_port_that_a_drive_moves_is_measured_by_its_motion_and_the_force() -> None:
     """Not by the frequency that it would have if it were let go."""
     time, readings = 0.01 * np.arange(300.0), np.linspace(-50.0, 40.0, 300)[:, None]
-    read = {"channels": ("cell",), "values": readings, "used": np.ones((300, 1), bool)}
+    read = {"channels": ("cell",), "values": readings}
     what = trial(time, actuator(0.02 * np.sin(2.0 * time)), **read)
     given = campaign(what, cell=Channel("cell", Quantity.FORCE, "cell", None))
     found = rig("damper").scales(given).ports["piston"]
@@ -311,7 +311,7 @@ def test_scales_of_what_nothing_drives_come_from_its_readings(text, unit, rate: 
     model = model_of(INPUTS.text("left_alone.toml", ("UNIT", unit.value)) + text)
     time = np.linspace(0.0, 3e4 if rate == 0.0 else 30.0, 400)
     values = 20.0 + 75.0 * np.exp(-time * 3e-4) * np.cos(rate * time)
-    read = {"values": values[:, None], "used": np.ones((400, 1), dtype=bool), "channels": ("shown",)}
+    read = {"values": values[:, None], "channels": ("shown",)}
     given = campaign(trial(time, begins=Start.UNKNOWN, **read), shown=Channel("shown", unit, "shown", None))
     port = model.scales(given).ports["it"]
     assert (port.displacement, port.angular_frequency * port.displacement) == pytest.approx(largest, rel=0.5)

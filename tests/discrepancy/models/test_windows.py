@@ -95,16 +95,6 @@ def test_a_law_between_two_moments_against_a_general_integrator(item: Primitive,
     np.testing.assert_allclose(found, expected, atol=2e-4 * np.abs(expected).max())
 
 
-def test_the_response_follows_the_moment_smoothly() -> None:
-    given = trial(TrialKind.FORCED)
-    first, second = (
-        response(given, friction(0.9, 2.003 + h))[:, 0] - response(given, friction(0.9, 2.003 - h))[:, 0]
-        for h in (1e-3, 2e-3)
-    )
-    assert np.abs(first).max() > 1e-5
-    np.testing.assert_allclose(2.0 * first, second, atol=0.05 * np.abs(second).max())
-
-
 @pytest.mark.parametrize("kind", [TrialKind.FORCED, TrialKind.RINGDOWN])
 def test_without_edges_within_the_record_nothing_changes(kind: TrialKind) -> None:
     given, law = replace(trial(kind), begins=Start.SETTLED), BoucWen("slide", 60.0, 0.01, 1.5)

@@ -138,13 +138,17 @@ def test_drag_is_named_with_its_exponent_and_nothing_that_only_describes(rig):
 
 
 @pytest.mark.long
-def test_the_tanks_have_a_root_of_the_level_and_an_overflow_in_part(rig):
+def test_the_tanks_have_an_outflow_that_is_not_in_proportion_in_part(rig):
+    """What is left counts as some twenty samples: an overflow beside it gains less than it costs.
+
+    It was named with it as long as the outflow alone was not fitted to its end (twice its chi^2).
+    """
     verdict = judged(rig("two_tanks"), "outflow", "overflow", "logger_clock")
     assert verdict.kind is VerdictKind.NAMED_IN_PART, verdict.sentence
     found = {(effect.identifier, effect.place) for effect in verdict.effects}
-    assert found == {("outflow", "lower outlet"), ("overflow", "upper outlet")}
+    assert found == {("outflow", "lower outlet")}
     assert verdict.explained.trials == "held-out"
-    assert verdict.explained.low > 0.5
+    assert verdict.explained.low > 0.6
 
 
 def test_the_pendulum_has_no_name_and_its_share_is_said(rig):

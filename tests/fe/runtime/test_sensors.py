@@ -1,5 +1,6 @@
 """Sensor primitives on arrays, against closed forms and independent integration, as a whole or by samples."""
 
+import tomllib
 from dataclasses import replace
 from itertools import pairwise
 
@@ -15,7 +16,10 @@ from fe.runtime import patch, sensors
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import Clock, HighPass, ModelPatch, RunOffset, SensorDrift, SensorGain, SensorRotation
 from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, check_channels
+from tests.refusals import Inputs, refused
 
+INPUTS = Inputs(__file__)
+CHANNELS_SEEN = tomllib.loads(INPUTS.text("channels.toml"))["row"]
 CHANNELS = (("tip", "displacement"), ("g0", "strain"), ("g1", "strain"))
 TIME = np.arange(200) * 0.01
 RECORD = SensorRecord(CHANNELS, "ringdown", TIME, 100.0, np.full(200, 5.0), "A", 0.05)
@@ -49,25 +53,10 @@ def test_order_of_sensors_matters() -> None:
     assert rates[:, 1] == pytest.approx(1.5 * (RATES[:, 1] + 2e-5))
 
 
-@pytest.mark.parametrize(
-    ("item", "record", "changed"),
-    [
-        (SensorGain("*", 0.1), RECORD, [0, 1, 2]),
-        (SensorGain("*", 0.1, "strain"), RECORD, [1, 2]),
-        (SensorGain("tip", 0.1, "strain"), RECORD, [0]),
-        (patch.ThermalStrain("*", 1e-5), RECORD, [1, 2]),
-        (SensorGain("elsewhere", 0.1), RECORD, []),
-        (patch.Line("tip", 50.0, 0.3, -0.4), RECORD, [0]),
-        (patch.Line("tip", 50.0, 0.3, -0.4), STATIC, []),  # only where time runs
-        (patch.DecayingLine("g1", 2.0, 0.05, 0.1, 0.2), FORCED, []),
-        (RunOffset("A", 1e-3), STATIC, [0]),  # for static displacements
-        (RunOffset("B", 1e-3), STATIC, []),
-        (RunOffset("A", 1e-3), RECORD, []),
-        (RunOffset("A", 1e-3, "g1"), STATIC, [2]),
-    ],
-)
-def test_channels_are_chosen_by_name_quantity_and_kind_of_trial(item, record, changed) -> None:
-    values = shown(item, record=record)[0]
+@pytest.mark.parametrize(("kind", "given", "trial", "changed"), CHANNELS_SEEN)
+def test_channels_are_chosen_by_name_quantity_and_kind_of_trial(kind, given, trial, changed) -> None:
+    item = patch.PRIMITIVES[kind](*given)
+    values = shown(item, record=replace(RECORD, kind=trial))[0]
     assert np.flatnonzero(np.any(values != VALUES, axis=0)).tolist() == changed
     if isinstance(item, RunOffset):
         assert values[:, changed] == pytest.approx(VALUES[:, changed] + 1e-3)
@@ -117,27 +106,12 @@ def test_lines_run_with_the_trial() -> None:
     assert rates[:, 2] - RATES[:, 2] == pytest.approx((root * wave).real, abs=1e-13)
 
 
-def remembered(item: HighPass):
-    return FilterMemory(None, 0.1).filtered(item, RECORD, np.zeros((1, 2)), np.zeros((1, 2)))
-
-
-@pytest.mark.parametrize(
-    ("ask", "item", "sentence"),
-    [
-        (shown, SensorDrift("tip", 1.0, 0.0), "must be positive, but is 0"),
-        (shown, SensorRotation("g0", 0.2), "transverse and shear"),
-        (shown, patch.DecayingLine("g1", 2.0, 1.0, 0.1, 0.2), "below one, but is 1"),
-        (None, SensorGain("g9", 0.1), r"'sensor_gain' names the channel 'g9'.*tip, g0, g1\."),
-        (None, patch.ThermalStrain("tip", 0.1), "'tip' measures displacement"),
-        *(
-            (remembered, HighPass("*", *given), "sample by sample")
-            for given in ((0.0,), (1.0, 1.5), (1.0, 5.0))
-        ),
-    ],
-)
-def test_what_cannot_be_is_refused_in_one_sentence(ask, item, sentence: str) -> None:
-    with pytest.raises(InvalidPatchError, match=sentence):
-        (ask or (lambda item: check_channels(ModelPatch((item,)), CHANNELS)))(item)
+@pytest.mark.parametrize(("kind", "given", "sentence"), INPUTS.refused("sensors"))
+def test_what_cannot_be_is_refused_in_one_sentence(kind: str, given, sentence: str) -> None:
+    item = ModelPatch((patch.PRIMITIVES[kind](*given),))
+    with refused(InvalidPatchError, sentence):
+        check_channels(item, CHANNELS)
+        applied(item, RECORD, VALUES, RATES, filtered=FilterMemory(None, 0.1).filtered)
     check_channels(ModelPatch((SensorGain("*", 0.1), SensorGain("g1", 0.1), Clock(0.0, 0.1))), CHANNELS)
 
 

@@ -187,7 +187,7 @@ def test_a_design_file_that_asset_and_component_share_is_tailored_in_both(file, 
 
 COUPLED = next(name for name in scenario_files() if 'kind = "coupled"' in text_of(name))
 UNKNOWN = r"spring 7 has the parameter nonsense, which the binding \w+ does not know; .*`uav-twin"
-OF_A_WING = r"the parameter servo_mass, which the reduced model of the design .* `uav-twin calibrate`"
+OF_A_WING = r"the parameter servo_mass, which the design .* `uav-twin calibrate`"
 
 
 @pytest.mark.parametrize(

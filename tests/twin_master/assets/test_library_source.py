@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import norm
 
 from fmu_asset.packing.script import build_script_fmu
+from reporting.arrays import Float
 from reporting.progress import SilentProgress
 from scenarios import asset_scripts
+from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, cut_off_after, figures_of, loaded_from, table_of
 from twin_master.assets.library_source import ObservationLibrary, load_observation_library
 from twin_master.assets.resolution import Overrides
@@ -29,7 +30,7 @@ from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
 
 pytestmark = pytest.mark.usefixtures("no_report")
-Float = NDArray[np.float64]
+INPUTS = Inputs(__file__)
 
 
 def pump_table() -> dict[str, Any]:
@@ -141,20 +142,7 @@ def test_a_library_of_another_fmu_is_flown_with_a_notice(made, tmp_path):
     assert json.loads((outcome.folder / "summary.json").read_text())["asset_and_model_differ"] is True
 
 
-@pytest.mark.parametrize(
-    ("key", "entry", "words"),
-    [
-        ("state.0.levels_percent", [0, 25, 60], "has the levels 0, 0.3, 0.6 of wear.*asks for 0.25"),
-        ("control.2.values.speed", 1900.0, "not sampled at speed = 1900.*control boost"),
-        (
-            "observation.unit",
-            ["L/min", "N.m", "1", "bar"],
-            r"has them in L/min, N\.m, degC, bar.* L/min, N\.m, 1, bar",
-        ),
-        ("calibration.mean", 1.5, "reach from .* and the observation library from 0.9 to 1.1"),
-        ("state.0.unit", "percent", "has the states in clogging: 1, wear: 1"),
-    ],
-)
+@pytest.mark.parametrize(("key", "entry", "words"), INPUTS.refused("library"))
 def test_what_a_library_lacks_is_named(made, tmp_path, key, entry, words):
     with pytest.raises(InvalidObservationLibraryError, match=words):
         new_run(changed(key, entry), tmp_path / "run", Overrides(library=made))
@@ -199,25 +187,7 @@ def test_files_that_are_no_library_are_refused(made, library_file, tmp_path):
         grid_of_scenario(load_scenario("level_turns"), tmp_path, **given)
 
 
-@pytest.mark.parametrize(
-    ("key", "entry", "words"),
-    [
-        ("asset.library", "pump.nc", "unknown key `asset.library`"),
-        ("asset.file", "pump.fmu", "unknown key `asset.file`"),
-        ("asset.kind", "fmu", "unknown key `asset.script`"),
-        ("observation.unit", ["bar"], r"`observation\.unit` must be one value, or one for each of the 4"),
-        ("observation.standard_deviation", [1.0, 1.0], r"`observation\.standard_deviation` must be one"),
-        ("observation.titles", ["flow"], r"`observation\.titles`"),
-        ("rewards.health_limit", [1.0, 2.0, 3.0], r"`rewards\.health_limit` .* 2 sensors, and 3 came"),
-        (
-            "rewards.health_sensors",
-            [1, 5],
-            r"`rewards\.health_sensors` must name different sensors from 1 to 4",
-        ),
-        ("rewards.error_scale", [1.0], r"`rewards\.error_scale`"),
-        ("truth.noise", {"standard_deviation": [1.0]}, r"`truth\.noise\.standard_deviation`"),
-    ],
-)
+@pytest.mark.parametrize(("key", "entry", "words"), INPUTS.refused("pump"))
 def test_keys_and_lists_that_do_not_fit_are_refused(key, entry, words):
     with pytest.raises(ScenarioError, match=words):
         changed(key, entry)

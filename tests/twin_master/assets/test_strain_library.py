@@ -32,8 +32,6 @@ def small_content() -> dict[str, Any]:
     return {
         "states": LEVELS,
         "controls": ["2g", "3g"],
-        "gamma": 0.6,
-        "transition_probabilities": {"2g": 0.05, "3g": 0.1},
         "observations": observations,
     }
 
@@ -57,8 +55,6 @@ def test_published_format(tmp_path):
     state = library.states.index((0.4, 0.5))
     np.testing.assert_allclose(library.strain[state, 1], 1e-6 * strain(40, 50, 3))
     np.testing.assert_allclose(library.strain_per_draw[0, state, 1], 1e-6 * strain(40, 50, 3, 0.99))
-    assert library.discount == 0.6
-    assert library.worsening_probability == {"2g": 0.05, "3g": 0.1}
     by_file = load_strain_library(tmp_path / "UAVconfig.json")
     np.testing.assert_array_equal(by_file.strain, library.strain)
 
@@ -72,8 +68,6 @@ def test_between_the_levels_strain_is_multilinear(tmp_path):
         ((0.41, 0.0), 0, r"covers z1 from 0 to 0\.4"),
         ((-0.01, 0.0), 0, r"covers z1 from 0 to 0\.4"),
         ((np.nan, 0.0), 0, r"covers z1 from 0 to 0\.4"),
-        ((0.0, 0.0), 2, "control index below 2"),
-        ((0.0,), 0, "one stiffness loss for each"),
     ):
         with pytest.raises(InvalidStrainLibraryError, match=sentence):
             library.strain_at(bad, control)
@@ -83,7 +77,6 @@ def test_between_the_levels_strain_is_multilinear(tmp_path):
     ("change", "sentence"),
     [
         (lambda content: content.pop("observations"), "lacks the entry 'observations'"),
-        (lambda content: content.pop("gamma"), "lacks the entry 'gamma'"),
         (lambda content: content["observations"].pop("40"), "lacks the entry '40'"),
         (
             lambda content: content["observations"]["20"]["0"]["3g"]["0.99"].pop(),
@@ -118,8 +111,6 @@ def test_what_is_known_of_the_published_library(published_library):
     """Gauge 16 carries the maximum everywhere."""
     library = load_strain_library(published_library)
     assert library.strain_per_draw.shape == (30, 25, 2, 24)
-    assert library.discount == 0.6
-    assert library.worsening_probability == {"2g": 0.05, "3g": 0.1}
     assert np.all(library.strain.argmax(axis=2) == 16)
     assert np.all(library.strain_per_draw.argmax(axis=3) == 16)
     states = [library.states.index((z, 0.0)) for z in (0.0, 0.2, 0.4, 0.6, 0.8)]

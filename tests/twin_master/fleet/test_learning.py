@@ -11,7 +11,7 @@ from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import fly_fleet, group_folder
 from twin_master.fleet.learn import learn_fleet
-from twin_master.fleet.lessons import lessons_record, write_learnt
+from twin_master.fleet.lessons import learn_from_fleet
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
 from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, logistic, logit, population, refined, shared
 from twin_master.fleet.reading import attention
@@ -61,11 +61,12 @@ def test_evidence_of_a_twin_is_that_of_all_paths(probability):
     found = transition_evidence(worsening, points, likelihood, control)
     for row, point in enumerate(points):
         given: dict[str, object] = {}
-        for (name, factor), value in zip(worsening.keys, point.tolist(), strict=True):
-            if factor is None:
-                given[name] = value
+        for name, value in zip(worsening.names, point.tolist(), strict=True):
+            own, _, factor = name.partition(", ")
+            if factor:
+                given.setdefault(own, {})[factor] = value  # type: ignore[index]
             else:
-                given.setdefault(name, {})[factor] = value  # type: ignore[index]
+                given[own] = value
         other = tiny(given)
         for twin in range(2):
             expected = enumerated(other, control[twin].tolist(), likelihood[twin])
@@ -210,13 +211,12 @@ def grown(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple
 
 def test_a_fleet_learns_and_flies_what_it_has_learnt(grown, tmp_path):
     fleet, folder = grown
-    lessons = learn_fleet(folder)
-    record = lessons_record(lessons)["groups"]["growing_damage"]
+    file = tmp_path / "learnt.toml"
+    record = learn_from_fleet(folder, file)["groups"]["growing_damage"]
     for control, truth in (("2g", 0.05), ("3g", 0.1)):
         rate = record["probability"][control]
         assert abs(rate["mean"] - truth) < 4.0 * rate["standard_deviation"] < 0.1
         assert rate["lower_95"] < rate["mean"] < rate["upper_95"]
-    file = write_learnt(tmp_path / "learnt.toml", lessons)
     scenario = resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=file))
     assert scenario.transition.probability["3g"] == record["probability"]["3g"]["mean"]
     assumed = fleet.groups[0].scenarios[0].observation.standard_deviation

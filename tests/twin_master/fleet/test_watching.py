@@ -24,7 +24,7 @@ from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.learn import learn_fleet
-from twin_master.fleet.lessons import lessons_record, write_learnt
+from twin_master.fleet.lessons import learn_from_fleet
 from twin_master.fleet.plan import ensemble, load_fleet
 from twin_master.fleet.reading import attention, group_figures, leaving
 from twin_master.fleet.reading import open_fleet as fleet_groups
@@ -378,9 +378,8 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
             assert late or evidence == np.float32(last[turn]["log_evidence"])
     assert group_figures(group)["flown"] == 3
     assert "early fallback" not in group_figures(group)
-    lessons = learn_fleet(outcome.folder)
-    assert lessons_record(lessons)["groups"]["north"]["probability"]["2g"]["flown"] is False
-    write_learnt(tmp_path / "learnt.toml", lessons)
+    learnt = learn_from_fleet(outcome.folder, tmp_path / "learnt.toml")
+    assert learnt["groups"]["north"]["probability"]["2g"]["flown"] is False
     probability = tomllib.loads((tmp_path / "learnt.toml").read_text())["transition"]["probability"]
     assert probability["2g"] == 0.05  # as it was assumed
     assert probability["3g"] != 0.10
@@ -400,8 +399,8 @@ def test_recordings_teach_what_the_flights_taught(fleet_file, tmp_path):
     again = fleet_groups(tmp_path / "recorded")["north"]
     assert np.array_equal(again["observed"].values, group["observed"].values)
     np.testing.assert_allclose(again["mean"].values, group["mean"].values, atol=1e-4)
-    first, second = (learn_fleet(tmp_path / name).groups[0].grid.marginals for name in ("flown", "recorded"))
-    assert [m.mean for m in first] == [m.mean for m in second]
+    flown, recorded = (learn_fleet(tmp_path / name)["groups"] for name in ("flown", "recorded"))
+    assert flown["growing_damage"]["probability"] == recorded["north"]["probability"]
 
 
 def test_the_store_counts_the_notices_that_watches_gave(fleet_file, tmp_path):
@@ -429,7 +428,7 @@ def test_the_store_counts_the_notices_that_watches_gave(fleet_file, tmp_path):
     assert group["notices"].values[1, 1] >= 1
     assert alarmed >= 1
     assert group_figures(group)["raised an alarm"] == alarmed
-    assert learn_fleet(tmp_path / "flown").groups[0].alarmed == alarmed
+    assert learn_fleet(tmp_path / "flown")["groups"]["north"]["alarmed"] == alarmed
     assert "raised an alarm, first in" in write_fleet_report(tmp_path / "flown").read_text()
     config = json.loads((tmp_path / "flown" / "config.json").read_text())
     soon = leaving(tmp_path / "flown", config["fleet"]["groups"][0], group)

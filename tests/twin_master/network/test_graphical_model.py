@@ -29,7 +29,7 @@ from twin_master.network.graphical_model import (
     deterministic_policy,
     worsening_table,
 )
-from twin_master.network.inference import filter_sequence, filter_step, predict, smooth
+from twin_master.network.inference import filter_sequence, predict, smooth
 from twin_master.network.memory import check_scenario_fits
 from twin_master.network.planner import evaluate_policy, given_policy, value_iteration
 from twin_master.network.sensor_model import check_noise
@@ -253,8 +253,6 @@ def test_a_product_of_blocks_gives_what_the_table_gives(seed, scale):
     np.testing.assert_allclose(smoothed, smoothed_by_table, rtol=1e-10, atol=1e-300)
     np.testing.assert_allclose(found.log_filtered, expected.log_filtered, rtol=1e-13, atol=1e-11)
     np.testing.assert_allclose(found.log_evidence, expected.log_evidence, rtol=1e-13, atol=1e-11)
-    last = filter_step(product, found.log_filtered[-2], int(control[-2]), rows[-1])
-    np.testing.assert_array_equal(last.log_filtered, found.log_filtered[-1])
 
 
 def test_probabilities_that_no_double_holds_come_back():

@@ -25,7 +25,6 @@ from twin_master.network.graphical_model import (
 from twin_master.network.inference import (
     filter_many,
     filter_sequence,
-    filter_step,
     predict,
     smooth,
     smooth_many,
@@ -126,29 +125,6 @@ def test_extreme_likelihoods_equal_arbitrary_precision(seed, scale, steps, shift
     np.testing.assert_allclose(filtered.log_evidence, oracle[3], rtol=1e-13, atol=known)
 
 
-def test_a_state_that_underflows_comes_back():
-    """Data of 2,000 nats for the wrong state are outweighed later; no floor decides, the data do."""
-    wrong, right = 0, 24
-    log_likelihood = np.zeros((12, 25))
-    log_likelihood[:, wrong] = 0.0
-    log_likelihood[8, wrong] = 2000.0
-    log_likelihood[11] = -9000.0
-    log_likelihood[11, right] = -100.0
-    control = np.ones(12, dtype=int)
-    filtered, smoothed = infer(MODEL, control, log_likelihood)
-    assert filtered.filtered[8, wrong] == pytest.approx(1.0)
-    assert filtered.filtered[8, right] == 0.0
-    forecast = MODEL.prior @ np.linalg.matrix_power(MODEL.transition.matrix[1], 8)
-    assert filtered.log_filtered[8, right] == pytest.approx(
-        np.log(forecast[right] / forecast[wrong]) - 2000.0, rel=1e-13
-    )
-    assert filtered.filtered[11, right] == pytest.approx(1.0)
-    oracle = precise_forward_backward(MODEL, control, log_likelihood)
-    np.testing.assert_allclose(filtered.filtered, oracle[0], **EXACT)
-    np.testing.assert_allclose(smoothed, oracle[1], **EXACT)
-    assert smoothed[8, right] > 0.05
-
-
 def test_stable_over_ten_thousand_steps():
     rng = np.random.default_rng(0)
     steps = 10_000
@@ -169,14 +145,13 @@ def test_step_by_step_equals_the_sequence():
     control = rng.integers(0, 2, 20)
     log_likelihood = rng.normal(size=(20, 25)) * 200
     filtered = filter_sequence(MODEL, control, log_likelihood)
-    carried, before = None, None
+    before = None
     for t in range(20):
-        step = filter_step(MODEL, carried, before, log_likelihood[t])
-        np.testing.assert_allclose(step.filtered, filtered.filtered[t], rtol=1e-12, atol=1e-300)
-        np.testing.assert_allclose(step.forecast, filtered.forecast[t], rtol=1e-12, atol=1e-300)
-        np.testing.assert_allclose(step.log_filtered, filtered.log_filtered[t], rtol=1e-13)
-        assert step.log_evidence == pytest.approx(filtered.log_evidence[t], rel=1e-13)
-        carried, before = step.log_filtered, int(control[t])
+        step = filter_sequence(MODEL, control[t : t + 1], log_likelihood[t : t + 1], before)[0]
+        for name, found in vars(step).items():
+            expected = getattr(filtered, name)[t]
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-300, err_msg=name)
+        before = step.log_filtered, int(control[t])
 
 
 def test_many_twins_equal_one_by_one():
@@ -220,8 +195,6 @@ def test_log_likelihoods_must_be_numbers(value):
     log_likelihood[1, 7] = value
     with pytest.raises(InvalidObservationError, match=r"log-likelihood at \(1, 7\)"):
         filter_sequence(MODEL, [1] * 3, log_likelihood)
-    with pytest.raises(InvalidObservationError, match=r"log-likelihood at \(7,\)"):
-        filter_step(MODEL, None, None, log_likelihood[1])
 
 
 POLICY = deterministic_policy([0] * 25, 2)
@@ -235,7 +208,6 @@ ZEROS = np.zeros((3, 25))
         (lambda: filter_sequence(MODEL, [1, 2], ZEROS[:2]), "between 0 and 1"),
         (lambda: filter_sequence(MODEL, 1, ZEROS[0]), r"controls of shape \(1,\), got \(\)"),
         (lambda: smooth(MODEL, [[1]], ZEROS[None, :1]), r"controls of shape \(1,\), got \(1, 1\)"),
-        (lambda: filter_step(MODEL, None, 1, ZEROS[0]), "both or neither"),
         (lambda: predict(MODEL, np.ones(3), 0, POLICY, 1), r"belief of shape \(25,\)"),
         (lambda: predict(MODEL, np.ones(25), 0, POLICY, -1), "horizon of 0 or more"),
     ],

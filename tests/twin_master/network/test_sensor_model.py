@@ -3,11 +3,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import logsumexp
-from scipy.stats import kstest, multivariate_normal, norm
+from scipy.stats import multivariate_normal, norm
 
 from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network.identified import IdentifiedSensorModel
-from twin_master.network.inference import known_control
 from twin_master.network.sensor_model import GaussianSensorModel
 
 DRAWS, STATES, CONTROLS, SENSORS = 5, 4, 2, 6
@@ -34,40 +33,12 @@ def test_a_sequence_is_its_steps():
         np.testing.assert_array_equal(rows[t], model.log_likelihood(observations[t], int(control[t])))
 
 
-def test_sensors_that_are_received_are_counted():
-    _, values, weight, deviation, observation = random_case(3)
-    model = GaussianSensorModel(values, deviation, weight)
-    partly = np.where(np.arange(SENSORS) < 2, np.nan, observation)
-    lost = np.full(SENSORS, np.nan)
-    assert model.observed_count([lost, observation, partly]).tolist() == [0, SENSORS, SENSORS - 2]
-
-
 def test_far_observations_stay_comparable_and_beyond_double_precision_they_are_impossible():
     model = GaussianSensorModel(np.arange(2.0).reshape(1, 2, 1, 1), 1e-3)
     low, high = model.log_likelihood([500.0], 0)
     assert high - low == pytest.approx((500.0**2 - 499.0**2) / 2e-6, rel=1e-12)
     assert low < -1e11
     assert np.all(np.isneginf(model.log_likelihood([1e200], 0)))
-
-
-@pytest.mark.parametrize("error", [0.0, 0.4])
-def test_predictive_check_of_a_model_that_holds(error):
-    """Observations drawn from the model: uniform transforms, unit residuals, coverage as stated."""
-    rng, values, weight, deviation, _ = random_case(5)
-    model = GaussianSensorModel(values, deviation, weight, model_error=error)
-    steps = 4000
-    belief = rng.dirichlet(np.ones(STATES))
-    draw, state = rng.choice(DRAWS, steps, p=weight), rng.choice(STATES, steps, p=belief)
-    noise = rng.normal(size=(steps, SENSORS)) * model.total_standard_deviation[state, 1]
-    check = model.predictive_check(
-        known_control(np.tile(belief, (steps, 1)), 1, CONTROLS), values[draw, state, 1] + noise
-    )
-    for sensor in range(SENSORS):
-        assert kstest(check.probability_integral_transform[:, sensor], "uniform").pvalue > 1e-3
-    np.testing.assert_allclose(check.residual.mean(axis=0), 0.0, atol=0.08)
-    np.testing.assert_allclose(check.residual.std(axis=0), 1.0, atol=0.05)
-    np.testing.assert_allclose(check.coverage(0.95), 0.95, atol=0.02)
-    np.testing.assert_allclose(check.coverage(0.5), 0.5, atol=0.04)
 
 
 @settings(deadline=None)
@@ -174,22 +145,8 @@ def test_an_absurd_observation_is_impossible_within_an_interval_too():
         GaussianSensorModel(np.zeros((1, 2, 1, 1)), 1.0, interval=interval[..., 0])
 
 
-def test_predictive_check_leaves_lost_sensors_out():
-    _, values, weight, deviation, observation = random_case(6)
-    observation[2] = np.nan
-    check = GaussianSensorModel(values, deviation, weight).predictive_check(
-        known_control(np.full(STATES, 0.25), 0, CONTROLS), observation
-    )
-    assert np.isnan(check.residual[2])
-    assert np.isnan(check.probability_integral_transform[2])
-    assert np.isfinite(check.mean[2])
-    assert np.isnan(check.coverage()[2])
-    assert np.all(np.isfinite(np.delete(check.residual, 2)))
-
-
 _, VALUES, WEIGHT, DEVIATION, OBSERVATION = random_case(7)
 HOLDING = GaussianSensorModel(VALUES, DEVIATION, WEIGHT)
-UNIFORM = known_control(np.full(STATES, 0.25), 0, CONTROLS)
 REFUSED = [
     *((lambda bad=bad: GaussianSensorModel(VALUES, bad, WEIGHT), "positive noise standard deviation")
       for bad in (0.0, -1.0, np.nan, np.ones(SENSORS + 1), np.r_[DEVIATION[:-1], np.inf])),
@@ -200,7 +157,6 @@ REFUSED = [
     (lambda: HOLDING.log_likelihood(np.r_[OBSERVATION[:3], -np.inf, 0.0, 0.0], 0), r"\(3,\) is infinite"),
     (lambda: HOLDING.log_likelihood(OBSERVATION, 2), "control indices between 0 and 1"),
     (lambda: HOLDING.log_likelihood_sequence(OBSERVATION[None], [0, 1]), r"observations of shape \(2, 6\)"),
-    (lambda: HOLDING.predictive_check(UNIFORM, OBSERVATION[None]), rf"observations of shape \({SENSORS},\)"),
 ]  # fmt: skip
 
 

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.refusals import Inputs
 from tests.twin_master.runs import of_library
 from twin_master.mission.loop import operate
 from twin_master.mission.preparation import Knowledge
@@ -101,26 +102,10 @@ def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
     assert same(watched(knowledge, [*parts, *halves])[0], expected)
 
 
-@pytest.mark.parametrize(
-    ("sent", "reason"),
-    [
-        ({"turn": 55, "strain": [1e-4] * 24}, "contradicts what was received of turn 55"),
-        ({"turn": 58, "control": "2g"}, "contradicts the control of turn 58"),
-        ({"turn": 30}, "turn 30 is 29 turns late, and `watch.lag` is 20"),
-        ({"turn": 10**9}, "ahead of the next one, 60, and `watch.longest_gap` is 30"),
-        ({"turn": -1}, "`turn` is a whole number from 0"),
-        ({"turn": 60.0}, "`turn` is a whole number"),
-        ({"turn": True}, "`turn` is a whole number"),
-        ({"time": 3.0}, "no `watch.seconds_per_turn`"),
-        ({"control": "4g"}, "`control` is one of 2g, 3g"),
-        ({"strain_25": 1e-4}, "is no sensor"),
-        ({"strain_3_bar": 1.0}, "`bar` is no unit of sensor 3"),
-        ({"strian_3": 1e-4}, "such as `strain_3`, `strain_23` and `strain_13`, its unit behind it"),
-        ({"strain_3": 1e-4, "strain_3_percent": 0.01}, "sensor 3 is given twice"),
-        ({"strain": [1e-4] * 23}, "24 values are expected, and 23 came"),
-        ({"unit": 3}, "`unit` is the name of a unit"),
-    ],
-)
+INPUTS = Inputs(__file__)
+
+
+@pytest.mark.parametrize(("sent", "reason"), INPUTS.refused("messages"))
 def test_what_is_refused_changes_nothing(knowledge, clean, expected, tmp_path, sent, reason):
     line = json.dumps(sent).encode() + b"\n"
     twin, intake = watched(knowledge, [*clean, line], tmp_path / "rejected.jsonl")
@@ -283,21 +268,7 @@ def test_csv_as_people_write_it(knowledge, strains, tmp_path):
         MessageReader(allowing).parse(b'{"strain_2_bar": 1e-4}')
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("null", "null"),
-        ("NaN", "NaN"),
-        ("-Infinity", "-Infinity"),
-        ("1e999", "Infinity"),
-        ("9" * 5000, "Infinity"),
-        ('"OL"', '"OL"'),
-        ("true", "true"),
-        ("[1e-4]", "[0.0001]"),
-        ("0.6", "0.6; give its unit, such as `strain_5_microstrain`"),
-        ("1e8", "1e+08; give its unit"),
-    ],
-)
+@pytest.mark.parametrize(("text", "shown"), [*INPUTS.refused("unreadable"), ("9" * 5000, "Infinity")])
 def test_an_unreadable_gauge_is_lost_alone_and_named_once(knowledge, strains, tmp_path, text, shown):
     """As a list, under its name, and as a cell; through a watch that is taken up in the middle of it."""
     lines: dict[str, list[bytes]] = {"list": [], "names": [], "lost": []}

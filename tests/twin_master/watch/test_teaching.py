@@ -29,10 +29,9 @@ from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
 from twin_master.mission.replay import replay
 from twin_master.network.inference import known_control
-from twin_master.viewer.messages import Request, Teller
-from twin_master.viewer.scene import scene_of
+from twin_master.viewer.messages import Request, Teller, scene_of
 from twin_master.watch.feeds import CsvFeed
-from twin_master.watch.folder import Patched, Tutor, Watch
+from twin_master.watch.folder import Tutor, Watch
 from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence
 from twin_master.watch.trial import Outcome, patched_model, policy_change
 
@@ -124,7 +123,7 @@ def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(base, recorded,
     watch = watchful(base, tmp_path / "watch")
     ran(watch, CsvFeed(recorded, watch.scenario), 20)
     assert viewed(watch).pictures == []  # turns are no motion
-    given = Patched(folder / "patch.json", 15)
+    given = (folder / "patch.json", 15)
     watch.run(CsvFeed(recorded, watch.scenario), str, turns=25, patched=given)
     shutil.rmtree(folder)
     flight = viewed(watch)

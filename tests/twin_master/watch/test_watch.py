@@ -39,7 +39,7 @@ from twin_master.network.estimator import ExactFilter
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.feeds import CsvFeed, FolderFeed, JsonLinesFeed, file_feed
-from twin_master.watch.folder import Patched, Watch
+from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Feed
 from twin_master.watch.message import Message
 from twin_master.watch.opening import flown, resumed_watch
@@ -334,7 +334,7 @@ def test_silence_is_told_and_journalled(base, mission, plain, tmp_path, source):
     assert [journalled_decision(line, watch.scenario, model) for line in journal(watch.folder)] == told
     assert ran(watch, CsvFeed(plain, watch.scenario))
     seen = [
-        [notice.kind for notice in turn.notices] for turn in viewed(watch).seen(0, 4)
+        [notice["kind"] for notice in turn.get("notices", ())] for turn in viewed(watch).seen(0, 4)
     ]  # as the page shows it
     assert seen == [["heard", "quiet", "quiet"], ["heard", "quiet"], ["heard"], []]
     assert [turn for turn, notice in watch.told(0) if notice.kind == "quiet"] == [0, 0, 1]
@@ -423,10 +423,10 @@ def test_a_patch_is_believed_from_a_stated_turn_on(base, mission, tmp_path):
     watch = begun(base, tmp_path / "watch")
     ran(watch, CsvFeed(path, watch.scenario), 40)
     with pytest.raises(MissionInputError, match="--from-turn names one of the 40 turns"):
-        watch.run(CsvFeed(path, watch.scenario), str, patched=Patched(patch, 41))
+        watch.run(CsvFeed(path, watch.scenario), str, patched=(patch, 41))
     watch = begun(base, tmp_path / "other")
     shutil.copy(tmp_path / "watch" / JOURNAL_NAME, tmp_path / "other")
-    watch.run(CsvFeed(path, watch.scenario), str, turns=45, patched=Patched(patch, 20))
+    watch.run(CsvFeed(path, watch.scenario), str, turns=45, patched=(patch, 20))
     later = begun(base, tmp_path / "later")
     shutil.copytree(tmp_path / "other", tmp_path / "later", dirs_exist_ok=True)
     later.models.append(watch.models[1])  # as the journal says

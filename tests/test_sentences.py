@@ -4,14 +4,19 @@ import ast
 from pathlib import Path
 from string import Formatter
 
-import fe
-from fe.sentences import SENTENCES
+import pytest
+
+from reporting.sentences import Sentences
+
+ROOT = Path(__file__).parents[1]
 
 
-def test_every_sentence_is_said_with_its_values():
-    known = {f"{table}.{key}": text for table, own in SENTENCES.items() for key, text in own.items()}
+@pytest.mark.parametrize("package", ["fe", "twin_master"])
+def test_every_sentence_is_said_with_its_values(package):
+    tables = Sentences(str(ROOT / package / "sentences.py")).tables
+    known = {f"{table}.{key}": text for table, own in tables.items() for key, text in own.items()}
     said = set()
-    for path in Path(fe.__file__).parent.rglob("*.py"):
+    for path in (ROOT / package).rglob("*.py"):
         for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "said":
                 name, given = ast.literal_eval(call.args[0]), {item.arg for item in call.keywords}

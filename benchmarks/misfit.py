@@ -3,20 +3,15 @@
 A `Misfit` says what the difference does to an estimate.
 """
 
-from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fmu_asset.errors import FmuCallError
-from twin_master.assets.asset_source import Asset, asked_table
+from twin_master.assets.asset_source import Asset, shown_without_noise
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
-
-__all__ = ["Misfit", "find_misfit"]
 
 Float = NDArray[np.float64]
 
@@ -96,15 +91,7 @@ def find_misfit(
     asset : Asset
         What is flown.
     """
-    start, controls = asset.save_state(), [control.values for control in scenario.control]
-
-    def ask(control: Mapping[str, float], health: Mapping[str, float]) -> Float:
-        asset.restore_state(start)  # an asset with hidden effects may remember
-        with suppress(FmuCallError):
-            return asset.step(control, health).values
-        return np.full(sensor_model.sensor_count, np.nan)
-
-    observation = asked_table(scenario.state_names, model.states.coordinates, controls, ask)
+    observation = shown_without_noise(scenario, model.states.coordinates, asset)
     return Misfit(sensor_model.mean - observation, observation, _gain(model, sensor_model))
 
 
