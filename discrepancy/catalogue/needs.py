@@ -7,7 +7,7 @@ from math import isinf
 import numpy as np
 
 from discrepancy.campaign.noise import MAINS, aliased
-from discrepancy.campaign.records import Channel, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import Channel, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.models.interface import ACROSS
 from discrepancy.sentences import SENTENCES, said
 from fe.runtime.motion import PLANFORM
@@ -183,18 +183,17 @@ def mains_lines(setting: Setting) -> Names:
     aliases differ by less than half a period in every record look alike and are one.
     """
     sampled = [(item.interval, float(item.time[-1] - item.time[0])) for item in trials(setting, DYNAMIC)]
+
+    def periods(frequency: float) -> FloatArray:
+        return np.array([aliased(frequency, interval) * length for interval, length in sampled])
+
     groups: list[list[float]] = []
     for frequency in MAINS:
-        if all(aliased(frequency, interval) * length < 1.0 for interval, length in sampled):
-            continue
-        for group in groups:
-            if all(
-                abs(aliased(frequency, interval) - aliased(group[0], interval)) * length < 0.5
-                for interval, length in sampled
-            ):
-                group.append(frequency)
-                break
-        else:
+        seen = periods(frequency)
+        alike = (group for group in groups if np.all(np.abs(seen - periods(group[0])) < 0.5))
+        if (group := next(alike, None)) is not None and np.any(seen >= 1.0):
+            group.append(frequency)
+        elif np.any(seen >= 1.0):
             groups.append([frequency])
     return tuple(" or ".join(f"{frequency:g}" for frequency in group) + " Hz" for group in groups)
 

@@ -152,12 +152,21 @@ def test_a_coarse_force_does_between_its_samples_what_is_said(kind: Kind, hold: 
     assert (np.abs(straight - wanted).max() > 2e-2 * largest) == (hold is not Hold.LINEAR)
 
 
-@pytest.mark.parametrize("law", [(), (3e-2,)])
-def test_rates_are_derivatives(kind: Kind, law: tuple[float, ...]) -> None:
+@pytest.mark.parametrize("change", ["none", "spring", "drift"])
+def test_rates_are_derivatives(kind: Kind, change: str) -> None:
     what = replace(kind.trial(TrialKind.RINGDOWN), time=0.003 / kind.pace * np.arange(3000))
     outputs = [(kind.output, quantity) for quantity in Quantity.DISPLACEMENT.moving]
     outputs += [(name, Quantity(quantity)) for name, quantity in kind.quantities.items() if quantity]
-    items = patch.ModelPatch(tuple(PowerStiffness(kind.ports[-1], size, 3.0, 0, 1e-2) for size in law))
+    items = patch.ModelPatch(
+        tuple(
+            item
+            for name, item in (
+                ("spring", PowerStiffness(kind.ports[-1], 3e-2, 3.0, 0, 1e-2)),
+                ("drift", patch.StiffnessDrift(0.05 * kind.pace)),
+            )
+            if name == change and kind.model.supports(type(item))
+        )
+    )
     found = kind.model.respond(what, tuple(outputs), items, Conditions(kind.means))
     slope, seen_later = np.gradient(found.values, what.time, axis=0), slice(100, -5)  # what is left out fades
     scale = np.abs(slope).max(axis=0)
@@ -209,8 +218,10 @@ def test_what_a_kind_cannot_do_is_refused(kind: Kind, how: TrialKind, said, item
         kind.seen(replace(kind.trial(how, force=np.ones(3)), **said), *items)
 
 
-FILES = ["two_masses", "rig"]
-ROWS = [*((name, *row) for name in FILES for row in INPUTS.refused(name)), *INPUTS.refused("rigs")]
+ROWS = [
+    *((name, *row) for name in ("two_masses", "rig") for row in INPUTS.refused(name)),
+    *INPUTS.refused("rigs"),
+]
 
 
 @pytest.mark.parametrize(("name", "old", "new", "sentence"), ROWS)

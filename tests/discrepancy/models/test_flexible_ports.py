@@ -32,7 +32,7 @@ TIP = np.array([0.0, 0.0, 0.0, 1.0])
 ROWS = np.vstack((TIP, [1.0, 0.0, 0.0, 0.0]))
 """Of the tip and of the joint."""
 RELEASE = Release(displacement=0.02, deviation=0.0, at_rest=True, mode_count=1, time_zero_deviation=0.0)
-TIME = np.linspace(0.0, 2.796, 700)
+TIME, EARLY = np.linspace(0.0, 2.796, 700), np.linspace(0.0, 0.01, 101)
 A = 0.02 * 0.135
 """About the motion of the joint [m]."""
 
@@ -47,10 +47,12 @@ def chain(modes: int, beta: float) -> LinearSystem:
     return LinearSystem(mass, 0.3 * mass + beta * stiffness, stiffness, ports, modes, beta)
 
 
-def ringdown(beta: float, *items: Primitive, refinement: int = 1) -> Motion:
-    system = chain(3, beta)
+def ringdown(
+    beta: float, *items: Primitive, refinement: int = 1, time: FloatArray = TIME, modes: int = 3
+) -> Motion:
+    system = chain(modes, beta)
     acts = laws_of(ModelPatch(items), list(system.ports))
-    acting = Acting(TIME, TIME, initial=np.zeros((0, 2)), release=(TIP, RELEASE))
+    acting = Acting(time, time, initial=np.zeros((0, 2)), release=(TIP, RELEASE))
     return motion_of(system, acting, acts, refinement)
 
 
@@ -131,13 +133,19 @@ def integrated(items: tuple[Primitive, ...], time: FloatArray) -> FloatArray:
     return np.asarray(found.y[[2, 6]].T)
 
 
-@pytest.mark.parametrize("name", LAWS)
-def test_a_ring_down_is_that_of_the_whole_structure(name: str) -> None:
-    count = 250
-    true = integrated(LAWS[name], TIME[:count])
+def test_what_the_modes_leave_out_of_a_release_fades_by_its_damping() -> None:
+    few, whole = (values(ringdown(BETA, time=EARLY, modes=modes), ROWS) for modes in (3, 4))
+    assert np.abs(few - whole).max(axis=0) == pytest.approx([0.0, 0.0], abs=1e-5 * A)
+
+
+@pytest.mark.parametrize(
+    ("name", "time"), [*((n, TIME[:250]) for n in LAWS), ("cubic", EARLY), ("play", EARLY)]
+)
+def test_a_ring_down_is_that_of_the_whole_structure(name: str, time: FloatArray) -> None:
+    true = integrated(LAWS[name], time)
     effect, usual, fine = (
-        np.abs(values(motion, ROWS)[:count] - true).max(axis=0)
-        for motion in (ringdown(BETA), ringdown(BETA, *LAWS[name]), ringdown(BETA, *LAWS[name], refinement=8))
+        np.abs(values(ringdown(BETA, *items, time=time, refinement=n), ROWS) - true).max(axis=0)
+        for items, n in (((), 1), (LAWS[name], 1), (LAWS[name], 8))
     )
     assert np.all(fine < 0.01 * effect + 1e-3 * np.array([0.02, A]))
     assert fine[0] < 1e-3 * 0.02
