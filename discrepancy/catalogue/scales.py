@@ -102,7 +102,7 @@ def _largest_release(here: Here) -> float:
 
 
 def _station(end: int, here: Here) -> float:
-    return (here.setting.model.stations() or (0.0, 0.0))[end]
+    return (here.setting.model.stations or (0.0, 0.0))[end]
 
 
 SCALES: dict[str, Callable[[Here], float]] = {

@@ -81,8 +81,8 @@ def kind(request, coarse_patch_arrays, pushed_beam, foreign_fmu, tmp_path_factor
 def test_it_says_what_it_is_and_what_it_carries(kind: Kind) -> None:
     model, groups = kind.model, {"laws": [law.kind for law in LAWS]}
     carried = [name for item in kind.carried for name in groups.get(item, [item])]
-    assert model.ports() == tuple(kind.ports)
-    assert list(model.stations() or ()) == pytest.approx(kind.stations)
+    assert model.ports == tuple(kind.ports)
+    assert list(model.stations or ()) == pytest.approx(kind.stations)
     assert [item.name for item in model.parameters] == kind.parameters
     assert all(item.low < item.mean < item.high for item in model.parameters)
     shown = {name: model.output_quantity(name) for name in kind.quantities}
@@ -96,7 +96,7 @@ def test_scales_are_those_of_stiffness_and_mass_and_of_what_acts(kind: Kind) -> 
     model = kind.model
     stiffness, mass, row, rows = np.full((1, 1), 1974.0), np.full((1, 1), 2.0), np.ones(1), [np.ones(1)]
     if isinstance(model, SystemModel):
-        state = State(kind.means, (0.0,) * len(model.regions))
+        state = State(tuple(kind.means), (0.0,) * len(model.regions))
         stiffness, mass = (getattr(model.system(state), name) for name in ("stiffness", "mass"))
         row, rows = model.force_row(kind.place, state), [model.port_rows[name] for name in kind.ports]
     loads = kind.trial(TrialKind.STATIC, force=np.array([1.0, -6.0]))

@@ -13,7 +13,7 @@ from discrepancy.campaign.records import Channel, Hold, Quantity, RecordedInput,
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Course
+from discrepancy.models.acting import Course, straight
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.port_scales import FORCES
 from fe.runtime.patch import ModulusTemperature, Overflow, PowerDamping, PowerStiffness
@@ -226,7 +226,7 @@ def test_plain_models_take_driven_trials_and_other_begins() -> None:
 def test_straight_lines_have_the_mean_effect_of_a_spline() -> None:
     """Those of t^2 over a step h have its mean and its first moment: both ends lie h^2 / 6 lower."""
     time, steps = np.linspace(0.0, 3.0, 13), np.array([0.0, 0.5, 0.7, 1.6])
-    found = Course.of(time, time**2, Hold.SMOOTH).ends(steps)
+    found = straight(Course(time, time**2, Hold.SMOOTH).at, steps)
     lower = np.diff(steps) ** 2 / 6.0
     np.testing.assert_allclose(found, (steps[:-1] ** 2 - lower, steps[1:] ** 2 - lower), atol=1e-12)
 

@@ -129,8 +129,8 @@ def test_gauges_lie_where_the_design_has_them():
          "flow 0.500 m/s times capacity at 2 m"),
         (lambda: model_of(TANK), Overflow("outlet", 0.5, 1.5, 3.0, 2.0),
          "flow 0.500 m/s times capacity, level 3.000 m"),
-        (WingModel.shipped, PowerDamping("root", 0.5, 0.0, 0.0, 1.0, 1.0), "moment 0.500 N m"),
-        (WingModel.shipped, PowerDamping("tip", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N"),
+        (WingModel.of_design, PowerDamping("root", 0.5, 0.0, 0.0, 1.0, 1.0), "moment 0.500 N m"),
+        (WingModel.of_design, PowerDamping("tip", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N"),
     ],
 )  # fmt: skip
 def test_sizes_have_the_unit_of_their_port_state_or_channel(drag, make, primitive, text):
