@@ -24,7 +24,7 @@ ROUNDS = 3
 
 def run() -> list[Measurement]:
     """Measure the scan of all effects near and far from the truth, all pairs, and the memory."""
-    model = WingModel.shipped()
+    model = WingModel.of_design()
     cases = {
         "nothing hidden": ModelPatch(),
         "compliant root hidden": ModelPatch((RootCompliance(5e-6),)),

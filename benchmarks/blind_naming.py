@@ -39,7 +39,7 @@ def model_of(folder: Path) -> Model:
     file = folder / "model.toml"
     key = file.read_text(encoding="utf-8") if file.exists() else "wing"
     if key not in _models:
-        _models[key] = LumpedModel.load(file) if file.exists() else WingModel.shipped()
+        _models[key] = LumpedModel.load(file) if file.exists() else WingModel.of_design()
     return _models[key]
 
 
@@ -150,7 +150,7 @@ def main() -> None:
         for folder in sorted((arguments.folder / "campaigns").iterdir())
         if arguments.again or not (out / f"{folder.name}.json").exists()
     ]
-    WingModel.shipped()  # built once, before the processes start
+    WingModel.of_design()  # built once, before the processes start
     with ProcessPoolExecutor(arguments.jobs, initializer=threadpool_limits, initargs=(1,)) as pool:
         named = pool.map(partial(_one, out, left_out), folders, chunksize=1)
         for _ in track(named, description="verdicts", total=len(folders), console=Console()):

@@ -20,8 +20,8 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.models.acting import Acting, Course, Shown, release_of
-from discrepancy.models.interface import Conditions, Model, Outputs, Response
+from discrepancy.models.acting import Acting, Course, Load, Shown, release_of
+from discrepancy.models.interface import ACROSS, Conditions, Model, Outputs, Response
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.motion import motion_of
 from discrepancy.models.scales import PortScale, Scales
@@ -141,25 +141,19 @@ class Cantilever(Model):
     """The cantilever; outputs "tip_displacement" and "strain[0]" to "strain[2]", ports root, tip and span."""
 
     name = "cantilever"
+    ports, shows_ports = tuple(PORTS), False
+    stations = 0.0, LENGTH
     parameters = (ParameterPrior("young_modulus_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 
     def output_quantity(self, output: str) -> Quantity | None:
         """Return what an output is."""
-        if output in GAUGES:
+        if output.removesuffix(ACROSS[0]).removesuffix(ACROSS[1]) in GAUGES:
             return Quantity.STRAIN
         return Quantity.DISPLACEMENT if output == "tip_displacement" else None
 
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the cantilever can carry a primitive: it can carry all."""
         return True
-
-    def ports(self) -> tuple[str, ...]:
-        """Names of the ports."""
-        return tuple(PORTS)
-
-    def stations(self) -> tuple[float, float]:
-        """Root and tip [m]."""
-        return 0.0, LENGTH
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign."""
@@ -195,15 +189,13 @@ class Cantilever(Model):
 
     def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
         """Return the response of a trial."""
-        rows = np.array(
-            [SKIN * curvature_row(GAUGES[name]) if name in GAUGES else TIP for name, _ in outputs]
-        )
-        values, rates, torque = _motion(trial, rows, patch, conditions)
-        if not conditions.components:
-            return Response(values, rates)
-        gauge = np.array([name in GAUGES for name, _ in outputs])
-        shear = np.outer(torque, gauge) * 2.0 * SKIN / TORSIONAL_STIFFNESS
-        return Response(values, rates, -POISSON * values * gauge, shear)
+        across, along = ACROSS[0], {name: SKIN * curvature_row(place) for name, place in GAUGES.items()}
+        rows = along | {name + across: -POISSON * row for name, row in along.items()}
+        chosen = np.array([rows.get(name, TIP) for name, _ in outputs])
+        values, rates, torque = _motion(trial, chosen, patch, conditions)
+        sheared = [name.endswith(ACROSS[1]) for name, _ in outputs]
+        values[:, sheared] = torque[:, None] * 2.0 * SKIN / TORSIONAL_STIFFNESS
+        return Response(values, rates)
 
 
 def _motion(
@@ -233,7 +225,7 @@ def _motion(
         if trial.kind is TrialKind.RINGDOWN:
             acting = replace(acting, release=(TIP, release_of(trial)), initial=conditions.initial)
         else:
-            acting = replace(acting, loads=[(row, Course.of(trial.time, force, trial.hold))])
+            acting = replace(acting, loads=[Load(row, Course(trial.time, force, trial.hold))])
         moved = motion_of(system, acting, laws, conditions.refinement)
         response = moved.seen([Shown.of(row) for row in rows])
         return response.values, response.rates, behind * force

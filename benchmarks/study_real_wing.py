@@ -134,7 +134,7 @@ def main() -> int:
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--begin", type=float, nargs="+", default=BEGINS, help="windows of the ring-downs, s")
     given = parser.parse_args()
-    model = WingModel.shipped()
+    model = WingModel.of_design()
     table = Table("records", "verdict", "", "held out: rms, mV", "χ²/dof")
     console = Console(width=160)
     runs = []

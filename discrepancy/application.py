@@ -113,10 +113,7 @@ def apply_verdict(
     patch = changed(patch, sentence=f"{sentence} {stored.verdict.sentence}")
     if path.suffix == ".toml":
         if not plain:
-            raise ModelError(
-                f"{path}: only laws at the ports of a lumped model can stand in its own file; give --out "
-                "with the ending .json, which is taken wherever a model is."
-            )
+            raise ModelError(said("applied.no_laws", path=path))
         atomic_write_text(path, _lumped_text(choice, patch))
     elif path.suffix == ".fmu":
         pack_patched(choice, patch, path, activate=True, replace=replace, progress=progress)
@@ -203,10 +200,7 @@ def pack_patched(
         If an FMU cannot carry an effect.
     """
     if choice.design is None:
-        raise ModelError(
-            f"{path}: only a wing is packed with its effects; of {choice.label} give --out with the ending "
-            ".json, which is taken wherever a model is."
-        )
+        raise ModelError(said("applied.no_wing", path=path, model=choice.label))
     rows = [{"id": item.identifier, "primitives": item.patch.to_list()} for item in patch.effects]
     content = {"schema": SCHEMA, "effects": rows, "channels": dict(patch.channels)}
     options: dict[str, Any] = {"state": DigitalState()}
@@ -214,15 +208,8 @@ def pack_patched(
         options = tailoring(load_calibration(choice.path))
     options["state"] = changed(options["state"], **{item.name: item.mean for item in patch.parameters})
     effects = parse_patch(json.dumps(content).encode(), "The patch")
-    pack_wing(
-        choice.design,
-        path,
-        patch=effects,
-        activate=activate,
-        replace=replace,
-        progress=progress,
-        **options,
-    )
+    options |= {"activate": activate, "replace": replace, "progress": progress}
+    pack_wing(choice.design, path, patch=effects, **options)
     return [f"effect.{effect.id}.active" for effect in effects.effects]
 
 

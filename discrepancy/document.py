@@ -6,12 +6,11 @@ The records themselves (`verdict`) say what a file holds; pydantic checks it aga
 
 import json
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, fields
 from importlib import resources
 from math import inf, isfinite, isnan, nan
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, TypeVar
 
 from pydantic import PlainValidator, TypeAdapter, ValidationError, WithJsonSchema
@@ -176,12 +175,9 @@ def write_document(path: Path, schema: str, record: object) -> Path:
 
 
 def read_document(
-    path: Path,
-    schema: str,
-    kind: type[_Record],
-    older: Mapping[str, Callable[[dict[str, Any]], dict[str, Any]]] = MappingProxyType({}),
+    path: Path, schema: str, kind: type[_Record], older: Collection[str] = (), **absent: Any
 ) -> _Record:
-    """Return the record of a document; `older` brings what older schemas hold up to this one.
+    """Return the record of a document; `absent` is what one of an older schema may lack.
 
     Raises
     ------
@@ -194,44 +190,20 @@ def read_document(
     content = read_json(path, VerdictFileError)
     came = content.pop("schema", None) if isinstance(content, dict) else None
     if came != schema and came not in older:
-        raise VerdictFileError(
-            f"{path} is {f'of the schema {came!r}' if came else 'no file of this kind'}, but {schema!r} is "
-            "needed."
-        )
-    content = older.get(str(came), dict)(content)
+        which = f"of the schema {came!r}" if came else "no file of this kind"
+        raise VerdictFileError(f"{path} is {which}, but {schema!r} is needed.")
+    content = {**({} if came == schema else absent), **content}
     origin = {item.name: content.pop(item.name) for item in fields(Origin) if item.name in content}
     before, after = f"{path} does not fit its schema: ", "; write it again."
     return _checked(kind, {**content, "origin": origin}, before, after)
 
 
 def _checked(kind: type[_Record], content: dict[str, Any], before: str, after: str) -> _Record:
-    """Return the record of plain data that holds what it should, all of it and nothing else."""
+    """Return the record of plain data that holds what it should and nothing else."""
     try:
-        record = TypeAdapter(kind).validate_python(content)
+        return TypeAdapter(kind).validate_json(json.dumps(content), strict=True, extra="forbid")
     except ValidationError as cause:
         error = cause.errors()[0]
         place = ".".join(str(part) for part in error["loc"])
         more = f" (and {cause.error_count() - 1} more)" if cause.error_count() > 1 else ""
         raise VerdictFileError(f"{before}{place}: {error['msg']}{more}{after}") from cause
-    odd = _difference(content, plain(record), "")
-    if odd:
-        raise VerdictFileError(f"{before}{odd}{after}")
-    return record
-
-
-def _difference(came: Any, expected: Any, place: str) -> str:
-    """Return the first place where plain data are not those of the record that was made of them."""
-    pairs: list[tuple[Any, Any, str]] = []
-    if isinstance(came, Mapping) and isinstance(expected, Mapping):
-        for name in {**expected, **came}:
-            where = f"{place}.{name}".lstrip(".")
-            if name not in came:
-                return f"{where} is missing"
-            if name not in expected:
-                return f"{where} is no key that is known"
-            pairs.append((came[name], expected[name], where))
-    elif isinstance(came, list) and isinstance(expected, list):
-        pairs = [(*both, f"{place}.{n}") for n, both in enumerate(zip(came, expected, strict=True))]
-    elif came != expected or isinstance(came, bool) is not isinstance(expected, bool):
-        return f"{place} is {came!r}"
-    return next((found for pair in pairs if (found := _difference(*pair))), "")

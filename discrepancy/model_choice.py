@@ -93,7 +93,7 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
         If there is no such model, or its file cannot be used.
     """
     if name is None:
-        return _wing(WingModel.shipped(progress), ModelKind.WING, None)
+        return _wing(WingModel.of_design(None, progress), ModelKind.WING, None)
     path = Path(name)
     file = str(path.resolve() if path.exists() else name)
     return replace(_chosen(path, progress), file=file)

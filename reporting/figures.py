@@ -145,6 +145,14 @@ def band(axes: Axes, x: ArrayLike, low: ArrayLike, high: ArrayLike, color: str) 
     axes.fill_between(x, low, high, color=color, alpha=BAND_OPACITY, linewidth=0)
 
 
+def shared_legend(figure: Figure, rows: int = 1, **place: Any) -> None:
+    """Name above the panels, in some rows, what is drawn with a label in any of them."""
+    pairs = (pair for axes in figure.axes for pair in zip(*axes.get_legend_handles_labels(), strict=True))
+    named = {label: handle for handle, label in pairs}
+    place = {"loc": "upper center", "bbox_to_anchor": (0.53, 1.0), **place}
+    figure.legend(named.values(), named.keys(), ncols=-(-len(named) // rows), **place)
+
+
 def color_bar(figure: Figure, drawn: Any, label: str, **place: Any) -> Axes:
     """Draw the scale of colours of what was drawn; `place` is `ax`, beside a panel, or `cax`, in one."""
     bar = figure.colorbar(drawn, **place)

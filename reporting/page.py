@@ -15,7 +15,7 @@ from hashlib import sha256
 from importlib import resources
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jinja2 import Environment, StrictUndefined
+from jinja2 import Environment, StrictUndefined, Template
 from markupsafe import Markup, escape
 
 from reporting import words
@@ -107,7 +107,8 @@ class Words:
         Where the file is, such as ``twin_master.report``.
     name
         Of the file: ``[said]`` holds sentences by name, ``[figures]`` titles and captions, and ``[tables]``
-        titles, captions and columns, each a heading, or ``{ number = heading, unit = unit }``.
+        titles, captions and columns, each a heading, or ``{ number = heading, unit = unit }``; `cell` says
+        what a column shows of each `row`, where rows are records and no ready cells.
     **shared
         What every template may name beside its own values, such as functions that print numbers.
     """
@@ -122,8 +123,12 @@ class Words:
 
     def headings(self, name: str) -> tuple[str, ...]:
         """Return the headings of a table, for a terminal."""
-        columns = self.content["tables"][name]["columns"]
-        return tuple(head if isinstance(head, str) else head["number"] for head in columns)
+        return tuple(head["name"] for head in self._columns(name))
+
+    def _columns(self, name: str) -> list[dict[str, Any]]:
+        rows = self.content["tables"][name]["columns"]
+        columns = [{"text": head} if isinstance(head, str) else head for head in rows]
+        return [{**head, "name": head.get("text") or head["number"]} for head in columns]
 
     def words(self, kind: str, name: str, /, **values: Any) -> dict[str, str]:
         """Return title and caption of one of the `figures` or `tables`."""
@@ -134,17 +139,17 @@ class Words:
         """Return a figure with its words."""
         return ReportFigure(name, figure, **self.words("figures", name, **values))
 
-    def add_table(self, page: "Page", name: str, rows: Sequence[Sequence[str]], /, **values: Any) -> None:
+    def add_table(self, page: "Page", name: str, rows: Sequence[Any], /, **values: Any) -> None:
         """Add a table with its words to a page, if it has rows; `more` are further columns."""
         if not rows:
             return
+        columns = self._columns(name)
         heads = [
-            Column(filled(head, **values))
-            if isinstance(head, str)
-            else numbers(filled(head["number"], **values), head.get("unit", ""))
-            for head in self.content["tables"][name]["columns"]
+            Column(filled(head["name"], **values), head.get("unit", ""), "number" in head) for head in columns
         ]
         heads += [head if isinstance(head, Column) else numbers(head) for head in values.get("more", ())]
+        if "cell" in columns[0]:
+            rows = [[filled(head["cell"], **self._shared, row=row) for head in columns] for row in rows]
         page.add_table(Table(heads[: len(rows[0])], rows), **self.words("tables", name, **values))
 
 
@@ -232,7 +237,12 @@ class Page:
 
 def filled(template: str, /, **values: Any) -> str:
     """Return a text whose Jinja2 expressions are filled with values, in one line."""
-    return " ".join(_environment(plain=True).from_string(template).render(**values).split())
+    return " ".join(_plain(template).render(**values).split())
+
+
+@cache
+def _plain(template: str) -> Template:
+    return _environment(plain=True).from_string(template)
 
 
 @cache

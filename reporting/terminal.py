@@ -5,12 +5,15 @@ progress, and takes no option for them: `with_common_options` gives every comman
 """
 
 import functools
+import inspect
 import json
 import os
 import sys
+import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from importlib.resources import files
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_origin
 
 import typer
 
@@ -27,10 +30,49 @@ INTERRUPTED = 130
 WIDTH_OF_A_PIPE = 1000
 """Columns of what is no terminal."""
 
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
-"""Option of the commands that answer a question."""
-NoReport = Annotated[bool, typer.Option("--no-report", help="Draw no report and no figures.")]
-"""Option of the commands that draw one."""
+SHARED = {
+    "json": "Print the result as JSON, and nothing else.",
+    "no_report": "Draw no report and no figures.",
+}
+"""What is said of the options of the commands that answer a question, and that draw a report."""
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+@functools.cache
+def told_by(package: str) -> Callable[[str], Callable[[_Function], _Function]]:
+    """Return what makes a function a command, by what `commands.toml` of a package tells of its parameters.
+
+    Parameters before `*` are arguments, the others options. A text is the help; a table holds what else Typer
+    takes (`metavar`, `min`, `show_default`, ...), and as `flags` the name of an option that has another one
+    than its parameter. What stands in `[shared]` holds for all commands that do not say otherwise.
+    """
+    tables = tomllib.loads(files(package).joinpath("commands.toml").read_text(encoding="utf-8"))
+
+    def told(words: str) -> Callable[[_Function], _Function]:
+        known = SHARED | tables["shared"] | tables.get(words, {})
+
+        def described(parameter: inspect.Parameter) -> inspect.Parameter:
+            plain = parameter.annotation
+            if parameter.name not in known or get_origin(plain) is Annotated:
+                return parameter
+            told = known[parameter.name]
+            given = {"help": told} if isinstance(told, str) else dict(told)
+            if parameter.kind is not inspect.Parameter.KEYWORD_ONLY:
+                made = typer.Argument(**{"show_default": False} | given)
+            else:
+                flags = given.pop("flags", "--" + parameter.name.replace("_", "-"))
+                made = typer.Option(flags, **given)
+            return parameter.replace(annotation=Annotated[plain, made])
+
+        def command(function: _Function) -> _Function:
+            signature = inspect.signature(function)
+            parameters = [described(parameter) for parameter in signature.parameters.values()]
+            vars(function)["__signature__"] = signature.replace(parameters=parameters)
+            return function
+
+        return command
+
+    return told
 
 
 @dataclass

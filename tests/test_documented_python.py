@@ -82,7 +82,7 @@ def empty_cart(folder: Path) -> None:
 def campaign_folder(folder: Path) -> None:
     from discrepancy.models.structures import WingModel
 
-    write_example(WingModel.shipped(), folder / "my_campaign", "static", seed=1)
+    write_example(WingModel.of_design(), folder / "my_campaign", "static", seed=1)
 
 
 def verdict_folder(folder: Path) -> None:

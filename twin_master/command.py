@@ -4,92 +4,43 @@ import traceback
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from reporting import terminal
-from twin_master.fleet.command import Cluster, Workers, engine_of, fly_and_show
-from twin_master.viewer.command import View, shown
+from twin_master.fleet.command import engine_of, fly_and_show
+from twin_master.viewer.command import shown
+
+told = terminal.told_by("twin_master")
 
 if TYPE_CHECKING:
     from twin_master.store.writing import RunOutcome
 
 
-Scenario = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="SCENARIO",
-        help="A shipped scenario (see `uav-twin scenarios`), the path of a TOML file, or of an SSP file "
-        "(with --scenario).",
-    ),
-]
-Out = Annotated[Path | None, typer.Option(help="The run folder to make.", show_default="runs/SCENARIO")]
-Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the run; by default that of the scenario.")]
-Fmu = Annotated[
-    Path | None, typer.Option(help="Fly this FMU; the design of the scenario stays the twin's model.")
-]
-Binding = Annotated[
-    Path | None,
-    typer.Option(help="Which variable of the FMU plays which role; by default as in the scenario."),
-]
-StrainLibrary = Annotated[
-    Path | None,
-    typer.Option(
-        help="Fly the authors' strain library (UAVconfig.json or its folder) as model and asset; in a "
-        "scenario that flies a library, its file."
-    ),
-]
-Calibration = Annotated[
-    Path | None,
-    typer.Option(help="Fly with this calibration, a calibration.nc of `uav-twin calibrate`."),
-]
-Library = Annotated[
-    Path | None,
-    typer.Option(help="Believe this observation library, made by `uav-twin library sample`."),
-]
-Learnt = Annotated[
-    Path | None, typer.Option(help="Fly with what a fleet has learnt, a file of `uav-twin fleet learn`.")
-]
-Policy = Annotated[
-    Path | None, typer.Option(help="Fly this policy, a file of `uav-twin plan --out`, without planning.")
-]
-InProcess = Annotated[
-    bool, typer.Option("--in-process", help="Run the FMU in this process instead of a worker.")
-]
-Seeds = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FIRST:END",
-        help="Fly one mission for each of these seeds, END left out, into a store; see `uav-twin fleet`.",
-    ),
-]
-WithScenario = Annotated[
-    str | None, typer.Option("--scenario", help="What is flown with the SSP file that SCENARIO names.")
-]
-
-
+@told("run")
 def run(
-    scenario: Scenario = None,
-    out: Out = None,
-    seed: Seed = None,
-    resume: Annotated[Path | None, typer.Option(help="Continue the interrupted run in this folder.")] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the run folder if it exists.")] = False,
-    fmu: Fmu = None,
-    binding: Binding = None,
-    strain_library: StrainLibrary = None,
-    calibration: Calibration = None,
-    library: Library = None,
-    learnt: Learnt = None,
-    in_process: InProcess = False,
-    view: View = False,
-    with_scenario: WithScenario = None,
-    no_report: terminal.NoReport = False,
-    json: terminal.Json = False,
-    seeds: Seeds = None,
-    workers: Workers = None,
-    cluster: Cluster = None,
-    policy: Policy = None,
+    scenario: str | None = None,
+    *,
+    out: Path | None = None,
+    seed: int | None = None,
+    resume: Path | None = None,
+    replace: bool = False,
+    fmu: Path | None = None,
+    binding: Path | None = None,
+    strain_library: Path | None = None,
+    calibration: Path | None = None,
+    library: Path | None = None,
+    learnt: Path | None = None,
+    in_process: bool = False,
+    view: bool = False,
+    with_scenario: str | None = None,
+    no_report: bool = False,
+    json: bool = False,
+    seeds: str | None = None,
+    workers: int | None = None,
+    cluster: str | None = None,
+    policy: Path | None = None,
 ) -> None:
     """Fly a scenario: model, reduce, pack, calibrate, fly, report."""
     from twin_master import workflow

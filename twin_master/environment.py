@@ -22,6 +22,7 @@ from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.truth import Plant
 from twin_master.network.rewards import health_reward
 from twin_master.scenario.reading import LoadedScenario, load_scenario
+from twin_master.sentences import said
 
 try:
     import gymnasium
@@ -79,10 +80,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         loaded = scenario if isinstance(scenario, LoadedScenario) else load_scenario(scenario)
         self.scenario = resolve_scenario(loaded, given_overrides(overrides))
         if self.scenario.observation.role == "modes":
-            raise MissionInputError(
-                f"the scenario {self.scenario.mission.name} observes modes with a covariance, which are no "
-                "vector of sensors: take a scenario that observes sensors."
-            )
+            raise MissionInputError(said("environment.modes", name=self.scenario.mission.name))
         source = source_of(self.scenario)
         source.check()
         self._folder = TemporaryDirectory(prefix="uav_twin_")  # holds what is packed as long as it is flown
@@ -142,8 +140,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
             raise gymnasium.error.ResetNeeded("the mission is over or has not begun: call reset().")
         if not self.action_space.contains(action):
             raise gymnasium.error.InvalidAction(
-                f"expected the index of one of the controls {', '.join(self.scenario.control_names)}, "
-                f"got {action!r}"
+                said("environment.control", known=", ".join(self.scenario.control_names), action=action)
             )
         try:
             observation, reward, info = self._fly(int(action), self._control)

@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from reporting import terminal
-from twin_master.command import Calibration, Seed
 from twin_master.errors import MissionInputError
+from twin_master.sentences import said
+
+told = terminal.told_by("twin_master")
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,26 +24,17 @@ if TYPE_CHECKING:
 
     Float = NDArray[np.float64]
 
-ValueOf = Annotated[
-    str | None,
-    typer.Option(
-        metavar="NAME", help="Say what an action that inspects is worth, or a gauge by its number or title."
-    ),
-]
 
-
+@told("plan")
 def plan(
-    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A shipped scenario, or a TOML file.")],
-    out: Annotated[
-        Path | None, typer.Option(help="Write the policy to this file, for `uav-twin run --policy`.")
-    ] = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="Draw what is done at which belief, as SVG or PNG.")
-    ] = None,
-    value_of: ValueOf = None,
-    seed: Seed = None,
-    calibration: Calibration = None,
-    json: terminal.Json = False,
+    scenario: str,
+    *,
+    out: Path | None = None,
+    picture: Path | None = None,
+    value_of: str | None = None,
+    seed: int | None = None,
+    calibration: Path | None = None,
+    json: bool = False,
 ) -> None:
     """Plan on the belief: expected return with its bounds, beside simpler rules."""
     from twin_master.mission.planning import compared, risk_of, write_policy
@@ -117,8 +108,13 @@ def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
     for name in names:
         if name not in (*titles, *inspecting):
             raise MissionInputError(
-                f"--value-of names an action that inspects ({', '.join(inspecting) or 'there is none'}) or a "
-                f"gauge ({titles[0]} to {titles[-1]}), and `{name}` came."
+                said(
+                    "plan_command.value_of",
+                    inspecting=", ".join(inspecting) or "there is none",
+                    first=titles[0],
+                    last=titles[-1],
+                    name=name,
+                )
             )
     given, count = scenario.observation.standard_deviation, scenario.observation.count
     each = given if isinstance(given, tuple) else (given,) * count
@@ -168,27 +164,18 @@ def _show(record: Mapping[str, Any], rows: "list[ComparedPolicy]") -> None:
         terminal.say(f"{value['of']} is worth {value['mean']:.3g} ± {value['half_width']:.2g} (95 %).")
 
 
+@told("design")
 def design(
-    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A shipped scenario, or a TOML file.")],
-    sensors: Annotated[int, typer.Option(min=1, help="How many to choose.")],
-    among: Annotated[
-        str | None,
-        typer.Option(metavar="NAMES", help="Candidates, by numbers or titles with commas; all by default."),
-    ] = None,
-    candidates: Annotated[
-        str | None,
-        typer.Option(
-            metavar="N|FILE",
-            help="More candidates on a structure: N rosettes spread over its surface, or a file of gauges.",
-        ),
-    ] = None,
-    picture: Annotated[Path | None, typer.Option(help="Draw the choice, as SVG or PNG.")] = None,
-    vtu: Annotated[Path | None, typer.Option(help="Write the gauges as points with their ranks.")] = None,
-    worth: Annotated[
-        bool, typer.Option("--worth", help="Plan with the chosen and with all, and compare the returns.")
-    ] = False,
-    calibration: Calibration = None,
-    json: terminal.Json = False,
+    scenario: str,
+    *,
+    sensors: int,
+    among: str | None = None,
+    candidates: str | None = None,
+    picture: Path | None = None,
+    vtu: Path | None = None,
+    worth: bool = False,
+    calibration: Path | None = None,
+    json: bool = False,
 ) -> None:
     """Choose the sensors that tell most of the state, and name what none of them separates."""
     from twin_master.mission.sensor_design import chosen_sensors, drawn_readings, separations
@@ -197,9 +184,7 @@ def design(
     titles = _titles(knowledge.scenario)
     wanted = titles if among is None else tuple(among.split(","))
     if not {*wanted} <= {*titles} or len({*wanted}) < len(wanted):
-        raise MissionInputError(
-            f"--among names different sensors ({titles[0]} to {titles[-1]}), and `{among}` came."
-        )
+        raise MissionInputError(said("plan_command.among", first=titles[0], last=titles[-1], among=among))
     pool, readings = [titles.index(name) for name in wanted], drawn_readings(knowledge)
     found = chosen_sensors(readings, pool, sensors)
     names = [titles[sensor] for sensor in found.sensors]

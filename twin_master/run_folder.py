@@ -15,6 +15,7 @@ from reporting.folders import lock_folder, whole_folder
 from reporting.json_file import read_json
 from reporting.provenance import collect_provenance
 from twin_master.errors import NotResumableError, RunFolderError, RunFolderExistsError
+from twin_master.sentences import said
 
 CONFIG_NAME = "config.json"
 FIELD_NAME = "wing.vtu"
@@ -81,14 +82,9 @@ def create_run_folder(
         raise RunFolderExistsError(f"{folder} exists and is no folder: choose another --out.")
     occupied = folder.is_dir() and any(folder.iterdir())
     if occupied and not is_run_folder(folder):
-        raise RunFolderExistsError(
-            f"{folder} exists and is no run folder, so it is not touched: choose another --out."
-        )
+        raise RunFolderExistsError(said("run_folder.foreign", folder=folder))
     if occupied and not replace:
-        raise RunFolderExistsError(
-            f"{folder} holds a run already: choose another --out, go on with it by --resume, or give "
-            "--replace."
-        )
+        raise RunFolderExistsError(said("run_folder.there", folder=folder))
     lock = None
     try:
         with whole_folder(folder, lock_run_folder) as fresh:
@@ -112,18 +108,13 @@ def read_config(folder: Path) -> dict[str, Any]:
         There is none, or it is damaged.
     """
     if not folder.is_dir():
-        raise NotResumableError(
-            f"there is no run folder {folder}: nothing was begun there, fly the mission with --out."
-        )
+        raise NotResumableError(said("run_folder.none", folder=folder))
     if not is_run_folder(folder):
         raise NotResumableError(f"{folder} is no run folder: it holds no {CONFIG_NAME} of a run.")
     config: dict[str, Any] = read_json(folder / CONFIG_NAME, NotResumableError)
     for name in ("scenario", "scenario_file", "provenance", "inputs"):
         if not isinstance(config.get(name, {} if name == "inputs" else None), dict):
-            raise NotResumableError(
-                f"{folder / CONFIG_NAME} is damaged, its table `{name}` is missing: "
-                "fly the mission again with --replace."
-            )
+            raise NotResumableError(said("run_folder.damaged", path=folder / CONFIG_NAME, name=name))
     return config
 
 
@@ -171,10 +162,7 @@ def check_versions(folder: Path, config: Mapping[str, Any], seed: int) -> None:
         another = {name for name, value in now[what].items() if known.get(name) != value}
         changed = sorted(another - HARMLESS_PACKAGES)
         if changed:
-            raise NotResumableError(
-                f"{folder} was begun with another version of {', '.join(changed)}, so its results could not "
-                "be the same: fly the mission again with --replace."
-            )
+            raise NotResumableError(said("run_folder.version", folder=folder, names=", ".join(changed)))
 
 
 def with_inputs(folder: Path, config: dict[str, Any], hashes: Mapping[str, str]) -> dict[str, Any]:
@@ -189,8 +177,7 @@ def with_inputs(folder: Path, config: dict[str, Any], hashes: Mapping[str, str])
     if recorded is not None and recorded != dict(hashes):
         changed = sorted(name for name in {*recorded, *hashes} if recorded.get(name) != hashes.get(name))
         raise NotResumableError(
-            f"the {', '.join(changed).replace('_', ' ')} changed since the run in {folder} was begun: "
-            "fly the mission again with --replace."
+            said("run_folder.changed", names=", ".join(changed).replace("_", " "), folder=folder)
         )
     if recorded is None:
         config = {**config, "inputs": dict(hashes)}

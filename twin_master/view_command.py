@@ -2,25 +2,16 @@
 
 import webbrowser
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
+from reporting import terminal
 
-def view(
-    folder: Annotated[
-        Path,
-        typer.Argument(
-            metavar="DIR",
-            help="Folder of a run, a watch or a fleet, finished or going on.",
-            show_default=False,
-        ),
-    ],
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, help="Port on the loopback.", show_default="any that is free")
-    ] = 0,
-    browser: Annotated[bool, typer.Option("--browser", help="Open the page in the default browser.")] = False,
-) -> None:
+told = terminal.told_by("twin_master")
+
+
+@told("view")
+def view(folder: Path, *, port: int = 0, browser: bool = False) -> None:
     """Show a flight in the browser, turn by turn or while it goes on, or a whole fleet."""
     from twin_master.fleet.view import is_fleet, serve_fleet
     from twin_master.viewer.server import serve

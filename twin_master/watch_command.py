@@ -8,71 +8,42 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from reporting import terminal
-from twin_master.command import Calibration, Library, Seed
-from twin_master.viewer.command import View, shown
+from twin_master.viewer.command import shown
+
+told = terminal.told_by("twin_master")
 
 if TYPE_CHECKING:
     from twin_master.scenario.schema import Scenario
     from twin_master.watch.folder import Watch
 
-Observations = Annotated[
-    str | None,
-    typer.Option(
-        metavar="SOURCE",
-        help="A CSV or NetCDF file, the folder of a run or watch, `-` for JSON lines on standard input, or "
-        "mqtt://[USER@]HOST[:PORT]/TOPIC (mqtts:// with TLS).",
-        show_default="the recording of the scenario, else -",
-    ),
-]
 
-Pace = Annotated[
-    float,
-    typer.Option(min=0.0, max=3600.0, help="Seconds to wait after each turn, to look at a recording."),
-]
-Teach = Annotated[
-    bool, typer.Option("--teach", help="Look for the cause of an alarm, and believe what is named.")
-]
-Unknown = Annotated[
-    bool, typer.Option("--allow-unknown", help="Pass over keys and columns that are no sensor.")
-]
-Authority = Annotated[Path | None, typer.Option(help="Certificate of the authority of an mqtts:// broker.")]
-
-
+@told("watch")
 def watch(
-    scenario: Annotated[
-        str | None,
-        typer.Argument(metavar="[SCENARIO]", help="A shipped scenario, or the path of a TOML file."),
-    ] = None,
-    observations: Observations = None,
-    out: Annotated[
-        Path | None, typer.Option(help="The folder of the watch.", show_default="runs/SCENARIO")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Take up the watch in --out.")] = False,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the folder if it exists.")] = False,
-    follow: Annotated[bool, typer.Option("--follow", help="Wait at the end of a CSV file for more.")] = False,
-    pace: Pace = 0.0,
-    turns: Annotated[int | None, typer.Option(min=0, help="End after so many turns in all.")] = None,
-    model_patch: Annotated[
-        Path | None,
-        typer.Option(help="Believe this patch (`patch.json` of `discrepancy run`) from --from-turn on."),
-    ] = None,
-    from_turn: Annotated[
-        int | None, typer.Option(min=0, help="The first turn that --model-patch is believed in.")
-    ] = None,
-    teach: Teach = False,
-    allow_unknown: Unknown = False,
-    ca_file: Authority = None,
-    seed: Seed = None,
-    calibration: Calibration = None,
-    library: Library = None,
-    last: Annotated[int, typer.Option(min=1, help="Turns, the last ones, in run.nc and report.")] = 1000,
-    view: View = False,
-    no_report: terminal.NoReport = False,
+    scenario: str | None = None,
+    *,
+    observations: str | None = None,
+    out: Path | None = None,
+    resume: bool = False,
+    replace: bool = False,
+    follow: bool = False,
+    pace: float = 0.0,
+    turns: int | None = None,
+    model_patch: Path | None = None,
+    from_turn: int | None = None,
+    teach: bool = False,
+    allow_unknown: bool = False,
+    ca_file: Path | None = None,
+    seed: int | None = None,
+    calibration: Path | None = None,
+    library: Path | None = None,
+    last: int = 1000,
+    view: bool = False,
+    no_report: bool = False,
 ) -> None:
     """Watch a real asset: observations in, a decision for each turn out, as a line of JSON.
 

@@ -2,36 +2,29 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from reporting import terminal
 from uav_twin.calibrate_laboratory import calibrate_ringdown, calibrate_simulate
-from uav_twin.options import refuse_before
+from uav_twin.options import refuse_before, told
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
 
 
+@told("calibrate campaign")
 def calibrate_campaign(
-    campaign: Annotated[Path, typer.Argument(help="Folder with campaign.toml.", show_default=False)],
-    model: Annotated[
-        str | None,
-        typer.Option(
-            help="The model file of an FMU or a structure, a lumped model, a wing design: as of `discrepancy "
-            "run`.",
-            show_default="the shipped wing",
-        ),
-    ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for calibration.nc and report.")] = None,
-    asset: Annotated[
-        str | None, typer.Option(help="Name of what was measured.", show_default="that of the campaign")
-    ] = None,
-    samples: Annotated[int, typer.Option(min=100, max=100_000, help="Samples that are kept.")] = 1000,
-    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all samples.")] = 0,
-    json: terminal.Json = False,
-    no_report: terminal.NoReport = False,
+    campaign: Path,
+    *,
+    model: str | None = None,
+    out: Path | None = None,
+    asset: str | None = None,
+    samples: int = 1000,
+    seed: int = 0,
+    json: bool = False,
+    no_report: bool = False,
 ) -> None:
     """Posterior of the parameters of any model, an FMU or a structure too, from a campaign."""
     from calibration.result.file import check_folder
@@ -127,43 +120,20 @@ class ProcedureName(StrEnum):
     paper = "paper"
 
 
-Data = Annotated[
-    Path | None,
-    typer.Option(help="Lab folder with step1, step2, step3, or some of them; published figures otherwise."),
-]
-Out = Annotated[Path | None, typer.Option(help="Folder for calibration.nc, report, table and figures.")]
-Asset = Annotated[str | None, typer.Option(help="Name of this wing.", show_default="that of the design")]
-Procedure = Annotated[
-    ProcedureName,
-    typer.Option(help="Keep samples of the joint posterior, or of the paper's steps one after another."),
-]
-Design = Annotated[Path | None, typer.Option(help="The wing as drawn; the shipped design by default.")]
-Measured = Annotated[
-    bool | None,
-    typer.Option(
-        "--measured/--published",
-        help="Aim step 3 at the ring-down records of --data or at the published figures.",
-        show_default="measured where there are records",
-    ),
-]
-Fitted = Annotated[
-    bool,
-    typer.Option("--fitted", help="Fit the frequencies of the records too; spectral peaks by default."),
-]
-
-
+@told("calibrate")
 def calibrate_wing(
     context: typer.Context,
-    data: Data = None,
-    out: Out = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all samples.")] = 0,
-    asset: Asset = None,
-    procedure: Procedure = ProcedureName.joint,
-    design: Design = None,
-    measured: Measured = None,
-    fitted: Fitted = False,
-    json: terminal.Json = False,
-    no_report: terminal.NoReport = False,
+    *,
+    data: Path | None = None,
+    out: Path | None = None,
+    seed: int = 0,
+    asset: str | None = None,
+    procedure: ProcedureName = ProcedureName.joint,
+    design: Path | None = None,
+    measured: bool | None = None,
+    fitted: bool = False,
+    json: bool = False,
+    no_report: bool = False,
 ) -> None:
     """Tailor the model to one wing: planform, stiffness, masses and damping, in this order.
 

@@ -5,32 +5,26 @@ import io
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from reporting import terminal
-from uav_twin.options import Design
+from uav_twin.options import told
 
 if TYPE_CHECKING:
     from calibration.virtual_wing import TestBench
     from fe.runtime.state import DigitalState, Geometry
 
 
+@told("calibrate ringdown")
 def calibrate_ringdown(
-    data: Annotated[Path, typer.Option(help="Ring-down records: the authors' folder, or one file.")],
-    out: Annotated[Path | None, typer.Option(help="Folder for table and figures.")] = None,
-    fitted: Annotated[
-        bool,
-        typer.Option("--fitted", help="Fit the frequencies too; by default those of the spectral peaks."),
-    ] = False,
-    extremes: Annotated[
-        bool,
-        typer.Option("--extremes", help="Fit the extremes of records read off a plot, not the middle."),
-    ] = False,
-    start: Annotated[
-        float | None, typer.Option(min=0.0, help="Where records are cropped [s]; the first peak by default.")
-    ] = None,
+    *,
+    data: Path,
+    out: Path | None = None,
+    fitted: bool = False,
+    extremes: bool = False,
+    start: float | None = None,
 ) -> None:
     """Natural frequencies and damping ratios of two modes from ring-down records."""
     from calibration.dynamics.records import read_records
@@ -76,36 +70,22 @@ def _cells(rows: Sequence[tuple[str, str, tuple[float, ...]]], digits: str) -> l
 TRUTH_FILE = "truth.json"
 
 
-Fmu = Annotated[
-    Path | None,
-    typer.Option(
-        help="Do the experiments on this wing FMU, not on the reduced model; of the shipped planform."
-    ),
-]
-SamplingRate = Annotated[
-    float, typer.Option(help="Samples per second of a ring-down record; the published have 100000.")
-]
-Quantisation = Annotated[float | None, typer.Option(help="Step of the recorder [V]; none by default.")]
-FrequencyError = Annotated[
-    tuple[float, float],
-    typer.Option(help="Relative differences of the wing's f1 and f2 from its model's; not with --fmu."),
-]
-
-
+@told("calibrate simulate")
 def calibrate_simulate(
-    out: Annotated[Path, typer.Option(help="Folder to write; it must be empty or not exist.")],
-    e: Annotated[float, typer.Option(help="True Young's modulus factor.")] = 1.0073,
-    servo_mass: Annotated[float, typer.Option(help="True mass of each servo [kg].")] = 0.169,
-    pitot_mass: Annotated[float, typer.Option(help="True mass of the pitot tube [kg].")] = 0.134,
-    alpha: Annotated[float, typer.Option(help="True mass-proportional damping [1/s].")] = 1.03,
-    beta: Annotated[float, typer.Option(help="True stiffness-proportional damping [s].")] = 7.66e-4,
-    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all errors.")] = 0,
-    fmu: Fmu = None,
-    design: Design = None,
-    sampling_rate: SamplingRate = 2000.0,
-    noise: Annotated[float, typer.Option(min=0.0, help="Noise of a record [V], standard deviation.")] = 1e-4,
-    quantisation: Quantisation = None,
-    frequency_error: FrequencyError = (0.0, 0.0),
+    *,
+    out: Path,
+    e: float = 1.0073,
+    servo_mass: float = 0.169,
+    pitot_mass: float = 0.134,
+    alpha: float = 1.03,
+    beta: float = 0.000766,
+    seed: int = 0,
+    fmu: Path | None = None,
+    design: Path | None = None,
+    sampling_rate: float = 2000.0,
+    noise: float = 0.0001,
+    quantisation: float | None = None,
+    frequency_error: tuple[float, float] = (0.0, 0.0),
 ) -> None:
     """Measure a virtual wing: a folder as `calibrate` reads it, and truth.json beside it."""
     import json

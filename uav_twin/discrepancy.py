@@ -1,7 +1,6 @@
 """`uav-twin discrepancy ...`: what a model lacks beside measured data, and the model with it (`apply`)."""
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -10,23 +9,13 @@ from uav_twin.discrepancy_catalogue import convert, effects, example
 from uav_twin.discrepancy_check import check
 from uav_twin.discrepancy_import import import_files
 from uav_twin.discrepancy_run import run
-from uav_twin.options import Replace
+from uav_twin.options import told
 
 
+@told("discrepancy apply")
 def apply(
-    verdict: Annotated[
-        Path, typer.Argument(help="Folder of a verdict, or its verdict.json.", show_default=False)
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(help="The file: .toml (a lumped model), .json (any model) or .fmu (a wing).",
-                     show_default="MODEL_patched"),
-    ] = None,
-    member: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Of a group: which; the most probable by default.")
-    ] = None,
-    replace: Replace = False,
-) -> None:  # fmt: skip
+    verdict: Path, *, out: Path | None = None, member: str | None = None, replace: bool = False
+) -> None:
     """Write the model with the effect that was found and the parameters beside it."""
     from discrepancy.application import apply_verdict
 

@@ -2,13 +2,11 @@
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from reporting import terminal
 from reporting.words import counted
-from uav_twin.options import Effects, ModelFile
+from uav_twin.options import told
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
@@ -18,10 +16,8 @@ if TYPE_CHECKING:
     from fe.runtime.patch import ModelPatch
 
 
-def effects(
-    show: Annotated[str | None, typer.Option(metavar="ID", help="Everything about one effect.")] = None,
-    add: Effects = None,
-) -> None:
+@told("discrepancy effects")
+def effects(*, show: str | None = None, add: list[Path] | None = None) -> None:
     """List the effects that can be named."""
     from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
     from discrepancy.report.text import formula
@@ -66,23 +62,9 @@ def _show(effect: "Effect") -> None:
     terminal.print_table(headings, rows)
 
 
+@told("discrepancy example")
 def example(
-    kind: Annotated[
-        str, typer.Argument(help="static, ringdown, flight, laboratory or complete.", show_default=False)
-    ],
-    out: Annotated[Path, typer.Argument(help="The folder to write.", show_default=False)],
-    model: ModelFile = None,
-    seed: Annotated[
-        int, typer.Option(min=0, max=2**63 - 1, help="Seed of noise, zeros, gains and releases.")
-    ] = 0,
-    effect: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="ID[@PLACE][:NAME=VALUE,...]",
-            help="Hide an effect; values of its parameters in the catalogue's order, else their prior "
-            "medians. May be given several times.",
-        ),
-    ] = None,
+    kind: str, out: Path, *, model: str | None = None, seed: int = 0, effect: list[str] | None = None
 ) -> None:
     """Write a simulated campaign, with an effect hidden in it if asked for."""
     from discrepancy.model_choice import choose_model
@@ -166,11 +148,8 @@ def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> d
     return values
 
 
-def convert(
-    out: Annotated[Path, typer.Argument(help="Folder to write the campaign to.", show_default=False)],
-    data: Annotated[Path, typer.Option(help="The folder of the published data.", show_default=False)],
-    rig: Annotated[str, typer.Option(help="real_wing, falling_phone, two_tanks or pendulum.")] = "real_wing",
-) -> None:
+@told("discrepancy convert")
+def convert(out: Path, *, data: Path, rig: str = "real_wing") -> None:
     """Write published measurements as a campaign; of other rigs than the wing with `model.toml` beside it."""
     from discrepancy.campaign.reading import read_campaign
     from discrepancy.sources.measured_rigs import THE_WING, write_rig_campaign, write_wing_campaign

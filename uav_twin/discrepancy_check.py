@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from reporting import terminal
-from uav_twin.options import Effects, ModelFile
+from uav_twin.options import told
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
@@ -16,11 +16,9 @@ if TYPE_CHECKING:
     from discrepancy.judgement.separability import Separability
 
 
+@told("discrepancy check")
 def check(
-    campaign: Annotated[Path, typer.Argument(help="Folder with campaign.toml.", show_default=False)],
-    model: ModelFile = None,
-    effects: Effects = None,
-    json: terminal.Json = False,
+    campaign: Path, *, model: str | None = None, effects: list[Path] | None = None, json: bool = False
 ) -> None:
     """Say what is wrong with the data, which effects they can show, and which they cannot tell apart."""
     from discrepancy.campaign.reading import read_campaign
@@ -105,11 +103,7 @@ def _show(
     if able is None:
         return
     shown = [at for at, title in enumerate(HEADINGS) if title not in ("testable", "confused with")]
-    rows = [
-        [row[at] for at in shown]
-        for row, item in zip(rows_of(able), able.detectability, strict=True)
-        if not item.reason
-    ]
+    rows = [[row[at] for at in shown] for row in rows_of(able)]
     terminal.print_table([HEADINGS[at] for at in shown], rows)
     told = group_lines(able, "to which is said above")
     for line in (*untested_lines(able), *confused_lines(able), *told, *needs(able, data, catalogue)):

@@ -4,55 +4,32 @@ import re
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from reporting import terminal
 from reporting.words import counted
+from uav_twin.options import told
 
 if TYPE_CHECKING:
     from discrepancy.campaign.importing import Understanding
 
-Said = list[str] | None
 
-
-def _option(metavar: str, text: str, **more: Any) -> Any:
-    return typer.Option(metavar=metavar, help=f"{text} May be given several times.", **more)
-
-
-Column = Annotated[Said, _option(
-    "HEAD=WHAT", "The model's output that a column measures; time, force, temperature or load_factor; "
-    "input:NAME; or - to leave it out.",
-)]  # fmt: skip
-Unit = Annotated[Said, _option("HEAD=UNIT", "Where the head does not say it.")]
-Quantity = Annotated[Said, _option("HEAD=QUANTITY", "Where a unit is of several, such as V, % and 1.")]
-Kind = Annotated[Said, _option(
-    "[FILE=]KIND", "What was done: static, ringdown, forced, driven or flight; noise: samples at rest."
-)]  # fmt: skip
-Release = Annotated[Said, _option("[FILE=]SIZE", "How far the point was held that was let go, as 15.5mm.")]
-LoadPlace = Annotated[Said, _option("[FILE=]PLACE", "Where a force acts.", show_default="tip_load")]
-Decimal = Annotated[Said, _option("[FILE=]MARK", "Point or comma, where 1,234 can be two numbers.")]
-
-
+@told("discrepancy import")
 def import_files(
-    files: Annotated[
-        list[Path], typer.Argument(help="CSV, FILE.xlsx or FILE.xlsx#SHEET.", show_default=False)
-    ],
-    out: Annotated[Path | None, typer.Option(help="The folder.", show_default="as the first file")] = None,
-    column: Column = None,
-    unit: Unit = None,
-    quantity: Quantity = None,
-    kind: Kind = None,
-    release: Release = None,
-    load_place: LoadPlace = None,
-    decimal: Decimal = None,
-    reference_temperature: Annotated[
-        str | None, typer.Option(metavar="DEGC", help="Where a column is a temperature.")
-    ] = None,
-    model: Annotated[
-        str | None, typer.Option(help="As of `discrepancy run`: columns may be called like its outputs.")
-    ] = None,
+    files: list[Path],
+    *,
+    out: Path | None = None,
+    column: list[str] | None = None,
+    unit: list[str] | None = None,
+    quantity: list[str] | None = None,
+    kind: list[str] | None = None,
+    release: list[str] | None = None,
+    load_place: list[str] | None = None,
+    decimal: list[str] | None = None,
+    reference_temperature: str | None = None,
+    model: str | None = None,
 ) -> None:
     """Make a campaign of a laboratory's files: show how they are understood, and ask what they do not say."""
     from discrepancy.campaign.importing import OF_COLUMNS, OF_FILES, Understanding

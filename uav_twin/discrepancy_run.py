@@ -4,12 +4,12 @@ import dataclasses
 import shlex
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from reporting import terminal
-from uav_twin.options import Effects
+from uav_twin.options import told
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
@@ -24,47 +24,21 @@ if TYPE_CHECKING:
 SHOWN_EXPERIMENTS = 3
 
 
-CampaignOption = Annotated[Path | None, typer.Argument(help="Folder with campaign.toml.", show_default=False)]
-FromRun = Annotated[
-    Path | None,
-    typer.Option(help="Folder of a mission (uav-twin run): its flight, and by default its twin's model."),
-]
-FromTurn = Annotated[int | None, typer.Option(min=0, help="First turn of --from-run that is compared.")]
-ToTurn = Annotated[int | None, typer.Option(min=0, help="Last turn of --from-run that is compared.")]
-Model = Annotated[
-    str | None,
-    typer.Option(
-        help="A calibration.nc, a wing design, a structure, a lumped model or a description of an FMU "
-        "(.toml), one of them patched (.json), or the name of a shipped lumped model.",
-        show_default="the shipped wing",
-    ),
-]
-Out = Annotated[Path | None, typer.Option(help="Folder of the verdict.", show_default="verdicts/CAMPAIGN")]
-Replace = Annotated[bool, typer.Option("--replace", help="Replace the folder of an earlier verdict.")]
-Calibrate = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        max=10_000,
-        metavar="N",
-        help="Try the workflow on N simulated campaigns of this geometry; takes minutes.",
-    ),
-]
-
-
+@told("discrepancy run")
 def run(
-    campaign: CampaignOption = None,
-    from_run: FromRun = None,
-    from_turn: FromTurn = None,
-    to_turn: ToTurn = None,
-    model: Model = None,
-    out: Out = None,
-    replace: Replace = False,
-    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all draws.")] = 0,
-    effects: Effects = None,
-    calibrate: Calibrate = None,
-    no_report: terminal.NoReport = False,
-    json: terminal.Json = False,
+    campaign: Path | None = None,
+    *,
+    from_run: Path | None = None,
+    from_turn: int | None = None,
+    to_turn: int | None = None,
+    model: str | None = None,
+    out: Path | None = None,
+    replace: bool = False,
+    seed: int = 0,
+    effects: list[Path] | None = None,
+    calibrate: int | None = None,
+    no_report: bool = False,
+    json: bool = False,
 ) -> None:
     """Find out what the model lacks: verdict, report, patch, residuals."""
     from discrepancy.catalogue.library import load_catalogue

@@ -2,13 +2,13 @@
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
 from reporting import terminal
 from reporting.words import counted
-from uav_twin.options import FmiVersion, Kind, Replace, StepTimeout
+from uav_twin.options import told
 from uav_twin.simulated import simulate
 from uav_twin.structure import fmu as build_structure
 from uav_twin.structure import names_structure
@@ -17,16 +17,9 @@ if TYPE_CHECKING:
     from fmu_asset.compiled.compiler import Platform
 
 
+@told("fmu bind")
 def bind(
-    file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)],
-    out: Annotated[
-        Path | None, typer.Option(help="The binding file to write; on the terminal by default.")
-    ] = None,
-    step_size: Annotated[
-        float | None,
-        typer.Option(help="Communication step size in seconds; the FMU's own by default.", min=0.0),
-    ] = None,
-    replace: Replace = False,
+    file: Path, *, out: Path | None = None, step_size: float | None = None, replace: bool = False
 ) -> None:
     """Draft a binding for an FMU: which variable is which role, in which unit."""
     import gc
@@ -51,22 +44,16 @@ def bind(
 _COLOURS = {"ok": "green", "warning": "yellow", "problem": "red", "skipped": "dim"}
 
 
+@told("fmu check")
 def check(
-    file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)],
-    binding: Annotated[
-        Path | None, typer.Option(help="A binding file; drafted from the model description by default.")
-    ] = None,
-    cycles: Annotated[
-        int, typer.Option(help="Instances to make and free in one process; 0 for none.", min=0)
-    ] = 2000,
-    step_size: Annotated[
-        float | None, typer.Option(help="Communication step size in seconds of a drafted binding.", min=0.0)
-    ] = None,
-    step_timeout: StepTimeout = None,
-    memory_limit: Annotated[
-        float | None, typer.Option(help="Limit of a worker's memory in MiB.", min=0.0)
-    ] = None,
-    json: terminal.Json = False,
+    file: Path,
+    *,
+    binding: Path | None = None,
+    cycles: int = 2000,
+    step_size: float | None = None,
+    step_timeout: float | None = None,
+    memory_limit: float | None = None,
+    json: bool = False,
 ) -> None:
     """Check an FMU in every way we know; exit code 1 if anything is wrong with it."""
     from dataclasses import asdict
@@ -112,40 +99,20 @@ fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe, bind, check a
 
 
 @fmu_app.command("build")
+@told("fmu build")
 def build(
-    out: Annotated[
-        Path | None,
-        typer.Option(help="The file to write: by default uav_wing.fmu, of a structure beside its file."),
-    ] = None,
-    design: Annotated[
-        Path | None,
-        typer.Option(help="Wing design, or a structure file beside its mesh; the shipped wing by default."),
-    ] = None,
-    kind: Kind = "python",
-    fmi: FmiVersion = 2,
-    interface: Annotated[
-        Literal["co-simulation", "model-exchange"],
-        typer.Option(help="How it is run; in model exchange a compiled wing has its modes as states."),
-    ] = "co-simulation",
-    windows: Annotated[
-        bool, typer.Option("--windows", help="Add a binary for 64-bit Windows to a compiled wing.")
-    ] = False,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="Tailor it to a wing: the calibration.nc of `uav-twin calibrate`."),
-    ] = None,
-    script: Annotated[
-        str | None,
-        typer.Option(help="Pack this model script instead of a wing: gear_pump, or a file."),
-    ] = None,
-    patch: Annotated[
-        Path | None,
-        typer.Option(help="A patch file: missing effects that the FMU carries as tunable parameters."),
-    ] = None,
-    activate: Annotated[
-        bool, typer.Option("--activate", help="Switch the effects of --patch on from the start.")
-    ] = False,
-    replace: Replace = False,
+    *,
+    out: Path | None = None,
+    design: Path | None = None,
+    kind: Literal["python", "compiled", "source"] = "python",
+    fmi: int = 2,
+    interface: Literal["co-simulation", "model-exchange"] = "co-simulation",
+    windows: bool = False,
+    calibration: Path | None = None,
+    script: str | None = None,
+    patch: Path | None = None,
+    activate: bool = False,
+    replace: bool = False,
 ) -> None:
     """Pack a wing, a structure or a model script as an FMU; equal input gives equal bytes."""
     if script is None and calibration is None and design is not None and names_structure(design):
@@ -153,7 +120,7 @@ def build(
             raise typer.BadParameter(
                 "--patch, --activate, --interface and --windows are for wings; the design is a structure."
             )
-        build_structure(design, out, kind, fmi, None, None, replace, None)
+        build_structure(design, out=out, kind=kind, fmi=fmi, replace=replace)
         return
     out = out or Path("uav_wing.fmu")
     if calibration is not None and design is not None:
@@ -233,11 +200,8 @@ def _build_wing(
 
 
 @fmu_app.command("info")
-def info(
-    file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)],
-    variables: Annotated[bool, typer.Option("--variables/--no-variables", help="List the variables.")] = True,
-    json: terminal.Json = False,
-) -> None:
+@told("fmu info")
+def info(file: Path, *, variables: bool = True, json: bool = False) -> None:
     """Say what an FMU is: version, capabilities, variables with units and ranges."""
     from fmu_asset.archive.declared import describe_fmu
     from fmu_asset.archive.fmu_file import inspect_fmu

@@ -2,12 +2,11 @@
 
 import tempfile
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from reporting import terminal
-from uav_twin.options import Replace
+from uav_twin.options import told
 
 library_app = typer.Typer(no_args_is_help=True, help="Sample FMUs into observation libraries.")
 
@@ -17,41 +16,21 @@ def library() -> None:
     """Sample FMUs into observation libraries."""
 
 
-Scenario = Annotated[
-    str | None,
-    typer.Argument(help="A scenario, whose FMU is sampled at its states, controls and draws."),
-]
-Grid = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="NAME=VALUES with a name of the binding, such as wear=0,0.2,0.4 or wear=0:0.4:3; repeated.",
-        show_default=False,
-    ),
-]
-Role = Annotated[
-    str | None, typer.Option(help="Observation of the binding, where it has several.", show_default=False)
-]
-Settle = Annotated[
-    int,
-    typer.Option(min=0, help="Steps from a fresh start at every point, for an FMU with memory."),
-]
-Workers = Annotated[int | None, typer.Option(min=1, help="Processes.", show_default="one for each processor")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with the blocks of an interrupted sampling.")]
-
-
 @library_app.command("sample")
+@told("library sample")
 def sample(
-    out: Annotated[Path, typer.Option(help="The NetCDF file to write.", show_default=False)],
-    scenario: Scenario = None,
-    fmu: Annotated[Path | None, typer.Option(help="The FMU to sample.", show_default=False)] = None,
-    binding: Annotated[Path | None, typer.Option(help="Its binding.", show_default=False)] = None,
-    grid: Grid = None,
-    role: Role = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the draws of a scenario.")] = None,
-    settle: Settle = 0,
-    workers: Workers = None,
-    resume: Resume = False,
-    replace: Replace = False,
+    scenario: str | None = None,
+    *,
+    out: Path,
+    fmu: Path | None = None,
+    binding: Path | None = None,
+    grid: list[str] | None = None,
+    role: str | None = None,
+    seed: int | None = None,
+    settle: int = 0,
+    workers: int | None = None,
+    resume: bool = False,
+    replace: bool = False,
 ) -> None:
     """Ask an FMU for its observation at every draw, state and control; write an observation library."""
     from twin_master.assets.resolution import Overrides

@@ -1,11 +1,11 @@
 """`uav-twin scenarios` and `uav-twin scenario check`."""
 
-from typing import Annotated
+from pathlib import Path
 
 import typer
 
 from reporting import terminal
-from twin_master.command import Calibration
+from uav_twin.options import told
 
 scenario_app = typer.Typer(no_args_is_help=True)
 
@@ -15,6 +15,7 @@ def scenario() -> None:
     """Check a scenario before it is flown."""
 
 
+@told("scenarios")
 def list_scenarios() -> None:
     """List the scenarios that are shipped."""
     from scenarios import scenario_files
@@ -37,13 +38,8 @@ def list_scenarios() -> None:
 
 
 @scenario_app.command("check")
-def check(
-    file: Annotated[
-        str, typer.Argument(metavar="FILE", help="A scenario file, or a shipped name.", show_default=False)
-    ],
-    calibration: Calibration = None,
-    json: terminal.Json = False,
-) -> None:
+@told("scenario check")
+def check(file: str, *, calibration: Path | None = None, json: bool = False) -> None:
     """Say what a scenario flies and believes, and what it takes; exit code 1 if anything is wrong with it."""
     from twin_master.assets.resolution import Overrides
     from twin_master.scenario.reading import load_scenario

@@ -2,12 +2,10 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from reporting import terminal
-from uav_twin.options import Replace, StepTimeout
+from uav_twin.options import told
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,19 +15,6 @@ if TYPE_CHECKING:
     from fmu_asset.door.layout import ObservationHistory
     from fmu_asset.door.session import FmiAsset
 
-OutFile = Annotated[Path | None, typer.Option(help="The file to write: CSV, or NetCDF (.nc) with units.")]
-PlotFile = Annotated[Path | None, typer.Option(help="A picture of the outputs to write: .png or .svg.")]
-InterpolationName = Annotated[
-    str | None,
-    typer.Option(
-        "--interpolation",
-        help="How inputs go on between communication points: zero-order or linear; by default as the binding "
-        "says, and zero-order in a system.",
-    ),
-]
-InProcess = Annotated[
-    bool, typer.Option("--in-process", help="Faster, without protection from crashes and endless steps.")
-]
 
 _MOST_PANELS, _MOST_LINES = 8, 10
 
@@ -147,32 +132,21 @@ def _draw(path: Path, asset: "FmiAsset", history: "ObservationHistory") -> None:
         atomic_write_bytes(path, to_svg(figure) if path.suffix == ".svg" else to_png(figure))
 
 
+@told("fmu simulate")
 def simulate(
-    file: Annotated[Path, typer.Argument(help="An FMU.", show_default=False)],
-    binding: Annotated[
-        Path | None, typer.Option(help="Its binding file; without one, all outputs in the FMU's units.")
-    ] = None,
-    inputs: Annotated[
-        Path | None,
-        typer.Option(help="CSV: `time` (s, where each step begins) and the inputs by the binding's names."),
-    ] = None,
-    out: OutFile = None,
-    stop_time: Annotated[
-        float | None, typer.Option(help="End in seconds; the FMU's own by default, or 1 s after the start.")
-    ] = None,
-    step_size: Annotated[
-        float | None,
-        typer.Option(help="Communication step size in seconds; the FMU's own by default.", min=0.0),
-    ] = None,
-    values: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A parameter (of any kind) or input of the FMU."),
-    ] = None,
-    plot: PlotFile = None,
-    interpolation: InterpolationName = None,
-    in_process: InProcess = False,
-    step_timeout: StepTimeout = None,
-    replace: Replace = False,
+    file: Path,
+    *,
+    binding: Path | None = None,
+    inputs: Path | None = None,
+    out: Path | None = None,
+    stop_time: float | None = None,
+    step_size: float | None = None,
+    values: list[str] | None = None,
+    plot: Path | None = None,
+    interpolation: str | None = None,
+    in_process: bool = False,
+    step_timeout: float | None = None,
+    replace: bool = False,
 ) -> None:
     """Simulate an FMU: its default experiment, or with --binding and --inputs under histories."""
     from fmu_asset.archive.fmu_file import read_fmu

@@ -2,17 +2,12 @@
 
 import tempfile
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from reporting import terminal
-from uav_twin.options import Replace
+from uav_twin.options import told
 from uav_twin.simulated import (
-    InProcess,
-    InterpolationName,
-    OutFile,
-    PlotFile,
     finish,
     interpolated,
     refuse_files,
@@ -23,21 +18,8 @@ ssp_app = typer.Typer(no_args_is_help=True, help="Write, check and simulate syst
 
 
 @ssp_app.command("export")
-def export(
-    what: Annotated[
-        str,
-        typer.Argument(
-            metavar="SCENARIO|DESIGN",
-            help="A shipped scenario, the path of a scenario, `uav_wing`, or the path of a wing design.",
-            show_default=False,
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="The file to write.", show_default=False)],
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the run; by default that of the scenario.")
-    ] = None,
-    replace: Replace = False,
-) -> None:
+@told("ssp export")
+def export(what: str, *, out: Path, seed: int | None = None, replace: bool = False) -> None:
     """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""
     from fmu_asset.errors import SspError
     from fmu_asset.packing.contents import checked_target
@@ -68,36 +50,21 @@ def _is_design(what: str) -> bool:
 
 
 @ssp_app.command("simulate")
+@told("ssp simulate")
 def simulate(
-    file: Annotated[Path, typer.Argument(help="An SSP file.", show_default=False)],
-    out: OutFile = None,
-    stop_time: Annotated[
-        float | None,
-        typer.Option(help="End in seconds; by default that of the file, or 1 s."),
-    ] = None,
-    step_size: Annotated[
-        float | None, typer.Option(help="Communication step size in seconds.", min=0.0)
-    ] = None,
-    values: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="A connector of the system, or component.variable."),
-    ] = None,
-    plot: PlotFile = None,
-    algorithm: Annotated[
-        str, typer.Option(help="How values are passed on within a step: gauss_seidel or jacobi.")
-    ] = "gauss_seidel",
-    iterations: Annotated[
-        int, typer.Option(help="How often a step of a circle of components is made at most.", min=1)
-    ] = 1,
-    delay: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="END", help="Delay the connection to this end by a step: it breaks a loop there."
-        ),
-    ] = None,
-    interpolation: InterpolationName = None,
-    in_process: InProcess = False,
-    replace: Replace = False,
+    file: Path,
+    *,
+    out: Path | None = None,
+    stop_time: float | None = None,
+    step_size: float | None = None,
+    values: list[str] | None = None,
+    plot: Path | None = None,
+    algorithm: str = "gauss_seidel",
+    iterations: int = 1,
+    delay: list[str] | None = None,
+    interpolation: str | None = None,
+    in_process: bool = False,
+    replace: bool = False,
 ) -> None:
     """Simulate the system of an SSP file from its start; all outputs of the system and its components."""
     from fmu_asset.coupling.asset import CoupledAsset
@@ -143,10 +110,8 @@ def _single_numbers(texts: list[str]) -> dict[str, float]:
 
 
 @ssp_app.command("check")
-def check(
-    file: Annotated[Path, typer.Argument(help="An SSP file.", show_default=False)],
-    json: terminal.Json = False,
-) -> None:
+@told("ssp check")
+def check(file: Path, *, json: bool = False) -> None:
     """Check an SSP file: archive, schemas, FMUs, connections, one step; exit code 1 if anything is wrong."""
     from dataclasses import asdict
 

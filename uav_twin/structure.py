@@ -6,12 +6,12 @@ from dataclasses import asdict
 from math import inf, nan
 from os.path import relpath
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
 from reporting import terminal
-from uav_twin.options import FmiVersion, Kind, Replace
+from uav_twin.options import told
 from uav_twin.wing import Check, end_with, print_checks
 
 if TYPE_CHECKING:
@@ -27,25 +27,6 @@ structure_app = typer.Typer(
     no_args_is_help=True,
     help="Look at a structure from a mesh or matrices, verify it against CalculiX, reduce it, pack it.",
 )
-
-Modes = Annotated[int, typer.Option(min=1, max=50, help="Number of modes.")]
-
-
-File = Annotated[
-    Path,
-    typer.Argument(
-        help="A structure file (TOML) beside its mesh or matrices, or a shipped one.", show_default=False
-    ),
-]
-MemoryLimit = Annotated[
-    float | None,
-    typer.Option(
-        min=0.1,
-        help="GiB that it may take; what the machine has left by default.",
-        callback=lambda gibibytes: None if gibibytes is None else 2.0**30 * gibibytes,
-    ),
-]
-"""As it is typed, in GiB; as commands get it, in bytes."""
 
 
 def located(file: Path) -> Path:
@@ -64,12 +45,17 @@ def names_structure(design: Path) -> bool:
     return is_structure(read_toml(located(design), DesignFileError, what="wing design"))
 
 
+def in_bytes(gibibytes: float | None) -> float | None:
+    """Return a limit that is typed in GiB."""
+    return None if gibibytes is None else 2.0**30 * gibibytes
+
+
 def assembled(file: Path, memory_limit: float | None, *, mass_as_stiffness: bool = False) -> "Structure":
     """Return the full model of a mesh."""
     from fe.structure.operators import load_and_assemble
 
     with terminal.progress().stage("Reading the mesh and assembling"):
-        return load_and_assemble(located(file), memory_limit, mass_as_stiffness=mass_as_stiffness)
+        return load_and_assemble(located(file), in_bytes(memory_limit), mass_as_stiffness=mass_as_stiffness)
 
 
 def assembled_of_any(file: Path, memory_limit: float | None) -> "AffineStructure":
@@ -77,18 +63,19 @@ def assembled_of_any(file: Path, memory_limit: float | None) -> "AffineStructure
     from fe.structure.operators import assemble_structure
 
     with terminal.progress().stage("Reading and assembling"):
-        return assemble_structure(located(file), memory_limit)
+        return assemble_structure(located(file), in_bytes(memory_limit))
 
 
 def reduced(file: Path, memory_limit: float | None) -> "ReducedModel":
     """Return the reduced model, from the cache where it is there."""
     from fe.reduction.model_cache import reduced_structure
 
-    return reduced_structure(located(file), progress=terminal.progress(), memory_limit=memory_limit)
+    return reduced_structure(located(file), progress=terminal.progress(), memory_limit=in_bytes(memory_limit))
 
 
 @structure_app.command("info")
-def info(file: File, modes: Modes = 6, memory_limit: MemoryLimit = None, json: terminal.Json = False) -> None:
+@told("structure info")
+def info(file: Path, *, modes: int = 6, memory_limit: float | None = None, json: bool = False) -> None:
     """Say what a structure is made of, what it weighs, how it vibrates and what its loads do to it."""
     structure = assembled_of_any(file, memory_limit)
     with terminal.progress().stage("Solving the loads and the modes"):
@@ -235,14 +222,14 @@ def _parts(structure: "Structure") -> Iterator[dict[str, Any]]:
 
 
 @structure_app.command("verify")
+@told("structure verify")
 def verify(
-    file: File,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for the decks and results of CalculiX; it must be empty.")
-    ] = None,
-    modes: Modes = 6,
-    memory_limit: MemoryLimit = None,
-    json: terminal.Json = False,
+    file: Path,
+    *,
+    out: Path | None = None,
+    modes: int = 6,
+    memory_limit: float | None = None,
+    json: bool = False,
 ) -> None:
     """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
     from fe.verification.calculix_comparison import agreement, required_calculix
@@ -282,18 +269,14 @@ def verify(
 
 
 @structure_app.command("field")
+@told("structure field")
 def field(
-    file: File,
-    out: Annotated[Path, typer.Option(help="The VTU file to write.", show_default=False)],
-    at: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            help="A parameter, loss, mass or control that is not nominal; may come again.",
-        ),
-    ] = None,
-    replace: Replace = False,
-    memory_limit: MemoryLimit = None,
+    file: Path,
+    *,
+    out: Path,
+    at: list[str] | None = None,
+    replace: bool = False,
+    memory_limit: float | None = None,
 ) -> None:
     """Solve the full structure under all its loads, and write its field as VTU for ParaView."""
     from fe.structure.operators import write_structure_vtu
@@ -325,14 +308,8 @@ def field(
 
 
 @structure_app.command("reduce")
-def reduce(
-    file: File,
-    states: Annotated[
-        int, typer.Option(min=0, max=1000, help="Random states at which it is compared with the full model.")
-    ] = 4,
-    memory_limit: MemoryLimit = None,
-    json: terminal.Json = False,
-) -> None:
+@told("structure reduce")
+def reduce(file: Path, *, states: int = 4, memory_limit: float | None = None, json: bool = False) -> None:
     """Make the reduced model of a structure, keep it in the cache, and measure its errors."""
     from fe.reduction.reduced_basis import measured_errors
 
@@ -387,25 +364,17 @@ def _errors(errors: "MeasuredErrors") -> Iterator[tuple[str, str]]:
 
 
 @structure_app.command("fmu")
+@told("structure fmu")
 def fmu(
-    file: File,
-    out: Annotated[
-        Path | None,
-        typer.Option(help="The FMU to write; by default beside the structure file, with its name."),
-    ] = None,
-    kind: Kind = "python",
-    fmi: FmiVersion = 2,
-    binding: Annotated[
-        Path | None, typer.Option(help="Write the binding of the FMU to this file, too.")
-    ] = None,
-    rig: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write the file by which `calibrate campaign` and `discrepancy` take the FMU as a model."
-        ),
-    ] = None,
-    replace: Replace = False,
-    memory_limit: MemoryLimit = None,
+    file: Path,
+    *,
+    out: Path | None = None,
+    kind: Literal["python", "compiled", "source"] = "python",
+    fmi: int = 2,
+    binding: Path | None = None,
+    rig: Path | None = None,
+    replace: bool = False,
+    memory_limit: float | None = None,
 ) -> None:
     """Pack the reduced model of a structure as an FMU; equal input gives equal bytes."""
     from fe.structure.design import load_structure

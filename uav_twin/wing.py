@@ -6,12 +6,12 @@ import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from reporting import terminal
-from uav_twin.options import Design, refuse_before
+from uav_twin.options import refuse_before, told
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import Modes, ReducedModel
@@ -32,14 +32,9 @@ wing_app = typer.Typer(no_args_is_help=False)
 
 
 @wing_app.callback(invoke_without_command=True)
+@told("wing")
 def wing(
-    context: typer.Context,
-    design: Design = None,
-    vtu: Annotated[
-        Path | None,
-        typer.Option(help="Write the undamaged wing at 3g for ParaView, and its modes beside it."),
-    ] = None,
-    as_json: terminal.Json = False,
+    context: typer.Context, *, design: Path | None = None, vtu: Path | None = None, as_json: bool = False
 ) -> None:
     """Say what the wing weighs, how it vibrates and how stiff its tip is."""
     if context.invoked_subcommand is not None:
@@ -150,19 +145,8 @@ class Check:
 
 
 @wing_app.command("verify")
-def verify(
-    design: Design = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for the record and the jobs of CalculiX; it must be empty.")
-    ] = None,
-    quick: Annotated[
-        bool,
-        typer.Option(
-            "--quick",
-            help="Coarser meshes, and no limit on their convergence.",
-        ),
-    ] = False,
-) -> None:
+@told("wing verify")
+def verify(*, design: Path | None = None, out: Path | None = None, quick: bool = False) -> None:
     """Check a wing's finite element model: balances, convergence, and CalculiX where it is installed."""
     from fe.verification.calculix_comparison import calculix_program
     from fe.wing.design import load_design

@@ -11,6 +11,7 @@ from discrepancy.campaign.schema import FORMAT, INPUT_COLUMNS, parse_campaign
 from discrepancy.campaign.sheet import Sheet
 from discrepancy.campaign.units import UNITS, Conversion, conversion, conversion_of, quantities_of
 from discrepancy.errors import CampaignFileError
+from discrepancy.sentences import said
 from reporting.provenance import hash_record
 from reporting.table_file import TextTable
 from reporting.words import be, counted, listing
@@ -98,20 +99,16 @@ class Understanding:
         self.questions: dict[tuple[str, str], list[str]] = {}
         names = [sheet.name for sheet in sheets]
         if len({*names}) < len(names):
-            raise CampaignFileError(
-                f"Two files have one name of {listing(names)}: rename one; trials have it."
-            )
+            raise CampaignFileError(said("sheets.one_name", names=listing(names)))
         heads = dict.fromkeys(head for sheet in sheets for head in sheet.heads)
         for options, known in ((OF_COLUMNS, [*heads]), (OF_FILES, [*names, ""])):
             for option in options:
                 for name in answers.get(option, {}).keys() - {*known}:
                     of = listing(map(repr, filter(None, known)), "or")
-                    raise CampaignFileError(f"--{option} must be NAME=... about {of}, and {name!r} came.")
+                    raise CampaignFileError(said("sheets.about", option=option, of=of, name=name))
         self.kinds = {name: self._said("kind", name, listing(KINDS, "or"), KINDS) for name in names}
         if len(resting := [name for name, kind in self.kinds.items() if kind == NOISE]) > 1:
-            raise CampaignFileError(
-                f"Noise is read from one file, and {listing(resting)} came: give one of them."
-            )
+            raise CampaignFileError(said("sheets.noise", files=listing(resting)))
         self.decimals = {
             sheet.name: sheet.decimal
             or self._said("decimal", sheet.name, f". or ,: {sheet.unclear} can be read as both", (".", ","))
@@ -126,13 +123,11 @@ class Understanding:
         self.releases = {name: self._release(name) for name in ringing}
         self.reference_temperature = None
         if any(column.role == "temperature" for column in self.columns):
-            said = self._said("reference-temperature", "", "degC, at which the model's parameters hold")
+            given = self._said("reference-temperature", "", "degC, at which the model's parameters hold")
             try:
-                self.reference_temperature = float(said) if said else None
+                self.reference_temperature = float(given) if given else None
             except ValueError:
-                raise CampaignFileError(
-                    f"--reference-temperature must be in degC, and {said!r} came."
-                ) from None
+                raise CampaignFileError(said("sheets.no_temperature", came=given)) from None
 
     def with_answer(self, option: str, about: str, said: str) -> "Understanding":
         """Return what is understood once a question is answered."""
@@ -142,23 +137,24 @@ class Understanding:
     def _said(self, option: str, about: str, expected: str, choices: Collection[str] = ()) -> str:
         """Return an answer; an empty one, and a question, where there is none."""
         given = self.answers.get(option, {})
-        said = given.get(about, given.get(""))
-        if said is None:
+        answer = given.get(about, given.get(""))
+        if answer is None:
             asked = self.questions.setdefault((option, expected), [])
             asked += [] if about in asked else [about]
-        elif choices and said not in choices:
-            raise CampaignFileError(f"--{option} must be {listing(choices, 'or')}, and {said!r} came.")
-        return said or ""
+        elif choices and answer not in choices:
+            raise CampaignFileError(f"--{option} must be {listing(choices, 'or')}, and {answer!r} came.")
+        return answer or ""
 
     def _release(self, file: str) -> dict[str, Any]:
-        said = (
-            self._said("release", file, "how far the point was held that was let go, such as 15.5mm") or "1m"
-        )
-        if found := re.fullmatch(r"\s*([-+]?\d+\.?\d*(?:e[-+]?\d+)?)\s*(\S+)\s*", said, re.ASCII):
+        question = "how far the point was held that was let go, such as 15.5mm"
+        given = self._said("release", file, question) or "1m"
+        if found := re.fullmatch(r"\s*([-+]?\d+\.?\d*(?:e[-+]?\d+)?)\s*(\S+)\s*", given, re.ASCII):
             for quantity in (item for item in _HELD if item in quantities_of(found[2])):
                 size = conversion_of(quantity, found[2]).si_text(found[1])
                 return {"displacement": float(size), "unit": UNITS[quantity].si}
-        raise CampaignFileError(f"--release must be a length or a voltage such as 15.5mm, and {said!r} came.")
+        raise CampaignFileError(
+            f"--release must be a length or a voltage such as 15.5mm, and {given!r} came."
+        )
 
     # ---------------------------------------------------------------- columns
 
@@ -179,21 +175,19 @@ class Understanding:
                 number = "1" if (role, unit) == ("load_factor", "g") else unit
                 to_si = conversion(number, _SI[role]) if kind is None else conversion_of(kind, unit)
                 return Column(sheet, head, role, unit, _SI[role], None, to_si)
-            quantity = self._quantity(head, role, unit)
-            if quantity is None:
+            if (quantity := self._quantity(head, role, unit)) is None:
                 return Column(sheet, head, role, unit)
-            return Column(
-                sheet, head, role, unit, UNITS[quantity].si, quantity, conversion_of(quantity, unit)
-            )
+            to_si = conversion_of(quantity, unit)
+            return Column(sheet, head, role, unit, UNITS[quantity].si, quantity, to_si)
         except ValueError as cause:
             raise CampaignFileError(f"{sheet.name}, column {head!r}: {cause}; say another.") from None
 
     def _role(self, sheet: Sheet, head: str, unit: str) -> str:
         """Return what a column is: as said, by its name, or as the only one of a time or a force."""
-        said, called = self.answers.get("column", {}).get(head), head.casefold()
+        answer, called = self.answers.get("column", {}).get(head), head.casefold()
         driven = self.kinds[sheet.name] not in (TrialKind.STATIC, TrialKind.FORCED, TrialKind.RINGDOWN, NOISE)
-        if said is not None or (called in _SI and not (driven and called == "force")):
-            return called if said is None else said
+        if answer is not None or (called in _SI and not (driven and called == "force")):
+            return called if answer is None else answer
         units = self.answers.get("unit", {})
         kinds = [_kind(units.get(*pair)) for pair in zip(sheet.heads, sheet.units, strict=True)]
         if kinds.count(_kind(unit)) == 1 and _kind(unit) in (("time",) if driven else ("time", "force")):
@@ -205,10 +199,10 @@ class Understanding:
 
     def _quantity(self, head: str, role: str, unit: str) -> Quantity | None:
         """Return the quantity of a channel or an input, None while that is open."""
-        said = self.answers.get("quantity", {}).get(head)
-        if said is not None and said not in list(Quantity):
-            raise ValueError(f"a quantity is {listing(Quantity, 'or')}, and {said!r} came")
-        able = quantities_of(unit) if said is None else (Quantity(said),)
+        answer = self.answers.get("quantity", {}).get(head)
+        if answer is not None and answer not in list(Quantity):
+            raise ValueError(f"a quantity is {listing(Quantity, 'or')}, and {answer!r} came")
+        able = quantities_of(unit) if answer is None else (Quantity(answer),)
         if not able:
             raise ValueError(f"{unit!r} is no unit of a quantity that is measured here")
         if self._quantity_of is not None and role and INPUT not in role:
@@ -252,8 +246,8 @@ class Understanding:
             "trial": [self._trial(file) for file, kind in self.kinds.items() if kind != NOISE],
             "remarks": [self._origin(sheet) for sheet in self.sheets],
         }  # fmt: skip
-        for file in (file for file, kind in self.kinds.items() if kind == NOISE):
-            content["noise"] = {"file": file}
+        if resting := [file for file, kind in self.kinds.items() if kind == NOISE]:
+            content["noise"] = {"file": resting[0]}
         if self.reference_temperature is not None:
             content["reference_temperature"] = self.reference_temperature
         tables = {sheet.name: self._table(sheet) for sheet in self.sheets}
@@ -264,8 +258,8 @@ class Understanding:
 
     def _trial(self, file: str) -> dict[str, Any]:
         places = self.answers.get("load-place", {})
-        said = {"release": self.releases.get(file), "load_place": places.get(file, places.get(""))}
-        given = {key: value for key, value in said.items() if value is not None}
+        known = {"release": self.releases.get(file), "load_place": places.get(file, places.get(""))}
+        given = {key: value for key, value in known.items() if value is not None}
         return {"name": _UNTITLED.sub("", file), "kind": self.kinds[file], "file": file, **given}
 
     def _table(self, sheet: Sheet) -> TextTable:
@@ -273,9 +267,7 @@ class Understanding:
         used = [item for item in self.columns if item.sheet is sheet and item.to_si is not None]
         titles = [item.title for item in used]
         if twice := next((title for title in titles if titles.count(title) > 1), None):
-            raise CampaignFileError(
-                f"{sheet.name} has more than one column that is {twice!r}: leave one out."
-            )
+            raise CampaignFileError(said("sheets.twice", file=sheet.name, title=twice))
         columns = {item.title: item.in_si(self.decimals[sheet.name]) for item in used}
         return TextTable(sheet.name, columns, sheet.lines, TABLE_ERRORS)
 

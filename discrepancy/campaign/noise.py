@@ -5,7 +5,7 @@ are not counted as evidence. Lines of the mains are taken out first: they are an
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil, inf
 
@@ -58,9 +58,9 @@ class NoiseModel:
     standard_deviation: float
     static_deviation: float
     degrees_of_freedom: float
-    autoregression: FloatArray
-    interval: float | None
-    lines: tuple[float, ...]
+    autoregression: FloatArray = field(default_factory=lambda: np.empty(0))
+    interval: float | None = None
+    lines: tuple[float, ...] = ()
 
     def whiten(self, columns: FloatArray, interval: float) -> FloatArray:
         """Return the columns (..., N) of a dynamic record filtered so that this noise becomes white.
@@ -121,20 +121,21 @@ def noise_model(channel: Channel, fallback: float) -> NoiseModel:
     """
     record = channel.noise
     if record is None:
-        return NoiseModel(fallback, fallback, 0.0, np.empty(0), None, ())
+        return NoiseModel(fallback, fallback, 0.0)
     samples, interval = record.samples, record.interval
-    deviation, freedom = record.standard_deviation, record.degrees_of_freedom
-    white = NoiseModel(deviation, deviation, freedom, np.empty(0), interval, ())
     if samples is None or interval is None or len(samples) < 50:
-        return white
+        deviation = record.standard_deviation
+        return NoiseModel(deviation, deviation, record.degrees_of_freedom, interval=interval)
     rest, lines = without_lines(samples - samples.mean(), interval)
     freedom = len(rest) - 1.0 - 3.0 * len(lines)  # cosine, sine and frequency
     deviation = float(np.sqrt(rest @ rest / freedom))
+    white = NoiseModel(deviation, deviation, freedom, interval=interval, lines=lines)
     if ljung_box(rest)[1] > WHITE_LEVEL:
-        return NoiseModel(deviation, deviation, freedom, np.empty(0), interval, lines)
-    coefficients, innovation = autoregression(rest)
-    return NoiseModel(
-        float(np.sqrt(innovation)), deviation, freedom - len(coefficients), coefficients, interval, lines
+        return white
+    found, innovation = autoregression(rest)
+    freedom -= len(found)
+    return replace(
+        white, standard_deviation=np.sqrt(innovation), degrees_of_freedom=freedom, autoregression=found
     )
 
 
@@ -243,17 +244,11 @@ def pre_trigger_record(samples: FloatArray, interval: float | None, name: str, s
         Fewer than four samples, or all of them alike.
     """
     if len(samples) < _LEAST_DEGREES + 1:
-        raise CampaignDataError(
-            f"{source} holds {counted(len(samples), 'sample')} of the channel {name!r}: a noise record needs "
-            f"at least {_LEAST_DEGREES + 1}; record more before the trigger or leave the column out."
-        )
+        told = {"source": source, "samples": counted(len(samples), "sample"), "least": _LEAST_DEGREES + 1}
+        raise CampaignDataError(said("campaign.few_at_rest", name=name, **told))
     mean, spread = float(np.mean(samples)), float(np.std(samples, ddof=1))
     if np.ptp(samples) == 0.0:
-        raise CampaignDataError(
-            f"{source}: all samples of the channel {name!r} are {samples[0]!r}, which is no noise; "
-            "record it with "
-            "the amplifier on, or state its standard deviation."
-        )
+        raise CampaignDataError(said("campaign.no_noise", source=source, name=name, value=samples[0]))
     if abs(mean) > 1e-12 * spread:
         samples = samples - mean
         spread = float(np.std(samples, ddof=1))
@@ -273,10 +268,10 @@ def repeat_record(channel: Channel, trials: Sequence[Trial]) -> NoiseRecord | No
     squares, degrees = 0.0, 0
     for group in repeated(trials, channel.name):
         # Repeats are weighed alike here, so they have one noise factor (`_repeats`).
-        stack = np.stack([trial.values[:, trial.channels.index(channel.name)] for trial in group])
-        stack = stack / group[0].noise_factor
-        used = np.all([trial.used[:, trial.channels.index(channel.name)] for trial in group], axis=0)
-        stack = stack[:, used]
+        columns = [trial.channels.index(channel.name) for trial in group]
+        pairs = [*zip(group, columns, strict=True)]
+        used = np.all([trial.used[:, column] for trial, column in pairs], axis=0)
+        stack = np.stack([trial.values[used, column] for trial, column in pairs]) / group[0].noise_factor
         rest = stack - stack.mean(axis=0)
         rows = stack.shape[1]
         if channel.offset_deviation > 0.0:
@@ -293,33 +288,26 @@ def repeated(trials: Sequence[Trial], channel: str) -> list[list[Trial]]:
     """Return the groups of two or more trials with a channel that repeat each other."""
     groups: list[list[Trial]] = []
     for trial in trials:
-        if trial.is_dynamic or channel not in trial.channels:
-            continue
-        for group in groups:
-            if _repeats(group[0], trial):
-                group.append(trial)
-                break
-        else:
-            groups.append([trial])
+        if not trial.is_dynamic and channel in trial.channels:
+            group = next((group for group in groups if _repeats(group[0], trial)), None)
+            if group is None:
+                groups.append(group := [])
+            group.append(trial)
     return [group for group in groups if len(group) > 1]
 
 
 def _repeats(first: Trial, second: Trial) -> bool:
-    if (first.kind, first.run, first.load_place, len(first.time), first.noise_factor) != (
-        second.kind, second.run, second.load_place, len(second.time), second.noise_factor,
-    ):  # fmt: skip
-        return False
-    if [item.name for item in first.inputs] != [item.name for item in second.inputs]:
-        return False
-    pairs = (
-        *zip([item.values for item in first.inputs], [item.values for item in second.inputs], strict=True),
-        (first.force, second.force),
-        (first.load_factor, second.load_factor),
-        (first.temperature, second.temperature),
-        (first.health, second.health),
-    )
-    return all(
-        float(np.max(np.abs(one - other))) <= SAME_INPUT * float(np.max(np.abs(one))) for one, other in pairs
+    def labels(trial: Trial) -> tuple[object, ...]:
+        names = [item.name for item in trial.inputs]
+        return trial.kind, trial.run, trial.load_place, len(trial.time), trial.noise_factor, names
+
+    def acting(trial: Trial) -> list[FloatArray]:
+        given = (trial.force, trial.load_factor, trial.temperature, trial.health)
+        return [*(item.values for item in trial.inputs), *given]
+
+    return labels(first) == labels(second) and all(
+        np.max(np.abs(one - other)) <= SAME_INPUT * np.max(np.abs(one))
+        for one, other in zip(acting(first), acting(second), strict=True)
     )
 
 

@@ -73,10 +73,7 @@ def read_campaign(folder: str | Path) -> Campaign:
     for name in sorted(names):
         path = PurePosixPath(name)
         if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name:
-            raise CampaignFileError(
-                f"The file {name!r} must lie in the campaign's folder: give its place in there, with forward "
-                "slashes."
-            )
+            raise CampaignFileError(said("campaign.outside", name=name))
     tables = {name: _read_table(folder, name) for name in sorted(names - {CAMPAIGN_FILE})}
     data_hash = hash_record({name: hash_file(folder / name) for name in sorted(names)})
     return assemble(section, tables, data_hash)
@@ -96,13 +93,11 @@ def assemble(section: schema.CampaignSection, tables: Mapping[str, TextTable], d
     """
     remarks = _unused(section, tables)
     trials = tuple(_trial(trial, tables[trial.file], section, remarks) for trial in section.trial)
-    for channel in section.channel:
-        if not any(channel.name in trial.channels for trial in trials):
-            name = section.trial[0].file
-            raise CampaignFileError(
-                f"The channel {channel.name!r} is in no trial: no table has a column "
-                f"{channel.table_column!r}; the columns of {name} are {', '.join(tables[name].columns)}."
-            )
+    measured = {name for trial in trials for name in trial.channels}
+    if nowhere := next((item for item in section.channel if item.name not in measured), None):
+        first = tables[section.trial[0].file]
+        has = ", ".join(first.columns)
+        raise CampaignFileError(said("campaign.in_no_trial", channel=nowhere, table=first, has=has))
     channels = _channels(section, tables, trials, remarks)
     remarks += remarks_on(channels, trials)
     return Campaign(
@@ -142,20 +137,16 @@ def _events(section: schema.CampaignSection, trials: tuple[Trial, ...]) -> Itera
             first, last = records[name][0], records[name][-1]
             for key, moment in (("time", event.time), ("until", event.until)):
                 if moment is not None and not first <= moment <= last:
-                    raise CampaignDataError(
-                        f"The event {event.name!r} has {key} = {moment:g} s, but the record of the trial "
-                        f"{name!r} goes from {first:g} to {last:g} s: times count from the trial's start."
-                    )
+                    told = {"event": event, "key": key, "moment": moment, "trial": name}
+                    raise CampaignDataError(said("campaign.not_then", first=first, last=last, **told))
         yield found
 
 
 def _read_table(folder: Path, name: str) -> TextTable:
     """Return a table of a campaign's folder; sentences about its content name it without the folder."""
     if not (folder / name).exists():
-        there = sorted(item.name for item in folder.glob("*.csv"))
-        raise CampaignFileError(
-            f"There is no file {name} in {folder}; the tables there are {', '.join(there) or 'none'}."
-        )
+        there = ", ".join(sorted(item.name for item in folder.glob("*.csv"))) or "none"
+        raise CampaignFileError(said("campaign.no_file", name=name, folder=folder, there=there))
     return read_table(folder / name, TABLE_ERRORS, name=name)
 
 
@@ -248,17 +239,14 @@ def _measured(
 ) -> tuple[schema.ChannelSection, ...]:
     """Return the channels of a trial: those that it names, or all whose columns are there."""
     channels = {channel.name: channel for channel in campaign.channel}
-    if section.channels is not None:
-        chosen = tuple(channels[name] for name in section.channels)
-        for channel in chosen:
-            table.cells(channel.table_column, f"the channel {channel.name!r}")
-    else:
-        chosen = tuple(channel for channel in channels.values() if channel.table_column in table.columns)
+    there = (name for name, channel in channels.items() if channel.table_column in table.columns)
+    chosen = tuple(channels[name] for name in (there if section.channels is None else section.channels))
+    for channel in chosen:
+        table.cells(channel.table_column, f"the channel {channel.name!r}")
     if not chosen:
+        has, wanted = map(", ".join, (table.columns, (item.table_column for item in campaign.channel)))
         raise CampaignFileError(
-            f"{table.name} of the trial {section.name!r} holds no channel: its columns are "
-            f"{', '.join(table.columns)}, and those of the channels "
-            f"{', '.join(channel.table_column for channel in channels.values())}."
+            said("campaign.no_channel", table=table, trial=section, has=has, wanted=wanted)
         )
     return chosen
 
@@ -269,23 +257,19 @@ def _readings(
     """Return a channel's readings and which of them are used; an empty cell is bridged and left out."""
     values = _numbers(table, channel, f"the channel {channel.name!r}", empty_allowed=True)
     used = np.isfinite(values)
+    told = {"channel": channel.name, "trial": section.name}
     if not used.any():
-        raise CampaignDataError(
-            f"{table.name} has no reading in the column {channel.table_column!r} of the trial "
-            f"{section.name!r}."
-        )
+        raise CampaignDataError(said("campaign.no_reading", table=table, column=channel.table_column, **told))
     if not used.all():
         rows = np.arange(len(values))
         values[~used] = np.interp(rows[~used], rows[used], values[used])
-        count, told = int((~used).sum()), {"channel": channel.name, "trial": section.name}
+        count = int((~used).sum())
         are = f"{be(count)} empty"
         remarks.append(said("remarks.left_out", count=count, total=len(values), are=are, **told))
     for row in section.left_out.get(channel.name, ()):
         if row > len(values):
-            raise CampaignFileError(
-                f"The trial {section.name!r} leaves out row {row} of {channel.name!r}, and {table.name} has "
-                f"{counted(len(values), 'row')}."
-            )
+            has = counted(len(values), "row")
+            raise CampaignFileError(said("campaign.no_row", row=row, table=table, has=has, **told))
         used[row - 1] = False
     return values, used
 
@@ -293,23 +277,15 @@ def _readings(
 def _temperature(
     section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
 ) -> FloatArray:
-    reference = campaign.reference_temperature
+    reference, stated = campaign.reference_temperature, section.temperature
     column = "temperature" in table.columns
-    if column and section.temperature is not None:
-        raise CampaignFileError(
-            f"{user.capitalize()} gives its temperature twice: remove `temperature` or the column of "
-            f"{table.name}."
-        )
-    if not column and section.temperature is None:
+    if column and stated is not None:
+        raise CampaignFileError(said("campaign.temperature_twice", trial=section, table=table))
+    if not column and stated is None:
         return np.zeros(len(table))
     if reference is None:
-        raise CampaignFileError(
-            f"{user.capitalize()} has a temperature, but the campaign has no `reference_temperature`: "
-            "give it, in degC."
-        )
-    if column:
-        return table.numbers("temperature", user) - reference
-    return np.full(len(table), (section.temperature or 0.0) - reference)
+        raise CampaignFileError(said("campaign.no_reference", trial=section))
+    return (table.numbers("temperature", user) if column else np.full(len(table), stated)) - reference
 
 
 def _health(
@@ -317,7 +293,7 @@ def _health(
 ) -> tuple[tuple[str, ...], FloatArray, FloatArray]:
     """Return damage regions, and their losses and deviations (N, K), from columns, keys, or healthy."""
     stated = {} if section.health is None else section.health.losses
-    usual = None if section.health is None else section.health.deviation
+    deviations = None if section.health is None else section.health.deviation
     columns = [
         name.removeprefix(schema.OF_REGION) for name in table.columns if name.startswith(schema.OF_REGION)
     ]
@@ -327,30 +303,20 @@ def _health(
     for index, name in enumerate(regions):
         column = name if name in USUAL_REGIONS else f"{schema.OF_REGION}{name}"
         if column in table.columns and name in stated:
-            raise CampaignFileError(
-                f"{user.capitalize()} gives {name} twice: remove it from `health` or from {table.name}."
-            )
-        what = "a fraction from 0 to 1"
-        health[:, index] = _within(table, column, user, 1.0, what, stated.get(name))
-        column = f"{column}_deviation"
-        deviation[:, index] = _within(table, column, user, inf, "a standard deviation", usual)
+            raise CampaignFileError(said("campaign.health_twice", trial=section, region=name, table=table))
+        for values, key, most, what, usual in (
+            (health, column, 1.0, "a fraction from 0 to 1", stated.get(name)),
+            (deviation, f"{column}_deviation", inf, "a standard deviation", deviations),
+        ):
+            if key not in table.columns:
+                values[:, index] = usual or 0.0
+                continue
+            values[:, index] = table.numbers(key, user)
+            if (outside := np.flatnonzero((values[:, index] < 0.0) | (values[:, index] > most))).size:
+                row = int(outside[0])
+                place = f"{table.name}, line {table.lines[row]}"
+                raise CampaignFileError(f"{place}: {key} is {what}, and {values[row, index]:g} came.")
     return regions, health, deviation
-
-
-def _within(
-    table: TextTable, name: str, user: str, most: float, what: str, stated: float | None
-) -> FloatArray | float:
-    """Return a column of numbers from zero to `most`, or what is stated where there is none."""
-    if name not in table.columns:
-        return stated or 0.0
-    values = table.numbers(name, user)
-    outside = np.flatnonzero((values < 0.0) | (values > most))
-    if outside.size:
-        row = int(outside[0])
-        raise CampaignFileError(
-            f"{table.name}, line {table.lines[row]}: {name} is {what}, and {values[row]:g} came."
-        )
-    return values
 
 
 def _release(section: schema.ReleaseSection) -> Release:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.sampling import IntArray, nearly_even
 from discrepancy.errors import CampaignDataError
+from discrepancy.sentences import said
 from reporting.words import brief
 
 FloatArray = NDArray[np.float64]
@@ -222,10 +223,7 @@ class Release:
     def __post_init__(self) -> None:
         """Refuse a release whose amplitude no unknown stands for: it would count as exact, unseen."""
         if self.mode_count < 1:
-            raise CampaignDataError(
-                f"The mode_count of a release must be at least 1, and {self.mode_count} came: the first mode "
-                "stands for the amplitude, which is known within `deviation` only."
-            )
+            raise CampaignDataError(said("campaign.mode_count", count=self.mode_count))
 
 
 USUAL_REGIONS = ("z1", "z2")
@@ -329,17 +327,8 @@ class Trial:
 
     def rows(self, rows: BoolArray | IntArray | slice, **changes: Any) -> "Trial":
         """Return the trial with its rows as an index chooses them, and other fields changed."""
-        parts = (
-            "values",
-            "used",
-            "time",
-            "force",
-            "load_factor",
-            "temperature",
-            "health",
-            "health_deviation",
-        )
-        of_rows: dict[str, Any] = {part: getattr(self, part)[rows] for part in parts}
+        keys = ("values", "used", "time", "force", "load_factor", "temperature", "health", "health_deviation")
+        of_rows: dict[str, Any] = {key: getattr(self, key)[rows] for key in keys}
         inputs = tuple(replace(item, values=item.values[rows]) for item in self.inputs)
         return replace(self, inputs=inputs, **{**of_rows, **changes})
 

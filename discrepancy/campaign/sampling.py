@@ -43,48 +43,38 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     """
     count = len(time)
     if count < LEAST_SAMPLES:
+        samples = counted(count, "sample")
         raise CampaignDataError(
-            f"{file} holds {counted(count, 'sample')} of {user}: a record in time needs at least "
-            f"{LEAST_SAMPLES}."
+            said("campaign.few_samples", file=file, samples=samples, user=user, least=LEAST_SAMPLES)
         )
     steps = np.diff(time)
     back = int(np.argmin(steps))
     if steps[back] <= 0.0:
-        raise CampaignDataError(
-            f"{file}: the time of {user} does not increase after sample {back + 1} ({cells[back]} s, then "
-            f"{cells[back + 1]} s); put the samples in order and keep each once."
-        )
+        told = {"at": back + 1, "time": cells[back], "then": cells[back + 1]}
+        raise CampaignDataError(said("campaign.time_goes_back", file=file, user=user, **told))
     # Trailing zeros may be dropped in print, so the finest cell says how many decimals there are.
-    rounding = 0.5 * min(_last_digit(cell) for cell in cells)
-    interval = float(time[-1] - time[0]) / (count - 1)
-    even = even_grid(time)
-    off = float(np.max(np.abs(time - even)))
-    if _EXACT * interval < off <= EVEN * interval + 2.0 * rounding:
-        return even
-    return time
+    rounding = min(_last_digit(cell) for cell in cells)  # twice half of it
+    even, off = even_grid(time)
+    interval = (time[-1] - time[0]) / (count - 1)
+    return even if _EXACT < off <= EVEN + rounding / interval else time
 
 
-def even_grid(time: FloatArray) -> FloatArray:
-    """Return the even grid (N,) through the first and the last of times (N,)."""
-    grid: FloatArray = time[0] + (time[-1] - time[0]) / (len(time) - 1) * np.arange(len(time))
-    return grid
+def even_grid(time: FloatArray) -> tuple[FloatArray, float]:
+    """Return the even grid (N,) through first and last of times (N,); how far off they are [intervals]."""
+    interval = (time[-1] - time[0]) / max(len(time) - 1, 1)
+    grid: FloatArray = time[0] + interval * np.arange(len(time))
+    return grid, float(np.max(np.abs(time - grid))) / abs(interval or 1.0)
 
 
 def is_even(time: FloatArray) -> bool:
     """Whether samples lie on an even grid to a thousandth of the interval."""
-    if len(time) < 3:
-        return True
-    interval = float(time[-1] - time[0]) / (len(time) - 1)
-    return bool(np.max(np.abs(time - even_grid(time))) <= EVEN * abs(interval))
+    return even_grid(time)[1] <= EVEN
 
 
 def nearly_even(time: FloatArray) -> bool:
     """Whether every step is within a tenth of the interval, so that a filter of even samples still holds."""
     steps = np.diff(time)
-    if not len(steps):
-        return True
-    usual = float(steps.mean())
-    return bool(np.max(np.abs(steps - usual)) <= ALIKE * usual)
+    return bool(np.allclose(steps, steps.mean(), rtol=ALIKE, atol=0.0)) if len(steps) else True
 
 
 def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:

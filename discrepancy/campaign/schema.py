@@ -1,6 +1,7 @@
 """The schema of `campaign.toml`: what it may say, checked strictly; units are still those of the file."""
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from keyword import iskeyword
 from math import inf, isinf
 from typing import Annotated, Any, Literal, Self
@@ -18,6 +19,7 @@ from pydantic import (
 from discrepancy.campaign.records import Hold, Quantity, Start, TrialKind
 from discrepancy.campaign.units import conversion_of
 from discrepancy.errors import CampaignFileError
+from discrepancy.sentences import said
 from fe.runtime.expression import RESERVED
 from fe.runtime.patch import EVERY_CHANNEL
 from reporting.section import Name, NotNegative, Number, Positive, Section, checked
@@ -113,14 +115,9 @@ class InputSection(ColumnSection):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.table_column in INPUT_COLUMNS and self.table_column != "force":
-            raise ValueError(
-                f"the column {self.table_column!r} is reserved: give the input {self.name!r} another column"
-            )
+            raise ValueError(said("campaign.reserved", item=self))
         if self.quantity.moving and not self.reference and self.hold not in (None, Hold.SMOOTH):
-            raise ValueError(
-                f"the input {self.name!r} is a motion, which no drive makes in steps or corners: leave "
-                "`hold` out, or say smooth, or reference = true where it is what a controller shall follow"
-            )
+            raise ValueError(said("campaign.motion", item=self))
         return self
 
     @property
@@ -195,28 +192,16 @@ class TrialSection(Section):
     def _place(cls, value: object) -> object:
         if isinstance(value, list):
             if len(value) != 2:
-                raise ValueError(
-                    "`load_place` must be a name or [y, x] (m from the root, fraction of the chord), "
-                    f"and {value} "
-                    "came"
-                )
+                raise ValueError(said("campaign.load_place", value=value))
             return tuple(value)
         return value
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.kind is not TrialKind.RINGDOWN and self.release is not None:
-            raise ValueError(f"the trial {self.name!r} is no ring-down and cannot have a `release`")
-        if self.begins is not None and self.kind not in (TrialKind.FORCED, TrialKind.DRIVEN):
-            raise ValueError(
-                f"the trial {self.name!r} is {self.kind.value}, and `begins` is for forced and driven ones; "
-                "a ring-down says it by its `release`"
-            )
-        if self.hold is not None and self.kind is not TrialKind.FORCED:
-            raise ValueError(
-                f"the trial {self.name!r} is {self.kind.value}, and its `hold` is for the force of a forced "
-                "one: say that of a driven one in its [[input]]"
-            )
+        kinds = {"release": {TrialKind.RINGDOWN}, "begins": {TrialKind.FORCED, TrialKind.DRIVEN}}
+        for key, allowed in {**kinds, "hold": {TrialKind.FORCED}}.items():
+            if getattr(self, key) is not None and self.kind not in allowed:
+                raise ValueError(said(f"campaign.no_{key}", trial=self))
         return self
 
 
@@ -232,21 +217,13 @@ class EventSection(Section):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if not self.name.isidentifier():
-            raise ValueError(
-                f"the event {self.name!r} is used in expressions, so its name must be of letters, digits and "
-                "underscores, a letter first"
-            )
+            raise ValueError(said("campaign.event_name", event=self))
         if self.name in RESERVED or iskeyword(self.name):
-            raise ValueError(
-                f"the event {self.name!r} has a name that means something else in an expression: rename it"
-            )
+            raise ValueError(said("campaign.event_reserved", event=self))
         if self.trial is not None and self.trials is not None:
-            raise ValueError(f"the event {self.name!r} has `trial` and `trials`: give one of the two")
+            raise ValueError(said("campaign.event_trials", event=self))
         if self.until is not None and self.until <= self.time:
-            raise ValueError(
-                f"the event {self.name!r} begins at {self.time:g} s and must end later, but `until` is "
-                f"{self.until:g} s"
-            )
+            raise ValueError(said("campaign.event_end", event=self))
         return self
 
     def among(self, trials: Sequence[TrialSection]) -> tuple[str, ...]:
@@ -257,6 +234,11 @@ class EventSection(Section):
             return self.trials
         still = (TrialKind.STATIC, TrialKind.FLIGHT)
         return tuple(item.name for item in trials if item.kind not in still)
+
+
+def _twice(names: Iterable[str]) -> str | None:
+    """Return the first name in the alphabet that comes more than once."""
+    return min((name for name, count in Counter(names).items() if count > 1), default=None)
 
 
 class CampaignSection(Section):
@@ -276,33 +258,21 @@ class CampaignSection(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        for kind, names in (
-            ("channel", [item.name for item in self.channel]),
-            ("input", [item.name for item in self.input]),
-            ("trial", [item.name for item in self.trial]),
-        ):
-            twice = sorted({name for name in names if names.count(name) > 1})
-            if twice:
-                raise ValueError(f"there is more than one {kind} called {twice[0]!r}: rename one")
+        for kind in ("channel", "input", "trial"):
+            if twice := _twice(item.name for item in getattr(self, kind)):
+                raise ValueError(f"there is more than one {kind} called {twice!r}: rename one")
         if self.input and not any(item.kind in (TrialKind.DRIVEN, TrialKind.STATIC) for item in self.trial):
             raise ValueError('[[input]] is for trials of the kind "driven" or "static", and there is none')
         every: tuple[ColumnSection, ...] = (*self.channel, *self.input)
-        columns = [item.table_column for item in every]
-        twice = sorted({column for column in columns if columns.count(column) > 1})
-        if twice:
+        if twice := _twice(item.table_column for item in every):
             what = "channel or input" if self.input else "channel"
-            raise ValueError(
-                f"more than one {what} reads the column {twice[0]!r}: give each its own `column`"
-            )
+            raise ValueError(f"more than one {what} reads the column {twice!r}: give each its own `column`")
         # the force is one of static and forced trials only: a load cell may be called so in a driven one
         forced = any(item.kind in (TrialKind.STATIC, TrialKind.FORCED) for item in self.trial)
         taken = {name for name in INPUT_COLUMNS if name != "force" or forced}
         for channel in self.channel:
             if channel.table_column in taken:
-                raise ValueError(
-                    f"the column {channel.table_column!r} holds an input of the trial: give the channel "
-                    f"{channel.name!r} another column"
-                )
+                raise ValueError(said("campaign.taken", item=channel))
         scales = {item.unit == "K" for item in every if item.quantity is Quantity.TEMPERATURE}
         if len(scales) > 1:
             raise ValueError("temperatures are given in degC and in K: give all of them in one of the two")
@@ -312,11 +282,8 @@ class CampaignSection(Section):
         for item in self.trial:
             for name in (*(item.channels or ()), *item.left_out):
                 if name not in known:
-                    raise ValueError(
-                        f"the trial {item.name!r} names the channel {name!r}, which is not among the "
-                        "channels "
-                        f"{', '.join(sorted(known))}"
-                    )
+                    names = ", ".join(sorted(known))
+                    raise ValueError(said("campaign.unknown_channel", trial=item, name=name, known=names))
         return self
 
     def _check_loggers(self) -> None:
@@ -329,9 +296,7 @@ class CampaignSection(Section):
         recorded = [name for names in self.loggers.values() for name in names]
         for name in recorded:
             if name not in wanted:
-                raise ValueError(
-                    f"`loggers` names {name!r}, but the channels and inputs are {', '.join(wanted)}"
-                )
+                raise ValueError(said("campaign.no_such_record", name=name, wanted=", ".join(wanted)))
         for name in wanted:
             if recorded.count(name) != 1:
                 came = "none" if name not in recorded else "more than one"
@@ -344,23 +309,15 @@ class CampaignSection(Section):
         kinds, seen = {item.name: item.kind for item in self.trial}, set[tuple[str, str]]()
         for event in self.event:
             for trial in event.among(self.trial):
+                told = {"event": event, "trial": trial, "known": ", ".join(kinds)}
                 if trial not in kinds:
-                    raise ValueError(
-                        f"the event {event.name!r} names the trial {trial!r}, which is not among the trials "
-                        f"{', '.join(kinds)}"
-                    )
+                    raise ValueError(said("campaign.no_trial", **told))
                 if kinds[trial] in (TrialKind.STATIC, TrialKind.FLIGHT):
-                    raise ValueError(
-                        f"the event {event.name!r} is in the trial {trial!r}, which is {kinds[trial].value} "
-                        "and has no course in time"
-                    )
+                    raise ValueError(said("campaign.no_course", kind=kinds[trial].value, **told))
                 # Its end has a name, too, by which expressions know it.
                 for word in (event.name, f"{event.name}_until")[: 1 if event.until is None else 2]:
                     if (word, trial) in seen:
-                        raise ValueError(
-                            f"there is more than one moment {word!r} in the trial {trial!r}: rename one, or "
-                            "name the trial once"
-                        )
+                        raise ValueError(said("campaign.two_moments", word=word, trial=trial))
                     seen.add((word, trial))
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from discrepancy.campaign.units import conversion, quantities_of
 from discrepancy.errors import CampaignFileError
+from discrepancy.sentences import said
 from reporting.provenance import hash_file
 from reporting.section import shown
 from reporting.text_file import read_text
@@ -119,10 +120,8 @@ def read_sheet(path: Path) -> Sheet:
             names.append((name, unit))
             columns.append(cells)
     heads = [name for name, _ in names]
-    heads = [
-        f"{name} {heads[:at].count(name) + 1}" if name in heads[:at] else name
-        for at, name in enumerate(heads)
-    ]
+    earlier = [heads[:at].count(name) for at, name in enumerate(heads)]
+    heads = [f"{name} {count + 1}" if count else name for name, count in zip(heads, earlier, strict=True)]
     between = f", {SEPARATORS[separator]} between cells" if separator else ""
     remark = f"{where.rpartition(' ')[2]}s {lines[0]} to {lines[-1]}{between}{left}{below}"
     return Sheet(
@@ -144,9 +143,8 @@ def _number(cell: str, mark: str) -> str | None:
 
 
 def _is_value(cell: str) -> bool:
-    if _PLAIN.fullmatch(cell):
-        return True
-    return any(_number(cell, mark) for mark in _NUMBERS) or _CLOCK.fullmatch(cell) is not None
+    plain = _PLAIN.fullmatch(cell)
+    return bool(plain or any(_number(cell, mark) for mark in _NUMBERS) or _CLOCK.fullmatch(cell))
 
 
 def _time(cell: str, where: str) -> Decimal:
@@ -158,10 +156,7 @@ def _time(cell: str, where: str) -> Decimal:
             moment = datetime.strptime(f"{day or '1.1.2000'} {clock}", f"{layout} %H:%M:%S")
             whole = (moment - datetime.min) // timedelta(seconds=1)
             return whole + Decimal(f"0{fraction.replace(',', '.')}")
-    raise CampaignFileError(
-        f"{where}: {cell!r} is no time, or has a date that can be read in two ways: write it as 10:15:02.5, "
-        "2026-03-31 10:15:02.5 or 31.3.2026 10:15:02.5."
-    )
+    raise CampaignFileError(said("sheets.no_time", where=where, cell=cell))
 
 
 def _decimal(
@@ -178,10 +173,8 @@ def _decimal(
             elif point != comma:
                 sure.setdefault("." if point else ",", f"{cell!r} in line {line}")
     if len(sure) > 1:
-        raise CampaignFileError(
-            f"{where.rpartition(',')[0]} writes decimals with a point ({sure['.']}) and with a comma "
-            f"({sure[',']}): write all in one way."
-        )
+        file = where.rpartition(",")[0]
+        raise CampaignFileError(said("sheets.decimals", file=file, point=sure["."], comma=sure[","]))
     if unclear and not sure:
         # What commas stand between, and in none of, has points for decimals.
         return ("." if separator == "," and "," not in unclear.rpartition(" in ")[0] else None), unclear
@@ -227,12 +220,11 @@ def _text_rows(path: Path) -> tuple[Rows, str]:
 
     def numbers(separator: str) -> tuple[bool, int]:
         """Return whether a separator makes a table, and how many more numbers than texts it makes."""
-        found = rows(separator, _LOOKED_AT)
+        found, is_table = rows(separator, _LOOKED_AT), False
         values = [(sum(map(_is_value, row)), sum(map(bool, row))) for _, row in found]
         with suppress(CampaignFileError):
-            _laid_out(found, path.name, "")
-            return True, sum(2 * count - of for count, of in values if count > 1)
-        return False, sum(2 * count - of for count, of in values if count > 1)
+            is_table = bool(_laid_out(found, path.name, ""))
+        return is_table, sum(2 * count - of for count, of in values if count > 1)
 
     separator = max(SEPARATORS, key=numbers)
     return rows(separator), separator
@@ -254,14 +246,10 @@ def _excel_rows(path: Path, tab: str) -> Rows:
                 sheets[sheet.title] = [(line, row) for line, row in filled if any(row)]
             book.close()
     except Exception as cause:  # openpyxl answers damage with nearly any
-        raise CampaignFileError(
-            f"{path} cannot be read as an Excel workbook ({one_line(cause)}): save it anew, or as CSV."
-        ) from cause
+        raise CampaignFileError(said("sheets.no_workbook", path=path, reason=one_line(cause))) from cause
     full = [title for title, rows in sheets.items() if rows]
     if (tab and tab not in sheets) or (not tab and len(full) != 1):
-        raise CampaignFileError(
-            f"{path.name} has the sheets {', '.join(full) or 'none'}: say which as {path.name}#SHEET."
-        )
+        raise CampaignFileError(said("sheets.which", file=path.name, has=", ".join(full) or "none"))
     return sheets[tab or full[0]]
 
 
@@ -287,10 +275,7 @@ def _laid_out(rows: Rows, name: str, where: str) -> tuple[list[str], list[str], 
     ]
     body = [at for at, found in enumerate(values) if core and texts[at] is None and core[0] in found]
     if not body or body[0] == 0:
-        raise CampaignFileError(
-            f"{name} holds no table: a row with the names of two or more columns is needed, and rows of "
-            "numbers under it, with commas, semicolons or tabs between cells."
-        )
+        raise CampaignFileError(said("sheets.no_table", name=name))
     first, last = body[0], body[-1]
     body = [at for at in range(first, last + 1) if texts[at] is None and values[at]]
     head, units = rows[first - 1][1], [""] * len(rows[first - 1][1])
@@ -300,19 +285,15 @@ def _laid_out(rows: Rows, name: str, where: str) -> tuple[list[str], list[str], 
     filled = max(at for row in body for at, cell in enumerate(rows[row][1]) if cell) + 1
     named = sum(map(bool, head))
     if 2 * named <= filled or len(head) < filled:
-        raise CampaignFileError(
-            f"{where} {rows[first][0]}: {counted(filled, 'cell')} came, and the row above names "
-            f"{counted(named, 'column')}: a table needs a name over each, and between commas a decimal comma "
-            "makes two cells of a number."
-        )
+        came, has, place = counted(filled, "cell"), counted(named, "column"), f"{where} {rows[first][0]}"
+        raise CampaignFileError(said("sheets.unnamed", place=place, came=came, named=has))
     torn = (at for at in range(last + 1, len(rows)) if core[0] in values[at])  # no footer begins so
     left = {*range(first, last), *(at for at in torn if 2 * len(values[at] & {*core}) >= len(core))} - {*body}
     for line, row in (rows[at] for at in sorted(left) if rows[at][1] not in (head, rows[first - 1][1])):
         if not row[0].startswith("#"):
+            came = shown(listing(filter(None, row)))
             raise CampaignFileError(
-                f"{where} {line}: numbers must stand under {head[core[0]]!r} and the other names, and "
-                f"{shown(listing(filter(None, row)))} came; leave the cell of a reading empty that is to be "
-                "left out, and remove what is no row of the table."
+                said("sheets.no_row", place=f"{where} {line}", name=head[core[0]], came=came)
             )
     below = [line for line, _ in rows[last + 1 :]]
     remark = f"; what stands from {below[0]} on is left out" if below else ""

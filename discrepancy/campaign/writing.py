@@ -23,6 +23,7 @@ from discrepancy.campaign.records import (
 from discrepancy.campaign.schema import FORMAT, OF_REGION, parse_campaign
 from discrepancy.campaign.units import UNITS, conversion_of
 from discrepancy.errors import CampaignFileError
+from discrepancy.sentences import said
 from reporting.files import atomic_write_text
 from reporting.table_file import table_text
 from reporting.toml_file import toml_text
@@ -87,10 +88,7 @@ def _trial_table(campaign: Campaign, trial: Trial, si: bool) -> str:
         columns["load_factor"] = trial.load_factor
     if np.any(trial.temperature != 0.0):
         if campaign.reference_temperature is None:
-            raise CampaignFileError(
-                f"The trial {trial.name!r} has temperatures, but the campaign has no reference "
-                "temperature to write them with."
-            )
+            raise CampaignFileError(said("campaign.temperature_of_none", trial=trial))
         columns["temperature"] = campaign.reference_temperature + trial.temperature
     for index, region in enumerate(trial.regions):
         name = region if region in USUAL_REGIONS else f"{OF_REGION}{region}"
@@ -123,10 +121,7 @@ def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:
         return None
     interval = intervals.pop()
     if intervals or interval is None:
-        raise CampaignFileError(
-            "Noise records can be written only if all have one sampling interval: resample them, or keep "
-            "their standard deviations."
-        )
+        raise CampaignFileError(said("campaign.several_intervals"))
     longest = max(len(samples) for samples, _ in recorded.values())
     columns: dict[str, FloatArray] = {"time": interval * np.arange(float(longest))}
     for name, (samples, _) in recorded.items():

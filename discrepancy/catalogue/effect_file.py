@@ -52,6 +52,7 @@ from pydantic import ConfigDict, Field
 
 from discrepancy.campaign.records import TrialKind
 from discrepancy.errors import CatalogueError
+from discrepancy.sentences import said
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.expression import RESERVED, Expression
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive, Window
@@ -59,7 +60,7 @@ from reporting.section import Section, checked
 from reporting.toml_file import read_toml
 
 from .entry import Effect, EffectParameter, Number, Setting, ShapeParameter
-from .needs import NEEDS, PLACES, USUAL, Entry, Kinds, Target, first_reason, targets_of
+from .needs import DYNAMIC, NEEDS, PLACES, USUAL, Entry, Target, first_reason, targets_of
 from .scales import SCALES, Here, names_with
 
 Text = Annotated[str, Field(min_length=0)]
@@ -124,12 +125,13 @@ def _effect(row: object, where: str) -> Effect:
         _recipe(item, names, moments, f"{where}, primitives {n}")
         for n, item in enumerate(section.primitives, start=1)
     )
-    _check_in_time(recipes, section.acts_on)
-    entry = Entry(
-        section.id, section.acts_on, section.places if isinstance(section.places, str) else "",
-        section.preferred, tuple(PRIMITIVES[recipe.kind] for recipe in recipes),
-        frozenset().union(*(recipe.moments for recipe in recipes)),
-    )  # fmt: skip
+    timed = [item for item in recipes if item.in_windows or PRIMITIVES[item.kind].courses]
+    if timed and (still := [kind for kind in TrialKind if kind in section.acts_on - DYNAMIC]):
+        raise CatalogueError(said("effects.no_course", where=timed[0].where, kind=still[0].value))
+    word = section.places if isinstance(section.places, str) else ""
+    kinds = tuple(PRIMITIVES[recipe.kind] for recipe in recipes)
+    needed = frozenset().union(*(recipe.moments for recipe in recipes))
+    entry = Entry(section.id, section.acts_on, word, section.preferred, kinds, needed)
     return Effect(
         identifier=section.id,
         build=partial(_build, recipes, entry),
@@ -151,15 +153,10 @@ def _check_words(section: EffectSection, names: frozenset[str], where: str) -> N
             raise CatalogueError(f"{where}: 'needs' has {need!r}, but known are {', '.join(NEEDS)}.")
     places = section.places
     if isinstance(places, str) and places not in PLACES:
-        raise CatalogueError(
-            f"{where}: 'places' must be a list or one of {'; '.join(PLACES)}, but is {places!r}."
-        )
-    for name in places or ():
-        if not isinstance(places, str) and name in PLACES:
-            raise CatalogueError(
-                f"{where}: 'places' is a list that holds {name!r}, which would be the name of a single "
-                f'place; for all {name} write places = "{name}", without brackets.'
-            )
+        raise CatalogueError(said("effects.places", where=where, known="; ".join(PLACES), places=places))
+    for name in () if isinstance(places, str) else places or ():
+        if name in PLACES:
+            raise CatalogueError(said("effects.listed", where=where, name=name))
 
 
 def _places(places: str | tuple[str, ...] | None, entry: Entry, setting: Setting) -> tuple[str, ...]:
@@ -265,17 +262,6 @@ def _recipe(
     written = [item for item in (*values.values(), *when.values()) if isinstance(item, Expression)]
     used = frozenset(name for item in written for name in item.used())
     return _Recipe(where, kind, values, when, used & SCALES.keys() - names, used & moments)
-
-
-def _check_in_time(recipes: tuple[_Recipe, ...], acts_on: Kinds) -> None:
-    """Refuse effects that ask for the time of trials which have none."""
-    still = [kind.value for kind in (TrialKind.STATIC, TrialKind.FLIGHT) if kind in acts_on]
-    timed = [item for item in recipes if item.in_windows or PRIMITIVES[item.kind].courses]
-    if timed and still:
-        raise CatalogueError(
-            f"{timed[0].where} asks for the time of trials, but 'acts_on' has {still[0]!r}, whose rows "
-            "are no course in time."
-        )
 
 
 def _build(

@@ -4,11 +4,12 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 
 from discrepancy.errors import CatalogueError
+from discrepancy.sentences import said
 from fe.runtime.patch import SENSORS, ModelPatch, Window
 
 from .effect_file import effects_of_file
@@ -63,9 +64,7 @@ def load_catalogue(extra: Iterable[Effect | Path] = (), *, installed: bool = Tru
     CatalogueError
         If an entry cannot be read, is not sound, or has an identifier that is taken.
     """
-    effects = [*library()]
-    if installed:
-        effects += effects_of_entry_points()
+    effects = [*library(), *(effects_of_entry_points() if installed else ())]
     for item in extra:
         effects += (item,) if isinstance(item, Effect) else effects_of_file(item)
     check(effects)
@@ -115,20 +114,13 @@ def _during(effect: Effect, event: str, setting: Setting) -> Effect:
         if item.name == event
         for trial in item.trials
     )
-    return replace(
-        effect,
-        identifier=f"{effect.identifier}_during_{event}",
-        name=f"{effect.name} during {event}",
-        acts_on=effect.acts_on & DYNAMIC,
-        build=partial(_build_during, effect, windows),
-    )
 
+    def build(setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
+        patch = effect.build(setting, values, place)
+        return ModelPatch(tuple(replace(item, windows=windows) for item in patch))
 
-def _build_during(
-    effect: Effect, windows: tuple[Window, ...], setting: Setting, values: Mapping[str, float], place: str
-) -> ModelPatch:
-    patch = effect.build(setting, values, place)
-    return ModelPatch(tuple(replace(item, windows=windows) for item in patch))
+    identifier, name = f"{effect.identifier}_during_{event}", f"{effect.name} during {event}"
+    return replace(effect, identifier=identifier, name=name, acts_on=effect.acts_on & DYNAMIC, build=build)
 
 
 def check(effects: Iterable[Effect]) -> None:
@@ -136,18 +128,14 @@ def check(effects: Iterable[Effect]) -> None:
     effects = tuple(effects)
     known = Counter(effect.identifier for effect in effects)
     for effect in effects:
-        for fault in _faults(effect):
+        if fault := next(_faults(effect), ""):
             raise CatalogueError(f"The effect {effect.identifier!r}{fault}")
-    for identifier, count in known.items():
-        if count > 1:
-            raise CatalogueError(f"The catalogue has {count} effects with the identifier {identifier!r}.")
+    if twice := next((name for name, count in known.items() if count > 1), None):
+        raise CatalogueError(f"The catalogue has {known[twice]} effects with the identifier {twice!r}.")
     for effect in effects:
         for other in effect.confusable:
             if other not in known or other == effect.identifier:
-                raise CatalogueError(
-                    f"The effect {effect.identifier!r} names {other!r} as confusable, "
-                    "which is no other effect of the catalogue."
-                )
+                raise CatalogueError(said("effects.confusable", effect=effect, other=other))
 
 
 def _faults(effect: Effect) -> Iterator[str]:
@@ -173,7 +161,4 @@ def _faults(effect: Effect) -> Iterator[str]:
             yield f"{where}a log-normal prior must have low > 0, but has {prior.low:g}."
     for shape in effect.shape:
         if not shape.prior.low < shape.canonical < shape.prior.high:
-            yield (
-                f": the canonical value {shape.canonical:g} of {shape.name!r} must lie between "
-                f"{shape.prior.low:g} and {shape.prior.high:g}."
-            )
+            yield said("effects.canonical", shape=shape)

@@ -1,19 +1,17 @@
 """Where an effect may act and what it needs, by the words of its entry, and why it cannot be tested."""
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import isinf
 
 import numpy as np
 
 from discrepancy.campaign.noise import MAINS, aliased
-from discrepancy.campaign.records import Channel, Quantity, Trial, TrialKind
-from discrepancy.errors import ModelError
-from discrepancy.models.interface import Conditions, Response
+from discrepancy.campaign.records import Channel, FloatArray, Quantity, Trial, TrialKind
+from discrepancy.models.interface import ACROSS
 from discrepancy.sentences import SENTENCES, said
 from fe.runtime.motion import PLANFORM
-from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch, PortForce, Primitive
+from fe.runtime.patch import EVERY_CHANNEL, SENSORS, PortForce, Primitive
 
 from .entry import Setting
 
@@ -102,7 +100,7 @@ def state_ports(setting: Setting, entry: Entry = ANY) -> Names:
 def force_ports(setting: Setting, entry: Entry = ANY) -> Names:
     """Return the ports where forces act: those of `preferred` that the model has, else all."""
     flows, spread = state_ports(setting, entry), PLANFORM in setting.scales.ports
-    known = tuple(port for port in setting.model.ports() if port not in flows)
+    known = tuple(port for port in setting.model.ports if port not in flows)
     wanted = ["span" if name == PLANFORM and not spread else name for name in entry.preferred]
     return tuple(name for name in wanted if name in known or name == PLANFORM) or known
 
@@ -185,18 +183,17 @@ def mains_lines(setting: Setting) -> Names:
     aliases differ by less than half a period in every record look alike and are one.
     """
     sampled = [(item.interval, float(item.time[-1] - item.time[0])) for item in trials(setting, DYNAMIC)]
+
+    def periods(frequency: float) -> FloatArray:
+        return np.array([aliased(frequency, interval) * length for interval, length in sampled])
+
     groups: list[list[float]] = []
     for frequency in MAINS:
-        if all(aliased(frequency, interval) * length < 1.0 for interval, length in sampled):
-            continue
-        for group in groups:
-            if all(
-                abs(aliased(frequency, interval) - aliased(group[0], interval)) * length < 0.5
-                for interval, length in sampled
-            ):
-                group.append(frequency)
-                break
-        else:
+        seen = periods(frequency)
+        alike = (group for group in groups if np.all(np.abs(seen - periods(group[0])) < 0.5))
+        if (group := next(alike, None)) is not None and np.any(seen >= 1.0):
+            group.append(frequency)
+        elif np.any(seen >= 1.0):
             groups.append([frequency])
     return tuple(" or ".join(f"{frequency:g}" for frequency in group) + " Hz" for group in groups)
 
@@ -210,7 +207,7 @@ def _seen_lines(setting: Setting, entry: Entry = ANY) -> Names:
 
 
 PLACES: dict[str, Callable[[Setting, Entry], Names]] = {
-    "ports": lambda setting, entry: setting.model.ports(),
+    "ports": lambda setting, entry: setting.model.ports,
     "channels": _channels,
     "channels, or all": lambda setting, entry: _or_all(_channels(setting, entry)),
     "strain channels": strain_channels,
@@ -292,7 +289,7 @@ def _law(setting: Setting, entry: Entry) -> str | None:
     model = setting.model
     for primitive in entry.primitives:
         if primitive not in SENSORS and not model.supports(primitive):
-            no_port = issubclass(primitive, PortForce) and not model.ports()
+            no_port = issubclass(primitive, PortForce) and not model.ports
             what = NO_PORT if no_port else said("needs.cannot_carry", kind=primitive.kind)
             return said("needs.model", model=model.name, what=what)
     return None
@@ -305,7 +302,7 @@ def _place(setting: Setting, entry: Entry) -> str | None:
 
 
 def _port(setting: Setting, entry: Entry) -> str | None:
-    if not setting.model.ports():
+    if not setting.model.ports:
         return said("needs.model", model=setting.model.name, what=NO_PORT)
     return None if force_ports(setting) else said("needs.only_states", model=setting.model.name)
 
@@ -319,18 +316,12 @@ def _temperature(setting: Setting, entry: Entry) -> str | None:
 
 
 def _strain_across(setting: Setting, entry: Entry) -> str | None:
-    model, campaign = setting.model, setting.campaign
-    names = strain_channels(setting)
-    trial = next(trial for trial in trials(setting) if any(name in names for name in trial.channels))
-    channel = campaign.channels[next(name for name in trial.channels if name in names)]
-    means = [campaign.parameters.get(item.name, (item.mean, 0.0))[0] for item in model.parameters]
-    conditions = Conditions(np.array(means), health=trial.health, components=True)
-    given: Response | None = None
-    with suppress(ModelError):
-        given = model.respond(trial, ((channel.output, channel.quantity),), ModelPatch(), conditions)
-    if given is None or given.transverse is None or given.shear is None:
-        return said("needs.no_strain_across", model=model.name)
-    return None
+    outputs = [
+        setting.campaign.channels[name].output + part for name in strain_channels(setting) for part in ACROSS
+    ]
+    if all(map(setting.model.output_quantity, outputs)):
+        return None
+    return said("needs.no_strain_across", model=setting.model.name)
 
 
 def _has_force(setting: Setting) -> bool:
@@ -350,7 +341,7 @@ NEEDS: dict[str, Callable[[Setting, Entry], str | None]] = {
     "place": _place,
     "port": _port,
     "turning port": _met(turning_ports, "places.turning ports"),
-    "stations": _met(lambda setting: setting.model.stations() is not None, "needs.no_length"),
+    "stations": _met(lambda setting: setting.model.stations is not None, "needs.no_length"),
     "force": _met(_has_force, "needs.no_force"),
     "temperature": _temperature,
     "channel": _met(channels, "needs.no_channel"),

@@ -19,6 +19,7 @@ from scipy.special import beta
 from discrepancy.campaign.records import TrialKind
 from discrepancy.errors import CatalogueError
 from discrepancy.models.scales import PortScale
+from discrepancy.sentences import said
 from fe.runtime.patch import EVERY_CHANNEL
 
 from .entry import Setting
@@ -42,9 +43,9 @@ class Here:
         """Natural scales of the port; raises `CatalogueError` if the model has no such port."""
         ports = self.setting.scales.ports
         if self.target.name not in ports:
+            known = ", ".join(ports) or "none"
             raise CatalogueError(
-                f"The model {self.setting.model.name!r} has no port {self.target.name!r}; "
-                f"it has {', '.join(ports) or 'none'}."
+                said("effects.no_port", setting=self.setting, target=self.target, ports=known)
             )
         return ports[self.target.name]
 
@@ -101,7 +102,7 @@ def _largest_release(here: Here) -> float:
 
 
 def _station(end: int, here: Here) -> float:
-    return (here.setting.model.stations() or (0.0, 0.0))[end]
+    return (here.setting.model.stations or (0.0, 0.0))[end]
 
 
 SCALES: dict[str, Callable[[Here], float]] = {

@@ -4,11 +4,21 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
 from math import pi
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from discrepancy.campaign.records import BoolArray, Campaign, FloatArray, Hold, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import (
+    BoolArray,
+    Campaign,
+    Channel,
+    FloatArray,
+    Hold,
+    Quantity,
+    Trial,
+    TrialKind,
+)
 from discrepancy.catalogue.entry import Setting
 from discrepancy.checks.quality import rest_faults
 from discrepancy.fits.candidate import Candidate
@@ -125,16 +135,13 @@ def _holds(campaign: Campaign, model: Model, trial: Trial) -> Iterator[DataFault
     curved = replace(trial, inputs=inputs, hold=Hold.SMOOTH if forced else trial.hold)
     conditions = prior_mean(campaign, model, trial)
     one, other = (observe(model, campaign, i, ModelPatch(), conditions).values for i in (trial, curved))
-    sizes = np.sqrt(np.mean((one - other) ** 2, axis=0))
     noises = [campaign.channels[name].noise for name in trial.channels]
     known = [np.inf if noise is None else noise.standard_deviation for noise in noises]
-    worst = int(np.argmax(sizes / known))
-    if sizes[worst] / known[worst] > MATTERS:
-        yield fault(
-            FaultKind.BETWEEN_SAMPLES, trial=trial.name, names=", ".join(map(repr, straight)),
-            worst=sizes[worst] / known[worst], where=trial.channels[worst],
-            table="[[trial]]" if forced else "[[input]]",
-        )  # fmt: skip
+    sizes = np.sqrt(np.mean((one - other) ** 2, axis=0)) / known
+    if (worst := sizes.max()) > MATTERS:
+        told = {"names": ", ".join(map(repr, straight)), "where": trial.channels[int(sizes.argmax())]}
+        table = "[[trial]]" if forced else "[[input]]"
+        yield fault(FaultKind.BETWEEN_SAMPLES, trial=trial.name, worst=worst, table=table, **told)
 
 
 # ---------------------------------------------------------------- outputs and length
@@ -160,19 +167,14 @@ def _lengths(campaign: Campaign, model: Model) -> Iterator[DataFault]:
     frequency = model.scales(campaign).angular_frequency / (2.0 * pi)
     for trial in dynamic:
         periods = float(trial.time[-1] - trial.time[0]) * frequency
+        told: dict[str, Any] = {"trial": trial.name, "frequency": frequency}
         if periods < LEAST_PERIODS:
-            yield fault(
-                FaultKind.TOO_SHORT, trial=trial.name, periods=periods, frequency=frequency,
-                least=LEAST_PERIODS,
-            )  # fmt: skip
+            yield fault(FaultKind.TOO_SHORT, periods=periods, least=LEAST_PERIODS, **told)
         samples = 1.0 / (trial.interval * frequency)
         if samples < LEAST_SAMPLES:
             slip = samples < LEAST_SAMPLES / 10.0 and 1e3 * samples >= LEAST_SAMPLES
-            say = "undersampled_in_milliseconds" if slip else ""
-            yield fault(
-                FaultKind.UNDERSAMPLED, trial=trial.name, say=say, samples=samples, more=1e3 * samples,
-                frequency=frequency, least=LEAST_SAMPLES,
-            )  # fmt: skip
+            told |= {"say": "undersampled_in_milliseconds" if slip else "", "more": 1e3 * samples}
+            yield fault(FaultKind.UNDERSAMPLED, samples=samples, least=LEAST_SAMPLES, **told)
 
 
 # ---------------------------------------------------------------- scales
@@ -252,12 +254,11 @@ def _signs(campaign: Campaign, scales: dict[tuple[str, str], float]) -> Iterator
         # A filter turns the phase of a motion; readings at rest know no phase and go first.
         if trial not in dynamic or name not in at_rest:
             by_channel[name].append(scale)
-    reversed_channels = [name for name, found in by_channel.items() if max(found) < 0.0]
-    if len(reversed_channels) == len(by_channel) > 1:
+    wrong = [name for name, found in by_channel.items() if max(found) < 0.0]
+    if len(wrong) == len(by_channel) > 1:
         yield fault(FaultKind.SIGN, say="sign_of_all")
-        return
-    for name in reversed_channels:
-        yield fault(FaultKind.SIGN, name)
+    else:
+        yield from (fault(FaultKind.SIGN, name) for name in wrong)
 
 
 # ---------------------------------------------------------------- swapped channels
@@ -284,13 +285,11 @@ def _swaps_of(
     for trial in trials:
         columns = [trial.channels.index(name) for name in names]
         for row, own in enumerate(columns):
-            channel = campaign.channels[names[row]]
             used = trial.used[:, own]
-            noise = channel.noise_in(trial)
             for place, other in enumerate(columns):
-                predicted, offset = predictions[trial.name][used, other], channel.offset_deviation
+                predicted = predictions[trial.name][used, other]
                 misfit[row, place] += _misfit(
-                    trial.values[used, own], predicted, noise, trial.is_dynamic, offset
+                    trial.values[used, own], predicted, campaign.channels[names[row]], trial
                 )
     _, assigned = linear_sum_assignment(misfit)
     for row, place in enumerate(assigned):
@@ -303,24 +302,19 @@ def _swaps_of(
                 yield pair, fault(FaultKind.SWAPPED, pair[0], other=pair[1])
 
 
-def _misfit(
-    data: FloatArray, model: FloatArray, noise: float, dynamic: bool, offset_deviation: float
-) -> float:
+def _misfit(data: FloatArray, model: FloatArray, channel: Channel, trial: Trial) -> float:
     """Return chi-square of data about a prediction, with a share of the prediction as the least deviation."""
-    if dynamic:
+    noise = channel.noise_in(trial)
+    if trial.is_dynamic:
         # Amplitudes only: a small error of frequency would outweigh what the places of two gauges differ by.
-        one, other = np.array([np.std(data)]), np.array([np.std(model)])
         sign = 1.0 if float(data[: max(len(data) // 50, 3)].mean() * model[0]) >= 0.0 else -1.0
-        deviation = np.hypot(noise / np.sqrt(len(data)), _FLOOR * other)
-        return _chi_square(sign * one - other, deviation)
-    rest = data - model
-    if offset_deviation > 0.0:
-        rest = rest - np.median(rest)
-    deviation = np.maximum(np.hypot(noise, _FLOOR * np.abs(model)), 1e-300)
-    deviation = np.maximum(deviation, _FLOOR * float(np.max(np.abs(model), initial=0.0)) * 0.2)
-    return _chi_square(rest, deviation)
-
-
-def _chi_square(rest: FloatArray, deviation: FloatArray) -> float:
+        rest = np.asarray(sign * np.std(data) - np.std(model))
+        deviation = np.hypot(noise / np.sqrt(len(data)), _FLOOR * np.std(model))
+    else:
+        rest = data - model
+        if channel.offset_deviation > 0.0:
+            rest = rest - np.median(rest)
+        least = 0.2 * _FLOOR * float(np.max(np.abs(model), initial=0.0))
+        deviation = np.maximum(np.hypot(noise, _FLOOR * np.abs(model)), least)
     # Bounded: readings of any size stay comparable.
     return float(np.sum(np.minimum(np.abs(rest / np.maximum(deviation, 1e-300)), 1e9) ** 2))

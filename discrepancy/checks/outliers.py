@@ -40,24 +40,21 @@ def mark_outliers(campaign: Campaign) -> Campaign:
     of eight or more rows, one row may go if a parabola through the others explains them within twice the
     noise and misses this one by eight deviations. Both ask for a noise record.
     """
-    trials = {trial.name: trial for trial in campaign.trials}
+    used = {trial.name: trial.used.copy() for trial in campaign.trials}
     remarks = list(campaign.remarks)
-    for name, channel, found in find_outliers(campaign):
-        trial = trials[name]
+    for trial, channel, found in find_outliers(campaign):
         count, total = int(found.sum()), len(found)
         if trial.is_dynamic and count > LARGEST_SHARE * total:
             continue
-        used = trial.used.copy()
-        used[found, trial.channels.index(channel)] = False
-        trials[name] = replace(trial, used=used)
+        used[trial.name][found, trial.channels.index(channel)] = False
+        told = {"channel": channel, "trial": trial.name, "count": count, "total": total}
         are = "is an outlier" if count == 1 else "are outliers"
-        remarks.append(
-            said("remarks.left_out", count=count, total=total, channel=channel, trial=name, are=are)
-        )
-    return replace(campaign, trials=tuple(trials.values()), remarks=tuple(remarks))
+        remarks.append(said("remarks.left_out", are=are, **told))
+    trials = tuple(replace(trial, used=used[trial.name]) for trial in campaign.trials)
+    return replace(campaign, trials=trials, remarks=tuple(remarks))
 
 
-def find_outliers(campaign: Campaign) -> Iterator[tuple[str, str, BoolArray]]:
+def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
     """Yield trial, channel and the outliers (N,) of every record that has any."""
     for name, channel in campaign.channels.items():
         by_repeats = _repeat_outliers(campaign, channel)
@@ -73,7 +70,7 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[str, str, BoolArray]]:
             else:
                 found = _row_outlier(trial, values, used, channel)
             if found.any():
-                yield trial.name, name, found
+                yield trial, name, found
 
 
 def sample_outliers(values: FloatArray, used: BoolArray | None = None) -> BoolArray:
@@ -86,22 +83,17 @@ def sample_outliers(values: FloatArray, used: BoolArray | None = None) -> BoolAr
     used : (N,) ndarray of bool, optional
         Samples that count; the others are bridged and never reported.
     """
-    count = len(values)
-    none = np.zeros(count, dtype=bool)
-    if count < 4 * _EDGE + 4 or (used is not None and used.sum() < 0.5 * count):
-        return none
-    size = float(np.max(np.abs(values)))
-    if size == 0.0:
-        return none
-    clean = values / size  # squares of readings of any size stay in range
-    if used is not None and not used.all():
-        rows = np.arange(count)
-        clean[~used] = np.interp(rows[~used], rows[used], clean[used])
+    count, size = len(values), float(np.max(np.abs(values), initial=0.0))
+    used = np.ones(count, dtype=bool) if used is None else used
+    suspects, events = np.zeros((2, count), dtype=bool)
+    if count < 4 * _EDGE + 4 or used.sum() < 0.5 * count or size == 0.0:
+        return suspects
+    rows = np.arange(count)
+    # squares of readings of any size stay in range
+    clean = np.where(used, values / size, np.interp(rows, rows[used], values[used] / size))
     judged = clean.copy()
     shapes = [shape for shape in _SHAPES if 4 * shape[0] + 4 <= count]
     shape = min(shapes, key=lambda item: _scatter(_rest(clean, item)))
-    suspects = none.copy()
-    events = none.copy()
     edge = _EDGE if shape[1] == _SHAPES[0][1] else shape[0]
     for _ in range(_PASSES):
         rest = _rest(clean, shape)
@@ -118,9 +110,7 @@ def sample_outliers(values: FloatArray, used: BoolArray | None = None) -> BoolAr
         clean[new[~event]] -= rest[new[~event]]
     # Judge again with clean neighbours, and let events stay: three of five in a row are no single readings.
     rest = _rest(clean, shape)
-    found = suspects & (np.abs(judged - clean + rest) > SIGNIFICANT * _scale(rest))
-    if used is not None:
-        found &= used
+    found = used & suspects & (np.abs(judged - clean + rest) > SIGNIFICANT * _scale(rest))
     crowded = np.convolve(found, np.ones(5), mode="same") >= 3
     event = np.convolve(crowded, np.ones(5), mode="same") > 0
     result: BoolArray = found & ~event
@@ -166,9 +156,8 @@ def _is_event(rest: FloatArray, index: int, shape: tuple[int, int]) -> bool:
     """Return whether a kink or a step explains the rest near a sample better than one wrong reading."""
     width = shape[0]
     low, high = max(index - width, 0), min(index + width + 1, len(rest))
-    window = rest[low:high]
     patterns = _patterns(*shape)[:, low - index + width : high - index + width]
-    explained = (patterns @ window) ** 2 / np.sum(patterns**2, axis=1)
+    explained = (patterns @ rest[low:high]) ** 2 / np.sum(patterns**2, axis=1)
     return int(np.argmax(explained)) > 0
 
 
@@ -239,8 +228,8 @@ def _repeat_outliers(campaign: Campaign, channel: Channel) -> dict[str, BoolArra
         scale = max(noise, _NORMAL * float(np.median(np.abs(rest))))
         far = np.abs(rest) > SIGNIFICANT_ROW * scale
         # A trial that is off in several rows has an offset or a gain of its own; that is no single reading.
-        for trial, row in zip(group, far, strict=True):
-            result[trial.name] = row if row.sum() == 1 and len(row) > 1 else np.zeros(len(row), dtype=bool)
+        alone = (far.sum(axis=1, keepdims=True) == 1) & (far.shape[1] > 1)
+        result |= {trial.name: row for trial, row in zip(group, far & alone, strict=True)}
     return result
 
 

@@ -36,11 +36,10 @@ _LEVEL = 1e-5
 def rest_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[DataFault]:
     """Yield a limit for each channel whose noise record moves; see `moves`."""
     for name, channel in campaign.channels.items():
-        what = None if channel.noise is None else moves(channel.noise, frequency)
-        if channel.noise is None or channel.noise.interval is None or what is None:
-            continue
-        column = f"{(channel.column or name)!r}" + (f" of {channel.noise.file}" if channel.noise.file else "")
-        yield fault(FaultKind.MOVES_AT_REST, name, column=column, what=what)
+        if channel.noise is not None and (what := moves(channel.noise, frequency)) is not None:
+            file = f" of {channel.noise.file}" if channel.noise.file else ""
+            column = f"{(channel.column or name)!r}{file}"
+            yield fault(FaultKind.MOVES_AT_REST, name, column=column, what=what)
 
 
 def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:
@@ -206,7 +205,7 @@ def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
                 found.setdefault((one, other), []).append((trial, how))
     for (one, other), where in found.items():
         trial, how = where[0]
-        more = f", and so in {len(where) - 1} more of its trials" if len(where) > 1 else ""
+        more = f", and so in {len(where) - 1} more of its trials" if where[1:] else ""
         place = place_of(campaign.channels[other], trial)
         yield fault(FaultKind.COPIED, other, trial.name, one=one, how=how, place=place, more=more)
 
@@ -270,11 +269,8 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
     channel, or more than 3 % of outliers in a record in time, as a fault of the data (`DataFault.fatal`).
     """
     faults: list[DataFault] = []
-    for name, channel in campaign.channels.items():
-        if channel.noise is None:
-            faults.append(fault(FaultKind.NO_NOISE_RECORD, name))
-        else:
-            faults += _noise_faults(campaign, channel)
+    for channel in campaign.channels.values():
+        faults += _noise_faults(campaign, channel)
     for trial in campaign.trials:
         for column, name in enumerate(trial.channels):
             faults += _record_faults(trial, name, trial.values[:, column], trial.used[:, column])
@@ -282,11 +278,9 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
             faults += held_faults(campaign, trial)
     faults += copy_faults(campaign)
     faults += rest_faults(campaign)
-    for trial_name, name, found in find_outliers(campaign):
-        trial = next(item for item in campaign.trials if item.name == trial_name)
-        if trial.is_dynamic and found.sum() > LARGEST_SHARE * len(found):
-            share = float(found.mean())
-            faults.append(fault(FaultKind.OUTLIERS, name, trial_name, share=share, most=LARGEST_SHARE))
+    for trial, name, found in find_outliers(campaign):
+        if trial.is_dynamic and (share := found.mean()) > LARGEST_SHARE:
+            faults.append(fault(FaultKind.OUTLIERS, name, trial.name, share=share, most=LARGEST_SHARE))
     return tuple(faults)
 
 
@@ -294,34 +288,29 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
 
 
 def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
-    record = channel.noise
+    record, what = channel.noise, ""
+    if record is None:
+        yield fault(FaultKind.NO_NOISE_RECORD, channel.name)
     if record is None or record.source == "repeats":
         return
     stated = record.standard_deviation
-    found = repeat_record(channel, campaign.trials)
-    if found is not None:
-        ratio = (found.standard_deviation / stated) ** 2
-        freedom = min(record.degrees_of_freedom, 1e9)
-        tail = min(side(ratio, found.degrees_of_freedom, freedom) for side in (fisher.sf, fisher.cdf))
-        if 2.0 * tail < _ALPHA and not 1.0 / _NOISE_FACTOR**2 < ratio < _NOISE_FACTOR**2:
-            yield _noise_fault(channel, stated, found.standard_deviation, "repeated trials scatter")
-            return
-    rough = [
-        roughness(trial.values[:, column]) / trial.noise_factor
+    rough = (
+        roughness(trial.values[:, trial.channels.index(channel.name)]) / trial.noise_factor
         for trial in campaign.trials
-        if trial.is_dynamic
-        for column, name in enumerate(trial.channels)
-        if name == channel.name and len(trial.time) >= 50
-    ]
+        if trial.is_dynamic and channel.name in trial.channels and len(trial.time) >= 50
+    )
+    scatter = min(rough, default=np.inf)
     # Only downwards: a fast mode may well be rougher than the noise, but nothing is smoother than its noise.
-    if rough:
-        white = min(rough)
-        if 0.0 < white < stated / _NOISE_FACTOR:
-            yield _noise_fault(channel, stated, white, "neighbouring samples scatter")
-
-
-def _noise_fault(channel: Channel, stated: float, found: float, what: str) -> DataFault:
-    return fault(FaultKind.NOISE_LABEL, channel.name, stated=stated, found=found, what=what)
+    if 0.0 < scatter < stated / _NOISE_FACTOR:
+        what = "neighbouring samples scatter"
+    if (found := repeat_record(channel, campaign.trials)) is not None:
+        ratio = (found.standard_deviation / stated) ** 2
+        freedom = found.degrees_of_freedom, min(record.degrees_of_freedom, 1e9)
+        tail = min(fisher.sf(ratio, *freedom), fisher.cdf(ratio, *freedom))
+        if 2.0 * tail < _ALPHA and not _NOISE_FACTOR**-2 < ratio < _NOISE_FACTOR**2:
+            what, scatter = "repeated trials scatter", found.standard_deviation
+    if what:
+        yield fault(FaultKind.NOISE_LABEL, channel.name, stated=stated, found=scatter, what=what)
 
 
 # ---------------------------------------------------------------- records
@@ -336,12 +325,13 @@ def _record_faults(trial: Trial, name: str, values: FloatArray, used: BoolArray)
     if excited and np.ptp(kept) == 0.0:
         yield fault(FaultKind.DEAD, name, trial.name)
         return
-    order = np.arange(len(kept)) if trial.is_dynamic else np.argsort(load[used], kind="stable")
-    sorted_load = None if trial.is_dynamic else load[used][order]
-    for extreme, side in ((kept.max(), "largest"), (kept.min(), "smallest")):
-        run = clipped_run(kept[order], float(extreme), sorted_load)
-        if run:
-            yield fault(FaultKind.CLIPPED, name, trial.name, run=run, side=side, extreme=float(extreme))
+    loads = None
+    if not trial.is_dynamic:
+        order = np.argsort(load[used], kind="stable")
+        kept, loads = kept[order], load[used][order]
+    for extreme, side in ((float(kept.max()), "largest"), (float(kept.min()), "smallest")):
+        if run := clipped_run(kept, extreme, loads):
+            yield fault(FaultKind.CLIPPED, name, trial.name, run=run, side=side, extreme=extreme)
 
 
 def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = None) -> int:
@@ -353,27 +343,22 @@ def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = No
     order of their load: the run must span three loads, and nowhere else may two neighbours be alike.
     """
     distinct = np.unique(values)
-    if len(distinct) < 3:
-        return 0
     found: list[tuple[int, int]] = _runs(values == extreme).tolist()
     runs = [(start, stop) for start, stop in found if stop - start >= CLIPPED_RUN]
-    if load is not None:
-        for start, stop in runs:
-            outside = np.concatenate([np.diff(values[:start]), np.diff(values[stop:])])
-            if outside.size and np.all(outside != 0.0) and np.unique(load[start:stop]).size >= CLIPPED_RUN:
-                return stop - start
+    if len(distinct) < 3 or not runs:
         return 0
-    if not runs:
-        return 0
-    limit = 3.0 * float(np.diff(distinct).min()) + 6.0 * roughness(values)
-    return max((stop - start for start, stop in runs if _overshoot(values, start, stop) > limit), default=0)
+    limit = 3.0 * float(np.diff(distinct).min()) + 6.0 * roughness(values) if load is None else 0.0
 
+    def clipped(start: int, stop: int) -> bool:
+        if load is not None:
+            outside = np.r_[np.diff(values[:start]), np.diff(values[stop:])]
+            several = np.unique(load[start:stop]).size >= CLIPPED_RUN
+            return bool(outside.size and np.all(outside != 0.0) and several)
+        beside = np.r_[start - 3 : start, stop : stop + 3]
+        if beside[0] < 0 or beside[-1] >= len(values):
+            return False
+        middle = 0.5 * (start + stop - 1)
+        parabola = np.polynomial.Polynomial.fit(beside - middle, values[beside], 2)
+        return bool(abs(parabola(0.0) - extreme) > limit)
 
-def _overshoot(values: FloatArray, start: int, stop: int) -> float:
-    """Return by how much a parabola through the samples beside a run goes beyond the run's value."""
-    beside = np.concatenate([np.arange(start - 3, start), np.arange(stop, stop + 3)])
-    if beside[0] < 0 or beside[-1] >= len(values):
-        return 0.0
-    middle = 0.5 * (start + stop - 1)
-    parabola = np.polynomial.Polynomial.fit(beside - middle, values[beside], 2)
-    return float(abs(parabola(0.0) - values[start]))
+    return max((stop - start for start, stop in runs if clipped(start, stop)), default=0)

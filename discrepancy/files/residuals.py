@@ -104,9 +104,9 @@ def read_residuals(path: Path) -> ResidualSet:
         if schema == SCHEMA:
             return _residuals(tree)
     except _DAMAGED as error:
+        reason = f"{type(error).__name__}: {one_line(error)}"
         raise VerdictFileError(
-            f"{path} is damaged or no file of residuals ({type(error).__name__}: {one_line(error)}); write "
-            "it again."
+            f"{path} is damaged or no file of residuals ({reason}); write it again."
         ) from error
     raise VerdictFileError(f"{path} has the schema {schema!r}, but {SCHEMA!r} is needed.")
 
@@ -179,7 +179,6 @@ def _trial(group: xr.Dataset) -> FittedTrial:
         if not np.all(np.isfinite(values)):
             raise ValueError(f"{name} is not finite")
     place = json.loads(attributes["load_place"])
-    release = json.loads(attributes["release"]) if "release" in attributes else None
     trial = Trial(
         name=str(attributes["name"]),
         kind=TrialKind(attributes["kind"]),
@@ -189,7 +188,7 @@ def _trial(group: xr.Dataset) -> FittedTrial:
         load_place=place if isinstance(place, str) else (float(place[0]), float(place[1])),
         start=float(attributes["start"]),
         run=str(attributes["run"]),
-        release=None if release is None else Release(*release),
+        release=Release(*json.loads(attributes["release"])) if "release" in attributes else None,
         held_out=bool(attributes["held_out"]),
         regions=tuple(json.loads(attributes["regions"])) if "regions" in attributes else USUAL_REGIONS,
         **rows,

@@ -1,13 +1,11 @@
 """`verdict.json`: what was concluded, what it rests on, and the proof."""
 
 import re
-from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from math import nan
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import AfterValidator, Field, WithJsonSchema
@@ -26,13 +24,8 @@ from reporting.folders import restore_folder
 VERDICT_SCHEMA = "uav-twin verdict 4"
 """Value of the key `schema`; files of earlier numbers are read too."""
 VERDICT_NAME = "verdict.json"
-_NEW: tuple[dict[str, Any], ...] = (
-    {"explained": None, "remainders": [], "not_fitted": [], "windows": []},
-    {"parameters": []},
-    {"force": None},
-)
-LATER_KEYS = {f"uav-twin verdict {k + 1}": dict(ChainMap(*_NEW[k:])) for k in range(len(_NEW))}
-"""Keys of the verdict that older files lack, by their schema."""
+OLDER_SCHEMAS = ("uav-twin verdict 1", "uav-twin verdict 2", "uav-twin verdict 3")
+"""They lack keys of this one, which have defaults."""
 
 
 @dataclass(frozen=True)
@@ -82,19 +75,7 @@ def read_verdict_file(path: Path) -> StoredVerdict:
     VerdictFileError
         If the file is missing, damaged, of another schema, or holds something else than it should.
     """
-    older = {schema: partial(_with_later_keys, keys) for schema, keys in LATER_KEYS.items()}
-    return read_document(path, VERDICT_SCHEMA, StoredVerdict, older)
-
-
-def _with_later_keys(keys: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of an older file with the keys that it lacks, empty."""
-    verdict = content.get("verdict")
-    if not isinstance(verdict, dict):
-        return content
-    hypotheses = verdict.get("hypotheses")
-    if isinstance(hypotheses, list) and all(isinstance(row, dict) for row in hypotheses):
-        verdict = {**verdict, "hypotheses": [{"parameters": [], **row} for row in hypotheses]}
-    return {"model_file": None, **content, "verdict": {**keys, **verdict}}
+    return read_document(path, VERDICT_SCHEMA, StoredVerdict, OLDER_SCHEMAS)
 
 
 def read_verdict(folder: Path | str) -> VerdictFolder:
@@ -128,8 +109,10 @@ APPLIED = (*PATCHED, VerdictKind.UNEXPLAINED)
 PATCH_NAME = "patch.json"
 
 _INTERVAL = (0.05, 0.95)
-_STRAIN = re.compile(r"strain\[\d+\]")
-_DISPLACEMENTS = ("tip_displacement", "load_point_displacement")
+_OUTPUTS = {
+    Quantity.STRAIN: re.compile(r"strain\[\d+\]"),
+    Quantity.DISPLACEMENT: re.compile("(tip|load_point)_displacement"),
+}
 
 
 @dataclass(frozen=True)
@@ -199,15 +182,10 @@ class StoredPatch:
         """Return this patch and the one that was built into its model, for the model that had neither."""
         if earlier is None:
             return self
-        beneath = replace(
-            self.origin, model_file=earlier.origin.model_file, model_hash=earlier.origin.model_hash
-        )
-        return replace(
-            self,
-            effects=earlier.effects + self.effects,
-            origin=beneath,
-            channels={**earlier.channels, **self.channels},
-        )
+        beneath = earlier.origin
+        origin = replace(self.origin, model_file=beneath.model_file, model_hash=beneath.model_hash)
+        effects, channels = earlier.effects + self.effects, {**earlier.channels, **self.channels}
+        return replace(self, effects=effects, origin=origin, channels=channels)
 
 
 def primitive_intervals(patch: ModelPatch, draws: Sequence[ModelPatch] = ()) -> tuple[PrimitiveInterval, ...]:
@@ -225,14 +203,11 @@ def primitive_intervals(patch: ModelPatch, draws: Sequence[ModelPatch] = ()) -> 
     VerdictFileError
         If a draw has other primitives than the patch.
     """
-    kinds = [item.kind for item in patch]
-    for count, draw in enumerate(draws, start=1):
-        if [item.kind for item in draw] != kinds:
-            raise VerdictFileError(
-                f"Draw {count} of the posterior has the primitives "
-                f"{', '.join(item.kind for item in draw) or 'none'}, but the patch has "
-                f"{', '.join(kinds) or 'none'}."
-            )
+    kinds, *others = (", ".join(item.kind for item in each) or "none" for each in (patch, *draws))
+    for count, came in enumerate(others, start=1):
+        if came != kinds:
+            odd = f"Draw {count} of the posterior has the primitives {came}"
+            raise VerdictFileError(f"{odd}, but the patch has {kinds}.")
     found = []
     for place, primitive in enumerate(patch):
         for name, unit in PRIMITIVE_UNITS[primitive.kind].items():
@@ -293,13 +268,11 @@ def fmu_outputs(channels: Mapping[str, Channel]) -> dict[str, str]:
     dict of str to str
         Output by channel, such as "strain[17]" for "g17".
     """
-    outputs = {}
-    for name, channel in channels.items():
-        strain = channel.quantity is Quantity.STRAIN and _STRAIN.fullmatch(channel.output)
-        displacement = channel.quantity is Quantity.DISPLACEMENT and channel.output in _DISPLACEMENTS
-        if strain or displacement:
-            outputs[name] = channel.output
-    return outputs
+    return {
+        name: channel.output
+        for name, channel in channels.items()
+        if (known := _OUTPUTS.get(channel.quantity)) and known.fullmatch(channel.output)
+    }
 
 
 def read_patch(path: Path) -> StoredPatch:
@@ -310,5 +283,4 @@ def read_patch(path: Path) -> StoredPatch:
     VerdictFileError
         As `read_verdict_file`.
     """
-    older = {FIRST_SCHEMA: lambda content: {**content, "model_file": None, "parameters": []}}
-    return read_document(path, PATCH_SCHEMA, StoredPatch, older)
+    return read_document(path, PATCH_SCHEMA, StoredPatch, (FIRST_SCHEMA,), parameters=[])

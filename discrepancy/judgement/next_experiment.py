@@ -195,7 +195,7 @@ def _changed(problem: Problem, trial: Trial, what: str, by: float) -> tuple[Tria
 
     Beside it the new value of what is neither load nor release, and what is added to the structure.
     """
-    model, stations, nothing = problem.model, problem.model.stations(), ModelPatch()
+    model, stations, nothing = problem.model, problem.model.stations, ModelPatch()
     if what == "release" and trial.release is not None:
         release = replace(trial.release, displacement=by * trial.release.displacement)
         return replace(trial, release=release), 0.0, nothing

@@ -30,7 +30,7 @@ def sees_forces(problem: Problem) -> bool:
     """Whether missing forces can be seen: in trials in motion, of a model that tells how its ports move."""
     model = problem.model
     moving = any(data.trial.is_dynamic for data in problem.trials)
-    return moving and model.shows_ports and bool(model.ports())
+    return moving and model.shows_ports and bool(model.ports)
 
 
 def log_prior(candidate: Candidate, count: int, setting: Setting) -> float:

@@ -160,7 +160,7 @@ class ForceSearch:
         trials = tuple(data.trial for data in problem.trials)
         self.problem = Problem(problem.campaign, linear, problem.setting, trials, like=problem)
         self.numbers = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
-        self.ports = tuple(linear.ports())
+        self.ports = tuple(linear.ports)
         self.at: dict[str, Explained] = {}
         self.point = self.problem.start(NOTHING)
         if about is not None:

@@ -365,7 +365,7 @@ def seen_force(
     """
     terms = fit.candidate.terms
     try:
-        ports = problem.model.ports()
+        ports = problem.model.ports
         if not sees_forces(problem) or (terms and not any(term.place in ports for term in terms)):
             return None, None
         force = force or ForceSearch(problem)

@@ -1,9 +1,9 @@
 """What acts on a system in a trial, between the samples too and under a patch, and what its outputs show."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from math import isfinite, pi
+from math import inf, isfinite, pi, sqrt
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -11,13 +11,9 @@ from scipy.interpolate import CubicSpline, PPoly
 
 from discrepancy.campaign.records import FloatArray, Hold, Release, Start, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.interface import Memory, Place
+from discrepancy.models.interface import Place
 from fe.runtime.expression import Expression
 from fe.runtime.patch import LoadGain, LoadPlace, Primitive
-
-KEPT_COURSES, KEPT_TIMES = 64, 48
-"""Records whose courses are kept, and times at which each of them is: a search asks for the same ones."""
-_courses = Memory(KEPT_COURSES)
 
 DEFAULT_PLACE = "tip_load"
 """What a campaign says when it does not say where the force acts; a model with one input takes that one."""
@@ -34,8 +30,8 @@ class Course:
     ----------
     time, values : (N,) ndarray
         Its samples [s], [SI].
-    hold : Hold
-        Between them. A load keeps its values before the first and after the last.
+    hold : Hold, optional
+        Between them, linear unless it is said. A load keeps its values before the first and after the last.
     motion : int, optional
         What was recorded of a motion, which is `SMOOTH`: 0 displacement, 1 velocity, 2 acceleration; the
         latter two begin at zero displacement, and the last at zero velocity. None: it is a load.
@@ -43,70 +39,30 @@ class Course:
 
     time: FloatArray
     values: FloatArray
-    hold: Hold
+    hold: Hold | None = None
     motion: int | None = None
-    _known: Memory = field(default_factory=lambda: Memory(KEPT_TIMES), init=False, repr=False)
-
-    @staticmethod
-    def of(
-        time: FloatArray, values: FloatArray, hold: Hold | None = None, motion: int | None = None
-    ) -> "Course":
-        """Return the course of a record, the same one for the same record; linear unless it is said."""
-        known = hold or Hold.LINEAR
-        key = (known, motion, time.tobytes(), values.tobytes())
-        return _courses.get(key, lambda: Course(time, values, known, motion))
-
-    @staticmethod
-    def always(time: FloatArray) -> "Course":
-        """Return the course of what acts by one all the time."""
-        return Course.of(time, np.ones(len(time)))
 
     edges: ClassVar[tuple[float, ...]] = ()
     """Moments at which it jumps between the stamps: none."""
 
     @cached_property
-    def _splines(self) -> list[PPoly]:
-        """The spline and its derivatives up to the third, before it those that lead to a motion."""
+    def _spline(self) -> PPoly:
+        """The spline of the load, or of the displacement."""
         base: PPoly = CubicSpline(self.time, self.values)
-        lower = [base.antiderivative(number) for number in range(self.motion or 0, 0, -1)]
-        return [*lower, base, *(base.derivative(number) for number in range(1, 4 - len(lower)))]
-
-    @property
-    def slope(self) -> "Course":
-        """Its derivative, of a linear one in steps."""
-        if self.hold is Hold.SMOOTH:
-            return Course(self.time, self.at(self.time, 1), Hold.SMOOTH)
-        slopes = np.diff(self.values) / np.diff(self.time)
-        return Course(self.time, np.append(slopes, slopes[-1]), Hold.ZERO_ORDER)
+        return base.antiderivative(self.motion) if self.motion else base
 
     def at(self, time: FloatArray, order: int = 0) -> FloatArray:
-        """Return the values (N,) at times, of a held one that of just before, or a derivative of a spline."""
-        return self._known.get((order, time.tobytes()), lambda: self._at(time, order))
-
-    def _at(self, time: FloatArray, order: int) -> FloatArray:
-        if self.hold is Hold.ZERO_ORDER:
-            row = np.searchsorted(self.time, time - 1e-9 * (self.time[-1] - self.time[0]) / len(self.time))
-            return np.asarray(self.values[np.maximum(row - 1, 0)])
-        if self.hold is Hold.LINEAR:
+        """Return the values (N,) at times, or a derivative; where it jumps, that of just before."""
+        if self.hold is Hold.SMOOTH:
+            inside = np.clip(time, self.time[0], self.time[-1]) if self.motion is None else time
+            return np.asarray(self._spline(inside, order))
+        if self.hold is not Hold.ZERO_ORDER and order == 0:
             return np.asarray(np.interp(time, self.time, self.values))
-        inside = np.clip(time, self.time[0], self.time[-1]) if self.motion is None else time
-        return np.asarray(self._splines[order](inside))
-
-    def ends(self, time: FloatArray, order: int = 0) -> tuple[FloatArray, FloatArray]:
-        """Return the values (K,) at the begin and at the end of the steps between times (K + 1,).
-
-        Of a spline, or of a derivative of it, those of straight lines that have its mean effect, to fourth
-        order in the step.
-        """
-        return self._known.get((order, "ends", time.tobytes()), lambda: self._ends(time, order))
-
-    def _ends(self, time: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
-        if self.hold is Hold.ZERO_ORDER:
-            held = self.at(0.5 * (time[1:] + time[:-1]))
-            return held, held
-        found, bend = self.at(time, order), np.diff(time) ** 2 / 12.0
-        curve = self.at(time, order + 2) if self.hold is Hold.SMOOTH and order < 2 else np.zeros(len(time))
-        return found[:-1] - bend * curve[:-1], found[1:] - bend * curve[1:]
+        held = self.values
+        if order:  # slopes of straight lines
+            held = np.diff(self.values, append=self.values[-1]) / np.diff(self.time, append=np.inf)
+        row = np.searchsorted(self.time, time - 1e-9 * (self.time[-1] - self.time[0]) / len(self.time))
+        return np.asarray(held[np.maximum(row - 1, 0)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,24 +87,31 @@ class FormulaCourse:
         """Moments at which it begins or ends [s]."""
         return tuple(moment for span in self.spans for moment in span if isfinite(moment))
 
-    def _inside(self, time: FloatArray) -> FloatArray:
-        inside = np.full(len(time), 0.0 if self.spans else 1.0)
-        for begin, end in self.spans:
-            inside[(time >= begin) & (time < end)] = 1.0
-        return inside
-
-    def at(self, time: FloatArray) -> FloatArray:
+    def at(self, time: FloatArray, order: int = 0) -> FloatArray:
         """Return the values (N,) at times."""
-        return self._inside(time) * self.formula.course(time, {"pi": pi})
-
-    def ends(self, time: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the values (K,) at the begin and at the end of the steps between times (K + 1,)."""
-        inside, found = self._inside(0.5 * (time[1:] + time[:-1])), self.formula.course(time, {"pi": pi})
-        return inside * found[:-1], inside * found[1:]
+        spans = self.spans or ((-inf, inf),)
+        inside = np.any([(time >= begin) & (time < end) for begin, end in spans], axis=0)
+        return np.where(inside, self.formula.course(time, {"pi": pi}), 0.0)
 
 
-Load = tuple[FloatArray, Course | FormulaCourse]
-"""Row (N,) along which a load acts, and its course."""
+class Load(NamedTuple):
+    """The row (N,) along which a load acts, and its course, which is derived `order` times."""
+
+    row: FloatArray
+    course: Course | FormulaCourse
+    order: int = 0
+
+
+def straight(at: Callable[[FloatArray], FloatArray], time: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return values (K, ...) at the begin and at the end of the steps between times (K + 1,).
+
+    They are those of straight lines that have the mean effect of what is asked, to fourth order in the step:
+    through its values at the points of Gauss and Legendre.
+    """
+    middle, half = 0.5 * (time[1:] + time[:-1]), 0.5 * np.diff(time)
+    low, high = (at(middle + side * half / sqrt(3.0)) for side in (-1.0, 1.0))
+    mean, rise = 0.5 * (low + high), 0.5 * sqrt(3.0) * (high - low)
+    return mean - rise, mean + rise
 
 
 @dataclass(frozen=True)
@@ -186,24 +149,15 @@ class Acting:
     @property
     def levels(self) -> tuple[FloatArray, FloatArray]:
         """Loads (k, n + m), and how much of each (L, k) acts in the rows of a trial at rest."""
-        pushes = [(row, course.values) for row, course in self.loads if isinstance(course, Course)]
+        pushes = [(load.row, load.course.values) for load in self.loads if isinstance(load.course, Course)]
         units, amounts = zip(*pushes, strict=True)
         return np.array(units), np.column_stack(amounts)
 
     def load_at(self, time: FloatArray, base: FloatArray) -> FloatArray:
         """Return the loads (T, B) in a base (n + m, B) at times, held ones as they were just before."""
-        return self._total([course.at(time) for _, course in self.loads], base, len(time))
-
-    def ends(self, time: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the loads (K, B) at the begin and the end of the steps between times (K + 1,)."""
-        found = [course.ends(time) for _, course in self.loads]
-        begin, end = ([pair[side] for pair in found] for side in (0, 1))
-        return self._total(begin, base, len(time) - 1), self._total(end, base, len(time) - 1)
-
-    def _total(self, amounts: Sequence[FloatArray], base: FloatArray, count: int) -> FloatArray:
-        """Return the loads (T, B) of amounts (T,) of each."""
-        rows = np.array([row for row, _ in self.loads]).reshape(len(self.loads), len(base))
-        return np.array(amounts).reshape(len(rows), count).T @ (rows @ base)
+        rows = np.array([load.row for load in self.loads]).reshape(len(self.loads), len(base))
+        amounts = np.array([load.course.at(time, load.order) for load in self.loads])
+        return amounts.reshape(len(rows), len(time)).T @ (rows @ base)
 
 
 class Shown(NamedTuple):
@@ -213,18 +167,18 @@ class Shown(NamedTuple):
     ----------
     rows : (4, N) ndarray
         Of z = (u, s) and its first three derivatives; a state is x = s'.
-    reaction : int, optional
-        Number of a drive whose force it shows instead.
     constant : float
         In it.
-    courses : sequence of (float, Course), optional
-        In it, each with its factor; None but for what a controller gives.
+    courses : sequence of (float, Load), optional
+        Courses of loads in it, each with its factor; None but for the force of a drive or of a controller.
+    felt : (N,) ndarray, optional
+        Row along which forces of laws are in it, of a drive.
     """
 
     rows: FloatArray
-    reaction: int | None = None
     constant: float = 0.0
-    courses: Sequence[tuple[float, Course | FormulaCourse]] | None = None
+    courses: Sequence[tuple[float, Load]] | None = None
+    felt: FloatArray | None = None
 
     @classmethod
     def of(cls, row: FloatArray, order: int = 0, further: int = 0, states: int = 0) -> "Shown":
@@ -232,6 +186,11 @@ class Shown(NamedTuple):
         rows, n = np.zeros((4, len(row))), len(row) - states
         rows[order, :n], rows[further + 1, n:] = row[:n], row[n:]
         return cls(rows)
+
+
+def by_order(shown: Sequence[Shown], shapes: FloatArray) -> FloatArray:
+    """Return what outputs show of modal coordinates and their derivatives (4, C, M), in shapes (N, M)."""
+    return np.moveaxis(np.array([item.rows for item in shown]) @ shapes, 1, 0)
 
 
 def place_among(places: Sequence[str], place: Place, what: str, where: str = "a trial") -> str:

@@ -42,13 +42,13 @@ class FmuModel(DescribedModel):
     """
 
     holds_inputs: ClassVar[bool] = True
-    shows_ports: ClassVar[bool] = True
 
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
         self.description: FmuModelDescription = description
         self.fmu = fmu = FmuMotion(description, Path(folder))
         super().__init__(description, fmu.quantities)
         self.length, self.regions = description.scales.length, tuple(description.inputs.regions)
+        self.stations = None if self.length is None else (0.0, self.length)
         flies = description.inputs.load_factor is not None
         self.kinds = frozenset(TrialKind) - {TrialKind.DRIVEN, *(() if flies else (TrialKind.FLIGHT,))}
         self._keys = [fmu.parameter(item.variable) for item in description.parameter]
@@ -76,7 +76,7 @@ class FmuModel(DescribedModel):
             return True
         if primitive in (LoadGain, LoadPlace):
             return bool(inputs.force) and (primitive is LoadGain or inputs.bending_moment is not None)
-        return issubclass(primitive, PortForce) and bool(self.ports())
+        return issubclass(primitive, PortForce) and bool(self.ports)
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign: those of the file, else what the FMU shows."""
@@ -96,7 +96,7 @@ class FmuModel(DescribedModel):
         if moving is not None:
             state = self._state(moving, conditions)
             frequency = frequency or fmu.pace(moving, state)[0]
-            if (system := fmu.system(fmu.case(moving, state, self.ports()))) is not None:
+            if (system := fmu.system(fmu.case(moving, state, self.ports))) is not None:
                 pairs = [system.stiffness(column, number) for number, column in enumerate(fmu.x)]
         interval = 0.01
         for _ in range(0 if trials or frequency else 3):  # until the interval suits it
@@ -115,7 +115,7 @@ class FmuModel(DescribedModel):
             **campaign_sizes(campaign),
             ports={
                 port: PortScale(float(most) or 1.0, own, frequency, rest)
-                for port, most, (own, rest) in zip(self.ports(), largest, pairs, strict=True)
+                for port, most, (own, rest) in zip(self.ports, largest, pairs, strict=True)
             },
         )
 
@@ -184,7 +184,7 @@ class FmuModel(DescribedModel):
         """
         fmu = self.fmu
         base, found = (
-            fmu.system(fmu.case(trial, self._state(trial, conditions, self.patch), self.ports()))
+            fmu.system(fmu.case(trial, self._state(trial, conditions, self.patch), self.ports))
             for values in (self.prior_mean(), parameters)
             for conditions in [Conditions(values, health=trial.health[:1])]
         )
@@ -202,7 +202,7 @@ class FmuModel(DescribedModel):
         found = found.in_state_of(base)
         (position, _), (speed, _) = (found.rows(fmu.x, order) for order in (0, 1))
         rows, at_once = found.rows(*self._read(outputs))
-        return PortedSystem(found.generator, self.ports(), found.push.T, position, speed, rows, at_once.T)
+        return PortedSystem(found.generator, self.ports, found.push.T, position, speed, rows, at_once.T)
 
     def port_motion(
         self, trial: Trial, conditions: Conditions, parts: int = 1
@@ -214,7 +214,7 @@ class FmuModel(DescribedModel):
     # ------------------------------------------------------------ trials in its names and units
 
     def _laws(self, patch: ModelPatch) -> Laws:
-        return laws_of(patch.of(PortForce), self.ports())
+        return laws_of(patch.of(PortForce), self.ports)
 
     def _load(self, patch: ModelPatch) -> LoadChange:
         return LoadChange.of(item for item in patch if item.kind not in self.description.effects)
@@ -225,7 +225,7 @@ class FmuModel(DescribedModel):
         if trial.kind is not TrialKind.RINGDOWN:
             acting = self._load(patch).changed(trial.force, trial.force)
             case = fmu.case(trial, state, laws.ports, self._levers(trial, patch))
-            return case._replace(course=Course.of(trial.time, acting, trial.hold))
+            return case._replace(course=Course(trial.time, acting, trial.hold))
         case = fmu.case(trial, state, laws.ports)
         release = release_of(trial)
         if not fmu.release:

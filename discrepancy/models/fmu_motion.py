@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting
+from discrepancy.models.acting import Acting, Load
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_pace import LINEAR, RECORD, Case, FmuPace
 from discrepancy.models.fmu_runs import Run, State
@@ -71,7 +71,7 @@ class FmuMotion(FmuPace):
         even = np.ptp(np.diff(stamps[1:])) <= ALIKE * stamps[-1]
         if not even:  # as many lengths of steps as stamps would take long
             stamps = case.step * np.arange(ceil(end / case.step - 1e-6) + 1.0)
-        loads = [] if case.course is None else [(case.lever, case.course)]
+        loads = [] if case.course is None else [Load(case.lever, case.course)]
         states, forces = system.motion(
             Acting(trial.time, stamps, loads), self._start(system, case, amounts), laws, seen, numbers,
             still[seen], refinement,

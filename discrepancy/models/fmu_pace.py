@@ -12,7 +12,7 @@ from scipy.signal import periodogram
 
 from discrepancy.campaign.records import FloatArray, Hold, Trial
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Acting, Course
+from discrepancy.models.acting import Acting, Course, Load, straight
 from discrepancy.models.fmu_file import FmuModelDescription, ReleaseOf
 from discrepancy.models.fmu_runs import FmuRuns, Run, State
 from discrepancy.models.fmu_system import FmuSystem, fmu_system
@@ -159,7 +159,7 @@ class FmuPace(FmuRuns):
         courses |= run.courses
         moved, time = self._moved(case, run._replace(courses=courses)), case.step * np.arange(run.steps + 1.0)
         held = (Course(time, np.append(values, 0.0), Hold.ZERO_ORDER) for values in courses.values())
-        acting = Acting(time, time, list(zip(np.eye(len(courses)), held, strict=True)))
+        acting = Acting(time, time, list(map(Load, np.eye(len(courses)), held)))
         states, forces = system.motion(acting, self._start(system, case, amounts))
         error = np.max(np.abs(moved - states @ system.outputs.T - forces @ system.direct.T)[1:], axis=0)
         return bool(np.all(error <= tolerance * np.max(np.abs(moved), axis=0) + 1e-300))
@@ -201,7 +201,7 @@ class FmuPace(FmuRuns):
         run = Run(state, case.step, case.record, begin)
         if case.course is None:
             return run
-        begins, ends = case.course.ends(case.step * np.arange(case.record + 1.0))
+        begins, ends = straight(case.course.at, case.step * np.arange(case.record + 1.0))
         begin |= {name: lever * float(case.course.values[0]) for name, lever in case.levers.items()}
         return run._replace(
             courses={name: 0.5 * lever * (begins + ends) for name, lever in case.levers.items()}

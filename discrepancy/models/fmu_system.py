@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import logm
 
 from discrepancy.campaign.records import FloatArray, Hold
-from discrepancy.models.acting import SMOOTH_PARTS, Acting
+from discrepancy.models.acting import SMOOTH_PARTS, Acting, straight
 from discrepancy.models.interface import Memory
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
@@ -145,9 +145,9 @@ class FmuSystem:
         """
         key = (laws.ports, columns.tobytes(), numbers.tobytes())
         acts, modal, law = self._kept.get(key, lambda: self._with_ports(laws.ports, columns, numbers))
-        smooth = any(course.hold is Hold.SMOOTH for _, course in acting.loads)
+        smooth = any(course.hold is Hold.SMOOTH for _, course, _ in acting.loads)
         boundaries = substeps(modal, laws, acting.sampled, refinement, SMOOTH_PARTS if smooth else 1)
-        begin, end = acting.ends(boundaries.time, acts.T)
+        begin, end = straight(lambda time: acting.load_at(time, acts.T), boundaries.time)
         feed = acting.load_at(boundaries.time, self.direct[columns].T)
         seen = self.outputs[columns[law]]
         first = Begin(

@@ -82,8 +82,6 @@ class Conditions:
         Stiffness losses z1, z2 of each row (dynamic trials: row 0 holds for all).
     offset : tuple of float
         Constants that the recorded inputs of a driven trial lack, in their order [SI]; empty: none.
-    components : bool
-        Whether `transverse` and `shear` are wanted.
     refinement : int
         Time steps are this many times smaller than usual, to check the integration.
     """
@@ -93,7 +91,6 @@ class Conditions:
     clock: tuple[float, float] = (0.0, 0.0)
     health: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
     offset: tuple[float, ...] = ()
-    components: bool = False
     refinement: int = 1
 
     def stamps(self, time: FloatArray) -> FloatArray:
@@ -116,15 +113,10 @@ class Response(NamedTuple):
         By output, SI units.
     rates : (N, C) ndarray or None
         Their time derivatives, for dynamic trials.
-    transverse, shear : (N, C) ndarray or None
-        Strain across the gauge's direction, and engineering shear strain, for strain outputs (zero for the
-        others); None unless asked for.
     """
 
     values: FloatArray
     rates: FloatArray | None = None
-    transverse: FloatArray | None = None
-    shear: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +153,9 @@ class PortedSystem:
 
 Outputs = tuple[tuple[str, Quantity], ...]
 """Outputs, and the quantity wanted of each."""
+ACROSS = ".transverse", ".shear"
+"""What follows the name of a strain in those across its gauge's direction: strain, and engineering shear
+strain."""
 NO_PATCH = ModelPatch()
 
 
@@ -175,10 +170,12 @@ class Model(ABC):
         Calibrated parameters: the posterior of a calibration is the prior here.
     quantities : mapping of str to Quantity
         What each output is, by name.
-    port_names : tuple of str
-        See `ports`.
+    ports : tuple of str
+        Names of the ports where internal forces can act on one motion; user effects act at these.
     length : float or None
-        Largest station or characteristic length [m], if it has any.
+        Characteristic length [m], if it has any.
+    stations : tuple of float, optional
+        Least and largest station [m] along the structure, if it has a length.
     patch : ModelPatch
         What is added to every question: a known addition, or an effect that was found.
     regions : tuple of str
@@ -193,6 +190,8 @@ class Model(ABC):
         Whether static trials can hold other inputs than a force.
     follows_windows : bool
         Whether it can follow laws that act in windows only.
+    linear : bool
+        Whether its own laws at ports are left out.
     shows_ports : bool
         Whether it tells how its ports move (`ported` and `port_motion`).
     """
@@ -200,8 +199,9 @@ class Model(ABC):
     name: str
     parameters: tuple[ParameterPrior, ...]
     quantities: Mapping[str, Quantity] = MappingProxyType({})
-    port_names: tuple[str, ...] = ()
+    ports: tuple[str, ...] = ()
     length: float | None = None
+    stations: tuple[float, float] | None = None
     patch: ModelPatch = NO_PATCH
     regions: tuple[str, ...] = ()
     kinds: frozenset[TrialKind] = frozenset(TrialKind)
@@ -209,7 +209,8 @@ class Model(ABC):
     largest_force: float = np.inf
     holds_inputs: ClassVar[bool] = False
     follows_windows: ClassVar[bool] = False
-    shows_ports: ClassVar[bool] = False
+    shows_ports: ClassVar[bool] = True
+    linear: bool = False
     _declared: tuple[ParameterPrior, ...] | None = None
     _kept: Memory | None = None
 
@@ -245,14 +246,6 @@ class Model(ABC):
 
         The model has the outputs and carries the patch.
         """
-
-    def ports(self) -> tuple[str, ...]:
-        """Names of the ports where internal forces can act on one motion; user effects act at these."""
-        return self.port_names
-
-    def stations(self) -> tuple[float, float] | None:
-        """Return the least and largest station [m] along the structure, None if it has no length."""
-        return None if self.length is None else (0.0, self.length)
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return natural sizes (L,) of the state at the begin of a trial; empty: it is never unknown."""
@@ -348,11 +341,6 @@ class Model(ABC):
         """
         return self.patch.of(*SENSORS)
 
-    @property
-    def has_law(self) -> bool:
-        """Whether it has a law of a port of its own, such as one that was found."""
-        return len(self.patch.of(PortForce)) > 0
-
     def prior_mean(self, campaign: Campaign | None = None) -> FloatArray:
         """Return the means (P,) of what is `declared`, those of a campaign where it says them."""
         known = {} if campaign is None else campaign.parameters
@@ -378,7 +366,7 @@ class Model(ABC):
             whole = (self.patch + patch).in_trial(trial.name)
             self.check(trial)
             self.check_outputs(outputs)
-            ports = self.ports()
+            ports = self.ports
             for item in whole:
                 at_port = isinstance(item, PortForce) and item.port in ports
                 if not (isinstance(item, SENSORS) or self.supports(type(item)) or at_port):
@@ -424,11 +412,15 @@ class Model(ABC):
         )
         return self._changed(patch=self.patch + patch, parameters=told, _declared=self.declared, _kept=None)
 
+    def own_laws(self, parameters: FloatArray) -> ModelPatch:
+        """Return the laws of ports that it has as it is."""
+        return NO_PATCH
+
     def apart(self) -> tuple[Self, ModelPatch]:
         """Return the model without laws at its ports, and these at the prior means."""
-        laws = self.patch.of(PortForce)
+        laws = self.own_laws(self.prior_mean()) + self.patch.of(PortForce)
         rest = ModelPatch(tuple(item for item in self.patch if not isinstance(item, PortForce)))
-        return self._changed(patch=rest, _kept=None), laws
+        return self._changed(patch=rest, linear=True, _kept=None), laws
 
     def _changed(self, **attributes: object) -> Self:
         """Return the model with other attributes."""

@@ -7,34 +7,31 @@ ports the prescribed motion is a coordinate of its own, so heavy that they do no
 put right at every step. The wing, a structure on springs and a lumped rig are such systems.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_factor, eigh, null_space
-from scipy.linalg.lapack import dpotrs
+from scipy.linalg import eigh, null_space
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import Shown
-from discrepancy.models.interface import Memory, PortedSystem
+from discrepancy.models.acting import Acting, Shown, by_order
+from discrepancy.models.interface import PortedSystem
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, static_solution
+from fe.runtime.patched_wing import PatchedState
+from fe.runtime.reduced import ReducedState
 
 HEAVY = 1e12
 """Mass of a prescribed coordinate over the largest of the system."""
 LEAST_PIVOT = 1e-9
 """A system whose equilibrium is determined worse than this has none of its own."""
-KEPT_ANSWERS = 16
-"""Loads whose answers a structure keeps: outputs and ports are often the same."""
 ROUNDING = 1e-10
 """Share of the largest entry below which what couples modes is rounding."""
 
 
-Flexibility = Callable[[FloatArray], FloatArray]
-"""What gives K^-1 loads, for loads (N,) or (N, k)."""
 Modes = tuple[FloatArray, FloatArray, int]
 """Angular frequencies (M,), shapes (N, M) of what is free, and how many are of displacements."""
 
@@ -68,11 +65,9 @@ class LinearSystem:
     drives : (P, N) ndarray
         Rows whose motion is prescribed.
     actions : mapping of str to (N,) ndarray
-        Rows along which laws at ports act, where that is not how they see.
-    known : callable, optional
-        What returns its modes by `flexibility`, where they are known or found in another way.
-    compliance : (N, N) ndarray, optional
-        K^-1, where it is known.
+        Rows along which laws at all ports act, where that is not how they see.
+    solved : ReducedState or PatchedState, optional
+        The structure that it is, which knows its modes and K^-1.
     """
 
     mass: FloatArray
@@ -85,8 +80,7 @@ class LinearSystem:
     states: int = 0
     drives: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     actions: Mapping[str, FloatArray] = field(default_factory=dict)
-    known: Callable[[Flexibility], Modes] | None = None
-    compliance: FloatArray | None = None
+    solved: ReducedState | PatchedState | None = None
 
     @property
     def displacements(self) -> int:
@@ -106,8 +100,9 @@ class LinearSystem:
     @cached_property
     def modes(self) -> Modes:
         """Its modes."""
-        if self.known is not None:
-            return self.known(self.flexibility)
+        if self.solved is not None:
+            frequency = 2.0 * np.pi * self.solved.modes.frequency
+            return frequency, np.ascontiguousarray(self.solved.shapes), len(frequency)
         n, most = self.displacements, self.mode_count
         mass, stiffness = self.mass[:n, :n], 0.5 * (self.stiffness[:n, :n] + self.stiffness[:n, :n].T)
         free = np.eye(n)
@@ -169,14 +164,16 @@ class LinearSystem:
     @cached_property
     def modal(self) -> ModalSystem:
         """What is free and the drives, with ports; what couples modes by rounding only does not."""
-        frequency, free = np.pad(self.angular_frequency, (0, len(self.drives))), self.free_shapes
-        damping, stiffness = (free.T @ matrix @ free for matrix in (self.damping, self.stiffness))
+        count, drives = len(self.angular_frequency), len(self.drives)
+        frequency, shapes = np.pad(self.angular_frequency, (0, drives)), self.all_shapes
+        damping, stiffness = (shapes.T @ matrix @ shapes for matrix in (self.damping, self.stiffness))
+        damping[count:] = stiffness[count:] = 0.0  # nothing moves a drive
         diagonal = np.diag(np.diag(damping))
-        damping = damping if _differs(damping, diagonal) else diagonal
-        loose = self.mode_count is None and _differs(stiffness, np.diag(frequency**2))
+        damping = damping if drives or _differs(damping, diagonal) else diagonal
+        loose = self.mode_count is None and (drives > 0 or _differs(stiffness, np.diag(frequency**2)))
         ports, actions = (
             {name: np.asarray(row @ self.all_shapes) for name, row in rows.items()}
-            for rows in (self.ports, self.acts if self.actions else {})
+            for rows in (self.ports, self.acts)
         )
         whole, left_out = stiffness if loose else None, None
         if self.truncated and ports:
@@ -187,10 +184,17 @@ class LinearSystem:
             left_out = np.where((left_out > 1e-9 * all_of_it) & flexible, left_out, 0.0)  # less is rounding
         return ModalSystem(frequency, damping, ports, left_out, self.relaxation, whole, actions)
 
-    @property
-    def free_shapes(self) -> FloatArray:
-        """Shapes (N, M + P) of what is free, and nothing for the drives."""
-        return np.pad(self.shapes, ((0, 0), (0, len(self.drives))))
+    def forces(self, acting: Acting, time: FloatArray) -> FloatArray:
+        """Return the modal forces (T, M + P) by what acts at times, that on a drive by its acceleration."""
+        found = acting.load_at(time, self.all_shapes)
+        if acting.drives:
+            given, count = (
+                [drive.at(time, 2) for drive in acting.drives.values()],
+                len(self.angular_frequency),
+            )
+            found[:, :count] -= np.transpose(given) @ (self.lift.T @ self.mass @ self.shapes)
+            found[:, count:] = self.heaviness * np.transpose(given)
+        return found
 
     def port_rows(self, laws: Laws, time: float | None = None) -> FloatArray:
         """Return the rows (J, N) of the laws' ports, see `Laws.rows`."""
@@ -199,17 +203,18 @@ class LinearSystem:
     # ------------------------------------------------------------ rest
 
     @cached_property
-    def flexibility(self) -> Flexibility:
-        """What gives K^-1 loads of a structure that springs hold; raises `ModelError` if K holds not all."""
-        if self.compliance is not None:
-            return partial(np.matmul, self.compliance)
+    def _root(self) -> FloatArray:
+        """L^-1 of the stiffness L L^T."""
         try:
-            factor, lower = cho_factor(self.stiffness, check_finite=False)
+            return np.linalg.inv(np.linalg.cholesky(self.stiffness))
         except np.linalg.LinAlgError as cause:
             raise ModelError(f"The structure has no stiffness left in some direction ({cause}).") from cause
-        # the LAPACK routine itself: checks of its arguments would take ten times as long
-        known, solve = Memory(KEPT_ANSWERS), partial(dpotrs, factor, lower=lower)
-        return lambda loads: known.get((loads.shape, loads.tobytes()), lambda: np.asarray(solve(loads)[0]))
+
+    def flexibility(self, loads: FloatArray) -> FloatArray:
+        """Return K^-1 loads, (N,) or (N, k), where springs hold all; raises `ModelError` if they do not."""
+        if self.solved is not None:
+            return self.solved.static(loads)
+        return np.asarray(self._root.T @ (self._root @ loads))
 
     def residual(self, loads: FloatArray) -> FloatArray:
         """Return what the modes leave out of K^-1 loads, for loads (N,) or (N, k)."""
@@ -228,7 +233,8 @@ class LinearSystem:
         free, moving, force = len(self.angular_frequency), self.moving, loads @ self.shapes
         restoring = np.hstack((self.modal.whole[:free, :moving], self.modal.damping[:free, moving:free]))
         found = np.linalg.lstsq(restoring, force.T, rcond=LEAST_PIVOT)[0]
-        if np.max(np.abs(restoring @ found - force.T)) > 1e-6 * max(float(np.max(np.abs(force))), 1e-300):
+        left = np.max(np.abs(restoring @ found - force.T), initial=0.0)
+        if left > 1e-6 * np.max(np.abs(force), initial=1e-300):
             size = float(np.max(np.abs(restoring), initial=0.0))
             raise ModelError(
                 "the rig has no rest under what acts at the first sample (nothing holds it): say "
@@ -239,7 +245,8 @@ class LinearSystem:
     def static(
         self, units: FloatArray, laws: Laws = NO_LAWS, amounts: FloatArray | None = None,
         memory: FloatArray | None = None, before: FloatArray | None = None,
-        held: FloatArray | float = 0.0, seen: FloatArray | None = None, time: float | None = None,
+        held: FloatArray | float = 0.0, fixed: FloatArray | None = None, seen: FloatArray | None = None,
+        time: float | None = None,
     ) -> tuple[FloatArray, FloatArray | None]:  # fmt: skip
         """Return the rest (L, N) under load levels that follow one another from zero, and the laws' memory.
 
@@ -255,6 +262,8 @@ class LinearSystem:
             Of the laws, and the amounts (k,) where the first level is reached from; by default never loaded.
         held : (N,) ndarray, optional
             Where something holds the system.
+        fixed : (N,) ndarray, optional
+            Row of a point that laws do not move.
         seen : (C, N) ndarray, optional
             What these rows show (L, C) is returned instead.
         time : float, optional
@@ -267,8 +276,10 @@ class LinearSystem:
         """
         rows, levels = self.port_rows(laws, time), np.eye(len(units)) if amounts is None else amounts
         rows[:, self.displacements :] = 0.0
-        found = self.resting(np.concatenate((units, rows)))
-        answers, flexible = found[: len(units)] + held, found[len(units) :]
+        answers, flexible = self.resting(units) + held, self.resting(rows)
+        if fixed is not None:
+            own = self.resting(fixed[None])
+            flexible = flexible - np.outer(flexible @ fixed, own) / float(own[0] @ fixed)
         at_ports, compliance = answers @ rows.T, rows @ flexible.T
         if seen is not None:
             answers, flexible = answers @ seen.T, flexible @ seen.T
@@ -285,20 +296,7 @@ class LinearSystem:
     @property
     def acts(self) -> Mapping[str, FloatArray]:
         """Rows along which laws at all ports act."""
-        return {**self.ports, **self.actions}
-
-    def resisting(self, number: int) -> list[FloatArray]:
-        """Return what resists a drive's motion, its speed and its acceleration, on all unknowns (N,)."""
-        return [matrix @ self.lift[:, number] for matrix in (self.stiffness, self.damping, self.mass)]
-
-    def by_order(self, shown: Sequence[Shown], shapes: FloatArray) -> FloatArray:
-        """Return what outputs show of modal coordinates and their derivatives (4, C, M), in shapes (N, M)."""
-        rows = np.array([item.rows for item in shown]).reshape(len(shown), 4, len(shapes))
-        for own, item in zip(rows, shown, strict=True):
-            if item.reaction is not None:
-                along = self.lift[:, item.reaction]
-                own[:3] = [along @ matrix for matrix in (self.stiffness, self.damping, self.mass)]
-        return np.moveaxis(rows @ shapes, 1, 0)
+        return self.actions or self.ports
 
     def seen_by(self, shown: Sequence[Shown], shapes: FloatArray) -> PortedSystem:
         """Return the system by which outputs see missing forces, in shapes (N, M) of what is free.
@@ -312,14 +310,14 @@ class LinearSystem:
         )
         force = np.zeros((len(ports), len(shown)))
         for number, item in enumerate(shown):
-            if item.reaction is not None:
-                force[:, number] = acts @ self.lift[:, item.reaction]
+            if item.felt is not None:
+                force[:, number] = acts @ item.felt
             elif self.truncated:
                 force[:, number] = -acts @ self.residual(item.rows[0])
         mass, *others = (shapes.T @ matrix @ shapes for matrix in (self.mass, self.damping, self.stiffness))
         sees, acts = sees @ shapes, acts @ shapes
         push, by_damping, by_stiffness = (np.linalg.solve(mass, item) for item in (acts.T, *others))
-        position, speed, acceleration, _ = self.by_order(shown, shapes)
+        position, speed, acceleration, _ = by_order(shown, shapes)
         count, moving, none = len(mass), self.moving, np.zeros((len(ports), len(mass)))
         generator = np.zeros((moving + count, moving + count))
         generator[:moving, moving : 2 * moving] = np.eye(moving)

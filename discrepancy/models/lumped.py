@@ -1,8 +1,9 @@
 """A lumped linear structure as a model: masses, springs, dampers with named inputs, outputs and ports."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar, NamedTuple, Self
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
@@ -11,9 +12,10 @@ from discrepancy.campaign.records import FloatArray, Hold, Quantity, RecordedInp
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, FormulaCourse, Load, LoadChange, Shown, place_among
-from discrepancy.models.interface import EITHER, MOVES, NO_PATCH, TURNS, Memory, Outputs, Place
+from discrepancy.models.interface import EITHER, MOVES, NO_PATCH, TURNS, Outputs, Place
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.lumped_file import (
+    BLOCKS,
     GAINS,
     ControllerSection,
     InputSection,
@@ -24,40 +26,55 @@ from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.runtime import patch as changes
 from fe.runtime.laws import LAWS
-from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortLoad, Primitive, course_of
+from fe.runtime.patch import SENSORS, ModelPatch, PortLoad, Primitive, course_of
 from fe.runtime.state import Losses
 
 LEAST_STIFFNESS = 0.05
 """A temperature that leaves less than this share of the stiffness is refused."""
+KEPT = 256
+"""Systems that a model keeps."""
 MOST_MODES = 8
 """Modes that move of a structure on springs; the others follow without inertia."""
+
+Recorded = Mapping[str, tuple[RecordedInput, float]]
+"""Recorded inputs by name, and a constant that each lacks."""
 
 
 class Loop(NamedTuple):
     """A controller in a rig of N unknowns.
 
     Its `section` of the file, `gains` (proportional, derivative and integral, times their factors), what it
-    `sees` and `gives` without a reference, (4, N) as `Shown.rows`, the load (N,) along which it `acts`, and
-    the unknown that is the integral of its error, None without an integral gain.
+    `sees` (4, N) as `Shown.rows`, the load (N,) along which it `acts`, and the row (N,) of the `integral` of
+    its error, zero without that gain.
     """
 
     section: ControllerSection
     gains: Sequence[float]
     sees: FloatArray
-    gives: FloatArray
     acts: FloatArray
-    integral: int | None
+    integral: FloatArray
 
-    def loads(self, trial: Trial, item: RecordedInput, offset: float) -> list[Load]:
+    @property
+    def gives(self) -> FloatArray:
+        """What it gives without a reference (4, N)."""
+        proportional, derivative, integral = self.gains
+        found = -proportional * self.sees - derivative * np.roll(self.sees, 1, axis=0)
+        found[1] += integral * self.integral
+        return found
+
+    def loads(self, trial: Trial, recorded: Recorded) -> list[Load]:
         """Return what a recorded reference does, as loads; raises `ModelError` if it cannot be followed."""
         section, (proportional, derivative, _) = self.section, self.gains
+        if section.reference is None or section.reference not in recorded:
+            return []
+        item, offset = recorded[section.reference]
         if item.quantity is not section.quantity:
             raise ModelError(
                 f"The controller {section.name!r} follows {section.quantity.value}, but the trial "
                 f"{trial.name!r} records its reference {item.name!r} as {item.quantity.value}."
             )
-        course = Course.of(trial.time, item.values + offset, item.hold)
-        found: list[Load] = [(proportional * self.acts, course)]
+        course = Course(trial.time, item.values + offset, item.hold)
+        found = [Load(proportional * self.acts + self.integral, course)]
         if derivative != 0.0 and section.derivative_of == "error":
             if course.hold is Hold.ZERO_ORDER:
                 raise ModelError(
@@ -65,23 +82,20 @@ class Loop(NamedTuple):
                     f"the controller {section.name!r} cannot differentiate: say derivative_of = "
                     "'measurement' in the model, or hold = 'linear' in the campaign."
                 )
-            found.append((derivative * self.acts, course.slope))
-        if self.integral is not None:
-            found.append((np.eye(len(self.acts))[self.integral], course))
+            found.append(Load(derivative * self.acts, course, 1))
         return found
 
 
 class Rig(NamedTuple):
     """A lumped model at values of its parameters, under a patch of its structure.
 
-    `factors` of terms by name, `terms` (N, N) by kind and those of parts by name, `loops`, the controllers by
-    name, and `systems` that were made of it.
+    `factors` of terms by name, `terms` (N, N) by kind and those of parts by name, and `loops`, the
+    controllers by name.
     """
 
     factors: Mapping[str, float]
     terms: Mapping[str, FloatArray]
-    loops: dict[str, Loop]
-    systems: Memory
+    loops: Mapping[str, Loop]
 
     def along(self, item: LoadSection, row: Sequence[float] | FloatArray) -> FloatArray:
         """Return a load (N,) along a row, through a matrix where it says so, times its own factor."""
@@ -110,10 +124,12 @@ class LumpedModel(DescribedModel, SystemModel):
         self.length = description.characteristic_length
         self.port_rows = {item.name: padded(item.vector) for item in description.port}
         self.acts = {item.name: padded(item.acts or item.vector) for item in description.port}
-        self._stations = sorted(place.station for place in description.place)
+        self._places = sorted(description.place, key=lambda place: place.station)
+        if self._places:
+            self.stations = self._places[0].station, self._places[-1].station
         self._inputs = {item.name: item for item in description.input}
         self._outputs = {item.name: item for item in description.output}
-        self._rigs = Memory()
+        self._rig_of, self.system = lru_cache(KEPT)(self._rig), lru_cache(KEPT)(self.made)
 
     @classmethod
     def load(cls, path: Path | str) -> "LumpedModel":
@@ -125,22 +141,19 @@ class LumpedModel(DescribedModel, SystemModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the model can carry a primitive."""
         description, ports = self.description, list(self.port_rows.values())
-        if primitive in LAWS and not primitive.of_speed:  # the position of a state's port means nothing
-            return bool(ports) and all(np.any(row[: description.size]) for row in ports)
+        if primitive in LAWS:  # the position of a state's port means nothing
+            moved = primitive.of_speed or all(np.any(row[: description.size]) for row in ports)
+            return bool(ports) and moved
         carried: dict[type[Primitive], bool] = {
             changes.StiffnessDrift: description.size > 0,
             changes.ModulusTemperature: True,
-            changes.PointMass: bool(self._stations),
+            changes.PointMass: bool(self._places),
             changes.RootCompliance: description.root is not None,
             changes.LoadGain: True,
             changes.LoadPlace: any(item.station_derivative is not None for item in description.input),
             PortLoad: bool(ports),
         }
-        return carried.get(primitive, primitive in SENSORS or (primitive in INTERNAL_FORCES and bool(ports)))
-
-    def stations(self) -> tuple[float, float] | None:
-        """Return the least and largest station [m] of the places, None without places."""
-        return (self._stations[0], self._stations[-1]) if self._stations else None
+        return carried.get(primitive, primitive in SENSORS)
 
     def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
         """Return none: health has no meaning here."""
@@ -149,7 +162,7 @@ class LumpedModel(DescribedModel, SystemModel):
     @property
     def oscillates(self) -> bool:
         """Whether it has a mode that vibrates."""
-        return bool(np.any(self.system(State(self.prior_mean())).angular_frequency > 0.0))
+        return bool(np.any(self.system(State(tuple(self.prior_mean().tolist()))).angular_frequency > 0.0))
 
     # ------------------------------------------------------------ in a trial
 
@@ -165,25 +178,25 @@ class LumpedModel(DescribedModel, SystemModel):
         """
         trial, _, patch, state = case
         rig, time, description = self.rig(state), trial.time, self.description
-        still = Course.of(time, np.zeros(len(time)), Hold.SMOOTH, 0)
+        still = Course(time, np.zeros(len(time)), Hold.SMOOTH, 0)
         drives = {item.reaction: still for item in description.output if item.reaction is not None}
-        loads: list[Load] = [(rig.along(item, item.vector), Course.always(time)) for item in description.load]
-        followed = {item.reference for item in description.controller}
-        for name in rig.loops:
-            loads += self._reference(case, name)
-        for item, offset in self._recorded(case):
-            if item.name in followed:
-                continue
+        always = Course(time, np.ones(len(time)))
+        loads = [Load(rig.along(item, item.vector), always) for item in description.load]
+        recorded = self._recorded(case)
+        for loop in rig.loops.values():
+            loads += loop.loads(trial, recorded)
+        followed = {loop.section.reference for loop in rig.loops.values()}
+        for item, offset in (own for name, own in recorded.items() if name not in followed):
             section = self._recorded_at(trial, item)
             values = item.values + offset
             if section.quantity.moving:
                 values = rig.factors.get(item.name, 1.0) * values
-                drives[item.name] = Course.of(time, values, Hold.SMOOTH, item.quantity.order)
+                drives[item.name] = Course(time, values, Hold.SMOOTH, item.quantity.order)
                 continue
             change = LoadChange.of(patch)
             if item.quantity in (Quantity.FORCE, Quantity.TORQUE):
                 values = change.changed(values, item.values)
-            loads.append((self._moved_row(rig, section, change), Course.of(time, values, item.hold)))
+            loads.append(Load(self._moved_row(rig, section, change), Course(time, values, item.hold)))
         for load in (item for item in patch if isinstance(item, PortLoad)):
             if load.port not in self.acts:
                 raise ModelError(
@@ -191,16 +204,17 @@ class LumpedModel(DescribedModel, SystemModel):
                     f"{', '.join(self.acts) or 'none'}."
                 )
             spans = tuple(window.span for window in load.windows)
-            loads.append((self.acts[load.port], FormulaCourse(course_of(load.force, load.kind), spans)))
+            loads.append(Load(self.acts[load.port], FormulaCourse(course_of(load.force, load.kind), spans)))
         return loads, drives
 
-    def _recorded(self, case: Case) -> list[tuple[RecordedInput, float]]:
+    def _recorded(self, case: Case) -> Recorded:
         """Return the recorded inputs of a trial, or its force at its place, and what each lacks."""
         trial, recorded = case.trial, case.trial.inputs
         if trial.kind is not TrialKind.DRIVEN:
             item = self._input_at(trial.load_place)
             recorded = (RecordedInput(item.name, item.quantity, trial.force, trial.hold),)
-        return list(zip(recorded, (*case.conditions.offset, *(0.0,) * len(recorded)), strict=False))
+        lacks = (*case.conditions.offset, *(0.0,) * len(recorded))
+        return {item.name: (item, lack) for item, lack in zip(recorded, lacks, strict=False)}
 
     def _recorded_at(self, trial: Trial, item: RecordedInput) -> InputSection:
         """Return the input that a trial records; raises `ModelError` if it is not the model's."""
@@ -224,16 +238,9 @@ class LumpedModel(DescribedModel, SystemModel):
             )
         return section
 
-    def _reference(self, case: Case, controller: str) -> list[Load]:
-        """Return what the recorded reference of a controller does."""
-        loop, recorded = self.rig(case.state).loops[controller], self._recorded(case)
-        found = [loop.loads(case.trial, *own) for own in recorded if own[0].name == loop.section.reference]
-        return found[0] if found else []
-
     def _input_at(self, place: Place) -> InputSection:
         """Return the input of a load place; raises `ModelError` if there is none."""
-        forces = [name for name, item in self._inputs.items() if not item.quantity.moving]
-        known = [*self._inputs] if place in self._inputs else forces
+        known = [name for name, item in self._inputs.items() if name == place or not item.quantity.moving]
         return self._inputs[place_among(known, place, self.what)]
 
     def _moved_row(self, rig: Rig, item: InputSection, change: LoadChange) -> FloatArray:
@@ -248,9 +255,9 @@ class LumpedModel(DescribedModel, SystemModel):
             row = row + change.along_span * np.array(item.station_derivative)
         return rig.along(item, row)
 
-    def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
+    def shown(self, case: Case, outputs: Outputs, acting: Acting | None) -> list[Shown]:
         """Return what each output shows under what acts; None: at rest."""
-        drives = [] if acting is None else list(acting.drives)
+        drives, loads = ([], []) if acting is None else (list(acting.drives), acting.loads)
         found, description = list[Shown](), self.description
         for name, quantity in outputs:
             item = self._outputs[name]
@@ -262,11 +269,14 @@ class LumpedModel(DescribedModel, SystemModel):
             elif item.controller is not None:
                 loop = self.rig(case.state).loops[item.controller]
                 along = loop.acts / float(loop.acts @ loop.acts)
-                loads = [] if acting is None else self._reference(case, item.controller)
-                courses = [(float(push @ along), course) for push, course in loads if push @ along != 0.0]
-                found.append(Shown(loop.gives, courses=courses))
+                given = [] if acting is None else loop.loads(case.trial, self._recorded(case))
+                found.append(Shown(loop.gives, courses=[(float(load.row @ along), load) for load in given]))
             elif item.reaction in drives:
-                found.append(Shown(np.zeros((4, description.width)), reaction=drives.index(item.reaction)))
+                system = self.system(case.state._replace(drives=tuple(drives)))
+                along = system.lift[:, drives.index(item.reaction)]
+                rows = [along @ matrix for matrix in (system.stiffness, system.damping, system.mass)]
+                courses = [(-float(load.row @ along), load) for load in loads]
+                found.append(Shown(np.array([*rows, 0.0 * along]), courses=courses, felt=along))
             else:
                 raise ModelError(
                     f"The output {name!r} of {self.name!r} is the reaction of {item.reaction!r}, whose "
@@ -278,19 +288,8 @@ class LumpedModel(DescribedModel, SystemModel):
 
     def own_laws(self, parameters: FloatArray) -> ModelPatch:
         """Return the laws of ports that it has as it is, each times its factor."""
-        factors = self._factors(parameters)
-        return ModelPatch(tuple(law.scaled(factors.get(law.name, 1.0)) for law in self.description.law))
-
-    @property
-    def has_law(self) -> bool:
-        """Whether it has a law of a port of its own, in its file or found."""
-        return bool(self.description.law) or super().has_law
-
-    def apart(self) -> tuple[Self, ModelPatch]:
-        """Return the linear model, and the laws that it has beside that, at the prior means."""
-        linear, laws = super().apart()
-        description = self.description.model_copy(update={"law": []})
-        return linear._changed(description=description), self.own_laws(self.prior_mean()) + laws
+        factors, laws = self._factors(parameters.tolist()), () if self.linear else self.description.law
+        return ModelPatch(tuple(law.scaled(factors.get(law.name, 1.0)) for law in laws))
 
     def port_units(self, port: str) -> tuple[str, str]:
         """Return the units of a force at a port and of what it acts on.
@@ -315,38 +314,37 @@ class LumpedModel(DescribedModel, SystemModel):
 
     # ------------------------------------------------------------ matrices
 
-    def _factors(self, parameters: FloatArray) -> dict[str, float]:
+    def _factors(self, parameters: Iterable[float]) -> dict[str, float]:
         """Return the factors of the terms at values of the parameters."""
         factors: dict[str, float] = {}
         for item, value in zip(self.description.parameter, parameters, strict=True):
             for term in item.terms:
-                factors[term] = factors.get(term, 1.0) * float(value)
+                factors[term] = factors.get(term, 1.0) * value
         return factors
 
     def rig(self, state: State) -> Rig:
         """Return the model at values of the parameters, a structure and a temperature."""
-        parameters, _, structure, temperature, *_ = state
-        softening = temperature * sum(
-            (item.coefficient for item in structure if isinstance(item, changes.ModulusTemperature)), 0.0
-        )
-        if 1.0 - softening < LEAST_STIFFNESS:
-            raise ModelError(
-                f"The temperature leaves {1.0 - softening:.2g} of the stiffness, which none has."
-            )
-        key = (parameters.tobytes(), structure.primitives, softening)
-        return self._rigs.get(key, lambda: self._made(self._factors(parameters), structure, softening))
+        return self._rig_of(state._replace(drives=(), closed=True))
 
-    def _made(self, factors: dict[str, float], structure: ModelPatch, softening: float) -> Rig:
+    def _rig(self, state: State) -> Rig:
         description, n = self.description, self.description.size
-        softened = factors | {"stiffness": factors.get("stiffness", 1.0) * (1.0 - softening)}
-        terms = description.terms(softened)
+        factors, padded = self._factors(state.parameters), description.padded
+        left = 1.0 - state.warmer * sum(
+            item.coefficient for item in state.structure if isinstance(item, changes.ModulusTemperature)
+        )
+        if left < LEAST_STIFFNESS:
+            raise ModelError(f"The temperature leaves {left:.2g} of the stiffness, which none has.")
+        terms = description.terms({**factors, "stiffness": factors.get("stiffness", 1.0) * left})
         mass, stiffness, damping = (terms[kind][:n, :n] for kind in ("mass", "stiffness", "damping"))
-        for change in structure if n else ():
+        for change in state.structure if n else ():
             if isinstance(change, changes.PointMass):
-                places = sorted(description.place, key=lambda place: place.station)
-                columns = zip(*(place.vector for place in places), strict=True)
-                row = np.array([np.interp(change.station, self._stations, column) for column in columns])
-                mass += change.mass * np.outer(row, row)
+                stations, vectors = zip(
+                    *((place.station, place.vector) for place in self._places), strict=True
+                )
+                row = np.array(
+                    [np.interp(change.station, stations, column) for column in np.transpose(vectors)]
+                )
+                mass += change.mass * np.outer(row[:n], row[:n])
             elif isinstance(change, changes.RootCompliance) and description.root is not None:
                 # in series: K^-1 + c l l^T, by Sherman and Morrison
                 lever = np.array(description.root.lever)
@@ -360,50 +358,33 @@ class LumpedModel(DescribedModel, SystemModel):
                 weighted, w = mass @ shapes, np.sqrt(np.maximum(square, 0.0))
                 own = (weighted * (2.0 * np.array(given.ratios) * w)) @ weighted.T
             damping += factors.get("damping", 1.0) * own
-        rig = Rig(factors, terms, {}, Memory())
-        integral = n + description.states
+        loops, integrals = dict[str, Loop](), iter(np.eye(description.width)[n + description.states :])
         for item in description.controller:
             named = (factors.get(f"{item.name}.{gain}", 1.0) * getattr(item, gain) for gain in GAINS)
             gains = [factors.get(item.name, 1.0) * gain for gain in named]
-            row, acts = description.padded(item.vector), description.padded(item.acts)
-            sees = Shown.of(row, item.quantity.order, states=description.width - n).rows
-            gives = -gains[0] * sees - gains[1] * np.roll(sees, 1, axis=0)
-            if item.integral:
-                gives[1, integral] += gains[2]
-            rig.loops[item.name] = Loop(item, gains, sees, gives, acts, integral if item.integral else None)
-            integral += item.integral != 0.0
-        return rig
+            sees = Shown.of(padded(item.vector), item.quantity.order, states=description.width - n).rows
+            integral = next(integrals) if item.integral else np.zeros(description.width)
+            loops[item.name] = Loop(item, gains, sees, padded(item.acts), integral)
+        return Rig(factors, terms, loops)
 
-    def system(self, state: State) -> LinearSystem:
+    def made(self, state: State) -> LinearSystem:
         """Return what moves, with prescribed motions and controllers as the state says."""
-        rig = self.rig(state)
-
-        def made() -> LinearSystem:
-            description, terms, n = self.description, rig.terms, self.description.size
-            own, rest = slice(n, n + description.states), slice(n + description.states, None)
-            mass, damping = terms["mass"] + terms["capacity"], terms["damping"] + terms["conductance"]
-            stiffness = terms["stiffness"].copy()
-            mass[rest, rest] = np.eye(len(mass[rest]))
-            coupling = description.coupling
-            for content, into, rows, columns in (
-                (coupling.force_of_states, damping, slice(n), own),
-                (coupling.flow_of_speeds, damping, own, slice(n)),
-                (coupling.flow_of_displacements, stiffness, own, slice(n)),
-            ):
-                if content is not None:
-                    into[rows, columns] = -np.array(content)
-            for loop in rig.loops.values() if state.closed else ():
-                for into, row, seen in zip((stiffness, damping), loop.gives[:2], loop.sees[:2], strict=True):
-                    into -= np.outer(loop.acts, row)
-                    if loop.integral is not None:
-                        into[loop.integral] += seen
-            beta = description.damping.beta if description.damping is not None else None
-            drives = [description.padded(self._inputs[name].vector) for name in state.drives]
-            return LinearSystem(
-                mass, damping, stiffness, self.port_rows,
-                mode_count=MOST_MODES if description.is_plain else None,
-                relaxation=rig.factors.get("damping", 1.0) * (beta or 0.0),
-                states=len(mass) - n, drives=np.array(drives), actions=self.acts,
-            )  # fmt: skip
-
-        return rig.systems.get((state.drives, state.closed), made)
+        rig, description = self.rig(state), self.description
+        matrices, padded = np.zeros((3, description.width, description.width)), description.padded
+        for kind, (order, *_) in BLOCKS.items():
+            matrices[order] += rig.terms[kind]
+        rest = np.arange(description.size + description.states, description.width)
+        matrices[2, rest, rest] = 1.0
+        for loop in rig.loops.values() if state.closed else ():
+            matrices += (
+                loop.integral[:, None] * loop.sees[:3, None] - loop.acts[:, None] * loop.gives[:3, None]
+            )
+        stiffness, damping, mass = matrices
+        beta = description.damping.beta if description.damping is not None else None
+        drives = [padded(self._inputs[name].vector) for name in state.drives]
+        return LinearSystem(
+            mass, damping, stiffness, self.port_rows,
+            mode_count=MOST_MODES if description.is_plain else None,
+            relaxation=rig.factors.get("damping", 1.0) * (beta or 0.0),
+            states=description.width - description.size, drives=np.array(drives), actions=self.acts,
+        )  # fmt: skip

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
@@ -24,7 +23,18 @@ SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
 """Models that come with the package, by file name without the ending."""
 KINDS = ("mass", "stiffness", "damping", "capacity", "conductance")
 """Matrices of a lumped model; each can have parts."""
-OF_STATES = KINDS[3:]
+BLOCKS = {
+    "mass": (2, False, False),
+    "stiffness": (0, False, False),
+    "damping": (1, False, False),
+    "capacity": (2, True, True),
+    "conductance": (1, True, True),
+    "force_of_states": (1, False, True),
+    "flow_of_speeds": (1, True, False),
+    "flow_of_displacements": (0, True, False),
+}
+"""Matrices in the equation of all unknowns z: the derivative of z that each multiplies, and whether its rows
+and its columns are of states, which are the speeds of their coordinates."""
 LOOSE = "; a structure that can float away has no static response: say `free = true` if it can"
 GAINS = ("proportional", "derivative", "integral")
 """Gains of a controller; NAME.proportional is what a parameter scales."""
@@ -149,9 +159,11 @@ class LawSection(Section):
 
     @model_validator(mode="after")
     def _is_a_law(self) -> Self:
-        known = ", ".join(law.kind for law in LAWS)
-        if self.kind not in known.split(", "):
-            raise ValueError(f"the law {self.name!r} has the kind {self.kind!r}, but known are {known}")
+        known = [law.kind for law in LAWS]
+        if self.kind not in known:
+            raise ValueError(
+                f"the law {self.name!r} has the kind {self.kind!r}, but known are {', '.join(known)}"
+            )
         try:
             self.scaled(1.0).check()
         except InvalidPatchError as cause:
@@ -284,44 +296,46 @@ class LumpedDescription(ModelDescription):
         reads = any(item.reaction or item.constant for item in self.output)
         return not (parts or motion or acts or reads)
 
-    def given(self, kind: str) -> dict[str, Matrix]:
-        """Return the matrix of a kind, empty where there is none, and its parts by name."""
-        base = (self.damping and self.damping.matrix) if kind == "damping" else getattr(self, kind)
-        return {kind: base or ()} | {part.name: part.matrix for part in getattr(self, f"{kind}_part")}
+    def given(self, kind: str) -> dict[str, Rows]:
+        """Return the matrix of a kind, by that as its name, and its parts by name, those that there are."""
+        base = getattr(self if kind in KINDS else self.coupling, kind)
+        parts: tuple[PartSection, ...] = getattr(self, f"{kind}_part", ())
+        matrix = base.matrix if isinstance(base, Damping) else base
+        return ({kind: matrix} if matrix else {}) | {part.name: part.matrix for part in parts}
 
-    def terms(self, factors: Mapping[str, float] = MappingProxyType({})) -> dict[str, FloatArray]:
+    def terms(self, factors: Mapping[str, float]) -> dict[str, FloatArray]:
         """Return the matrices (N, N) by kind, with their parts, and the parts by name, each times its factor.
 
         The factor of the matrix itself is that of the whole. Damping by modes is left out.
         """
         found, n = dict[str, FloatArray](), self.size
-        for kind in KINDS:
-            own = slice(n, n + self.states) if kind in OF_STATES else slice(n)
-            given = self.given(kind)
-            for name, matrix in given.items():
-                found[name] = np.zeros((self.width, self.width))
-                if matrix:
-                    found[name][own, own] = matrix
-                if name != kind:
-                    found[name] *= factors.get(name, 1.0)
-            found[kind] = factors.get(kind, 1.0) * np.sum([found[name] for name in given], axis=0)
+        unknowns = slice(n), slice(n, n + self.states)
+        for kind, (_, into, of) in BLOCKS.items():
+            whole = np.zeros((self.width, self.width))
+            for name, matrix in self.given(kind).items():
+                found[name] = np.zeros_like(whole)
+                found[name][unknowns[into], unknowns[of]] = matrix
+                found[name] *= 1.0 if name == kind else factors.get(name, 1.0)
+                whole += found[name]
+            sign = 1.0 if into is of else -1.0  # what couples stands on the other side
+            found[kind] = sign * factors.get(kind, 1.0) * whole
         return found
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         n, m, ratios = self.size, self.states, self.damping.ratios if self.damping is not None else None
-        missing = {
-            "mass is missing (or capacity, of states of first order)": not (n or m),
-            "stiffness is missing: give it, or [[stiffness_part]], or say `free = true`": not self.free
-            and n and not (self.stiffness or self.stiffness_part),
-            "'damping' is missing": not self.free and n and self.damping is None,
-            "conductance is missing: give it, or [[conductance_part]]": m
-            and not (self.conductance or self.conductance_part),
-            "[[input]] is missing: at least one force must be able to act": self.is_plain and not self.input,
-        }  # fmt: skip
-        for sentence, lacks in missing.items():
-            if lacks:
-                raise ValueError(sentence)
+        if not (n or m):
+            raise ValueError("mass is missing (or capacity, of states of first order)")
+        for kind, wanted, more in (
+            ("stiffness", n and not self.free, ", or say `free = true`"),
+            ("conductance", m, ""),
+        ):
+            if wanted and not self.given(kind):
+                raise ValueError(f"{kind} is missing: give it, or [[{kind}_part]]{more}")
+        if n and not self.free and self.damping is None:
+            raise ValueError("'damping' is missing")
+        if self.is_plain and not self.input:
+            raise ValueError("[[input]] is missing: at least one force must be able to act")
         self._check_names()
         self._check_matrices()
         for kind in ("input", "output", "port", "place", "load", "controller"):
@@ -336,36 +350,27 @@ class LumpedDescription(ModelDescription):
 
     def _check_matrices(self) -> None:
         """Refuse matrices of another size, that are not symmetric, feed energy or leave something loose."""
-        n, m = self.size, self.states
-        for kind in KINDS:
-            count, reference = (m, "capacity") if kind in OF_STATES else (n, "mass")
-            for name, matrix in self.given(kind).items():
-                base = "damping.matrix" if kind == "damping" else kind
-                place = base if name == kind else f"{kind}_part {name!r}"
-                if not matrix and name == kind:
-                    continue
-                if [len(row) for row in matrix] != [count] * count:
-                    raise ValueError(
-                        f"{place} must be a {count} x {count} matrix (or {counted(count, 'diagonal value')})"
-                        f", as {reference} has {counted(count, 'row')}"
-                    )
+        counts = self.size, self.states
+        for kind, (_, into, of) in BLOCKS.items():
+            given, rows, columns = self.given(kind), counts[into], counts[of]
+            whole = {"damping": "damping.matrix"}.get(kind, kind if kind in KINDS else f"coupling.{kind}")
+            for name, matrix in given.items():
+                place = whole if name == kind else f"{kind}_part {name!r}"
+                if [len(row) for row in matrix] != [columns] * rows:
+                    how = f" (or {counted(rows, 'diagonal value')})" if kind in KINDS else " by rows"
+                    raise ValueError(f"{place} must be a {rows} x {columns} matrix{how}")
                 full = np.array(matrix)
-                size = float(np.max(np.abs(full)))
-                if kind != "conductance" and np.max(np.abs(full - full.T)) > 1e-9 * size:
+                least = -1e-9 * np.abs(full).max()
+                if kind in KINDS[:4] and np.min(-np.abs(full - full.T)) < least:
                     raise ValueError(f"{place} must be symmetric")
-                if kind == "damping" and np.min(np.linalg.eigvalsh(full)) < -1e-9 * size:
+                if kind == "damping" and np.linalg.eigvalsh(full)[0] < least:
                     raise ValueError(f"{place} must not feed energy: it has a negative eigenvalue")
-        for key, content in self.coupling:
-            rows, columns = (n, m) if key == "force_of_states" else (m, n)
-            if content is not None and [len(row) for row in content] != [columns] * rows:
-                raise ValueError(f"coupling.{key} must be a {rows} x {columns} matrix by rows")
-        terms = self.terms()
-        for kind, own in {"mass": slice(n), "stiffness": slice(n), "capacity": slice(n, n + m)}.items():
-            values = np.linalg.eigvalsh(terms[kind][own, own])
-            floating = kind == "stiffness" and self.free
-            if np.any(values < -1e-9 * np.max(np.abs(values), initial=0.0) if floating else values <= 0.0):
-                loose = LOOSE if kind == "stiffness" else ""
-                raise ValueError(f"{kind} (with its parts) must be positive definite{loose}")
+            if given and kind in ("mass", "stiffness", "capacity"):
+                values = np.linalg.eigvalsh(np.sum([*given.values()], axis=0))
+                floats = kind == "stiffness" and self.free and values[0] >= -1e-9 * values[-1]
+                if values[0] <= 0.0 and not floats:
+                    loose = LOOSE if kind == "stiffness" else ""
+                    raise ValueError(f"{kind} (with its parts) must be positive definite{loose}")
 
     def _check_vectors(self, kind: str, item: NamedVector | OutputSection | ControllerSection) -> None:
         """Refuse vectors of another length and zero ones, and what sees both displacements and states."""
@@ -381,7 +386,7 @@ class LumpedDescription(ModelDescription):
         if kind in ("port", "controller") and any(row[:n]) and any(row[n:]):
             raise ValueError(f"the {kind} {item.name!r} sees displacements or states, not both")
         if isinstance(item, PortSection) and item.acts is not None:
-            push, capacity = np.array(item.acts), self.terms()["capacity"][n : n + m, n : n + m]
+            push, capacity = np.array(item.acts), np.sum([*self.given("capacity").values()], axis=0)
             of_states = not any(row[:n]) and not any(push[:n])
             if not of_states or row[n:] @ np.linalg.solve(capacity, push[n:]) <= 0.0:
                 raise ValueError(
@@ -408,19 +413,21 @@ class LumpedDescription(ModelDescription):
         }
         for kind, given in (names | further).items():
             self.check_unique(kind, given)
-        terms = [*(KINDS[:3] if self.size else ()), *(OF_STATES if self.states else ()), *parts]
-        more = ("law",) if self.is_plain else ("input", "load", "law", "controller")
+        there = self.size, self.states
+        terms = [*(kind for kind in KINDS if there[BLOCKS[kind][1]]), *parts]
         gains = [f"{name}.{gain}" for name in names["controller"] for gain in GAINS]
-        scaled = list(dict.fromkeys([*terms, *(name for kind in more for name in names[kind]), *gains]))
+        acting = [name for kind in ("input", "load", "law", "controller") for name in names[kind]]
         driven = [item.name for item in self.input if item.quantity.moving]
-        named = [(f"{item.name!r} acts through", item.through, terms) for item in (*self.input, *self.load)]
-        named += [(f"the law {law.name!r} acts on the port", law.port, names["port"]) for law in self.law]
-        for output in self.output:
-            is_ = f"the output {output.name!r} is"
-            named.append((f"{is_} the reaction of the prescribed motion", output.reaction, driven))
-            named.append((f"{is_} what a controller gives,", output.controller, names["controller"]))
-        for item in self.parameter:
-            named += [(f"parameter {item.name!r} scales", term, scaled) for term in item.terms]
-        for what, name, known in named:
-            if name is not None and name not in known:
-                raise ValueError(f"{what} {name!r}, but there are {', '.join(known) or 'none'}")
+        for kind, key, does, known in (
+            ("input", "through", "acts through", terms),
+            ("load", "through", "acts through", terms),
+            ("law", "port", "acts on the port", names["port"]),
+            ("output", "reaction", "is the reaction of the prescribed motion", driven),
+            ("output", "controller", "is what a controller gives,", names["controller"]),
+            ("parameter", "terms", "scales", [*terms, *acting, *gains]),
+        ):
+            for item in getattr(self, kind):
+                for name in _listed(getattr(item, key)):
+                    if name is not None and name not in known:
+                        has = ", ".join(known) or "none"
+                        raise ValueError(f"{kind} {item.name!r} {does} {name!r}, but there are {has}")

@@ -93,4 +93,4 @@ class DescribedModel(Model):
             ParameterPrior(item.name, item.unit, item.mean, item.deviation, item.low, item.high)
             for item in description.parameter
         )
-        self.port_names = tuple(item.name for item in description.port)
+        self.ports = tuple(item.name for item in description.port)

@@ -12,11 +12,12 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray, Hold, Start
 from discrepancy.errors import ModelError
-from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown
+from discrepancy.models.acting import SMOOTH_PARTS, Acting, Shown, by_order, straight
 from discrepancy.models.interface import Response
 from discrepancy.models.linear_system import LinearSystem
 from fe.compilation import compiled_kernel
-from fe.runtime.motion import Laws, static_solution
+from fe.runtime.arrays import FADING, LAGGED
+from fe.runtime.motion import Laws
 from fe.runtime.motion_arrays import ModalMotion, Steps
 from fe.runtime.stepwise import Begin, Boundaries, advance, steps_under, substeps
 
@@ -72,13 +73,9 @@ class Motion:
         pull = self.q @ modal.whole.T
         if self.laws.rate != 0.0:
             pull *= 1.0 + self.laws.rate * self.time[:, None]
-        found = self.acting.load_at(self.time, system.all_shapes) - pull - self.velocity @ modal.damping.T
+        found = system.forces(self.acting, self.time) - pull - self.velocity @ modal.damping.T
         if len(self.laws):
-            found -= self.port_forces @ self.laws.rows(modal.actions or modal.ports, self.q.shape[1])
-        for number, drive in enumerate(self.acting.drives.values()):
-            for order, part in enumerate(system.resisting(number)):
-                found -= np.outer(drive.at(self.time, order), part @ system.free_shapes)
-            found[:, len(system.angular_frequency) + number] = system.heaviness * drive.at(self.time, 2)
+            found -= self.port_forces @ self.laws.rows(modal.actions, self.q.shape[1])
         found[: self.held] = 0.0
         return found
 
@@ -111,27 +108,26 @@ class Motion:
         """Return what outputs show, and the rates; omitted modes are in what is not derived only."""
         system, moved = self.system, [self.q, self.velocity]
         values, rates = np.zeros((2, len(self.time), len(shown)))
-        by_order = system.by_order(shown, system.all_shapes)
-        asked = np.any(by_order, axis=(1, 2))
+        orders = by_order(shown, system.all_shapes)
+        asked = np.any(orders, axis=(1, 2))
         if asked[1:].any():
             moved.append(self.acceleration)
         if asked[2:].any():
             moved.append(np.gradient(self.acceleration, self.time, axis=0))
         for order in np.flatnonzero(asked):
-            values += moved[order] @ by_order[order].T
+            values += moved[order] @ orders[order].T
             if order < 3:
-                rates += moved[order + 1] @ by_order[order].T
+                rates += moved[order + 1] @ orders[order].T
         if system.truncated:
             values += self._left_out(np.array([item.rows[0] for item in shown]))
         for number, item in enumerate(shown):
             values[:, number] += item.constant
-            if item.reaction is not None:
-                along = system.lift[:, item.reaction]
-                values[:, number] -= self.acting.load_at(self.time, along[:, None])[:, 0]
-                values[:, number] += self.port_forces @ (self.laws.rows(system.acts, len(along)) @ along)
-            for factor, course in item.courses or ():
-                values[:, number] += factor * course.at(self.time)
-            if item.reaction is not None or item.courses:
+            for factor, load in item.courses or ():
+                values[:, number] += factor * load.course.at(self.time, load.order)
+            if item.felt is not None:
+                acts = self.laws.rows(system.acts, len(item.felt))
+                values[:, number] += self.port_forces @ (acts @ item.felt)
+            if item.courses or item.felt is not None:
                 rates[:, number] = np.gradient(values[:, number], self.time)
         return Response(values, rates)
 
@@ -174,11 +170,11 @@ def motion_of(system: LinearSystem, acting: Acting, laws: Laws, refinement: int 
     held = int(np.searchsorted(times, 0.0)) if acting.release[1].at_rest else 0
     stamps = times[held:] if held < len(times) - 1 else np.append(times[held:], abs(times[-1]) + 1.0)
     if stamps[0] < 0.0:
-        back = system.modal.exact_steps(-stamps[:1])[0][0]
-        begin = Begin(*np.split(np.linalg.solve(back, np.concatenate((q, v))), 2))
+        back = system.modal.exact_steps(stamps[:1])[0][0]
+        begin = Begin(*np.split(back @ np.concatenate((q, v)), 2))
     parts = list(_followed(system, acting, laws, 0.0, stamps, begin, refinement)[:4])
     if held:
-        felt = np.zeros(len(laws)) if begin.memory is None else begin.memory[:, 2]
+        felt = np.zeros(len(laws)) if begin.memory is None else begin.memory[:, LAGGED]
         still = (np.tile(part, (held, 1)) for part in (q, v, felt, felt))
         parts = [np.vstack(both)[: len(times)] for both in zip(still, parts, strict=True)]
     q, v, forces, lagged = parts
@@ -228,21 +224,16 @@ def _released(system: LinearSystem, acting: Acting, laws: Laws) -> tuple[Begin, 
     unit, size = release.displacement / safe, release.displacement
     if not release.at_rest:
         return Begin(given[:, 0] * unit, given[:, 1] * unit * w), None
-    compliance = float(row @ system.flexibility(row))  # release point, all modes
-    holding, memory = size * (1.0 + given[0, 0]) / compliance, None
-    acts = holding * row
-    if len(laws):
-        # With the release point held at its displacement: x = x_linear - (C - a a^T / a_0) F.
+    answer, deviation = system.flexibility(row), given[:, 0] * unit
+    deviation[0], compliance = 0.0, float(row @ answer)
+    holding = size * (1.0 + given[0, 0]) / compliance
+    memory, acts = system.static(holding * row[None], laws, fixed=row, time=0.0)[1], holding * row
+    if memory is not None:
         rows = system.port_rows(laws, 0.0)
-        along = rows @ system.flexibility(row)
-        held = rows @ system.flexibility(rows.T) - np.outer(along, along) / compliance
-        solution = static_solution(laws, (holding * along)[None], held, kernel=compiled_kernel())
-        holding += float(along @ solution.forces[0]) / compliance
-        acts, memory = holding * row - solution.forces[0] @ rows, solution.memory
+        holding += float(rows @ answer @ memory[:, LAGGED]) / compliance
+        acts = holding * row - memory[:, LAGGED] @ rows
         if system.truncated:  # of the port's position, fades after the release
-            memory[:, 3] = holding * (rows @ system.residual(row))
-    deviation = given[:, 0] * unit
-    deviation[0] = 0.0
+            memory[:, FADING] = holding * (rows @ system.residual(row))
     return Begin(acts @ system.shapes / w**2 + deviation, np.zeros(len(w)), memory), holding * row
 
 
@@ -261,8 +252,8 @@ def _followed(
     if free is not None:
         none = np.zeros((len(stamps), 0))
         return ModalMotion(*free, none, none, laws.memory())
-    smooth |= any(course.hold is Hold.SMOOTH for _, course in acting.loads)
-    edges = (*laws.edges, *(moment for _, course in acting.loads for moment in course.edges))
+    smooth |= any(load.course.hold is Hold.SMOOTH for load in acting.loads)
+    edges = (*laws.edges, *(moment for load in acting.loads for moment in load.course.edges))
     boundaries = substeps(modal, laws, times, refinement, SMOOTH_PARTS if smooth else 1, edges)
     feed = np.zeros((len(boundaries.time), len(laws)))
     if system.truncated and len(laws) and acting.loads:
@@ -276,12 +267,7 @@ def _followed(
 def _steps(system: LinearSystem, acting: Acting, boundaries: Boundaries, feed: FloatArray) -> Steps:
     """Return the steps of all coordinates; the drives follow from nothing but what is prescribed."""
     time, first, drives = boundaries.time, len(system.angular_frequency), list(acting.drives.values())
-    begin, end = acting.ends(time, system.all_shapes)
-    for number, drive in enumerate(drives):
-        for order, part in enumerate(system.resisting(number)):
-            for side, amount in zip((begin, end), drive.ends(time, order), strict=True):
-                side -= np.outer(amount, part @ system.free_shapes)
-                side[:, first + number] = system.heaviness * amount
+    begin, end = straight(lambda moments: system.forces(acting, moments), time)
     steps = steps_under(system.modal, boundaries, begin, end, feed)
     if drives:
         steps = steps._replace(transition=steps.transition.copy())

@@ -1,13 +1,14 @@
 """What the channels of a trial would show: the response of a model, seen through the sensors of a patch."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
 from discrepancy.models.high_pass import filtered_record
-from discrepancy.models.interface import Conditions, Model, Response
+from discrepancy.models.interface import ACROSS, Conditions, Model, Response
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive, SensorRotation
 from fe.runtime.sensors import SensorRecord, apply_sensors, check_channels, clock_of
@@ -41,34 +42,38 @@ def observe(
         If a sensor primitive names a channel that does not exist or has values that no sensor can have.
     """
     channels = [campaign.channels[name] for name in trial.channels]
-    outputs = tuple((channel.output, channel.quantity) for channel in channels)
     patch = (_by_channels(model.sensors, campaign) + patch).in_trial(trial.name)
+    outputs = tuple((channel.output, channel.quantity) for channel in channels)
     if not len(patch.of(*SENSORS)):
         return model.respond(trial, outputs, patch, conditions)
-    (rate, zero), components = clock_of(patch), len(patch.of(SensorRotation)) > 0
-    if rate or zero or components:
-        clock = (conditions.clock[0] + rate, conditions.clock[1] + zero)
-        conditions = replace(conditions, clock=clock, components=components)
+    rate, zero = clock_of(patch)
+    clock = (conditions.clock[0] + rate, conditions.clock[1] + zero)
     bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SENSORS)))
     # inputs at their true times, each channel sampled by its own clock
     inputs, by_channel = _logger_rates(campaign, trial, patch)
-    stamped, clock = trial, conditions.clock
-    if inputs:
-        stamped = replace(trial, time=(1.0 + inputs) * trial.time)
-    rates, found = np.unique(by_channel).tolist(), list[Response]()
-    for rate in rates:
-        beside = (rate - inputs) / (1.0 + inputs) * (1.0 + clock[0]) + clock[0]
-        found.append(model.respond(stamped, outputs, bare, replace(conditions, clock=(beside, clock[1]))))
-    response, own = found[0], [by_channel == rate for rate in rates]
-    if len(found) > 1:
-        each = zip(*found, strict=True)
-        response = Response._make(None if part[0] is None else np.select(own, part) for part in each)
-    if components and (response.transverse is None or response.shear is None):
+    stamped = replace(trial, time=(1.0 + inputs) * trial.time) if inputs else trial
+    turned = [column for column, (_, quantity) in enumerate(outputs) if quantity is Quantity.STRAIN]
+    turned *= len(patch.of(SensorRotation)) > 0
+    outputs += tuple((outputs[column][0] + part, Quantity.STRAIN) for part in ACROSS for column in turned)
+    if not all(model.output_quantity(output) for output, _ in outputs[len(channels) :]):
         raise ModelError(
             f"{model.name} gives no transverse and shear strain, so a turned gauge cannot be computed: leave "
             "gauge misalignment out for this model."
         )
-    return observe_response(campaign, trial, patch, conditions, response)
+    values = np.zeros((len(trial.time), len(outputs)))
+    slopes, by_output = np.zeros_like(values), np.append(by_channel, np.tile(by_channel[turned], 2))
+    for rate in np.unique(by_channel).tolist():
+        beside = (rate - inputs) / (1.0 + inputs) * (1.0 + clock[0]) + clock[0]
+        found = model.respond(stamped, outputs, bare, replace(conditions, clock=(beside, clock[1])))
+        own = by_output == rate
+        values[:, own] = found.values[:, own]
+        if found.rates is not None:
+            slopes[:, own] = found.rates[:, own]
+    count, width = len(channels), len(turned)
+    across = np.zeros((2, len(values), count))
+    across[:, :, turned] = values[:, count : count + width], values[:, count + width :]
+    seen = Response(values[:, :count], slopes[:, :count] if trial.is_dynamic else None)
+    return observe_response(campaign, trial, patch, conditions, seen, across)
 
 
 def _logger_rates(campaign: Campaign, trial: Trial, patch: ModelPatch) -> tuple[float, FloatArray]:
@@ -105,12 +110,13 @@ def _by_channels(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
 
 
 def observe_response(
-    campaign: Campaign, trial: Trial, patch: ModelPatch, conditions: Conditions, response: Response
-) -> Response:
+    campaign: Campaign, trial: Trial, patch: ModelPatch, conditions: Conditions, response: Response,
+    across: Iterable[FloatArray] = (),
+) -> Response:  # fmt: skip
     """Return what the channels show of a response that is known already; see `observe`.
 
     For callers that keep the response of a structure and try sensors on it. The clock of the patch must be in
-    the response.
+    the response. `across` are transverse and shear strain (N, C), which turned gauges see.
     """
     release = 1.0  # the nominal one; where the motion starts from the static shape, as that is scaled
     if trial.kind is TrialKind.RINGDOWN and trial.release is not None:
@@ -123,6 +129,6 @@ def observe_response(
     )  # fmt: skip
     try:
         check_channels(patch, [(name, channel.quantity.value) for name, channel in campaign.channels.items()])
-        return Response(*apply_sensors(patch, record, *response, filtered=filtered_record))
+        return Response(*apply_sensors(patch, record, *response, *across, filtered=filtered_record))
     except InvalidPatchError as cause:
         raise CatalogueError(str(cause)) from cause

@@ -1,12 +1,11 @@
 """A structure as a model by its modes: any from a mesh or matrices, and the wing with its patches."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
-from scipy.linalg import inv
 
 from calibration.errors import CalibrationError
 from calibration.joint.wing_table import wing_priors
@@ -15,19 +14,19 @@ from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Load, Shown, place_among
-from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Memory, Outputs, Place
-from discrepancy.models.linear_system import Flexibility, LinearSystem, Modes
+from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Outputs, Place
+from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.scales import PortScale
 from discrepancy.models.system_model import Case, State, SystemModel
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import PLANFORM, STATION_PORTS
-from fe.runtime.patch import INTERNAL_FORCES, PRIMITIVES, SENSORS, ModelPatch, PointMass, Primitive
+from fe.runtime.patch import INTERNAL_FORCES, PRIMITIVES, SENSORS, ModelPatch, Primitive
 from fe.runtime.patch_arrays import PatchArrays
-from fe.runtime.patched_wing import MODE_COUNT, ON_MODES, PatchedWing, motion_basis
-from fe.runtime.reduced import ReducedModel, ReducedState, dense_sum, lowest_modes
-from fe.runtime.state import Losses, wing_names
+from fe.runtime.patched_wing import PatchedState, PatchedWing
+from fe.runtime.reduced import ReducedModel, ReducedState
+from fe.runtime.state import wing_names
 from fe.runtime.wing_rows import LOAD_PLACE, PORTS, strain_gauge
 from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress
@@ -50,10 +49,8 @@ paper, its masses, and the damping of the joint posterior, whose spread holds th
 
 
 ROTATING_PORT = "root"
-STIFFNESSES = changes.RootCompliance, changes.LocalStiffnessLoss, changes.ModulusTemperature
-"""Primitives on which the stiffness of a wing depends."""
 KEPT_SYSTEMS = 64
-"""Systems of a wing that are kept, 2 MB each."""
+"""Systems that are kept, of a wing 2 MB each."""
 Prior = Mapping[str, tuple[float, float]]
 """Means and standard deviations of calibrated parameters, by the names of `STATE`."""
 Design = WingDesign | None
@@ -105,37 +102,40 @@ class StructureModel(SystemModel):
             **dict.fromkeys(model.accelerations, Quantity.ACCELERATION),
         }
         self._rows = dict(zip(self.quantities, (*outputs, *accelerations), strict=True))
-        self._systems = Memory()
-        along = [self._load(self.prior_mean(), force) for force in self.forces]
+        self.system = lru_cache(KEPT_SYSTEMS)(self.made)
+        mean = State(tuple(self.prior_mean().tolist()))
+        along = [self._load(mean, force) for force in self.forces]
         self.port_rows = {
             name: self._rows[name]
             for push in along
             for name in model.displacements
             if np.abs(self._rows[name] - push).max() <= SAME * np.abs(push).max()
         }
-        self.port_names = tuple(self.port_rows)
+        self.ports = tuple(self.port_rows)
 
-    def _at(self, parameters: FloatArray, controls: Mapping[str, float], losses: Losses = ()) -> FloatArray:
+    def _at(self, state: State, controls: Mapping[str, float]) -> FloatArray:
         """Return the values that the structure is made at; controls that are left out are nominal."""
         names = (*self.model.parameters, *self.model.masses)
-        return self.model.vector({**dict(zip(names, parameters.tolist(), strict=True)), **controls}, losses)
+        return self.model.vector(
+            {**dict(zip(names, state.parameters, strict=True)), **controls}, state.losses
+        )
 
-    def _pull(self, parameters: FloatArray, controls: Mapping[str, float]) -> FloatArray:
+    def _pull(self, state: State, controls: Mapping[str, float]) -> FloatArray:
         """Return the load (n,) under controls."""
-        return np.asarray(self.model.rows[0] @ self.model.load_coefficients(self._at(parameters, controls)))
+        return np.asarray(self.model.rows[0] @ self.model.load_coefficients(self._at(state, controls)))
 
-    def _load(self, parameters: FloatArray, control: str) -> FloatArray:
+    def _load(self, state: State, control: str) -> FloatArray:
         """Return what one of a control adds to the load (n,)."""
         none = dict.fromkeys(self.model.controls, 0.0)
-        return self._pull(parameters, none | {control: 1.0}) - self._pull(parameters, none)
+        return self._pull(state, none | {control: 1.0}) - self._pull(state, none)
 
-    def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
+    def shown(self, case: Case, outputs: Outputs, acting: Acting | None) -> list[Shown]:
         """Return what outputs show.
 
         Loads that always act shift what a motion shows.
         """
         found = [Shown.of(self._rows[output], quantity.order) for output, quantity in outputs]
-        always = self._always(case.state.parameters)
+        always = self._always(case.state)
         if acting is None or not always.any():
             return found
         still = self.system(case.state).flexibility(always)
@@ -144,7 +144,7 @@ class StructureModel(SystemModel):
     def supports(self, primitive: type[Primitive]) -> bool:
         """Whether the structure can carry a primitive: sensors, laws at its ports, errors of its forces."""
         forces = primitive is changes.LoadGain and bool(self.forces)
-        return primitive in SENSORS or forces or (primitive in INTERNAL_FORCES and bool(self.port_names))
+        return primitive in SENSORS or forces or (primitive in INTERNAL_FORCES and bool(self.ports))
 
     def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
         """Return the load (n,) of 1 N of a force, or, where there is none, of the load factor.
@@ -154,52 +154,44 @@ class StructureModel(SystemModel):
         ModelError
             If there is no such force, or none is named of several.
         """
-        return self._load(state.parameters, place_among(self.forces or (LOAD_FACTOR,), place, self.what))
+        return self._load(state, place_among(self.forces or (LOAD_FACTOR,), place, self.what))
 
     def lift(self, state: State, change: ModelPatch) -> FloatArray:
         """Return the load (1, n) of the load factor."""
-        return self._load(state.parameters, LOAD_FACTOR)[None]
+        return self._load(state, LOAD_FACTOR)[None]
 
-    def _always(self, parameters: FloatArray) -> FloatArray:
+    def _always(self, state: State) -> FloatArray:
         """Return the load (n,) of constant loads and of controls that no trial records."""
         recorded = {name: 0.0 for name in (*self.forces, LOAD_FACTOR) if name in self.model.controls}
-        return self._pull(parameters, recorded)
+        return self._pull(state, recorded)
 
     def pushes(self, case: Case) -> tuple[list[Load], dict[str, Course]]:
         """Return loads in a trial; in motion what always acts is in what is shown."""
         (loads, drives), trial = super().pushes(case), case.trial
         if not trial.is_dynamic:
-            loads.append((self._always(case.state.parameters), Course.always(trial.time)))
+            loads.append(Load(self._always(case.state), Course(trial.time, np.ones(len(trial.time)))))
         return loads, drives
 
-    def system(self, state: State) -> LinearSystem:
-        """Return the structure at parameters and losses, in the coordinates of `ReducedModel.at`.
+    def made(self, state: State) -> LinearSystem:
+        """Return the structure in a state, in the coordinates of `ReducedModel.at`.
 
         Raises
         ------
         OutsideModelError
-            If one lies outside the validity box of the reduced model.
+            If a value lies outside the validity box of the reduced model.
         """
-        parameters, losses, *_ = state
-        key = parameters.tobytes(), losses
-        return self._systems.get(key, lambda: self._made(self._at(parameters, {}, losses)))
+        return _system(self.model.at(self._at(state, {})), self.model.damping, self.port_rows)
 
-    def _made(self, vector: FloatArray) -> LinearSystem:
-        model, state = self.model, ReducedState(self.model, vector)
-        size, moving = len(state.shapes), model.modal_stiffness.shape[1]
-        theta = model.stiffness_coefficients(vector)
-        mass, stiffness, compliance = np.zeros((3, size, size))
-        cross = dense_sum(model.mass_coefficients(vector), model.cross_mass)
-        mass[:moving, :moving], mass[:moving, moving:] = state.modes.mass, cross
-        mass[moving:, :moving] = cross.T
-        stiffness[:moving, :moving] = dense_sum(theta, model.modal_stiffness)
-        compliance[moving:, moving:] = inv(dense_sum(theta, model.static_stiffness))
-        alpha, beta = model.damping
-        modes = 2.0 * np.pi * state.modes.frequency, np.ascontiguousarray(state.shapes), model.mode_count
-        return LinearSystem(
-            mass, alpha * mass + beta * stiffness, stiffness, self.port_rows, model.mode_count, float(beta),
-            known=lambda _: modes, compliance=compliance,
-        )  # fmt: skip
+
+def _system(
+    structure: ReducedState | PatchedState, rayleigh: Iterable[float], ports: Mapping[str, FloatArray]
+) -> LinearSystem:
+    """Return a structure with Rayleigh damping [1/s], [s] and rows of its ports."""
+    alpha, beta = rayleigh
+    return LinearSystem(
+        structure.mass, alpha * structure.mass + beta * structure.stiffness, structure.stiffness, ports,
+        structure.mode_count, beta, structure.on_modes, solved=structure,
+    )  # fmt: skip
 
 
 class WingModel(SystemModel):
@@ -219,11 +211,10 @@ class WingModel(SystemModel):
 
     Notes
     -----
-    Load places are "tip_load" or (y [m], chord fraction). Outputs are strain[k], tip_displacement,
-    load_point_displacement and displacement[y, x].
+    Load places are "tip_load" or (y [m], chord fraction). Outputs are strain[k], strain[k].transverse and
+    strain[k].shear across it, tip_displacement, load_point_displacement and displacement[y, x].
     """
 
-    components = 3
     reference = LOAD_PLACE
 
     def __init__(
@@ -234,17 +225,13 @@ class WingModel(SystemModel):
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
         self.name, self.parameters = name, wing_priors(box, **prior)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
-        self.port_names, self._row = tuple(PORTS), cache(wing.output_row)
-        self._systems, self._rows = Memory(KEPT_SYSTEMS), Memory()
+        self.stations = 0.0, wing.span
+        self.ports, self._row = tuple(PORTS), cache(wing.output_row)
+        self.system = lru_cache(KEPT_SYSTEMS)(self.made)
 
     @classmethod
-    def shipped(cls, progress: Progress | None = None) -> "WingModel":
-        """Return the shipped wing with the calibration that the documentation states."""
-        return cls.of_design(None, progress)
-
-    @classmethod
-    def of_design(cls, path: Path | str | None, progress: Progress | None = None) -> "WingModel":
-        """Return the wing of a design file, calibrated as the shipped wing is.
+    def of_design(cls, path: Path | str | None = None, progress: Progress | None = None) -> "WingModel":
+        """Return the wing of a design file, or the shipped one, calibrated as the documentation states.
 
         Raises
         ------
@@ -282,11 +269,10 @@ class WingModel(SystemModel):
             return None
         return Quantity.STRAIN if output.startswith("strain") else Quantity.DISPLACEMENT
 
-    def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
-        """Return what outputs show; `component` 1 and 2: transverse and shear strain."""
-        known = (self._row(output, component) for output, _ in outputs)
-        rows = self._rows.get((outputs, component), lambda: np.array([*known]).reshape(-1, self.wing.size))
-        factors = self.wing.strain_factors(case.patch.of(changes.LocalStiffnessLoss))
+    def shown(self, case: Case, outputs: Outputs, acting: Acting | None) -> list[Shown]:
+        """Return what outputs show."""
+        rows = np.array([self._row(output) for output, _ in outputs])
+        factors = self.wing.strain_factors(case.patch)
         if factors is not None:
             gauges = np.array([strain_gauge(output) for output, _ in outputs])
             rows = rows * np.where(gauges >= 0, factors[gauges], 1.0)[:, None]
@@ -327,25 +313,9 @@ class WingModel(SystemModel):
         by_place = tuple(zip(share.tolist(), ratio.tolist(), strict=True))
         return {PLANFORM: replace(ports["span"], spread=by_place)}
 
-    # ------------------------------------------------------------ structure
-
-    def system(self, state: State) -> LinearSystem:
+    def made(self, state: State) -> LinearSystem:
         """Return the wing in a state."""
-        masses, kept = state.structure.of(PointMass), state.structure.of(*STIFFNESSES)
-        warmer = state.warmer if len(kept.of(changes.ModulusTemperature)) else 0.0
-        key = (state.parameters.tobytes(), state.losses, masses.primitives, kept.primitives, warmer)
-        return self._systems.get(key, lambda: self._made(state._replace(warmer=warmer), masses))
-
-    def _made(self, state: State, masses: ModelPatch) -> LinearSystem:
-        wing, (factor, servo, pitot, alpha, beta) = self.wing, state.parameters.tolist()
-        stiffness, mass = wing.stiffness(factor, *state[1:4]), wing.mass(servo, pitot, masses)
-
-        def modes(flexibility: Flexibility) -> Modes:
-            basis = motion_basis(flexibility, mass, wing.arrays.start_shapes, flexibility(wing.held.T))
-            frequency, own = lowest_modes(basis.T @ stiffness @ basis, basis.T @ mass @ basis, MODE_COUNT)
-            return 2.0 * np.pi * frequency, basis @ own, MODE_COUNT
-
-        return LinearSystem(
-            mass, alpha * mass + beta * stiffness, stiffness, self.port_rows, MODE_COUNT, beta, ON_MODES,
-            known=modes,
-        )  # fmt: skip
+        factor, servo, pitot, alpha, beta = state.parameters
+        vector = np.array((factor, *state.losses, servo, pitot, 0.0, 0.0))
+        structure = self.wing.at(vector, state.structure, state.warmer)
+        return _system(structure, (alpha, beta), self.port_rows)

@@ -1,17 +1,25 @@
 """A model by its matrices, a wing, a structure or a lumped rig: under patches, at rest and in motion."""
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import groupby
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Course, Load, LoadChange, Shown, divided, release_of
-from discrepancy.models.interface import NO_PATCH, Conditions, Model, Outputs, Place, PortedSystem, Response
+from discrepancy.models.interface import (
+    NO_PATCH,
+    Conditions,
+    Model,
+    Outputs,
+    Place,
+    PortedSystem,
+    Response,
+)
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.motion import Motion, motion_of
 from discrepancy.models.port_scales import Ports
@@ -28,21 +36,21 @@ class State(NamedTuple):
 
     Attributes
     ----------
-    parameters : (P,) ndarray
-        Values of the model's.
+    parameters : tuple of float
+        Values (P,) of the model's.
     losses : tuple of float
         Of its damage regions.
     structure : ModelPatch
         What of a patch changes it.
     warmer : float
-        Temperature above the reference [K].
+        Temperature above the reference [K], zero where the structure does not depend on it.
     drives : tuple of str
         Inputs whose motion is prescribed.
     closed : bool
         Whether its controllers act.
     """
 
-    parameters: FloatArray
+    parameters: tuple[float, ...]
     losses: Losses = ()
     structure: ModelPatch = NO_PATCH
     warmer: float = 0.0
@@ -68,21 +76,20 @@ class SystemModel(Model):
         Rows of all ports where laws act.
     reference : str or None
         Place whose stiffness and modal mass are the natural ones; None: that of the first trial.
-    components : int
-        3 if it tells transverse and shear strain, too; else 1.
+    system : callable
+        Gives what moves in a state: `made`, which is kept.
     """
 
     port_rows: Mapping[str, FloatArray]
     reference: str | None = None
     kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
-    components: ClassVar[int] = 1
-    shows_ports: ClassVar[bool] = True
+    system: Callable[[State], LinearSystem]
 
     # ------------------------------------------------------------ what each says
 
     @abstractmethod
-    def system(self, state: State) -> LinearSystem:
-        """Return what moves in a state."""
+    def made(self, state: State) -> LinearSystem:
+        """Return what moves in a state, made anew."""
 
     @abstractmethod
     def force_row(self, place: Place, state: State, change: ModelPatch = NO_PATCH) -> FloatArray:
@@ -106,23 +113,16 @@ class SystemModel(Model):
         else:
             rows = self.force_row(trial.load_place, state, loads)[None]
             amounts = [LoadChange.of(loads).changed(trial.force, trial.force)]
-        courses = [Course.of(trial.time, values, trial.hold) for values in amounts]
-        return list(zip(rows, courses, strict=True)), {}
+        courses = [Course(trial.time, values, trial.hold) for values in amounts]
+        return list(map(Load, rows, courses)), {}
 
     @abstractmethod
-    def shown(self, case: Case, outputs: Outputs, acting: Acting | None, component: int = 0) -> list[Shown]:
-        """Return what outputs show under what acts, in its coordinates, or at rest.
-
-        `component` 1 and 2: transverse and shear strain.
-        """
+    def shown(self, case: Case, outputs: Outputs, acting: Acting | None) -> list[Shown]:
+        """Return what outputs show under what acts, in its coordinates; None: at rest."""
 
     def spread(self, ports: Mapping[str, PortScale], shape: FloatArray) -> dict[str, PortScale]:
         """Return the scales of forces that are spread over the structure, by the first mode (N,)."""
         return {}
-
-    def own_laws(self, parameters: FloatArray) -> ModelPatch:
-        """Return the laws of ports that it has as it is."""
-        return NO_PATCH
 
     # ------------------------------------------------------------ what all do alike
 
@@ -133,9 +133,10 @@ class SystemModel(Model):
 
     def case(self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH) -> Case:
         """Return a trial as it is at its begin."""
-        losses, warmer = self.losses(trial, conditions.health)[0], float(trial.temperature[0])
-        state = State(conditions.parameters, losses, patch.of(*STRUCTURE), warmer)
-        return Case(trial, conditions, patch, state)
+        parameters, structure = tuple(conditions.parameters.tolist()), patch.of(*STRUCTURE)
+        warmer = float(trial.temperature[0]) if len(patch.of(changes.ModulusTemperature)) else 0.0
+        losses = self.losses(trial, conditions.health)[0]
+        return Case(trial, conditions, patch, State(parameters, losses, structure, warmer))
 
     def acting(self, case: Case) -> Acting:
         """Return what acts in a trial."""
@@ -177,16 +178,13 @@ class SystemModel(Model):
         The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not zero. In a
         dynamic trial the structure is that at its first temperature.
         """
-        components = range(self.components if conditions.components else 1)
         laws, case = self.laws(conditions.parameters, patch), self.case(trial, conditions, patch)
         if not trial.is_dynamic:
-            return self._at_rest(case, outputs, laws, components)
+            return Response(self._at_rest(case, outputs, laws))
         moved = self.moved(case, laws)
-        shown = (self.shown(case, outputs, moved.acting, number) for number in components)
-        found, *further = map(moved.seen, shown)
-        return Response(found.values, found.rates, *(part.values for part in further))
+        return moved.seen(self.shown(case, outputs, moved.acting))
 
-    def _at_rest(self, case: Case, outputs: Outputs, laws: Laws, components: range) -> Response:
+    def _at_rest(self, case: Case, outputs: Outputs, laws: Laws) -> FloatArray:
         """Return what is shown at rest; rows of one structure that follow one another go together."""
         trial, conditions, patch, first = case
         if laws.spans or len(patch.of(PortLoad)):
@@ -194,16 +192,16 @@ class SystemModel(Model):
         count, losses = len(trial.force), self.losses(trial, conditions.health)
         losses = losses * count if len(losses) == 1 else losses
         warmer = trial.temperature.tolist() if len(patch.of(changes.ModulusTemperature)) else [0.0] * count
-        values = np.empty((count, len(components) * len(outputs)))
+        values = np.empty((count, len(outputs)))
         memory, before, start = None, None, 0
         for (lost, warm), group in groupby(zip(losses, warmer, strict=True)):
             rows = slice(start, start + len(list(group)))
             case = case._replace(state=first._replace(losses=lost, warmer=warm))
-            shown = [item for number in components for item in self.shown(case, outputs, None, number)]
+            shown = self.shown(case, outputs, None)
             units, amounts = self.acting(case).levels
             system, given = self.system(case.state), amounts[rows]
             n = system.displacements
-            for (_, quantity), item in zip(outputs, shown, strict=False):
+            for (_, quantity), item in zip(outputs, shown, strict=True):
                 if np.any(item.rows[2:, n:]) or (quantity.order > 0 and np.any(item.rows[1:, :n])):
                     raise ModelError(
                         f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
@@ -216,8 +214,7 @@ class SystemModel(Model):
                 raise ModelError(f"The trial {trial.name!r} is at rest, but {cause}") from cause
             values[rows] += [item.constant for item in shown]
             before, start = amounts[rows.stop - 1], rows.stop
-        along, *further = np.split(values, len(components), axis=1)
-        return Response(along, None, *further)
+        return values
 
     # ------------------------------------------------------------ ports
 
@@ -255,7 +252,7 @@ class SystemModel(Model):
         self.check_outputs(outputs)
         for column, item in enumerate(self.shown(case, outputs, moved.acting)):
             kept = trial.values[trial.used[:, column], column] - item.constant
-            if item.reaction is not None or item.courses is not None or not kept.size:
+            if item.courses is not None or not kept.size:
                 continue
             size, rows = float(np.max(np.abs(kept))), item.rows @ rig.shapes
             of_u, of_x, order = rows[:, :moving], rows[:, moving:], np.argmax(np.any(rows, axis=1))
@@ -273,8 +270,8 @@ class SystemModel(Model):
         A structure that springs hold, which only forces move from rest, has scales of its own; for others
         what acts and moves is the measure.
         """
-        trials, parameters, names = campaign.trials, self.prior_mean(campaign), self.ports()
-        state = State(parameters, (0.0,) * len(self.regions))
+        trials, parameters, names = campaign.trials, self.prior_mean(campaign), self.ports
+        state = State(tuple(parameters.tolist()), (0.0,) * len(self.regions))
         system, bare = self.system(state), self.system(state._replace(closed=False))
         rows = np.array([self.port_rows[name] for name in names]).reshape(len(names), len(bare.mass))
         held = system.mode_count is not None and all(
@@ -311,7 +308,7 @@ class SystemModel(Model):
         found = dict(zip(names, ports.scales(stiff.tolist(), driven_only=driven_only), strict=True))
         return Scales(
             **{**sizes, "force": sizes["force"] or weight},
-            length=self.length or max(map(abs, self.stations() or (0.0,))) or 1.0,
+            length=self.length or max(map(abs, self.stations or (0.0,))) or 1.0,
             tip_stiffness=stiffness, modal_mass=mass, angular_frequency=frequency,
             ports=found | self.spread(found, shape),
         )  # fmt: skip

@@ -113,21 +113,14 @@ def stated_priors(campaign: Campaign, choice: ModelChoice) -> tuple[ParameterPri
     for item in choice.model.parameters:
         mean, deviation = campaign.parameters.get(item.name, (item.mean, item.deviation))
         if not item.low <= mean <= item.high:
-            raise CampaignDataError(
-                f"The campaign states {item.name} = {mean:g}, outside the range {item.low:g} to "
-                f"{item.high:g} in which {label} holds: correct [parameters.{item.name}], or widen the range "
-                "in the model's file."
-            )
+            raise CampaignDataError(said("parameters.outside", item=item, mean=mean, model=label))
         if deviation > 0.0:
             stated = "the campaign" if item.name in campaign.parameters else label
             found.append(replace(item, mean=mean, deviation=deviation, stated_by=stated, title=""))
     if not found:
         names = [item.name for item in choice.model.parameters]
         known = f"all of {', '.join(names)} have the deviation 0" if names else "it lists none"
-        raise ModelError(
-            f"The model {label} has no parameter to calibrate: {known}; give a [[parameter]] with name, "
-            "mean, deviation, low and high in its file."
-        )
+        raise ModelError(said("parameters.none", model=label, known=known))
     return tuple(found)
 
 

@@ -1,7 +1,9 @@
 """Samples of the posterior of a model's parameters: by quadrature, of a checked Gaussian, or drawn."""
 
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,13 +94,12 @@ class Marginal:
         problem = copy(trials or self._problem)
         shared = problem.shared
         held = self.free if fixed is None else self.free[fixed]
-        mean, scale = shared.parameter_mean.copy(), shared.parameter_scale.copy()
-        low, high = shared.parameter_low.copy(), shared.parameter_high.copy()
-        mean[self.free] = np.where(np.isin(self.free, held), self.values(u), mean[self.free])
-        scale[held], low[held], high[held] = 0.0, mean[held], mean[held]
-        problem.shared = replace(
-            shared, parameter_mean=mean, parameter_scale=scale, parameter_low=low, parameter_high=high
-        )
+        names = ("mean", "low", "high", "scale")
+        moments = {f"parameter_{name}": getattr(shared, f"parameter_{name}").copy() for name in names}
+        for values in moments.values():
+            values[held] = self.values(u)[np.isin(self.free, held)]
+        moments["parameter_scale"][held] = 0.0
+        problem.shared = replace(shared, **moments)
         start = near or (self._near if trials is None else problem.start(NOTHING))
         at = start.shared.copy()
         at[held] = 0.0
@@ -133,13 +134,11 @@ class Marginal:
             u = np.clip(generator.standard_normal(len(self.free)), self.low, self.high)
             shared = problem.start(NOTHING).shared
             shared[self.free] = u
+            start = Point(shared, problem.start(NOTHING).local, np.empty(0))
             try:
-                other = fit(
-                    problem, NOTHING, Point(shared, problem.start(NOTHING).local, np.empty(0)), iterations=40
-                )
+                other = self._within(fit(problem, NOTHING, start, iterations=40))
             except (FitError, ModelError):
                 continue
-            other = self._within(other)
             near = [item for item in found if self._same(item, other)]
             if not near:
                 found.append(other)
@@ -236,18 +235,14 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
     ):
         procedure, draws = "quadrature", _along_the_widest(marginal, optima, count, generator)
     else:
-        shares = [
-            mass_inside(*item, marginal.low, marginal.high) for item in zip(centres, spreads, strict=True)
-        ]
+        ends = marginal.low, marginal.high
+        shares = [mass_inside(*item, *ends) for item in zip(centres, spreads, strict=True)]
         evidence = np.array([item.log_evidence for item in optima]) + np.log(np.maximum(shares, 1e-300))
         weight = np.exp(evidence - evidence.max())
         chosen = generator.choice(len(optima), count, p=weight / weight.sum())
-        draws = np.empty((count, len(free)))
-        for at, (centre, spread) in enumerate(zip(centres, spreads, strict=True)):
-            rows = chosen == at
-            draws[rows] = cut_off(
-                np.tile(centre, (int(rows.sum()), 1)), spread, marginal.low, marginal.high, generator
-            )
+        draws = np.array(centres)[chosen]
+        for at, spread in enumerate(spreads):
+            draws[chosen == at] = cut_off(draws[chosen == at], spread, *ends, generator)
     return ParameterPosterior(procedure, draws, optima, marginal, cut)
 
 
@@ -255,13 +250,11 @@ def is_gaussian(marginal: Marginal, centre: FloatArray, covariance: FloatArray) 
     """Return whether the energy rises along the principal axes as that of a Gaussian does."""
     least = marginal(centre)
     spread, directions = np.linalg.eigh(covariance)
-    for axis in (directions * np.sqrt(np.maximum(spread, 0.0))).T:
-        for size, allowed in CHECKED:
-            for side in (-1.0, 1.0):
-                rise = marginal(centre + side * size * axis) - least
-                if not abs(rise - 0.5 * size**2) < allowed:
-                    return False
-    return True
+    axes = (directions * np.sqrt(np.maximum(spread, 0.0))).T
+    return all(
+        abs(marginal(centre + side * size * axis) - least - 0.5 * size**2) < allowed
+        for axis, (size, allowed), side in product(axes, CHECKED, (-1.0, 1.0))
+    )
 
 
 def mass_inside(centre: FloatArray, covariance: FloatArray, low: FloatArray, high: FloatArray) -> float:
@@ -269,11 +262,8 @@ def mass_inside(centre: FloatArray, covariance: FloatArray, low: FloatArray, hig
     if len(centre) == 1:
         deviation = float(np.sqrt(covariance[0, 0]))
         return float(ndtr((high[0] - centre[0]) / deviation) - ndtr((low[0] - centre[0]) / deviation))
-    return float(
-        multivariate_normal.cdf(
-            high, centre, covariance, allow_singular=True, lower_limit=low, rng=np.random.default_rng(0)
-        )
-    )
+    how = {"allow_singular": True, "lower_limit": low, "rng": np.random.default_rng(0)}
+    return float(multivariate_normal.cdf(high, centre, covariance, **how))
 
 
 def cut_off(
@@ -345,22 +335,16 @@ class Slices:
             near = known[min(known, key=lambda place: abs(place - node))]
             u = np.zeros(len(free))
             u[index] = node
-            try:
-                found = marginal.fitted(u, fixed=fixed, near=near)
-            except (FitError, ModelError):
-                self._fits[node] = None
-                continue
-            self._fits[node] = found
-            known[node] = found.point
+            self._fits[node] = None
+            with suppress(FitError, ModelError):
+                self._fits[node] = found = marginal.fitted(u, fixed=fixed, near=near)
+                known[node] = found.point
         self.nodes = np.array(sorted(self._fits))
 
     def mass(self) -> tuple[FloatArray, FloatArray]:
         """Return points and the posterior's distribution function at them, `BETWEEN` to an interval."""
         nodes = self.nodes
-        energy = np.full(len(nodes), np.inf)
-        for at, node in enumerate(nodes.tolist()):
-            if (found := self._fits[node]) is not None:
-                energy[at] = 0.5 * node**2 - found.log_evidence - self._log_inside(found)
+        energy = np.array([self._energy(node) for node in nodes.tolist()])
         energy = np.minimum(energy - energy.min(), EMPTY)
         share = np.linspace(0.0, 1.0, BETWEEN, endpoint=False)
         fine = np.append((nodes[:-1, None] + np.diff(nodes)[:, None] * share).ravel(), nodes[-1])
@@ -374,13 +358,15 @@ class Slices:
         rest = np.arange(len(free)) != self._index
         return found.point.shared[free][rest], found.covariance[np.ix_(free, free)][np.ix_(rest, rest)]
 
-    def _log_inside(self, found: CandidateFit) -> float:
-        marginal = self._marginal
+    def _energy(self, node: float) -> float:
+        """Return the energy of a slice; infinite where the model could not be had."""
+        if (found := self._fits[node]) is None:
+            return np.inf
+        marginal, share = self._marginal, 1.0
         rest = np.arange(len(marginal.free)) != self._index
-        if not rest.any():
-            return 0.0
-        share = mass_inside(*self._rest(found), marginal.low[rest], marginal.high[rest])
-        return float(np.log(max(share, np.exp(-EMPTY))))
+        if rest.any():
+            share = mass_inside(*self._rest(found), marginal.low[rest], marginal.high[rest])
+        return 0.5 * node**2 - found.log_evidence - float(np.log(max(share, np.exp(-EMPTY))))
 
     def others(self, values: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return draws (N, P) of all parameters given the one, cut off at the model's range."""

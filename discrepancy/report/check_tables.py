@@ -12,20 +12,16 @@ from reporting.words import listing
 
 from .text import WORDS, number, unit_text
 
-HEADINGS = (
-    "effect", "testable", "shows best at", "parameter", "detectable from", "prior median", "confused with",
-)  # fmt: skip
+HEADINGS = WORDS.headings("decide")
 
 
 def rows_of(found: Separability) -> list[tuple[str, ...]]:
-    """Return one row for each effect of the catalogue under `HEADINGS`."""
-    return [_row(found, item) for item in found.detectability]
+    """Return one row for each effect that can be tested, under `HEADINGS`."""
+    return [_row(found, item) for item in found.detectability if not item.reason]
 
 
 def _row(found: Separability, item: Detectability) -> tuple[str, ...]:
     name = item.effect.identifier
-    if item.reason:
-        return (name, "no", "", "", item.reason.rstrip("."), "", "")
     seen = item.distance >= DETECTED
     visible, others = "yes" if seen else "larger than usual only", ", ".join(neighbours(found, name))
     if not item.parameter:
@@ -45,12 +41,6 @@ def neighbours(found: Separability, name: str) -> list[str]:
     at = found.identifiers.index(name)
     near = np.minimum(found.distance[at], found.distance[:, at]) < CONFUSED
     return [other for place, other in enumerate(found.identifiers) if near[place] and place != at]
-
-
-def can_decide_rows(found: Separability) -> list[tuple[str, ...]]:
-    """Return the rows of the effects that can be tested, as the page has them."""
-    testable = [_row(found, item) for item in found.detectability if not item.reason]
-    return [tuple(cell.replace("_", " ") for cell in row) for row in testable]
 
 
 def confused_lines(found: Separability) -> list[str]:

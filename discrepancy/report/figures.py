@@ -44,8 +44,10 @@ from .text import WORDS, added_label, force_sentence, motion_of, scored
 _LARGEST_DISTANCE = 1e4
 
 
-def pit_figure(scores: Mapping[str, Scores]) -> Figure:
+def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
     """Draw histograms of probability integral transforms; keys are titles, in order before and after."""
+    if not scores:
+        return None
     with publication_style():
         figure, (row,) = panels(1, 2, 1.9)
         for spare in row[len(scores) :]:
@@ -58,12 +60,12 @@ def pit_figure(scores: Mapping[str, Scores]) -> Figure:
                 color=PREDICTION if number == 0 and len(scores) > 1 else PAST, alpha=0.75,
             )  # fmt: skip
             axes.axhline(1.0 / count, color=OBSERVED, lw=0.9, ls="--")
-            axes.set_ylim(0.0, 1.1 * max(top, 0.16))
-            axes.set_xlim(0.0, 1.0)
             axes.yaxis.set_major_locator(MaxNLocator(4))
-            axes.set_xlabel("probability integral transform")
+            axes.set(
+                xlim=(0.0, 1.0), ylim=(0.0, 1.1 * max(top, 0.16)), xlabel="probability integral transform"
+            )
             axes.set_ylabel("share of samples" if number == 0 else "")
-            axes.set_title(f"{'ab'[number]}  {title}" if len(scores) > 1 else title, loc="left")
+            axes.set_title(f"{'ab'[number]}  {title}" if len(scores) > 1 else title)
     return figure
 
 
@@ -113,8 +115,7 @@ def confusion_figure(found: SelfCalibration) -> Figure:
     texts = np.where(counts > 0, counts.astype(str), "")
     with publication_style():
         figure, axes, _ = _map_of_names(share, rows, columns, Normalize(0.0, 1.0), texts)
-        axes.set_ylabel("what was hidden")
-        axes.set_xlabel("verdict")
+        axes.set(xlabel="verdict", ylabel="what was hidden")
     return figure
 
 
@@ -130,52 +131,48 @@ def missing_force_figure(missing: MissingForce, told: ForceAtPort) -> Figure:
     what, place, rate = motion_of(told)
     integral, state = ("displacement", "speed") if place else ("integral of the state", "state")
     along = (("position", ", ".join(filter(None, (integral, place)))), ("speed", f"{state}, {rate}"))
+    every = slice(None, None, -(-sum(len(item.time) for item in missing.courses) // MOST_DOTS))
+    strongest = max(missing.courses, key=lambda one: float(np.max(np.abs(one.force))))
+    first = int(np.argmax(np.abs(strongest.force))) - MOST_TURNS // 2
+    first = max(min(first, len(strongest.time) - MOST_TURNS), 0)
+    stretch = slice(first, first + MOST_TURNS)
     with publication_style():
-        figure, rows = panels(len(parts), 3, 2.4 * len(parts) + 0.5)
+        figure, rows = panels(len(parts), 3, 2.4 * len(parts) + 0.5, sharey=True)
         for number, (row, (title, name)) in enumerate(zip(rows, parts, strict=True)):
+            law = "law" if missing.law and name == "force" else ""
             for axes, (motion, label) in zip(row[:2], along, strict=True):
-                _draw_over(axes, missing, motion, name)
+                _draw_over(axes, missing, motion, name, law, every)
                 axes.set_xlabel(label)
-            _draw_in_time(row[2], missing, name)
+            time, values = strongest.time[stretch], getattr(strongest, name)[stretch]
+            reach = 2.0 * strongest.deviation[stretch]
+            band(row[2], time, values - reach, values + reach, OBSERVED)
+            row[2].plot(time, values, color=OBSERVED, lw=0.9)
+            if law and strongest.law is not None:
+                row[2].plot(time, strongest.law[stretch], "--", color=PREDICTION, lw=0.9)
+            row[2].set_xlabel(f"time in {strongest.trial}, s")
             row[0].set_ylabel(f"{what}, {told.unit}")
             for column, axes in enumerate(row):
                 axes.axhline(0.0, color=REFERENCE, lw=0.6, zorder=0)
                 axes.locator_params(axis="x", nbins=4)  # the integral of a state may have six digits
-                if axes is not rows[0][0]:
-                    axes.sharey(rows[0][0])
+                axes.tick_params(labelleft=True)
                 panel_label(axes, "abcdef"[3 * number + column], title)
         drawn = rows[0][0].get_legend_handles_labels()
         figure.legend(*drawn, loc="outside upper right", ncols=2, markerscale=3.0)
     return figure
 
 
-def _draw_over(axes: Axes, missing: MissingForce, motion: str, name: str) -> None:
-    total = sum(len(item.time) for item in missing.courses)
-    every = -(-total // MOST_DOTS)
-    along, values, deviation = (
-        np.concatenate([getattr(item, key)[::every] for item in missing.courses])
-        for key in (motion, name, "deviation")
-    )
+def _draw_over(axes: Axes, missing: MissingForce, motion: str, name: str, law: str, every: slice) -> None:
+    """Draw a force over a motion of its port, and its law where it has one."""
+
+    def joined(key: str) -> FloatArray:
+        parts = (getattr(item, key) for item in missing.courses)
+        return np.concatenate([values[every] for values in parts if values is not None])
+
+    along, values, deviation = map(joined, (motion, name, "deviation"))
     axes.vlines(along, values - deviation, values + deviation, color=OBSERVED, lw=0.4, alpha=BAND_OPACITY)
     axes.plot(along, values, ".", color=OBSERVED, ms=2.6, alpha=0.6, label="seen, ± 1 deviation")
-    if missing.law and name == "force":
-        law = np.concatenate([item.law[::every] for item in missing.courses if item.law is not None])
-        axes.plot(along, law, ".", color=PREDICTION, ms=1.2, alpha=0.7, label=missing.law)
-
-
-def _draw_in_time(axes: Axes, missing: MissingForce, name: str) -> None:
-    """Draw the stretch of the trial in which the force is largest."""
-    item = max(missing.courses, key=lambda one: float(np.max(np.abs(one.force))))
-    first = int(np.argmax(np.abs(item.force))) - MOST_TURNS // 2
-    first = max(min(first, len(item.time) - MOST_TURNS), 0)
-    stretch = slice(first, first + MOST_TURNS)
-    time, values, deviation = item.time[stretch], getattr(item, name)[stretch], item.deviation[stretch]
-    reach = 2.0 * deviation
-    band(axes, time, values - reach, values + reach, OBSERVED)
-    axes.plot(time, values, color=OBSERVED, lw=0.9)
-    if item.law is not None and name == "force":
-        axes.plot(time, item.law[stretch], "--", color=PREDICTION, lw=0.9)
-    axes.set_xlabel(f"time in {item.trial}, s")
+    if law:
+        axes.plot(along, joined(law), ".", color=PREDICTION, ms=1.2, alpha=0.7, label=missing.law)
 
 
 Pack = Callable[[Path, Path], str]
@@ -262,7 +259,7 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         shown = zip(("model as it was", "with the effect"), pair, strict=True)
         scores = {title: item for title, item in shown if item.pit}
         where = "Held-out trials." if trials == "held-out" else "Fitted trials: none is held out."
-        add("pit", pit_figure(scores) if scores else None, where=where)
+        add("pit", pit_figure(scores), where=where)
     if content.separability is not None:
         add("separability", separability_figure(content.separability), confused=CONFUSED)
     if content.self_calibration is not None:

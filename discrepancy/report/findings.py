@@ -153,11 +153,7 @@ def add_next(page: Page, investigation: Investigation) -> None:
     page.add_paragraph(WORDS.say("next"))
     if sentence := when_sentence(investigation.verdict.windows):
         page.add_paragraph(sentence)
-    rows = [
-        (item.description, item.reason, f"{item.information:.2f}", f"{item.cost:g}")
-        for item in investigation.verdict.next_experiments
-    ]
-    WORDS.add_table(page, "next", rows)
+    WORDS.add_table(page, "next", investigation.verdict.next_experiments)
 
 
 def add_location(page: Page, investigation: Investigation) -> None:
@@ -175,9 +171,4 @@ def add_location(page: Page, investigation: Investigation) -> None:
     findings = [item for item in location.disagreements if item.share >= LEAST_SHARE][:SHOWN_FINDINGS]
     for item in findings:
         page.add_paragraph(f"• {item.sentence}")
-    said = {True: "yes", False: "no"}
-    rows = [
-        (test.name, words.number(test.statistic, 4), words.p_value_text(test.p_value), said[test.rejected])
-        for test in location.tests
-    ]
-    WORDS.add_table(page, "tests", rows)
+    WORDS.add_table(page, "tests", location.tests)

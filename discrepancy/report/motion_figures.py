@@ -1,10 +1,10 @@
 """Motion before and after: histories, spectra, and frequency and damping over the amplitude."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
+from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.signal import welch
 
@@ -19,6 +19,8 @@ from reporting.figures import OBSERVED, REFERENCE, TRUTH, publication_style
 from .kit import draw_noise, models, panels, plain_powers
 from .residual_figures import size
 
+_ROWS = [item.name for item in fields(Backbone)[1:]]
+
 LEAST_POINTS = 4
 """Fewest measured points of a mode whose backbone is drawn."""
 LARGEST_ERROR = 0.25
@@ -27,8 +29,7 @@ MOST_MODES = 3
 """Modes that are fitted together in a window."""
 
 
-@dataclass(frozen=True)
-class Worst:
+class Worst(NamedTuple):
     """The record with the largest gap: index of the trial in its set, name of the channel."""
 
     trial: int
@@ -42,7 +43,7 @@ def worst_record(items: Sequence[FittedTrial]) -> Worst | None:
         for number, item in enumerate(items)
         if item.trial.is_dynamic
         for column, name in enumerate(item.trial.channels)
-        if item.used[:, column].any() and np.isfinite(found := size(item, column))
+        if item.used[:, column].any() and np.isfinite(found := size([item], name))
     ]
     return Worst(*max(found)[1:]) if found else None
 
@@ -56,30 +57,23 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     shown = models(before, after)
     with publication_style():
         count = 1 + len(shown)
-        ratios = [1.25, *([1.0] * len(shown))]
-        figure, cells = panels(count, 1, 1.45 * count + 0.35, height_ratios=ratios)
-        (axes,), *below = cells
+        shape = {"height_ratios": [1.25, *[1.0] * len(shown)], "sharex": True}
+        figure, ((axes,), *below) = panels(count, 1, 1.45 * count + 0.35, **shape)
+        axes.margins(x=0.01)
         values = factor * item.trial.values[used, column]
         axes.plot(time[used], values, ".", ms=1.8, color=OBSERVED, label="measured")
         for one in shown:
             predicted = factor * one.residuals.trials[worst.trial].prediction[:, column]
             axes.plot(time, predicted, one.dashes, lw=0.9, color=one.colour, label=one.label)
-        axes.set_ylabel(f"{worst.channel}, {unit}")
-        axes.set_title(f"a  {worst.channel} in {item.trial.name}", loc="left")
+        axes.set(ylabel=f"{worst.channel}, {unit}", title=f"a  {worst.channel} in {item.trial.name}")
         axes.legend(ncol=3, loc="upper right")
-        axes.margins(x=0.01)
         for number, ((panel,), one) in enumerate(zip(below, shown, strict=True)):
             each = one.residuals.trials[worst.trial]
-            panel.sharex(axes)
             draw_noise(panel, factor * float(each.noise_deviation[column]), 0.3)
             panel.plot(time[used], factor * each.residual[used, column], lw=0.6, color=one.colour)
-            panel.set_ylabel(f"residual, {unit}")
-            panel.set_title(f"{'bc'[number]}  residual, {one.label}", loc="left")
-            panel.margins(x=0.01)
+            panel.set(ylabel=f"residual, {unit}", title=f"{'bc'[number]}  residual, {one.label}")
         below[0][0].legend(loc="upper right")
         figure.axes[-1].set_xlabel("time, s")
-        for above in figure.axes[:-1]:
-            above.tick_params(labelbottom=False)
     return figure
 
 
@@ -109,11 +103,8 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
                 f"mode {number}", (frequency, 1.0), (2.0, -2.0), xycoords=("data", "axes fraction"),
                 textcoords="offset points", rotation=90, va="top", fontsize=6.5, color=OBSERVED,
             )  # fmt: skip
-        axes.set_yscale("log")
-        axes.set_xlim(0.0, float(drawn[0][0][-1]))
-        axes.set_xlabel("frequency, Hz")
-        axes.set_ylabel("power / white noise")
-        axes.set_title(f"residuals of {worst.channel}, all dynamic trials", loc="left")
+        axes.set(yscale="log", xlim=(0.0, float(drawn[0][0][-1])), xlabel="frequency, Hz")
+        axes.set(ylabel="power / white noise", title=f"residuals of {worst.channel}, all dynamic trials")
         low, high = axes.get_ylim()
         axes.set_ylim(min(low, 0.1), max(high, 10.0))
         axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=2, borderaxespad=0.0)
@@ -147,105 +138,74 @@ def mode_frequencies(residuals: ResidualSet) -> tuple[float, ...]:
 # ---------------------------------------------------------------- backbones
 
 
-def _ringdowns(residuals: ResidualSet) -> list[FittedTrial]:
-    return [item for item in residuals.trials if item.trial.kind is TrialKind.RINGDOWN]
-
-
 def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
     """Draw frequency and damping ratio of the ring-downs over the amplitude, and name the channel.
 
     None where no record is long enough or no mode rings long enough.
     """
-    items = _ringdowns(before)
     frequencies = mode_frequencies(before if after is None else after)[:MOST_MODES]
-    worst = worst_record(items)
+    worst = worst_record([item for item in before.trials if item.trial.kind is TrialKind.RINGDOWN])
     if worst is None or not frequencies:
         return None
     channel = worst.channel
-    measured = _backbones(items, channel, frequencies, None)
-    curves = [
-        (_backbones(_ringdowns(item.residuals), channel, frequencies, "prediction"), item)
-        for item in models(before, after)
-    ]
-    modes = [n for n in sorted(measured) if sum(len(c.time) for c in measured[n]) >= LEAST_POINTS][:2]
+    measured = _backbones(before, channel, frequencies, measured=True)
+    curves = [(_backbones(one.residuals, channel, frequencies), one) for one in models(before, after)]
+    modes = [n for n in sorted(measured) if np.isfinite(measured[n].time).sum() >= LEAST_POINTS][:2]
     if not modes:
         return None
     factor, unit = UNITS[before.channels[channel].quantity].drawn
+    drawn = (("frequency", "frequency, Hz", 1.0), ("damping_ratio", "damping ratio, %", 100.0))
     with publication_style():
         figure, cells = panels(len(modes), 2, 2.3 * len(modes) + 0.3)
         for row, mode in enumerate(modes):
-            for place, (name, label, scale) in enumerate(
-                (("frequency", "frequency, Hz", 1.0), ("damping_ratio", "damping ratio, %", 100.0))
-            ):
-                axes = cells[row][place]
+            points = measured[mode]
+            for place, (axes, (name, label, scale)) in enumerate(zip(cells[row], drawn, strict=True)):
                 for found, shown in curves:
-                    for number, curve in enumerate(found.get(mode, [])):
-                        axes.plot(
-                            factor * curve.amplitude, scale * getattr(curve, name), shown.dashes,
-                            color=shown.colour, lw=1.1, alpha=0.8,
-                            label="_nolegend_" if number else shown.label,
-                        )  # fmt: skip
-                _draw_points(axes, measured[mode], name, factor, scale)
-                axes.set_xscale("log")
+                    if (curve := found.get(mode)) is not None:
+                        (line,) = axes.plot(factor * curve.amplitude, scale * getattr(curve, name))
+                        line.set(color=shown.colour, ls=shown.dashes, lw=1.1, alpha=0.8, label=shown.label)
+                values, error = scale * getattr(points, name), scale * getattr(points, f"{name}_error")
+                axes.errorbar(
+                    factor * points.amplitude, values, error, fmt="o", ms=2.6, color=OBSERVED, elinewidth=0.6,
+                    lw=0.0, alpha=0.85, label="measured, ± 1 standard error", zorder=3,
+                )  # fmt: skip
+                title, across = f"{'abcd'[2 * row + place]}  mode {mode}", f"amplitude of {channel}, {unit}"
+                axes.set(xscale="log", title=title, xlabel=across, ylabel=label)
                 plain_powers(axes.xaxis, (1.0, 2.0, 5.0))
-                axes.set_ylabel(label)
-                axes.set_title(f"{'abcd'[2 * row + place]}  mode {mode}", loc="left")
-                axes.set_xlabel(f"amplitude of {channel}, {unit}")
-                _range(axes, measured[mode], name, scale)
-                if row == 0 and place == 1:
-                    axes.legend(loc="best")
+                # what was measured and its surroundings, whatever a wrong model does
+                low, high = np.nanquantile(values, (0.02, 0.98))
+                wide = 1.2 * max(float(high - low), 0.02 * abs(float(np.nanmedian(values))))
+                bottom, top = axes.get_ylim()
+                axes.set_ylim(max(bottom, low - wide), min(top, high + wide))
+        cells[0][1].legend(loc="best")
     return figure, channel
 
 
 def _backbones(
-    items: Sequence[FittedTrial], channel: str, frequencies: Sequence[float], source: str | None
-) -> dict[int, list[Backbone]]:
-    found: dict[int, list[Backbone]] = {}
-    for item in items:
-        if channel not in item.trial.channels:
+    residuals: ResidualSet, channel: str, frequencies: Sequence[float], *, measured: bool = False
+) -> dict[int, Backbone]:
+    """Return the backbones of the ring-downs by mode, of what was predicted or of what was measured.
+
+    Points whose errors leave nothing to be seen are left out; NaN stands between ring-downs.
+    """
+    found: dict[int, list[list[FloatArray]]] = {}
+    for item in residuals.trials:
+        if item.trial.kind is not TrialKind.RINGDOWN or channel not in item.trial.channels:
             continue
         column = item.column(channel)
-        noise = float(item.noise_deviation[column])
-        values = item.prediction[:, column] if source else np.where(
-            item.used[:, column], item.trial.values[:, column], item.prediction[:, column]
-        )  # fmt: skip
+        noise, values = float(item.noise_deviation[column]), item.prediction[:, column]
+        if measured:
+            values = np.where(item.used[:, column], item.trial.values[:, column], values)
         try:
             curves = backbones(item.trial.time, values, list(frequencies), noise_deviation=noise)
         except FitError:
             continue
-        for curve in curves:
-            clear = _clear(curve)
-            if clear is not None:
-                found.setdefault(curve.mode, []).append(clear)
-    return found
-
-
-def _clear(curve: Backbone) -> Backbone | None:
-    """Return the points of a curve whose errors leave something to be seen."""
-    if not curve.time.size:
-        return None
-    limit = LARGEST_ERROR * max(float(np.median(np.abs(curve.damping_ratio))), 1e-4)
-    keep = curve.damping_ratio_error < limit
-    if not keep.any():
-        return None
-    names = [item.name for item in fields(Backbone)[1:]]
-    return Backbone(curve.mode, *(getattr(curve, name)[keep] for name in names))
-
-
-def _draw_points(axes: Axes, curves: Sequence[Backbone], name: str, factor: float, scale: float) -> None:
-    label = "measured, ± 1 standard error"
-    for curve in curves:
-        axes.errorbar(
-            factor * curve.amplitude, scale * getattr(curve, name), scale * getattr(curve, f"{name}_error"),
-            fmt="o", ms=2.6, color=OBSERVED, elinewidth=0.6, lw=0.0, alpha=0.85, label=label, zorder=3,
-        )  # fmt: skip
-        label = "_nolegend_"
-
-
-def _range(axes: Axes, curves: Sequence[Backbone], name: str, scale: float) -> None:
-    """Show what was measured and its surroundings, whatever a wrong model does."""
-    values = scale * np.concatenate([getattr(curve, name) for curve in curves])
-    low, high = np.quantile(values, (0.02, 0.98))
-    drawn = axes.get_ylim()
-    wide = max(float(high - low), 0.02 * abs(float(np.median(values))))
-    axes.set_ylim(max(drawn[0], low - 1.2 * wide), min(drawn[1], high + 1.2 * wide))
+        for curve in (curve for curve in curves if curve.time.size):
+            limit = LARGEST_ERROR * max(float(np.median(np.abs(curve.damping_ratio))), 1e-4)
+            clear = curve.damping_ratio_error < limit
+            if clear.any():
+                rows = [np.r_[getattr(curve, name)[clear], np.nan] for name in _ROWS]
+                found.setdefault(curve.mode, []).append(rows)
+    return {
+        mode: Backbone(mode, *map(np.concatenate, zip(*each, strict=True))) for mode, each in found.items()
+    }

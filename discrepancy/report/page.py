@@ -1,8 +1,8 @@
 """The page: verdict first, then where the gap is, why this name, the proof, and what all rests on."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from math import isfinite, isnan, nan
+from math import isfinite, nan
 
 from discrepancy.campaign.units import UNITS
 from discrepancy.document import Origin
@@ -10,11 +10,11 @@ from discrepancy.judgement.conclusion import calibrated_parameters, probability_
 from discrepancy.judgement.when import NO_GAP
 from discrepancy.report import findings
 from discrepancy.report import text as words
-from discrepancy.report.check_tables import can_decide_rows, group_lines
+from discrepancy.report.check_tables import group_lines, rows_of
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.text import WORDS
-from discrepancy.self_calibration import Share, outcomes
-from discrepancy.verdict import Gate, Proof, Scores, Verdict, VerdictKind
+from discrepancy.self_calibration import outcomes
+from discrepancy.verdict import Proof, Scores, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page, ReportFigure
 from reporting.words import listing
@@ -22,28 +22,6 @@ from reporting.words import listing
 SHOWN_HYPOTHESES = 8
 NINETY = 1.6449
 """Normal quantile at 95 %: half of a 90 % interval in standard deviations."""
-
-
-def add_gates(page: Page, investigation: Investigation) -> None:
-    """Add the outcomes of the gates."""
-    gates = investigation.verdict.gates
-    if not gates:
-        return
-    passed = {None: "not applied", True: "yes", False: "no"}
-    rows = [(gate.name, passed[gate.passed], *_compared(gate), gate.reason) for gate in gates]
-    WORDS.add_table(page, "gates", rows)
-
-
-def _compared(gate: Gate) -> tuple[str, str]:
-    """Return what a gate compares, and with what: a p-value, or a gain in evidence."""
-    if isnan(gate.statistic):
-        return "\N{EN DASH}", "\N{EN DASH}"
-    if gate.name == "held-out trials":
-        return f"{words.number(gate.statistic)} deviations", f"at most {words.number(gate.limit)}"
-    if gate.name == "shape":
-        return f"gain {words.number(gate.statistic)} nat", f"at most {words.number(gate.limit)} nat"
-    text = words.p_value_text(gate.statistic)
-    return f"p {text}" if text.startswith("<") else f"p = {text}", f"p at least {words.number(gate.limit)}"
 
 
 def add_evidence(page: Page, verdict: Verdict) -> None:
@@ -146,24 +124,17 @@ def add_proof(page: Page, investigation: Investigation, proof: Proof) -> None:
     WORDS.add_table(page, "proof", rows, more=scores, gain=gain, closed=closed, trials=trials)
 
 
-def _share(share: Share) -> str:
-    return (
-        f"{share.count} of {share.total}: {100.0 * share.value:.0f} % "
-        f"({100.0 * share.low:.0f} to {100.0 * share.high:.0f} %)"
-    )
-
-
 def add_self_calibration(page: Page, content: ReportInput) -> None:
     """Add verdicts on simulated campaigns."""
     found = content.self_calibration
     if found is None:
         return
     rows = [
-        (title, outcome, _share(found.share(outcome, null=null)))
+        (title, outcome, found.share(outcome, null=null))
         for title, null in (("an effect was hidden", False), ("nothing was hidden", True))
         for outcome in outcomes(found, null=null)
     ]
-    rows.append(("named rightly", "90 % intervals that hold the true value", _share(found.coverage())))
+    rows.append(("named rightly", "90 % intervals that hold the true value", found.coverage()))
     names = ", ".join(found.not_detectable)
     absent = f" Never detectable in draws of their priors, so not hidden: {names}." if names else ""
     WORDS.add_table(page, "calibration", rows, absent=absent)
@@ -180,19 +151,7 @@ def add_data(page: Page, investigation: Investigation) -> None:
         page.add_paragraph(f"• {text}")
     if not told and not remarks:
         page.add_paragraph("No fault was found.")
-    campaign = investigation.campaign
-    rows = [
-        (
-            trial.name, trial.kind.value, trial.run or "\N{EN DASH}", str(len(trial.time)),
-            _few(trial.channels), "held out" if trial.held_out else "fitted", str(int((~trial.used).sum())),
-        )
-        for trial in campaign.trials
-    ]  # fmt: skip
-    WORDS.add_table(page, "trials", rows)
-
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names) if len(names) <= 8 else f"{', '.join(names[:6])} and {len(names) - 6} more"
+    WORDS.add_table(page, "trials", investigation.campaign.trials)
 
 
 def add_origin(page: Page, origin: Origin) -> None:
@@ -256,7 +215,7 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
     page.add_section("What it looks like")
     show("history", "backbone", "spectrum", "load")
     page.add_section("Why this verdict")
-    add_gates(page, investigation)
+    WORDS.add_table(page, "gates", verdict.gates)
     add_evidence(page, verdict)
     add_not_compared(page, verdict)
     added = words.added_label(investigation)
@@ -271,7 +230,8 @@ def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dic
         if content.separability is not None:
             for line in group_lines(content.separability):
                 page.add_paragraph(line)
-            WORDS.add_table(page, "decide", can_decide_rows(content.separability))
+            rows = [[cell.replace("_", " ") for cell in row] for row in rows_of(content.separability)]
+            WORDS.add_table(page, "decide", rows)
         show("separability")
         add_self_calibration(page, content)
         show("self_calibration")

@@ -1,7 +1,7 @@
 """Where and when the gap is: residuals on the wing, by channel and trial, over the load, and in time."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import FittedTrial, ResidualSet
-from discrepancy.verdict import GapWindow, Moment
+from discrepancy.verdict import GapWindow
 from fe.wing.design import WingDesign
 from reporting.figures import LEVELS, OBSERVED, REFERENCE, publication_style
 
@@ -28,47 +28,27 @@ MOST_CELLS = 12
 _STRAIN = re.compile(r"strain\[(\d+)\]")
 
 
-def _squares(item: FittedTrial, column: int) -> FloatArray:
-    """Return the sum of squared residuals of a channel over the noise, and what noise would leave (2,)."""
-    used = item.used[:, column]
-    left = np.sum(item.standardised[used, column] ** 2)
-    return np.array([left, item.expected_variance[used, column].sum()])
-
-
-def _rms(squares: FloatArray) -> float:
-    """Return a size over what noise would leave; nan where the fit has absorbed all that there was."""
-    left, expected = squares
+def size(trials: Sequence[FittedTrial], channel: str) -> float:
+    """Return the rms residual of a channel over what noise would leave; nan where the fit absorbed it all."""
+    left = expected = 0.0
+    for item in trials:
+        if channel in item.trial.channels:
+            column = item.column(channel)
+            used = item.used[:, column]
+            left += float(np.sum(item.standardised[used, column] ** 2))
+            expected += float(item.expected_variance[used, column].sum())
     return float(np.sqrt(left / expected)) if expected >= 0.5 else float("nan")
-
-
-def size(item: FittedTrial, column: int) -> float:
-    """Return the rms residual of a channel in a trial over what noise would leave; nan without samples."""
-    return _rms(_squares(item, column))
-
-
-def size_by_channel(residuals: ResidualSet) -> dict[str, float]:
-    """Return the rms residual of each channel over what noise would leave, all trials together."""
-    sums: dict[str, FloatArray] = {}
-    for item in residuals.trials:
-        for column, name in enumerate(item.trial.channels):
-            sums[name] = sums.get(name, 0.0) + _squares(item, column)
-    return {name: size for name, squares in sums.items() if np.isfinite(size := _rms(squares))}
 
 
 def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray]:
     """Return channels (C), trials (T), and the sizes (C, T) of the residuals; nan where there is none."""
-    channels = [
-        name for name in residuals.channels if any(name in i.trial.channels for i in residuals.trials)
-    ]
-    table = np.full((len(channels), len(residuals.trials)), np.nan)
-    for place, item in enumerate(residuals.trials):
-        for column, name in enumerate(item.trial.channels):
-            table[channels.index(name), place] = size(item, column)
+    items = residuals.trials
+    channels = [name for name in residuals.channels if any(name in item.trial.channels for item in items)]
     names = [
         f"{trial.name} (held out)" if trial.held_out and "held out" not in trial.name else trial.name
-        for trial in (item.trial for item in residuals.trials)
+        for trial in (item.trial for item in items)
     ]
-    return channels, names, table
+    return channels, names, np.array([[size([item], name) for item in items] for name in channels])
 
 
 def gauge_places(channels: Sequence[Channel], design: WingDesign) -> dict[str, tuple[float, float]]:
@@ -89,28 +69,30 @@ def gauge_places(channels: Sequence[Channel], design: WingDesign) -> dict[str, t
 def planform_figure(before: ResidualSet, after: ResidualSet | None, design: WingDesign) -> Figure | None:
     """Draw the sizes of the residuals on the planform, before and after at one scale; None without places."""
     places = gauge_places(list(before.channels.values()), design)
-    sizes = [size_by_channel(item) for item in (before, after) if item is not None]
+    shown = models(before, after)
+    sizes = [[size(item.residuals.trials, name) for name in places] for item in shown]
     if not places:
         return None
-    norm = scale_of([value for row in sizes for value in row.values()])
+    norm = scale_of(np.array(sizes))
+    strain = [before.channels[name].quantity is Quantity.STRAIN for name in places]
     with publication_style():
-        figure, rows = panels(len(sizes), 1, 1.62 * len(sizes) + 0.35)
-        for (axes,), row, title in zip(rows, sizes, titles(models(before, after)), strict=True):
+        figure, rows = panels(len(sizes), 1, 1.62 * len(sizes) + 0.35, sharex=True)
+        for (axes,), row, title in zip(rows, sizes, titles(shown), strict=True):
             _draw_planform(axes, design)
-            _draw_gauges(axes, before.channels, places, row, norm, design)
-            axes.set_title(title, loc="left")
-            axes.set_ylabel("chord, m")
-            axes.tick_params(labelbottom=axes is rows[-1][0])
+            for name, is_strain, value in zip(places, strain, row, strict=True):
+                if np.isfinite(value):
+                    _draw_gauge(axes, name, _depth(design, *places[name]), value, norm, is_strain)
+            axes.set(title=title, ylabel="chord, m")
         rows[-1][0].set_xlabel("distance from the root, m")
         size_bar(figure, norm, [axes for (axes,) in rows])
     return figure
 
 
-def _depth(design: WingDesign, station: float, fraction: float) -> float:
-    """Return how far behind the leading edge of the root a place lies [m]."""
+def _depth(design: WingDesign, station: float, fraction: float) -> tuple[float, float]:
+    """Return the distance of a place from the root, and how far it is behind the root's leading edge [m]."""
     form = design.planform
     behind = (fraction - form.straight_chord_line) * form.chord(min(station / form.semi_span, 1.0))
-    return form.straight_chord_line * form.root_chord + behind
+    return station, form.straight_chord_line * form.root_chord + behind
 
 
 def _draw_planform(axes: Axes, design: WingDesign) -> None:
@@ -120,32 +102,21 @@ def _draw_planform(axes: Axes, design: WingDesign) -> None:
     boxes = [((0.0, form.semi_span), (0.0, 1.0), wing)]
     boxes += [((d.span_start, d.span_end), (d.chord_start, d.chord_end), region) for d in design.defects]
     for (root, tip), (front, rear), look in boxes:
-        stations, fractions = (root, tip, tip, root), (front, front, rear, rear)
-        depth = [_depth(design, *place) for place in zip(stations, fractions, strict=True)]
-        axes.fill(stations, depth, **look)
-    axes.set_aspect("equal")
-    axes.set_xlim(-0.03 * form.semi_span, 1.06 * form.semi_span)
+        corners = ((root, front), (tip, front), (tip, rear), (root, rear))
+        axes.fill(*np.transpose([_depth(design, *place) for place in corners]), **look)
+    axes.set(aspect="equal", xlim=(-0.03 * form.semi_span, 1.06 * form.semi_span))
     axes.set_ylim(1.12 * form.root_chord, -0.12 * form.root_chord)
     axes.yaxis.set_major_locator(MaxNLocator(3))
 
 
-def _draw_gauges(
-    axes: Axes, channels: Mapping[str, Channel], places: dict[str, tuple[float, float]],
-    sizes: dict[str, float], norm: Normalize, design: WingDesign,
-) -> None:  # fmt: skip
-    for name, (station, fraction) in places.items():
-        if name not in sizes:
-            continue
-        depth = _depth(design, station, fraction)
-        marker = "o" if channels[name].quantity is Quantity.STRAIN else "s"
-        axes.scatter(
-            station, depth, c=[sizes[name]], cmap=LEVELS, norm=norm, s=46, marker=marker,
-            edgecolors="#333333", linewidths=0.6, zorder=3,
-        )  # fmt: skip
-        axes.annotate(
-            name, (station, depth), (0.0, -6.5), textcoords="offset points", ha="center", va="top",
-            fontsize=6.5,
-        )  # fmt: skip
+def _draw_gauge(
+    axes: Axes, name: str, place: tuple[float, float], value: float, norm: Normalize, is_strain: bool
+) -> None:
+    axes.scatter(
+        *place, c=[value], cmap=LEVELS, norm=norm, s=46, marker="o" if is_strain else "s",
+        edgecolors="#333333", linewidths=0.6, zorder=3,
+    )  # fmt: skip
+    axes.annotate(name, place, (0.0, -6.5), textcoords="offset points", ha="center", va="top", fontsize=6.5)
 
 
 def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
@@ -162,7 +133,7 @@ def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
         for number, (axes, (_, _, table), title) in enumerate(zip(row, tables, titles(shown), strict=True)):
             names = ([""] * len(channels) if number else channels, trials)
             heat_map(axes, table, names, norm, 40, _cells(table) if few else None)
-            axes.set_title(title, loc="left")
+            axes.set_title(title)
         size_bar(figure, norm, row)
     return figure
 
@@ -197,9 +168,8 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
             noise, *_ = [_draw_loads(axes, item, kind, names, factor) for item in models(before, after)]
             draw_noise(axes, noise, 0.25)
             axes.axhline(0.0, color=OBSERVED, lw=0.6)
-            axes.set_xlabel(label)
-            axes.set_ylabel(f"residual, {unit}")
-            axes.set_title(f"{'abcd'[number]}  {kind.value}, {quantity.value}", loc="left")
+            title = f"{'abcd'[number]}  {kind.value}, {quantity.value}"
+            axes.set(xlabel=label, ylabel=f"residual, {unit}", title=title)
         figure.legend(*cells[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure
 
@@ -233,11 +203,10 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
     """Draw the windows of the records with the largest gaps; None without a window."""
     if not windows:
         return None
-    sizes: dict[str, float] = {}
-    for window in windows:
-        sizes[window.trial] = max(sizes.get(window.trial, 0.0), window.size)
-    largest = set(sorted(sizes, key=lambda name: -sizes[name])[:MOST_RECORDS])
-    trials = [name for name in sizes if name in largest]
+    names = dict.fromkeys(window.trial for window in windows)
+    sizes = {name: max(window.size for window in windows if window.trial == name) for name in names}
+    largest = sorted(names, key=lambda name: -sizes[name])[:MOST_RECORDS]
+    trials = [name for name in names if name in largest]
     norm = scale_of([window.size for window in windows])
     both = any(window.with_effect for window in windows)
     with publication_style():
@@ -256,8 +225,7 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
 
 def _draw_record(axes: Axes, row: int, windows: Sequence[GapWindow], norm: Normalize, *, both: bool) -> None:
     first, last = windows[0].first, windows[0].last
-    for middle in (row - 0.14, row + 0.2) if both else (row,):
-        axes.plot([first, last], [middle, middle], color=REFERENCE, lw=1.0, zorder=1)
+    axes.hlines((row - 0.14, row + 0.2) if both else row, first, last, color=REFERENCE, lw=1.0, zorder=1)
     for window in windows:
         begin = first if window.begin is None else window.begin.value
         end = last if window.end is None else window.end.value
@@ -266,16 +234,12 @@ def _draw_record(axes: Axes, row: int, windows: Sequence[GapWindow], norm: Norma
         axes.broken_barh(
             [(begin, end - begin)], (low, height), facecolor=colour, edgecolor="#333333", lw=0.5, zorder=2
         )
-        for moment in (window.begin, window.end):
-            if moment is not None:
-                _draw_moment(axes, moment, low + 0.5 * height, height)
-
-
-def _draw_moment(axes: Axes, moment: Moment, middle: float, height: float) -> None:
-    axes.plot([moment.low, moment.high], [middle, middle], color="white", lw=2.6, zorder=3)
-    axes.plot([moment.low, moment.high], [middle, middle], color=OBSERVED, lw=1.2, zorder=4)
-    for at in (moment.low, moment.high):
-        axes.plot([at, at], [middle - 0.3 * height, middle + 0.3 * height], color=OBSERVED, lw=0.9, zorder=4)
+        middle, cap = low + 0.5 * height, 0.3 * height
+        for moment in filter(None, (window.begin, window.end)):
+            low, high = moment.low, moment.high
+            axes.hlines(middle, low, high, color="white", lw=2.6, zorder=3)
+            axes.hlines(middle, low, high, color=OBSERVED, lw=1.2, zorder=4)
+            axes.vlines([low, high], middle - cap, middle + cap, color=OBSERVED, lw=0.9, zorder=4)
 
 
 def _short(name: str) -> str:

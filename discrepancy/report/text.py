@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Iterable, Sequence
 from math import floor, isfinite, isnan, log10
+from typing import Any
 
 from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.campaign.units import UNITS
@@ -102,11 +103,9 @@ def headline(verdict: Verdict) -> str:
     for identifier, name in {effect.identifier: effect.name for effect in known}.items():
         whole = rf"{re.escape(name)}|\b{identifier}\b"  # a name may hold the identifier
         text = re.sub(whole, lambda _, name=name: name, text)  # type: ignore[misc]
-    if isnan(verdict.probability) or "probability" in text:
-        return text + "."
     about = WORDS.content["probability"].get(verdict.kind)
-    if about is None:
-        return text + "."
+    if isnan(verdict.probability) or "probability" in text or about is None:
+        return f"{text}."
     return f"{text} ({about} {probability_text(verdict.probability)})."
 
 
@@ -231,9 +230,8 @@ def nats(evidence: float) -> str:
     return f"{evidence:,.0f}" if abs(evidence) < BEYOND_DOUBT else f"more than {BEYOND_DOUBT:,.0f}"
 
 
-WORDS = Words(
-    "discrepancy.report", number=number, percent=percent, nats=nats, share_text=share_text, formula=formula
-)
+_NUMBERS: tuple[Any, ...] = (number, percent, nats, share_text, formula, p_value_text)
+WORDS = Words("discrepancy.report", "words.toml", **{function.__name__: function for function in _NUMBERS})
 """Words of the report, of figures and of the summary on the terminal."""
 
 
@@ -257,7 +255,7 @@ def si_sizes(
     campaign : Campaign
         Says what a channel measures.
     """
-    found = []
+    found: dict[str, None] = {}
     for item in intervals:
         primitive = patch.primitives[item.primitive]
         unit = definite_unit(item.unit, primitive, model, campaign)
@@ -266,12 +264,8 @@ def si_sizes(
         known = isfinite(item.low) and isfinite(item.high) and item.low < item.high
         show = rounded(item.value, 0.5 * (item.high - item.low) if known else 0.0)
         between = f" ({show(item.low)} to {show(item.high)})" if known else ""
-        words = _words(item.parameter, primitive, unit)
-        text = (
-            f"{words} {show(item.value)} {unit}{between}{_where(primitive, item.parameter, model, campaign)}"
-        )
-        if text not in found:
-            found.append(text)
+        words, where = _words(item.parameter, primitive, unit), _where(primitive, item, model, campaign)
+        found[f"{words} {show(item.value)} {unit}{between}{where}"] = None
     return ", ".join(found)
 
 
@@ -284,11 +278,9 @@ def size_sentence(
     model, campaign = investigation.model, investigation.campaign
     sizes = [si_sizes(e.patch, row, model, campaign) for e, row in zip(effects, intervals, strict=True)]
     named = investigation.verdict.kind in NAMING
-    parts = [
-        size if named and len(effects) == 1 else f"{effect.name}, {size}"
-        for effect, size in zip(effects, sizes, strict=True)
-        if size
-    ]
+    alone = named and len(effects) == 1
+    pairs = [(effect, size) for effect, size in zip(effects, sizes, strict=True) if size]
+    parts = [size if alone else f"{effect.name}, {size}" for effect, size in pairs]
     if not parts:
         return ""
     words = "In SI units" if named else "In SI units, were it the most probable member, which is not named"
@@ -305,18 +297,15 @@ def _words(parameter: str, primitive: Primitive, unit: str) -> str:
     return words.replace("force", "moment") if unit == "N m" else words  # at a port that turns
 
 
-def _where(primitive: Primitive, parameter: str, model: Model, campaign: Campaign) -> str:
+def _where(primitive: Primitive, item: PrimitiveInterval, model: Model, campaign: Campaign) -> str:
     """Return at which speed or displacement a force has its size, or where a mass sits."""
-    if primitive.kind == "point_mass" and parameter == "mass":
+    if primitive.kind == "point_mass" and item.parameter == "mass":
         return f" at {getattr(primitive, 'station'):.3g} m"  # noqa: B009
-    if parameter != "coefficient":
+    if item.parameter != "coefficient":
         return ""
     marks = []
-    for exponent, reference in (
-        ("velocity_exponent", "reference_velocity"),
-        ("displacement_exponent", "reference_displacement"),
-        ("exponent", "reference_displacement"),
-    ):
+    for exponent in ("velocity_exponent", "displacement_exponent", "exponent"):
+        reference = "reference_velocity" if exponent.startswith("velocity") else "reference_displacement"
         value = getattr(primitive, reference, None)
         if value is not None and getattr(primitive, exponent, 0.0) != 0.0:
             unit = definite_unit(PRIMITIVE_UNITS[primitive.kind][reference], primitive, model, campaign)

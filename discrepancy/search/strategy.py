@@ -365,7 +365,7 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
     usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
     usable = (*usable, *in_events(usable, problem.setting))
     found = Search(problem, usable, none, tell=tell)
-    if problem.model.has_law and found.force is not None and found.unexplained():
+    if len(problem.model.apart()[1]) and found.force is not None and found.unexplained():
         # a law of its own, as dry friction that ends a motion, has many optima
         again = attempt(problem, Candidate(), found.force.whole_point(found.force.whole))
         if again is not None and again.objective < none.objective - SEARCH.worth_fitting:

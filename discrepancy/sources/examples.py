@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from discrepancy.checks.model_check import prior_mean
 from discrepancy.errors import CampaignFileError, ModelError
 from discrepancy.models.interface import Conditions, Model
 from discrepancy.models.sensing import observe
+from discrepancy.sentences import said
 from fe.runtime.patch import ModelPatch
 
 ExampleKind = Literal["static", "ringdown", "flight", "laboratory", "complete"]
@@ -89,9 +90,7 @@ def plan_of(model: Model) -> ExamplePlan:
     if model.load_places is None:
         return wing_plan()
     if not model.load_places:
-        raise ModelError(
-            f"{model.name} has no force, and an example is made by forces: write a campaign of it."
-        )
+        raise ModelError(said("examples.no_force", model=model))
     outputs = tuple(name for name, quantity in model.quantities.items() if quantity.order == 0)
     return plan_for(model, outputs, model.load_places[0], model.largest_force)
 
@@ -126,9 +125,8 @@ def plan_for(
         if quantity is None:
             raise ModelError(f"{model.name} has no output {output!r}: an example cannot measure it.")
         channels[output] = Channel(output, quantity, output, None, 0.005)
-    bare = Campaign("", {}, (), None, {}, "")
-    scales = model.scales(bare)
-    bare = replace(bare, channels=channels)
+    bare = Campaign("", channels, (), None, {}, "")
+    scales = model.scales(replace(bare, channels={}))
     period = 2.0 * np.pi / scales.angular_frequency
     motion = min(0.02 * scales.length, largest_force / scales.tip_stiffness)
     force, plan = motion * scales.tip_stiffness, ExamplePlan(tuple(channels.values()), load_place=load_place)
@@ -178,9 +176,7 @@ def example_campaign(
         As `discrepancy.models.sensing.observe`.
     """
     if kind not in _KINDS:
-        raise CampaignFileError(
-            f"There is no example {kind!r}: the kinds are {', '.join(get_args(ExampleKind))}."
-        )
+        raise CampaignFileError(f"There is no example {kind!r}: the kinds are {', '.join(_KINDS)}.")
     plan = wing_plan() if plan is None else plan
     patch = ModelPatch() if patch is None else patch
     generator = np.random.default_rng(np.random.SeedSequence(seed))
@@ -188,18 +184,15 @@ def example_campaign(
     measured = {name for item in kinds for name in plan.names(item)}
     channels = {channel.name: channel for channel in plan.channels if channel.name in measured}
     gains = {
-        name: 1.0
-        + (channel.gain_deviation if np.isfinite(channel.gain_deviation) else 0.0) * generator.normal()
-        for name, channel in channels.items()
+        name: 1.0 + _known(channel.gain_deviation) * generator.normal() for name, channel in channels.items()
     }
-    recorded = channels
-    if TrialKind.RINGDOWN in kinds:
-        recorded = {
-            name: replace(channel, noise=_at_rest(channel, plan.interval, generator))
-            if name in plan.names(TrialKind.RINGDOWN)
-            else channel
-            for name, channel in channels.items()
-        }
+    recorded = dict(channels)
+    for name in plan.names(TrialKind.RINGDOWN) if TrialKind.RINGDOWN in kinds else ():
+        channel = channels[name]
+        if channel.noise is not None:
+            samples = channel.noise.standard_deviation * generator.normal(size=_AT_REST_SAMPLES)
+            noise = pre_trigger_record(samples, plan.interval, name, "the example")
+            recorded[name] = replace(channel, noise=noise)
     bare = Campaign(f"Example: {kind}", channels, (), 20.0, {}, "")
     trials = tuple(
         _measure(model, bare, trial, patch, gains, generator)
@@ -275,15 +268,11 @@ def _measure(
     values = observe(model, campaign, trial, patch, conditions).values.copy()
     for column, name in enumerate(trial.channels):
         channel = campaign.channels[name]
-        zero = channel.offset_deviation if np.isfinite(channel.offset_deviation) else 0.0
-        noise = channel.noise_in(trial)
-        values[:, column] = values[:, column] * gains[name] + zero * generator.normal()
-        values[:, column] += noise * generator.normal(size=len(values))
+        values[:, column] = values[:, column] * gains[name]
+        values[:, column] += _known(channel.offset_deviation) * generator.normal()
+        values[:, column] += channel.noise_in(trial) * generator.normal(size=len(values))
     return replace(trial, values=values)
 
 
-def _at_rest(channel: Channel, interval: float, generator: np.random.Generator) -> NoiseRecord | None:
-    if channel.noise is None:
-        return None
-    samples = channel.noise.standard_deviation * generator.normal(size=_AT_REST_SAMPLES)
-    return pre_trigger_record(samples, interval, channel.name, "the example")
+def _known(deviation: float) -> float:
+    return deviation if np.isfinite(deviation) else 0.0

@@ -3,6 +3,7 @@
 `docs/run_folder.md` describes the folder; it is read by its files alone.
 """
 
+from itertools import product
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,19 @@ from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.result.file import load_calibration
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import (
+    USUAL_REGIONS,
+    Campaign,
+    Channel,
+    NoiseRecord,
+    Quantity,
+    Trial,
+    TrialKind,
+)
 from discrepancy.campaign.sampling import FloatArray
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
 from discrepancy.models.structures import WingModel
+from discrepancy.sentences import said
 from fmu_asset.door.binding import load_binding
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch
@@ -82,10 +92,7 @@ def run_campaign(
         raise
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as cause:
         reason = str(cause.args[0] if cause.args else cause).rstrip(".")
-        raise CampaignFileError(
-            f"{folder / RUN_FILE} or the {CONFIG_FILE} beside it does not have the layout of a run of this "
-            f"version ({reason}): fly the run again."
-        ) from cause
+        raise CampaignFileError(said("runs.layout", file=folder / RUN_FILE, reason=reason)) from cause
 
 
 def _campaign(
@@ -99,35 +106,34 @@ def _campaign(
     observed, smoothed = (run[name].to_dataset().sel(step=since) for name in ("observed", "smoothed"))
     if not observed.sizes["step"]:
         ends = zip(("from {} on", "up to {}"), turns, strict=True)
-        wanted = [text.format(turn) for text, turn in ends if turn is not None]
+        wanted = ", ".join(text.format(turn) for text, turn in ends if turn is not None)
         steps = np.asarray(run["observed"]["step"].values).tolist()
         has = f"{steps[0]} to {steps[-1]}" if steps else "none"
-        raise CampaignDataError(f"{folder.name} has the turns {has}, and none {', '.join(wanted)}.")
+        raise CampaignDataError(f"{folder.name} has the turns {has}, and none {wanted}.")
     strain = np.asarray(observed[STRAIN].values, dtype=np.float64)
     used = np.isfinite(strain)
     if not used.any():
         raise CampaignDataError(f"No strain reached the twin in {folder}: there is nothing to compare.")
-    size, gauges = strain.shape
-    names = tuple(f"g{number}" for number in np.asarray(observed["sensor"].values).tolist())
-    mean = np.asarray(smoothed["mean"].values, dtype=np.float64)
-    deviation = np.asarray(smoothed["standard_deviation"].values, dtype=np.float64)
-    deviation = np.maximum(deviation, HEALTH_DEVIATION)
-    time = _step_size(folder) * (np.asarray(observed["step"].values, dtype=np.float64) + 1.0)
+    size = len(strain)
+    names = tuple(f"g{number}" for number in observed["sensor"].values.tolist())
     temperature, known = _temperature(run, since, size)
     noise, source = _noise(scenario)
     channels = {
         name: Channel(name, Quantity.STRAIN, f"strain[{name[1:]}]", NoiseRecord(noise, inf)) for name in names
     }
     whole = Trial.plain(
-        "turns", TrialKind.FLIGHT, names, time, values=np.where(used, strain, 0.0), used=used,
-        load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64), temperature=temperature,
-        run=str(run.attrs.get("scenario", "run")), health=mean, health_deviation=deviation,
+        "turns", TrialKind.FLIGHT, names, _step_size(folder) * (observed["step"].values + 1.0),
+        values=np.where(used, strain, 0.0), used=used, temperature=temperature,
+        load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64),
+        run=str(run.attrs.get("scenario", "run")), health=np.asarray(smoothed["mean"].values, dtype=float),
+        health_deviation=np.maximum(smoothed["standard_deviation"].values, HEALTH_DEVIATION),
     )  # fmt: skip
     held = held_out_turns(size, BLOCK, held_out_share)
     trials = [whole.rows(~held)]
     if held.any():
         trials.append(whole.rows(held, name="turns held out", held_out=True))
     lost = int(used.size - used.sum())
+    be = "was" if lost == 1 else "were"
     return Campaign(
         name=str(run.attrs.get("title", folder.name)),
         channels=channels,
@@ -139,7 +145,7 @@ def _campaign(
             f"Flight of {counted(size, 'turn')} read from a run folder; health in each turn: "
             f"belief with a deviation of {HEALTH_DEVIATION:g} or more.",
             f"Noise of a gauge: {1e6 * noise:.4g} microstrain, {source}.",
-            *([f"{lost} of {size * gauges} readings {'was' if lost == 1 else 'were'} lost."] if lost else []),
+            *([f"{lost} of {used.size} readings {be} lost."] if lost else []),
         ),
     )
 
@@ -164,10 +170,7 @@ def run_model(folder: Path | str) -> WingModel:
     elif (folder / DESIGN_FILE).is_file():
         model = WingModel.of_design(folder / DESIGN_FILE)
     else:
-        raise CampaignFileError(
-            f"{folder} holds no design (`{DESIGN_FILE}`): its twin believed no model of a wing that could be "
-            "patched."
-        )
+        raise CampaignFileError(said("runs.no_design", folder=folder, file=DESIGN_FILE))
     patch = patch_of_run(folder)
     if patch is not None:
         try:
@@ -205,16 +208,10 @@ def patch_of_run(folder: Path) -> Path | None:
 
 def held_out_turns(count: int, block: int, share: float) -> NDArray[np.bool_]:
     """Return which of `count` turns are held out (count,): whole blocks, evenly spread, never the first."""
-    held = np.zeros(count, dtype=bool)
     blocks = count // block
-    wanted = round(share * count / block)
-    if blocks < 2 or wanted < 1:
-        return held
-    for number in np.unique(
-        np.round(np.linspace(1, blocks - 1, min(wanted, blocks - 1) + 1)[:-1]).astype(int)
-    ).tolist():
-        held[number * block : (number + 1) * block] = True
-    return held
+    wanted = min(round(share * count / block), blocks - 1)
+    chosen = np.linspace(1, blocks - 1, max(wanted, 0) + 1)[:-1].round()
+    return np.isin(np.arange(count) // block, chosen)
 
 
 # ---------------------------------------------------------------- parts
@@ -222,20 +219,11 @@ def held_out_turns(count: int, block: int, share: float) -> NDArray[np.bool_]:
 
 def _refuse_others(folder: Path, scenario: dict[str, Any]) -> None:
     """Refuse the run of another asset than the wing, and one with a force beside the load factor."""
-    if scenario["observation"].get("role") != STRAIN or {item["name"] for item in scenario["state"]} != {
-        "z1",
-        "z2",
-    }:
-        raise CampaignFileError(
-            f"{folder} is the run of another asset than the wing: strains under the damage states z1 and z2 "
-            "are needed."
-        )
-    force = (scenario["asset"].get("load") or {}).get("tip_force", 0.0)
-    if force:
-        raise CampaignDataError(
-            f"A force of {force:g} N at the tip acts in all turns of {folder}; only flights without it can "
-            "be read."
-        )
+    states = {item["name"] for item in scenario["state"]}
+    if scenario["observation"].get("role") != STRAIN or states != {*USUAL_REGIONS}:
+        raise CampaignFileError(said("runs.no_wing", folder=folder))
+    if force := (scenario["asset"].get("load") or {}).get("tip_force", 0.0):
+        raise CampaignDataError(said("runs.force", force=force, folder=folder))
 
 
 def _config(folder: Path) -> dict[str, Any]:
@@ -254,11 +242,9 @@ def _run(folder: Path) -> xr.DataTree:
         run = read_groups(path)
     except DamagedFileError as cause:
         raise CampaignFileError(f"{cause}: it is not a whole run, resume the run or fly it again.") from cause
-    missing = {"observed", "smoothed", "calibration"} - {*run.children}
-    if missing:
-        raise CampaignFileError(
-            f"{path} lacks the groups {', '.join(sorted(missing))}: it is no run of a twin."
-        )
+    if missing := {"observed", "smoothed", "calibration"} - {*run.children}:
+        groups = ", ".join(sorted(missing))
+        raise CampaignFileError(f"{path} lacks the groups {groups}: it is no run of a twin.")
     for name in (STRAIN, "load_factor"):
         if name not in run["observed"]:
             raise CampaignFileError(f"{path} lacks the observed {name!r}: it is no run of a wing.")
@@ -276,13 +262,10 @@ def _step_size(folder: Path) -> float:
 
 def _temperature(run: xr.DataTree, since: slice, size: int) -> tuple[FloatArray, bool]:
     """Return temperatures less the reference [K], and whether they were recorded."""
-    for group in ("observed", "truth"):
-        if group not in run.children:
-            continue
-        for name in TEMPERATURE:
-            if name in run[group]:
-                values = np.asarray(run[group][name].sel(step=since).values, dtype=np.float64)
-                return values - (REFERENCE_TEMPERATURE if name == "temperature" else 0.0), True
+    for group, name in product(("observed", "truth"), TEMPERATURE):
+        if group in run.children and name in run[group]:
+            values = np.asarray(run[group][name].sel(step=since).values, dtype=np.float64)
+            return values - (REFERENCE_TEMPERATURE if name == "temperature" else 0.0), True
     return np.zeros(size), False
 
 

@@ -20,6 +20,7 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.campaign.sampling import FloatArray
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.errors import CampaignDataError, CampaignFileError
+from discrepancy.sentences import said
 from reporting.files import atomic_write_text
 from reporting.provenance import hash_record
 from reporting.table_file import table_text
@@ -82,9 +83,8 @@ def _numbers(file: Path, columns: Sequence[str], separator: str | None = ",", sk
     except ValueError:
         found = np.full((1, 1), np.nan)
     if found.ndim != 2 or len(found) < 8 or not np.all(np.isfinite(found)):
-        raise CampaignFileError(
-            f"{file} is not as it was published: it needs the columns {', '.join(columns)}."
-        )
+        wanted = ", ".join(columns)
+        raise CampaignFileError(f"{file} is not as it was published: it needs the columns {wanted}.")
     if columns[0] == "time" and np.min(np.diff(found[:, 0])) <= 0.0:
         raise CampaignFileError(f"{file} is not as it was published: its times must increase.")
     return np.asarray(found)
@@ -108,9 +108,7 @@ def _phone(data: Path) -> dict[str, str]:
     rest = _numbers(data / "at_rest.txt", ("time", "x", "y", "z"), None, 0)
     files = sorted(data.glob("fall_*.csv"), key=lambda path: path.stem.split("_")[1].zfill(9))
     if not files:
-        raise CampaignFileError(
-            f"There is no fall_NUMBER.csv in {data}: give the folder of the published records."
-        )
+        raise CampaignFileError(said("rigs.no_falls", data=data))
     falls = {file.name: table_text(dict(zip(("time", "z"), fall_of(file), strict=True))) for file in files}
     return {"noise.csv": table_text({"time": np.round(rest[:, 0], 9), "z": rest[:, 3]}), **falls}
 
@@ -218,49 +216,39 @@ def wing_campaign(
     data = Path(data)
     try:
         records = read_records(data)
-        pairs = read_measurements(data) if _has_pairs(data) else None
+        loaded = any((data / above / "step2").is_dir() for above in (".", "datafiles", "src/datafiles"))
+        pairs = read_measurements(data) if loaded else None
     except CalibrationError as cause:
         raise CampaignFileError(f"The measurements of the wing cannot be read: {cause}") from cause
     if any(len(record.time) != len(records[0].time) for record in records) or len(records) < 2:
-        raise CampaignDataError(
-            f"{data} must hold two or more ring-down records of one length; it holds {len(records)}."
-        )
+        raise CampaignDataError(said("rigs.records", data=data, count=len(records)))
     zero = _shared_zero(records) if detrended else np.zeros(records[0].count)
     windows = [_windowed(record, zero, begin, columns) for record in records]
-    scatter = trial_scatter(windows)
+    scatter, interval = trial_scatter(windows), float(windows[0][0][1])
     spread = float(np.std(scatter, ddof=1))
-    noise = pre_trigger_record(
-        scatter * np.hypot(1.0, READING_ERROR / spread), _interval(windows), SIGNAL, str(data)
-    )
+    noise = pre_trigger_record(scatter * np.hypot(1.0, READING_ERROR / spread), interval, SIGNAL, str(data))
     channels = {SIGNAL: Channel(SIGNAL, Quantity.SIGNAL, ROOT_GAUGE, noise, inf, inf)}
     trials: list[Trial] = []
     if pairs is not None:
-        displacement_deviation = np.hypot(
-            pairs.displacement_standard_deviation,
-            pairs.load_standard_deviation * float(np.median(pairs.displacement / pairs.load)),
-        )
-        at_tip = NoiseRecord(float(displacement_deviation), inf)
+        by_load = pairs.load_standard_deviation * float(np.median(pairs.displacement / pairs.load))
+        at_tip = NoiseRecord(float(np.hypot(pairs.displacement_standard_deviation, by_load)), inf)
         channels[TIP] = Channel(TIP, Quantity.DISPLACEMENT, "load_point_displacement", at_tip)
         trials += _loading_runs(pairs)
+    release = Release(RELEASE, 1.0, at_rest=False, mode_count=MODE_COUNT)
     for number, (time, signal) in enumerate(windows, start=1):
-        trials.append(
-            Trial.plain(
-                f"release {number}", TrialKind.RINGDOWN, (SIGNAL,), time, values=signal[:, None],
-                release=Release(RELEASE, 1.0, at_rest=False, mode_count=MODE_COUNT),
-                held_out=number in HELD_OUT,
-            )
-        )  # fmt: skip
+        given = {"values": signal[:, None], "release": release, "held_out": number in HELD_OUT}
+        trials.append(Trial.plain(f"release {number}", TrialKind.RINGDOWN, (SIGNAL,), time, **given))
     return Campaign(
         "The real wing of Kapteyn et al. 2021",
         channels,
         tuple(trials),
         None,
         PARAMETERS,
-        hash_record([[*trial.values.ravel().tolist()] for trial in trials]),
+        hash_record([trial.values.ravel().tolist() for trial in trials]),
         (
             f"Ring-downs: {records[0].source} to {records[-1].source}, from {begin:g} s after the "
             f"release; {counted(columns, 'column')} of the plot averaged into a sample of "
-            f"{1e3 * _interval(windows):.3g} ms.",
+            f"{1e3 * interval:.3g} ms.",
             f"Noise of the signal: scatter between the trials, {1e6 * spread:.3g} microvolt, and "
             f"the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
         ),
@@ -314,35 +302,18 @@ def _windowed(
     inside = np.flatnonzero(known & (record.time >= begin))
     count = len(inside) // columns
     if count < 60:
-        raise CampaignDataError(
-            f"{record.source}: {counted(count, 'sample')} {be(count)} left after {begin:g} s; 60 are needed."
-        )
+        left = f"{counted(count, 'sample')} {be(count)} left"
+        raise CampaignDataError(f"{record.source}: {left} after {begin:g} s; 60 are needed.")
     kept = inside[: count * columns].reshape(count, columns)
     time = record.time[kept].mean(axis=1)
     interval = float(time[-1] - time[0]) / (count - 1)
-    return np.asarray(interval * np.arange(count), dtype=np.float64), np.asarray(
-        (record.signal - zero)[kept].mean(axis=1)
-    )
-
-
-def _interval(windows: list[tuple[FloatArray, FloatArray]]) -> float:
-    return float(windows[0][0][1])
-
-
-def _has_pairs(data: Path) -> bool:
-    return any(
-        (data / above / "step2").is_dir() for above in (Path(), Path("datafiles"), Path("src") / "datafiles")
-    )
+    return interval * np.arange(float(count)), np.asarray((record.signal - zero)[kept].mean(axis=1))
 
 
 def _loading_runs(pairs: LoadDisplacementData) -> list[Trial]:
     trials = []
     for number in np.unique(pairs.run).tolist():
-        rows = pairs.run == number
-        trials.append(
-            Trial.plain(
-                f"loading run {number + 1}", TrialKind.STATIC, (TIP,), np.zeros(rows.sum()),
-                values=pairs.displacement[rows][:, None], force=pairs.load[rows], run=f"run {number + 1}",
-            )
-        )  # fmt: skip
+        rows, run = pairs.run == number, f"run {number + 1}"
+        given = {"values": pairs.displacement[rows][:, None], "force": pairs.load[rows], "run": run}
+        trials.append(Trial.plain(f"loading {run}", TrialKind.STATIC, (TIP,), np.zeros(rows.sum()), **given))
     return trials

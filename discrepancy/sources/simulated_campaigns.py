@@ -11,7 +11,7 @@ from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, Point, Term
-from discrepancy.fits.fitting import CandidateFit, fit
+from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
 from discrepancy.judgement.separability import DETECTED, as_predicted
@@ -50,12 +50,9 @@ class Simulator:
         problem = Problem(campaign, model, self.setting)
         self.fitted = fit(problem, Candidate(), problem.start(Candidate()))
         self.problem = problem.with_trials(campaign.trials)
-        everywhere = fit(self.problem, Candidate(), self._start(self.fitted), local_only=True, evidence=False)
-        self.found = everywhere.point
-
-    def _start(self, fitted: CandidateFit) -> Point:
         zeros = tuple(np.zeros(data.unknowns.size) for data in self.problem.trials)
-        return Point(fitted.point.shared, zeros, fitted.point.effect)
+        start = replace(self.fitted.point, local=zeros)
+        self.found = fit(self.problem, Candidate(), start, local_only=True, evidence=False).point
 
     def screen(self) -> Screen:
         """Return what measures d^2 of an effect under this campaign, on the predicted data."""
@@ -96,20 +93,15 @@ class Simulator:
             free = data.trial.release is not None and not data.trial.release.at_rest
             local = _drawn(self.found.local[number], data.unknowns.precision, generator)
             if free:
-                at = data.unknowns.zeros
-                local[at : at + data.unknowns.initials] = self.found.local[number][
-                    at : at + data.unknowns.initials
-                ]
+                initials = slice(data.unknowns.zeros, data.unknowns.zeros + data.unknowns.initials)
+                local[initials] = self.found.local[number][initials]
             acts = data.trial.kind in candidate.acts_on
             response, _ = problem.response(number, shared, local, patch if acts else nothing, REFINEMENT)
             point = Point(shared, (*self.found.local[:number], local), np.empty(0))
             values = problem.prediction(number, point, response).copy()
             for column, name in enumerate(data.trial.channels):
-                values[:, column] += (
-                    channels[name]
-                    * data.trial.noise_factor
-                    * _noise(data.noise[column], data.trial, generator)
-                )
+                noise = _noise(data.noise[column], data.trial, generator)
+                values[:, column] += channels[name] * data.trial.noise_factor * noise
             trials.append(replace(data.trial, values=values))
         return replace(self.campaign, name=f"{self.campaign.name} (simulated)", trials=tuple(trials))
 

@@ -21,7 +21,6 @@ from fe.wing.design import load_design
 from fe.wing.operators import AffineOperators, assemble
 from reporting import terminal
 from twin_master.command import guarded
-from uav_twin.options import Design
 from uav_twin.wing import Check, end_with, print_checks
 
 # R. H. MacNeal and R. L. Harder (1985), table 3, HEX20: in plane and out of plane.
@@ -29,7 +28,7 @@ MACNEAL_HARDER = {"regular": (0.970, 0.961), "trapezoid": (0.886, 0.920), "paral
 
 
 def check(
-    design: Design = None,
+    design: Annotated[Path | None, typer.Option(help="Wing design; the shipped one by default.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="A quarter of a period of ring-down.")] = False,
 ) -> None:
     """Check the elements against known answers, and a ring-down against CalculiX."""

@@ -186,8 +186,7 @@ class PatchedState:
         Rows of the strains across the gauges, and of shear.
     """
 
-    holding = HOLDING
-    on_modes = ON_MODES
+    holding, mode_count, on_modes = HOLDING, MODE_COUNT, ON_MODES
 
     def __init__(self, wing: PatchedWing, stiffness: FloatArray, mass: FloatArray, patch: ModelPatch) -> None:
         self._arrays = arrays = wing.arrays

@@ -106,15 +106,23 @@ class ReducedState:
 
     def __init__(self, model: "ReducedModel", vector: FloatArray) -> None:
         self.modes = modes = model.modes(vector)
-        self.acting = model.load_coefficients
+        self.acting, self.mode_count = model.load_coefficients, model.mode_count
         self.loads, self.outputs, self.accelerations = model.rows
-        stiffness = dense_sum(model.stiffness_coefficients(vector), model.static_stiffness)
+        theta = model.stiffness_coefficients(vector)
         cross = dense_sum(model.mass_coefficients(vector), model.cross_mass)
-        size, (moving, count) = len(model.static_load.T), modes.shape.shape
-        self.shapes = np.concatenate((modes.shape, np.zeros((size, count))))
-        answers = solve(stiffness, model.static_load.T)
-        self.answers = np.concatenate((np.zeros((moving, answers.shape[1])), answers))
-        self.to_modes = modes.shape.T @ np.concatenate((modes.mass, cross), axis=1)
+        size, moving = len(model.static_load.T), len(modes.shape)
+        self.shapes = np.pad(modes.shape, ((0, size), (0, 0)))
+        self._static = dense_sum(theta, model.static_stiffness)
+        self.answers = self.static(self.loads)
+        self.mass = np.pad(modes.mass, (0, size))
+        self.mass[:moving, moving:], self.mass[moving:, :moving] = cross, cross.T
+        self.stiffness = np.pad(dense_sum(theta, model.modal_stiffness), (0, size))
+        self.to_modes = self.shapes.T @ self.mass
+
+    def static(self, loads: FloatArray) -> FloatArray:
+        """Return the displacements K^-1 f of loads (Nm + N,) or (Nm + N, k), in the static basis."""
+        moving = len(self.loads) - len(self._static)
+        return np.concatenate((np.zeros_like(loads[:moving]), solve(self._static, loads[moving:])))
 
 
 @dataclass(frozen=True, repr=False)

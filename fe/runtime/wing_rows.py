@@ -92,7 +92,7 @@ OVERHANG = 0.15
 """How far beyond the tip a place may lie, as a share of the semi-span."""
 PORTS = ("root", "tip", "span")
 """Ports where internal forces act on the motion of one place, or of the mean."""
-_STRAIN = re.compile(r"strain\[(\d+)\]")
+_STRAIN = re.compile(r"strain\[(\d+)\](\.transverse|\.shear)?")
 _NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
 _DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
 
@@ -102,7 +102,7 @@ EMPTY = primitives.ModelPatch()
 
 
 def strain_gauge(output: str) -> int:
-    """Return the row k - 1 of an output strain[k], k from 1; -1 for other outputs."""
+    """Return the row k - 1 of an output strain[k] and the like, k from 1; -1 for other outputs."""
     strain = _STRAIN.fullmatch(output)
     return -1 if strain is None else int(strain.group(1)) - 1
 
@@ -261,27 +261,26 @@ class WingRows:
         """Rows (s, n) of the load point and of `PORTS`, whose static shapes a motion holds."""
         return np.vstack((self.arrays.load_tip, *(self.port_rows[name] for name in PORTS)))
 
-    def output_row(self, name: str, component: int = 0) -> FloatArray | None:
+    def output_row(self, name: str) -> FloatArray | None:
         """Return the row (n,) of an output, None if there is no such output.
 
         Parameters
         ----------
         name : str
-            strain[k] (gauges count from 1, as in the FMU), tip_displacement, load_point_displacement,
-            displacement[y, x].
-        component : int
-            Of a strain: 0 along the span, 1 across, 2 engineering shear strain; zero for displacements.
+            strain[k] (gauges count from 1, as in the FMU), strain[k].transverse across it, strain[k].shear
+            (engineering strain), tip_displacement, load_point_displacement, displacement[y, x].
         """
-        gauge, strains = strain_gauge(name), self.arrays.strain_rows[component]
-        if gauge >= 0:
-            return strains[gauge] if gauge < len(strains) else None
+        strain = _STRAIN.fullmatch(name)
+        if strain is not None:
+            strains = self.arrays.strain_rows[(None, ".transverse", ".shear").index(strain[2])]
+            return strains[int(strain[1]) - 1] if 0 < int(strain[1]) <= len(strains) else None
         row = {"tip_displacement": self.arrays.tip_row, "load_point_displacement": self.arrays.load_tip}.get(
             name
         )
         place = _DISPLACEMENT.fullmatch(name)
         if place is not None and 0.0 <= float(place.group(1)) <= self.span:
             row = self.displacement_row(float(place.group(1)), float(place.group(2)))
-        return row if row is None or component == 0 else np.zeros_like(row)
+        return row
 
     @cached_property
     def _skin_share(self) -> FloatArray:

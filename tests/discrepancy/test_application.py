@@ -146,7 +146,7 @@ def test_there_and_back_from_python(kind, foreign_fmu, write_beam, tmp_path):
     elif kind == "structure":
         file = write_beam(tmp_path, {'set = "end", force': "point = [100, 10, 5], force"}, cells=2)
     choice = choose_model(None if kind == "wing" else file)
-    ports = choice.model.ports()
+    ports = choice.model.ports
     port = "tip" if "tip" in ports else ports[0]
     campaign = example(choice, "static", 3, tmp_path / "campaign", "cubic_stiffness", CUBIC, port)
     found = verdict_of(choice, campaign, named(*SPRING), tmp_path / "verdict")

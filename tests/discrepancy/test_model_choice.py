@@ -51,7 +51,7 @@ def test_a_structure_needs_no_cache(write_beam, tmp_path):
     file = write_beam(tmp_path, {'set = "end", force': "point = [100, 10, 5], force"}, cells=2)
     program = (
         "import sys; from discrepancy.model_choice import choose_model; "
-        "print(choose_model(sys.argv[1]).model.ports())"
+        "print(choose_model(sys.argv[1]).model.ports)"
     )
     found = subprocess.run(
         [sys.executable, "-c", program, str(file)],

@@ -26,6 +26,7 @@ from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
@@ -370,10 +371,7 @@ class WatchedSource:
     def __getattr__(self, name: str) -> NoReturn:
         if name.startswith("__"):
             raise AttributeError(name)
-        raise MissionInputError(
-            "this scenario has no `[asset]`: it is for a real one, whose observations `uav-twin watch` takes "
-            "in, and its `belief` must be a model of its own."
-        )
+        raise MissionInputError(said("assets.no_asset"))
 
 
 FLOWN_DESIGN_HASH = "flown_design"

@@ -14,6 +14,7 @@ from twin_master.assets.asset_source import keep_files, read_files
 from twin_master.assets.structure_source import MODEL_COPY, StructureBelief
 from twin_master.errors import MissionInputError
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 
 __all__ = ["with_candidates"]
 
@@ -84,9 +85,7 @@ def _joined(file: Path, candidates: str) -> MeshDesign:
     try:
         content = read_toml(file, InvalidDesignError)
     except InvalidDesignError as error:  # it could be read before
-        raise MissionInputError(
-            "--candidates needs the gauges of the structure file as tables [[gauge]], not in a list."
-        ) from error
+        raise MissionInputError(said("assets.candidates")) from error
     design = parse_structure(content, f"--candidates {candidates}")
     assert isinstance(design, MeshDesign)
     return design

@@ -39,6 +39,7 @@ from twin_master.scenario.asset import AssetSection
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Flag, Name, Number, Positive
 from twin_master.seeds import generator
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from fmu_asset.coupling.asset import CoupledAsset
@@ -265,10 +266,7 @@ class FmuSource(AssetSource):
             own = [f"{name} = {mean:.6g}" for name, mean in means.items() if name not in section.parameters]
             if not own:
                 raise
-            raise MissionInputError(
-                f"{error} The calibration has {', '.join(own)}: give one of what is flown, or name the "
-                "parameter in `asset.parameters`."
-            ) from error
+            raise MissionInputError(said("assets.calibrated", error=error, own=", ".join(own))) from error
         self._observed(binding)
         self._inner_roles(binding)
 
@@ -312,12 +310,11 @@ class FmuSource(AssetSource):
         """Return where a role stands among the observations of the binding, in the units of the scenario."""
         role = role or self._scenario.observation.role
         chosen = self._slice(binding, role)
-        bound, said = binding.observation[role].units, self._scenario.observation.sensor_units
-        for number, (there, here) in enumerate(zip(bound, said, strict=True), 1):
+        bound, given = binding.observation[role].units, self._scenario.observation.sensor_units
+        for number, (there, here) in enumerate(zip(bound, given, strict=True), 1):
             if there != here != "1":
                 raise MissionInputError(
-                    f"the binding {binding.name} gives value {number} of `{role}` in {there}, and "
-                    f"`observation.unit` of the scenario says {here}: write the same unit in both."
+                    said("assets.unit", name=binding.name, number=number, role=role, there=there, here=here)
                 )
         return chosen
 
@@ -326,8 +323,13 @@ class FmuSource(AssetSource):
         chosen = binding.observation_slice(role)
         if chosen.stop - chosen.start != expected:
             raise MissionInputError(
-                f"the binding {binding.name} observes {chosen.stop - chosen.start} values of `{role}`, and "
-                f"the scenario expects {expected}."
+                said(
+                    "assets.width",
+                    name=binding.name,
+                    count=chosen.stop - chosen.start,
+                    role=role,
+                    expected=expected,
+                )
             )
         return chosen
 
@@ -343,10 +345,7 @@ class FmuSource(AssetSource):
         if truth.kind != "asset":
             return None
         if isinstance(self._scenario.belief, AssetBelief):
-            raise MissionInputError(
-                "an asset that carries its own damage cannot be asked what the twin should expect of each "
-                "state: name a model for the twin in the table `belief`."
-            )
+            raise MissionInputError(said("assets.own_damage"))
         rows = [("monitor", truth.state.values(), binding.monitor)]
         check_names("`truth.state` names the", f"the binding {binding.name}", rows)
         return InnerRoles(

@@ -30,6 +30,7 @@ from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpa
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.asset import BeliefSection
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -125,8 +126,7 @@ class ObservationLibrary:
         """
         if set(names) != set(self.states.names):
             raise InvalidObservationLibraryError(
-                f"the observation library has the states {', '.join(self.states.names)}, and the scenario "
-                f"asks for {', '.join(names)}: sample one for this scenario."
+                said("assets.states", own=", ".join(self.states.names), names=", ".join(names))
             )
         wanted = coordinates[:, [names.index(name) for name in self.states.names]]
         for factor, asked in zip(self.states.factors, wanted.T, strict=True):
@@ -134,8 +134,7 @@ class ObservationLibrary:
             for level in np.unique(asked):
                 if _place(levels[:, None], level) is None:
                     raise InvalidObservationLibraryError(
-                        f"the observation library has the levels {_listed(levels)} of {factor.name}, and the "
-                        f"scenario asks for {level:g}: sample one for this scenario."
+                        said("assets.levels", levels=_listed(levels), name=factor.name, level=level)
                     )
         return [_place(self.states.coordinates, state) or 0 for state in wanted]
 
@@ -149,15 +148,13 @@ class ObservationLibrary:
         """
         if set(values) != set(self.control_values):
             raise InvalidObservationLibraryError(
-                f"the observation library has the control inputs {', '.join(self.control_values)}, and the "
-                f"scenario sets {', '.join(values)}: sample one for this scenario."
+                said("assets.inputs", own=", ".join(self.control_values), values=", ".join(values))
             )
         known = np.column_stack([self.control_values[key] for key in values])
         if (place := _place(known, np.array([*values.values()]))) is None:
             shown = ", ".join(f"{key} = {value:g}" for key, value in values.items())
             raise InvalidObservationLibraryError(
-                f"the observation library was not sampled at {shown}, the control {name} of the scenario; it "
-                f"has {', '.join(self.controls)}: sample one for this scenario."
+                said("assets.control", shown=shown, name=name, known=", ".join(self.controls))
             )
         return place
 
@@ -173,17 +170,21 @@ class ObservationLibrary:
             return self.values
         if name != self.parameter:
             raise InvalidObservationLibraryError(
-                f"the observation library was sampled over the parameter {self.parameter or 'none'}, and the "
-                f"scenario calibrates {name}: sample one for this scenario."
+                said("assets.parameter", own=self.parameter or "none", name=name)
             )
         order = np.argsort(self.draws, kind="stable")
         nodes = self.draws[order]
         slack = _SAME * max(1.0, float(np.abs(nodes).max()))
         if draws.min() < nodes[0] - slack or draws.max() > nodes[-1] + slack:
             raise InvalidObservationLibraryError(
-                f"the draws of {name} reach from {draws.min():.6g} to {draws.max():.6g}, and the observation "
-                f"library from {nodes[0]:.6g} to {nodes[-1]:.6g}: sample one for this scenario and seed, or "
-                f"over a wider range with --grid parameter.{name}=..."
+                said(
+                    "assets.draws",
+                    name=name,
+                    least=draws.min(),
+                    most=draws.max(),
+                    low=nodes[0],
+                    high=nodes[-1],
+                )
             )
         share = np.array([np.interp(draws, nodes, own) for own in np.eye(len(nodes))])
         return np.tensordot(share.T, self.values[order], axes=1)
@@ -219,28 +220,20 @@ def load_observation_library(path: Path) -> ObservationLibrary:
         There is no whole library; the sentence says what is wrong.
     """
     if not path.is_file():
-        raise InvalidObservationLibraryError(
-            f"there is no observation library {path}: make it with `uav-twin library sample`."
-        )
+        raise InvalidObservationLibraryError(said("assets.no_library", path=path))
     from reporting.netcdf import read_groups  # which loads xarray
 
     try:
         dataset = read_groups(path).to_dataset()
     except DamagedFileError as error:
-        raise InvalidObservationLibraryError(
-            f"{path} is not a whole NetCDF file: sample the library again."
-        ) from error
+        raise InvalidObservationLibraryError(said("assets.not_whole", path=path)) from error
     if dataset.attrs.get("kind") != KIND or dataset.attrs.get("format") != FORMAT:
-        raise InvalidObservationLibraryError(
-            f"{path} is no observation library of this version (format {FORMAT}): sample it again."
-        )
+        raise InvalidObservationLibraryError(said("assets.format", path=path, format=FORMAT))
     try:
         return ObservationLibrary(dataset)
     except (KeyError, ValueError, TypeError, InvalidModelError) as error:
         reason = error.args[0] if error.args else error
-        raise InvalidObservationLibraryError(
-            f"{path} does not have the layout of an observation library ({reason}): sample it again."
-        ) from error
+        raise InvalidObservationLibraryError(said("assets.layout", path=path, reason=reason)) from error
 
 
 def _listed(values: Float) -> str:
@@ -266,10 +259,7 @@ class LibraryBelief(BeliefSection):
             What flies is no FMU.
         """
         if not isinstance(scenario.asset, FmuSection):
-            raise MissionInputError(
-                "an observation library was sampled from an FMU, and the kind of the asset is "
-                f"`{scenario.asset.kind}`: set `belief.kind` to `asset` or `design`."
-            )
+            raise MissionInputError(said("assets.not_sampled", kind=scenario.asset.kind))
         model: AssetSource = flown
         if self.design is not None:
             model = DesignSource(scenario, section=DesignBelief(design=self.design))
@@ -330,9 +320,13 @@ class LibrarySource(AssetSource):
         ):
             if has != wanted:
                 raise InvalidObservationLibraryError(
-                    f"the observation library {self.path(OBSERVATIONS_COPY).name} {what} "
-                    f"{', '.join(has) or 'none'}, and the scenario with its binding asks for "
-                    f"{', '.join(wanted) or 'none'}: sample one for this scenario."
+                    said(
+                        "assets.differs",
+                        name=self.path(OBSERVATIONS_COPY).name,
+                        what=what,
+                        has=", ".join(has) or "none",
+                        wanted=", ".join(wanted) or "none",
+                    )
                 )
         if not library.parameter or library.parameter == scenario.calibration.parameter:
             self._places(library, build_graphical_model(scenario))

@@ -12,6 +12,7 @@ from reporting.arrays import Float
 from twin_master.errors import MissingObservationModelError, MissionInputError, check_names
 from twin_master.scenario.schema import Calibration
 from twin_master.seeds import generator, seed_sequence
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration as Calibrated
@@ -99,10 +100,7 @@ def draw_parameter(
         values = mean + deviation * ndtri(stratified(random, count))
         return ParameterDraws(name, values, mean, deviation, "normal distribution of the scenario")
     if calibration.curve == "design" and model is None:
-        raise MissingObservationModelError(
-            "`calibration.curve` asks for the stiffness curve of a design, and the asset has none: "
-            "let the twin believe a `design`, or set `calibration.curve` to `published`."
-        )
+        raise MissingObservationModelError(said("assets.curve"))
     return _draws_of_load_test(calibration, seed, model if calibration.curve == "design" else None)
 
 
@@ -212,15 +210,27 @@ def check_calibration(
     check_names(f"the calibration of {found.asset} has the", where, rows, advice=advice)
     if design_hash and found.design_hash not in ("", design_hash):
         raise MissionInputError(
-            f"the calibration of {found.asset} is of the model {found.model} with the design "
-            f"{found.design_hash[:12]}, and {where}, which the twin believes, has the design "
-            f"{design_hash[:12]}: calibrate what is believed, or let the twin believe what was calibrated."
+            said(
+                "assets.another_design",
+                asset=found.asset,
+                model=found.model,
+                own=found.design_hash[:12],
+                where=where,
+                believed=design_hash[:12],
+            )
         )
     for name, (low, high) in ranges.items():
         if name in names and not low <= found.mean(name) <= high:
             raise MissionInputError(
-                f"the calibration of {found.asset} has {name} = {found.mean(name):.6g}, but {where} holds "
-                f"from {low:g} to {high:g} of it: give one of that, or widen the range if its file has one."
+                said(
+                    "assets.range",
+                    asset=found.asset,
+                    name=name,
+                    value=found.mean(name),
+                    where=where,
+                    low=low,
+                    high=high,
+                )
             )
 
 

@@ -18,6 +18,7 @@ from twin_master.scenario.asset import FileSection
 from twin_master.scenario.observation import ModesSection
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import seed_sequence
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from fe.runtime.patch_arrays import PatchArrays
@@ -296,7 +297,5 @@ def check_model_patch(patch: "PatchFile", gauge_count: int, where: str = "The pa
             drifts = isinstance(item, SensorDrift) and item.exponent != 0.0
             if drifts or (isinstance(item, PortForce) and item.hysteretic):
                 raise MissionInputError(
-                    f"the effect {effect.id!r} depends on {'time' if drifts else 'the loads before'}, and "
-                    "the twin predicts the readings of each state and control once for the whole mission: "
-                    "leave it out of `belief.patch`."
+                    said("assets.remembers", id=effect.id, what="time" if drifts else "the loads before")
                 )

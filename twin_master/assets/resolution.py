@@ -18,6 +18,7 @@ from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, AssetSection
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import NotNegative, Number, PerSensor, Probability, Section
+from twin_master.sentences import said
 
 
 @dataclass(frozen=True)
@@ -72,9 +73,7 @@ def given_overrides(given: Overrides | Mapping[str, Any] | None) -> Overrides:
     values = dict(given or {})
     known = {item.name: str(item.type) for item in fields(Overrides)}
     if unknown := [key for key in values if key not in known]:
-        raise MissionInputError(
-            f"what differs from the scenario must be among {', '.join(known)}, and {', '.join(unknown)} came."
-        )
+        raise MissionInputError(said("assets.overrides", known=", ".join(known), names=", ".join(unknown)))
     for key, value in values.items():
         if "Path" in known[key] and value is not None:
             values[key] = Path(value)
@@ -105,10 +104,7 @@ def resolve_scenario(loaded: LoadedScenario, overrides: Overrides) -> Scenario:
     if file and not is_of_parameters(file):
         _tailor(table)
     elif any(part.get("design") == CALIBRATED_DESIGN_NAME for part in _wings(table)):
-        raise MissionInputError(
-            "the design of a calibration is asked for, and there is no calibration file: give --calibration, "
-            'or `source = "file"` in the table `calibration`.'
-        )
+        raise MissionInputError(said("assets.no_calibration"))
     if overrides.learnt:
         apply_learnt(table, overrides.learnt, overrides.learnt_group)
     if overrides.seed is not None:
@@ -125,9 +121,7 @@ def _check_overrides(overrides: Overrides, kind: str) -> None:
     if overrides.ssp and (overrides.strain_library or overrides.fmu):
         raise MissionInputError("an SSP file is flown as it is: give neither --fmu nor --strain-library.")
     if overrides.fmu and kind in ("coupled", "ssp"):
-        raise MissionInputError(
-            "--fmu flies one FMU, and the scenario couples several: change its components."
-        )
+        raise MissionInputError(said("assets.several"))
 
 
 def _change_asset(table: dict[str, Any], overrides: Overrides) -> None:
@@ -150,10 +144,7 @@ def _change_asset(table: dict[str, Any], overrides: Overrides) -> None:
 
 def _change_kind(table: dict[str, Any], kind: str, file: Path) -> None:
     if table["asset"].get("patch"):
-        raise MissionInputError(
-            "`asset.patch` goes into the FMU that is packed of a design, and another asset is flown: leave "
-            "it out."
-        )
+        raise MissionInputError(said("assets.patch"))
     known = AssetSection.kinds()[kind].model_fields
     kept = {key: value for key, value in table["asset"].items() if key in known and value != ""}
     table["asset"] = kept | {"kind": kind, "file": str(file.resolve())}
@@ -168,9 +159,7 @@ def _tailor(table: dict[str, Any]) -> None:
     """Put the wing of the calibration file in the place of the designs that it describes."""
     asset, belief = table["asset"], table["belief"]
     if asset["kind"] == "strain_library" and belief["kind"] == "asset":
-        raise MissionInputError(
-            "a strain library brings its own samples of its parameter: fly it without a calibration file."
-        )
+        raise MissionInputError(said("assets.own_samples"))
     believed = belief.get("design")
     for part in _wings(table):
         if part.get("design") and (part is asset or part["design"] == believed):
@@ -279,9 +268,13 @@ def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) ->
             "kind"
         ] != "independent_worsening":
             raise MissionInputError(
-                f"{path} has probabilities for {', '.join(learnt.transition.probability)}, and the scenario "
-                f"has the controls {', '.join(sorted(names))} and transitions of the kind "
-                f"{table['transition']['kind']}."
+                said(
+                    "assets.learnt_controls",
+                    path=path,
+                    learnt=", ".join(learnt.transition.probability),
+                    names=", ".join(sorted(names)),
+                    kind=table["transition"]["kind"],
+                )
             )
         table["transition"]["probability"] = dict(learnt.transition.probability)
     if learnt.observation is not None:
@@ -290,8 +283,12 @@ def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) ->
         given: Mapping[str, Any] = table["calibration"]
         if learnt.calibration.parameter != given["parameter"]:
             raise MissionInputError(
-                f"{path} has learnt {learnt.calibration.parameter}, and the parameter of the scenario is "
-                f"{given['parameter']}."
+                said(
+                    "assets.learnt_parameter",
+                    path=path,
+                    learnt=learnt.calibration.parameter,
+                    parameter=given["parameter"],
+                )
             )
         kept = {key: given[key] for key in ("parameter", "draws")}
         table["calibration"] = {

@@ -28,6 +28,7 @@ from twin_master.errors import (
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
 from twin_master.scenario.asset import AssetSection, BeliefSection
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 
 FILE_NAME = "UAVconfig.json"
 """Name of the file in the authors' repository UAV-Digital-Twin."""
@@ -96,7 +97,7 @@ class StrainLibrary:
         for name, known, value in zip(self.states.names, levels, stiffness_loss, strict=True):
             if not known[0] <= value <= known[-1]:
                 raise InvalidStrainLibraryError(
-                    f"the strain library covers {name} from {known[0]:g} to {known[-1]:g}, got {value:g}"
+                    said("assets.covers", name=name, low=known[0], high=known[-1], value=value)
                 )
         grid = self.strain[:, control_index].reshape(*self.states.shape, -1)
         return np.asarray(interpn(levels, grid, np.array(stiffness_loss))[0])
@@ -123,20 +124,16 @@ def load_strain_library(path: str | Path) -> StrainLibrary:
         return _arranged(content)
     except KeyError as error:
         raise InvalidStrainLibraryError(
-            f"the strain library {file} lacks the entry {error}; is it the file {FILE_NAME} as published?"
+            said("assets.lacks", file=file, error=error, file_name=FILE_NAME)
         ) from error
     except (TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InvalidStrainLibraryError(
-            f"the strain library {file} is not in the published format: {error}"
-        ) from error
+        raise InvalidStrainLibraryError(said("assets.unread", file=file, error=error)) from error
 
 
 def _arranged(content: Mapping[str, Any]) -> StrainLibrary:
     levels = content["states"]
     if len(levels) != len(REGION_NAMES):
-        raise ValueError(
-            f"expected the levels of {len(REGION_NAMES)} regions under 'states', got {len(levels)}"
-        )
+        raise ValueError(said("assets.regions", regions=len(REGION_NAMES), came=len(levels)))
     controls = tuple(str(control) for control in content["controls"])
     observations = content["observations"]
     first = observations[str(levels[0][0])][str(levels[1][0])][controls[0]]
@@ -187,10 +184,7 @@ class StrainLibrarySection(AssetSection):
         """
         if self.file is None:
             raise MissionInputError(
-                f"the scenario {scenario.mission.name} flies the strain library of the paper's authors, "
-                f"which does not come with this program: clone their public repository UAV-Digital-Twin "
-                f"({REPOSITORY}) and name its file {FILE_NAME} by `--strain-library FILE`, or as "
-                f"`asset.file` in a copy of the scenario."
+                said("assets.authors", name=scenario.mission.name, repository=REPOSITORY, file_name=FILE_NAME)
             )
         return _read(scenario, Path(self.file), compared=self.differs_from(scenario.belief))
 
@@ -219,9 +213,7 @@ class StrainLibraryBelief(BeliefSection):
             The library is missing, damaged or does not fit the scenario.
         """
         if not scenario.asset.is_fmu:
-            raise MissionInputError(
-                "a strain library flies, and the twin is to believe one: set `belief.kind` to `asset`."
-            )
+            raise MissionInputError(said("assets.believed"))
         return _read(scenario, Path(self.file), compared=True)
 
 
@@ -241,9 +233,13 @@ class StrainLibrarySource(AssetSource):
         self._control_index = [library.controls.index(name) for name in scenario.control_names]
         if scenario.observation.count != library.gauge_count or scenario.state_names != library.states.names:
             raise MissingObservationModelError(
-                f"the strain library has {library.gauge_count} gauges and the states "
-                f"{', '.join(library.states.names)}, and the scenario asks for {scenario.observation.count} "
-                f"and {', '.join(scenario.state_names)}."
+                said(
+                    "assets.gauges",
+                    gauges=library.gauge_count,
+                    own=", ".join(library.states.names),
+                    count=scenario.observation.count,
+                    names=", ".join(scenario.state_names),
+                )
             )
 
     def _make(self, progress: Progress) -> dict[str, str]:
@@ -298,7 +294,6 @@ def _read(scenario: Scenario, path: Path, *, compared: bool) -> StrainLibrarySou
             continue
         if given is not None and abs(given - expected) > _TOLERANCE:
             raise MissingObservationModelError(
-                f"the strain library flies the control {control.name} at load factor {expected:g}, and the "
-                f"scenario gives the model of the design {given:g}: set `load_factor` to {expected:g}."
+                said("assets.load_factor", name=control.name, expected=expected, given=given)
             )
     return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)

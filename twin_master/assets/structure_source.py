@@ -32,6 +32,7 @@ from twin_master.errors import MissingObservationModelError, MissionInputError, 
 from twin_master.scenario.asset import BeliefSection, FileSection
 from twin_master.scenario.observation import ROLE
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
@@ -61,11 +62,7 @@ class StructureFiles(FileSection):
         design = load_structure(file)
         for inner in map(PurePosixPath, design.files):
             if inner.is_absolute() or ".." in inner.parts:
-                raise MissionInputError(
-                    f"the {design.what} {inner} of {file} does not lie beside it, and a run keeps copies of "
-                    f"both: move the {design.what} into the folder of the structure file, and name it without"
-                    " its folder."
-                )
+                raise MissionInputError(said("assets.beside", what=design.what, inner=inner, file=file))
             found[f"{PurePosixPath(copy).parent}/{inner}"] = file.parent / inner
         return found
 
@@ -92,10 +89,7 @@ class StructureSection(StructureFiles, FmuSection):
             There is none.
         """
         if not self.binding:
-            raise MissionInputError(
-                "the binding of the structure is needed as a file here: write it by `uav-twin structure fmu "
-                "FILE --binding NAME`, and name it as `asset.binding`."
-            )
+            raise MissionInputError(said("assets.binding"))
         return super().binding_path
 
     def source(self, scenario: Scenario) -> "StructureFmuSource":
@@ -203,9 +197,7 @@ class NamedStructure(AssetSource):
             return 0
         count, most = self._scenario.observation.count, StructureSettings.mode_count
         if count > most:
-            raise MissionInputError(
-                f"a structure tells its first {most} frequencies, and {count} are observed."
-            )
+            raise MissionInputError(said("assets.frequencies", most=most, count=count))
         return count
 
     def _check_observed(self) -> None:
@@ -230,20 +222,18 @@ class NamedStructure(AssetSource):
             most = StructureSettings.mode_count
             if max(modes.places) >= most:
                 raise MissingObservationModelError(
-                    f"a structure tells its first {most} modes, and mode {max(modes.places) + 1} is observed."
+                    said("assets.modes", most=most, number=max(modes.places) + 1)
                 )
         advice = f"give it in a table [[{table}]]"
         check_names("the scenario has the", where, [row], MissingObservationModelError, advice)
         if observation.count != known[role]:
             raise MissingObservationModelError(
-                f"{where} has {known[role]} sensors of `{role}`, and the scenario expects "
-                f"{observation.count}."
+                said("assets.sensors", where=where, has=known[role], role=role, count=observation.count)
             )
         titles, own = [*observation.titles], names.get(role, [])
         if titles != own and sorted(titles) == sorted(own):
             raise MissionInputError(
-                f"`observation.titles` are {', '.join(titles)}, and {where} has these sensors in the order "
-                f"{', '.join(own)}: give the titles in that order."
+                said("assets.titles", titles=", ".join(titles), where=where, own=", ".join(own))
             )
 
     def _check_parameter(self, *, believed: bool) -> None:
@@ -285,8 +275,15 @@ class NamedStructure(AssetSource):
             low, high = ranges.get(name, (value, value))
             if not low <= value <= high:
                 raise MissionInputError(
-                    f"the {what} is {value:g}, but {self.where} gives {name} the range {low:g} to {high:g}; "
-                    "give a value inside, or widen the range in its file."
+                    said(
+                        "assets.outside",
+                        what=what,
+                        value=value,
+                        where=self.where,
+                        name=name,
+                        low=low,
+                        high=high,
+                    )
                 )
 
 

@@ -29,6 +29,7 @@ from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import MissionInputError
 from twin_master.scenario.reading import LoadedScenario
+from twin_master.sentences import said
 
 
 def export_scenario(
@@ -61,10 +62,7 @@ def export_scenario(
     scenario = resolve_scenario(loaded, Overrides(seed=seed))
     source = scenario.asset.source(scenario)
     if not isinstance(source, FmuSource):
-        raise MissionInputError(
-            f"the scenario {scenario.mission.name} flies no FMU (its kind is `{scenario.asset.kind}`); only "
-            "FMUs can be exported."
-        )
+        raise MissionInputError(said("assets.no_fmu", name=scenario.mission.name, kind=scenario.asset.kind))
     source.check()
     with scratch_folder() as scratch:
         source.prepare(scratch, progress)

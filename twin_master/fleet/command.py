@@ -6,13 +6,15 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from reporting import terminal
 from reporting.words import counted
-from twin_master.viewer.command import View, shown
+from twin_master.viewer.command import shown
+
+told = terminal.told_by("twin_master")
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -30,25 +32,16 @@ ROWS = 20
 TABLE_SECONDS = 1.0
 
 
-Out = Annotated[Path | None, typer.Option(help="The folder to make.", show_default="runs/NAME")]
-FleetSeed = Annotated[int | None, typer.Option(min=0, help="Seed, in the place of that of the file.")]
-Authority = Annotated[Path | None, typer.Option(help="Certificate of the authority of an mqtts:// broker.")]
-
-
+@told("fleet watch")
 def watch(
-    file: Annotated[
-        Path, typer.Argument(help="The fleet file, its groups with `observations`.", show_default=False)
-    ],
-    out: Out = None,
-    seed: FleetSeed = None,
-    follow: Annotated[
-        bool, typer.Option("--follow", help="Wait for more at the end of CSV files, and for new files.")
-    ] = False,
-    turns: Annotated[
-        int | None, typer.Option(min=0, help="Leave an asset alone after so many turns.")
-    ] = None,
-    ca_file: Authority = None,
-    view: View = False,
+    file: Path,
+    *,
+    out: Path | None = None,
+    seed: int | None = None,
+    follow: bool = False,
+    turns: int | None = None,
+    ca_file: Path | None = None,
+    view: bool = False,
 ) -> None:
     """Watch many real assets: observations in, a decision for each turn of each asset out, as a line of JSON.
 
@@ -173,17 +166,6 @@ fleet_app.command("watch")(watch)
 SHOWN = 10
 """Failures that are printed; the others stand in `fleet.json`."""
 
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        min=0, help="Worker processes; 0 flies in this process.", show_default="one for each processor"
-    ),
-]
-Cluster = Annotated[
-    str | None, typer.Option(help="Fly on the Dask cluster of this scheduler, such as tcp://host:8786.")
-]
-Replace = Annotated[bool, typer.Option("--replace", help="Replace another fleet in the folder.")]
-
 
 @fleet_app.callback()
 def fleet() -> None:
@@ -191,15 +173,17 @@ def fleet() -> None:
 
 
 @fleet_app.command("run")
+@told("fleet run")
 def run(
-    file: Annotated[Path, typer.Argument(help="The fleet file.", show_default=False)],
-    out: Out = None,
-    seed: FleetSeed = None,
-    workers: Workers = None,
-    cluster: Cluster = None,
-    replace: Replace = False,
-    no_report: terminal.NoReport = False,
-    json: terminal.Json = False,
+    file: Path,
+    *,
+    out: Path | None = None,
+    seed: int | None = None,
+    workers: int | None = None,
+    cluster: str | None = None,
+    replace: bool = False,
+    no_report: bool = False,
+    json: bool = False,
 ) -> None:
     """Fly the assets of a fleet; repeated after an interruption, it goes on where it stopped."""
     from twin_master.fleet.plan import load_fleet
@@ -210,11 +194,9 @@ def run(
 
 
 @fleet_app.command("learn")
+@told("fleet learn")
 def learn(
-    folder: Annotated[Path, typer.Argument(help="The folder of the fleet.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="The file to write.")] = Path("learnt.toml"),
-    no_report: terminal.NoReport = False,
-    json: terminal.Json = False,
+    folder: Path, *, out: Path = Path("learnt.toml"), no_report: bool = False, json: bool = False
 ) -> None:
     """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ."""
     from twin_master.fleet.lessons import learn_from_fleet, lesson_rows
@@ -276,12 +258,8 @@ def _report(folder: Path) -> None:
         write_fleet_report(folder)
 
 
-def compare(
-    folders: Annotated[
-        list[Path], typer.Argument(help="Folders of fleets or ensembles.", show_default=False)
-    ],
-    json: terminal.Json = False,
-) -> None:
+@told("compare")
+def compare(folders: list[Path], *, json: bool = False) -> None:
     """Show the figures of several fleets or ensembles side by side."""
     figures = _figures(folders)
     if json:

@@ -22,6 +22,7 @@ from reporting.arrays import Float
 from reporting.files import synchronise, write_error
 from twin_master.errors import NotResumableError
 from twin_master.mission.turns import Happened, Reading, Turn
+from twin_master.sentences import said
 
 JOURNAL_NAME = "journal.jsonl"
 _DIGEST = 64
@@ -205,10 +206,7 @@ def records_of(
         if begin:
             yield record, begin, begin + len(line)
         elif header is not None and line != header:
-            raise NotResumableError(
-                f"the journal {path} belongs to another configuration than the config.json beside it: "
-                "begin again with --replace."
-            )
+            raise NotResumableError(said("mission.journal", path=path))
         begin += len(line)
 
 

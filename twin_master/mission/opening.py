@@ -14,6 +14,7 @@ from twin_master.errors import NotResumableError
 from twin_master.run_folder import CONFIG_NAME, KIND, create_run_folder, lock_run_folder, read_config
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 
 Held = Iterator[tuple[dict[str, Any], Scenario]]
 """Configuration of a folder that this process holds, and its scenario located in it."""
@@ -98,8 +99,14 @@ def resumed_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
     if loaded is not None and file.get("sha256") != loaded.content_hash:
         does = "watches" if config.get("watched") else "flies"
         raise NotResumableError(
-            f"{folder} {does} another scenario ({scenario.mission.name}, {file.get('name')}) "
-            f"than {loaded.path}: resume it without naming a scenario."
+            said(
+                "mission.another",
+                folder=folder,
+                does=does,
+                name=scenario.mission.name,
+                scenario_name=file.get("name"),
+                path=loaded.path,
+            )
         )
     lock = lock_run_folder(folder)
     with held(lock):

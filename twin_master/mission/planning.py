@@ -19,6 +19,7 @@ from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.simulated_return import Decide, simulated_returns
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
+from twin_master.sentences import said
 
 MISSIONS = 400
 """That are simulated for each rule."""
@@ -105,10 +106,7 @@ def expected_plan(
     while not holds((found := priced(price))[0]):
         below, price = price, 4.0 * price
         if price > _HARDEST:
-            raise PlanningError(
-                f"no plan keeps the probability beyond a health limit at {allowed:g}: allow more, or give "
-                "the scenario a gentler control or a repair"
-            )
+            raise PlanningError(said("mission.no_plan", allowed=allowed))
     for _ in range(_HALVINGS):
         middle = priced(0.5 * (below + price))
         if holds(middle[0]):
@@ -160,13 +158,17 @@ def read_policy(path: Path, model: GraphicalModel) -> BeliefPolicy:
         with np.load(path, allow_pickle=False) as kept:
             policy, controls = BeliefPolicy.of(kept), tuple(kept["controls"].tolist())
     except (OSError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
-        raise PlanningError(
-            f"{path} is no policy of `uav-twin plan --out` ({error}): give such a file"
-        ) from None
+        raise PlanningError(said("mission.no_policy", path=path, error=error)) from None
     if controls != model.controls or policy.vectors.shape[1] != model.states.size:
         raise PlanningError(
-            f"{path} is for {policy.vectors.shape[1]} states and the controls {', '.join(controls)}, and the "
-            f"scenario has {model.states.size} and {', '.join(model.controls)}: plan it anew"
+            said(
+                "mission.another_policy",
+                path=path,
+                states=policy.vectors.shape[1],
+                controls=", ".join(controls),
+                size=model.states.size,
+                known=", ".join(model.controls),
+            )
         )
     return policy
 

@@ -37,6 +37,7 @@ from twin_master.network.sensor_model import GaussianSensorModel, check_noise
 from twin_master.network.twin import Planner, Twin, build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 
 
 @dataclass(frozen=True)
@@ -375,6 +376,4 @@ def kept_knowledge(folder: Path, scenario: Scenario) -> Knowledge:
         model = build_graphical_model(scenario)
         return knowledge_of(scenario, model, parameter, predicted, on_belief or policy, true)
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise RunFolderError(
-            f"{path} is missing, damaged or of another scenario ({error}): fly the run again with --replace."
-        ) from error
+        raise RunFolderError(said("mission.knowledge", path=path, error=error)) from error

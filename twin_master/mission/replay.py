@@ -18,6 +18,7 @@ from twin_master.network.inference import known_control
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
+from twin_master.sentences import said
 
 _SUSPECTED = ("none_of_these", "hypotheses", "decided_by")
 """What is told of a suspicion."""
@@ -59,13 +60,13 @@ def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: Grap
 
 def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
     """Return mean and standard deviation of each factor of the state, as a decision tells them."""
-    said = {}
+    told = {}
     for name, known in decision["health"].items():
         scale, unit = printed_state(known["unit"])
         digits = ".0f" if unit == "%" else ".3g"
         mean, deviation = (f"{scale * known[moment]:{digits}}" for moment in ("mean", "standard_deviation"))
-        said[name] = f"{mean} ± {deviation} {unit}"
-    return said
+        told[name] = f"{mean} ± {deviation} {unit}"
+    return told
 
 
 def gap_of(history: History, skipped: int, sensors: GaussianSensorModel) -> dict[str, Any]:
@@ -165,15 +166,18 @@ def replay(
         except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
             raise damaged(path, begin, f"it has another layout, {error}") from error
     found = filtered_again(seen, [*models, *([question] if question else [])], lag, settled)
-    said = {turn.concluded.turn: turn.concluded.next_control for turn in found.turns}
-    other = [turn for turn, control in decided.items() if said.get(turn, control) != control]
+    again = {turn.concluded.turn: turn.concluded.next_control for turn in found.turns}
+    other = [turn for turn, control in decided.items() if again.get(turn, control) != control]
     if last and question is None and last["next_control"] != found.twin.proposed_control:
         other.append(last["turn"])
     if other:
         begin_again = f"begin another watch, in another folder, with `--observations {path.parent}`"
         raise NotResumableError(
-            f"the journal decided otherwise after turn {min(other)} than this version does: "
-            f"{begin_again if 'intake' in last else 'fly the mission again with --replace'}."
+            said(
+                "mission.decided",
+                turn=min(other),
+                advice=begin_again if "intake" in last else "fly the mission again with --replace",
+            )
         )
     return found, last
 

@@ -17,6 +17,7 @@ from reporting.arrays import Float, Index
 from twin_master.errors import MissionInputError
 from twin_master.mission.preparation import Knowledge
 from twin_master.seeds import generator
+from twin_master.sentences import said
 
 SAMPLES = 300
 """Readings that are drawn for each control."""
@@ -122,9 +123,7 @@ def chosen_sensors(readings: Sequence[Readings], candidates: Sequence[int], coun
         There are fewer candidates.
     """
     if not 1 <= count <= len(candidates):
-        raise MissionInputError(
-            f"--sensors is from 1 to {len(candidates)}, the candidates, and {count} came."
-        )
+        raise MissionInputError(said("mission.sensors", most=len(candidates), count=count))
 
     def information(sensors: Sequence[int]) -> float:
         return float(np.mean([under.information(sensors) for under in readings]))

@@ -16,6 +16,7 @@ from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
+from twin_master.sentences import said
 
 
 class SensorStatus(IntEnum):
@@ -171,14 +172,18 @@ def checked_values(scenario: Scenario, reading: AssetReading, step: int, control
     values = np.asarray(reading.values, dtype=np.float64)
     if values.shape != (scenario.observation.count,):
         raise AssetOutputError(
-            f"step {step}: the scenario expects {scenario.observation.count} values of "
-            f"`{scenario.observation.role}` and the asset returned {values.shape}"
+            said(
+                "mission.width",
+                step=step,
+                count=scenario.observation.count,
+                role=scenario.observation.role,
+                came=values.shape,
+            )
         )
     if not np.all(np.isfinite(values)):
         bad = ", ".join(str(index + 1) for index in np.flatnonzero(~np.isfinite(values)))
         raise AssetOutputError(
-            f"step {step}: the asset returned NaN or an infinity for `{scenario.observation.role}` "
-            f"{bad} under the control `{control}`; the run stops here and can be resumed"
+            said("mission.no_number", step=step, role=scenario.observation.role, bad=bad, control=control)
         )
     return values
 
@@ -265,9 +270,7 @@ class Plant:
     def _told(self, reading: AssetReading) -> Float:
         """Return the true state that an asset with damage of its own tells."""
         if reading.inner is None:
-            raise AssetOutputError(
-                f"step {self.step}: the asset does not tell its damage, which `truth` asks of it"
-            )
+            raise AssetOutputError(said("mission.no_damage", step=self.step))
         return np.array([reading.inner.state[name] for name in self._scenario.state_names])
 
     def save_state(self) -> bytes:

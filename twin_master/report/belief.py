@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
@@ -53,7 +52,7 @@ def _joint_figure(run: Run) -> Figure:
         )
         axes.set_title(f"{run.step} {turn}", fontweight="normal", pad=3.0)
         x, y = run.scales * run["filtered/mean"][turn]
-        axes.plot(x, y, **_MEAN, markeredgewidth=1.1, label="mean of the belief")
+        axes.plot(x, y, **_MEAN, linestyle="none", markeredgewidth=1.1, label="mean of the belief")
         if run.truth is not None:
             x, y = run.scales * run.truth[turn]
             for color, width in (("white", 2.6), (style.TRUTH, 1.2)):
@@ -66,12 +65,7 @@ def _joint_figure(run: Run) -> Figure:
     height = figure.get_figheight()
     place = figure.add_axes((right + 0.015, 0.43 / height, 0.013, 1 - 0.95 / height))
     style.color_bar(figure, image, "probability", cax=place)
-    handles = [Line2D([], [], linestyle="none", label="mean", **_MEAN)]
-    if run.truth is not None:
-        handles.append(
-            Line2D([], [], **{**_RING, "markersize": 8.0}, markeredgecolor=style.TRUTH, label="truth")
-        )
-    figure.legend(handles=handles, loc="upper center", ncols=2, bbox_to_anchor=(0.5, 1.0))
+    style.shared_legend(figure, bbox_to_anchor=(0.5, 1.0))
     return figure
 
 

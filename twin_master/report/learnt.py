@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from reporting import figures as style
@@ -44,7 +43,10 @@ def learnt_figure(run: Run) -> Figure:
         last = learnt.course[-1]
         chosen = int(np.nanargmax(np.abs(last[:, 0] - learnt.prior[:, 0]) / last[:, 1]))
         others = np.delete(learnt.course[:, :, 0], chosen, axis=1)
-        axes.plot(_steps(run), others, color=style.REFERENCE, linewidth=0.5, alpha=0.8)
+        axes.plot(
+            _steps(run), others, color=style.REFERENCE, linewidth=0.5, alpha=0.8,
+            label=f"other {run.sensors.word}s",
+        )  # fmt: skip
         truth = None if learnt.truth is None else learnt.truth[chosen]
         _course(axes, run, learnt.course[:, chosen], learnt.prior[chosen], truth)
         style.panel_label(axes, next(labels), label_of(learnt))
@@ -55,7 +57,7 @@ def learnt_figure(run: Run) -> Figure:
         beside.sharey(axes)
         _last_panel(beside, run, learnt, chosen)
         style.panel_label(beside, next(labels), f"After the last {run.step}")
-    _legend(figure, run)
+    style.shared_legend(figure)
     return figure
 
 
@@ -72,21 +74,12 @@ def _course(axes: Axes, run: Run, course: Float, prior: Float, truth: Float | No
     """Draw a course (T, 4) with its band and truth, from its prior (4,) before the first turn on."""
     steps = _steps(run)
     style.band(axes, steps, course[:, 2], course[:, 3], style.PRESENT)
-    axes.plot(steps, course[:, 0], color=style.PRESENT)
+    axes.plot(steps, course[:, 0], color=style.PRESENT, label="learnt, 90 % band")
     if run.first_step == 0:
-        _bar(
-            axes,
-            -1.0,
-            prior,
-            color=style.PAST,
-            marker="s",
-            markersize=3.2,
-            capsize=2.0,
-            elinewidth=1.2,
-            zorder=4,
-        )
+        look = {"color": style.PAST, "marker": "s", "markersize": 3.2, "capsize": 2.0, "elinewidth": 1.2}
+        _bar(axes, -1.0, prior, **look, zorder=4, label="prior, 90 %")
     if truth is not None and np.isfinite(truth):
-        axes.axhline(float(truth), **style.TRUTH_LINE)
+        axes.axhline(float(truth), **style.TRUTH_LINE, label="truth")
     axes.set_xlim(steps[0] - 1.8, steps[-1] + 0.8)
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], integer=True))
     axes.yaxis.set_major_locator(MaxNLocator(5))
@@ -115,20 +108,6 @@ def _last_panel(axes: Axes, run: Run, learnt: LearntQuantity, chosen: int) -> No
     axes.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 4, 5, 10], integer=True))
     axes.grid(axis="y")
     axes.set_xlabel(run.sensors.word, labelpad=1.0)
-
-
-def _legend(figure: Figure, run: Run) -> None:
-    handles = [
-        Line2D([], [], color=style.PAST, marker="s", markersize=3.2, label="prior, 90 %"),
-        Line2D([], [], color=style.PRESENT, label="learnt, 90 % band"),
-    ]
-    if any(learnt.of_sensors for learnt in run.learnt):
-        handles.append(
-            Line2D([], [], color=style.REFERENCE, linewidth=0.8, label=f"other {run.sensors.word}s")
-        )
-    if any(learnt.truth is not None for learnt in run.learnt):
-        handles.append(Line2D([], [], **style.TRUTH_LINE, label="truth"))
-    figure.legend(handles=handles, loc="upper center", ncols=len(handles), bbox_to_anchor=(0.53, 1.0))
 
 
 def asset_rows(run: Run) -> list[tuple[str, ...]]:

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from reporting import figures as style
@@ -105,7 +104,7 @@ def mission_figure(run: Run, now: int, sensors: Sequence[int] | None = None) -> 
                 axes.tick_params(labelbottom=False)
         for row in range(len(shown), rows):
             grid[row][column].remove()
-    _legend(figure, run, now)
+    style.shared_legend(figure, rows=2)
     return figure
 
 
@@ -174,7 +173,9 @@ def _state_panel(axes: Axes, run: Run, index: int, now: int) -> str:
     """Draw mean and two standard deviations within the levels: p(D_t | o_0..o_now), p(D_{now+h} | ...)."""
     factor = run.factors[index]
     at_the_time = factor.scale * run["filtered/mean"][: now + 1, index]
-    axes.plot(np.arange(now + 1), at_the_time, color=style.PRESENT, linewidth=0.9, label="at the time")
+    axes.plot(
+        np.arange(now + 1), at_the_time, color=style.PRESENT, linewidth=0.9, label="as seen at the time"
+    )
     if now == run.steps - 1:
         mean, deviation = run["smoothed/mean"], run["smoothed/standard_deviation"]
     else:
@@ -205,7 +206,13 @@ def _sensor_panel(axes: Axes, run: Run, sensor: int, now: int) -> str:
     lost = turn[seen & np.isnan(observation)]
     if len(lost):
         where = axes.get_xaxis_transform()
-        axes.plot(lost, np.full(len(lost), 0.04), **{**_DOT, "marker": "x"}, transform=where, label="lost")
+        axes.plot(
+            lost,
+            np.full(len(lost), 0.04),
+            **{**_DOT, "marker": "x"},
+            transform=where,
+            label="lost",
+        )
     truth = run.get(f"truth/{sensors.quantity}")
     _draw(
         axes, *_bands(run, "quantity", sensor, now, sensors.scale),
@@ -231,7 +238,7 @@ def _control_panel(axes: Axes, run: Run, _index: int, now: int) -> str:
         axes.bar(
             now + 1.0 + np.arange(run.horizon),
             tallest * run["predicted/control_probability"][now, :, control],
-            width=width, bottom=control, color=style.PREDICTION, linewidth=0, label=f"predicted {control}",
+            width=width, bottom=control, color=style.PREDICTION, linewidth=0, label=f"_predicted {control}",
         )  # fmt: skip
         axes.axhline(control, color=style.REFERENCE, linewidth=0.6)
     later = np.arange(now + 1, min(now + 1 + run.horizon, run.steps))
@@ -252,20 +259,3 @@ def _reward_panel(axes: Axes, run: Run, reward: int, now: int) -> str:
     axes.margins(y=0.15)
     axes.set_ylabel("reward")
     return f"{capital(REWARD_NAMES[reward])} reward"
-
-
-def _legend(figure: Figure, run: Run, now: int) -> None:
-    looks: dict[str, dict[str, Any] | bool] = {
-        "past": {"color": style.PAST},
-        "state as seen at the time": {"color": style.PRESENT, "linewidth": 0.9},
-        "present": {"color": style.PRESENT, "marker": "D", "linestyle": "none"},
-        "prediction": {"color": style.PREDICTION, "linestyle": _DASHES, "marker": "."},
-        "truth": run.truth is not None and style.TRUTH_LINE,
-        "observed": _DOT,
-        "observed later": now < run.steps - 1 and {**_DOT, "markerfacecolor": "none"},
-        "observation lost": bool(np.isnan(run.observed[: now + 1]).any()) and {**_DOT, "marker": "x"},
-    }
-    handles = [Line2D([], [], label=label, **look) for label, look in looks.items() if isinstance(look, dict)]
-    figure.legend(
-        handles=handles, loc="upper center", ncols=(len(handles) + 1) // 2, bbox_to_anchor=(0.53, 1.0)
-    )

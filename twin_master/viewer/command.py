@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
@@ -22,10 +21,6 @@ _COURTESY = 5
 
 Server = tuple[Callable[[Path], bool], Callable[[Path, int, Callable[[str], None], Callable[[], bool]], None]]
 """Whether a folder can be shown, and what shows it, as `viewer.server.serve`."""
-
-View = Annotated[
-    bool, typer.Option("--view", help="Show the flight in a browser of this machine while it goes on.")
-]
 
 
 @contextmanager

@@ -18,8 +18,7 @@ from reporting.errors import ReportingError
 from reporting.page import script_source
 from twin_master.errors import TwinMasterError, ViewError
 from twin_master.viewer.flight import Flight
-from twin_master.viewer.messages import Request, Teller
-from twin_master.viewer.scene import page_html, scene_of
+from twin_master.viewer.messages import Request, Teller, page_html, scene_of
 
 ADDRESS = "127.0.0.1"
 POLL_MILLISECONDS = 15.0

@@ -136,24 +136,19 @@ class CsvFeed(_FileFeed):
             cells = _cells(line)
         except ValueError as error:
             return Refused(f"it is no line of CSV: {str(error)[:80]}")
-        try:
-            if len(cells) != len(self._names):
-                return Refused(f"{len(self._names)} cells are expected, and {len(cells)} came")
-            return self._row(cells)
-        except Refused as refusal:
-            return refusal
-        except (ValueError, OverflowError) as error:
-            return Refused(f"a cell is no number: {str(error)[:80]}")
-
-    def _row(self, cells: list[str]) -> Message:
+        if len(cells) != len(self._names):
+            return Refused(f"{len(self._names)} cells are expected, and {len(cells)} came")
         record: dict[str, object] = {
             name: cell for name, cell in zip(self._names, cells, strict=True) if cell
         }
-        for name, reader in (("control", str), ("turn", _whole), ("time", float)):
-            if name in record:
-                cell = str(record[name])
-                record[name] = None if cell.lower() in _LOST else reader(cell)
-        return self._reader.read(record)
+        try:
+            for name, reader in (("control", str), ("turn", _whole), ("time", float)):
+                if name in record:
+                    cell = str(record[name])
+                    record[name] = None if cell.lower() in _LOST else reader(cell)
+        except (ValueError, OverflowError) as error:
+            return Refused(f"a cell is no number: {str(error)[:80]}")
+        return parsed(self._reader, record)
 
 
 class RunFeed:

@@ -272,14 +272,10 @@ def test_lines_that_a_sampling_rate_can_show(setting, rate, lines):
 class OutputsOnly(Cantilever):
     """The cantilever behind a door that shows neither its inside nor its ports."""
 
+    ports, stations = (), None
+
     def supports(self, primitive):
         return False
-
-    def ports(self):
-        return ()
-
-    def stations(self):
-        return None
 
 
 def names_available(setting, *kinds, model=None, **changes):

@@ -7,7 +7,7 @@ import pytest
 
 from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Quantity, TrialKind
-from discrepancy.models.interface import Model, Response
+from discrepancy.models.interface import ACROSS, Model, Response
 from discrepancy.models.scales import PortScale, Scales
 
 # Gauges of a square patch of skin in plane stress: strain along, across, shear per metre of displacement.
@@ -15,6 +15,11 @@ GAUGES = {
     "strain[0]": (1.0e-2, -0.3e-2, 0.2e-2),
     "strain[1]": (0.4e-2, -0.12e-2, -0.1e-2),
     "strain[2]": (0.05e-2, -0.02e-2, 0.0),
+}
+SEEN = {
+    name + part: value
+    for name, strains in GAUGES.items()
+    for part, value in zip(("", *ACROSS), strains, strict=True)
 }
 STIFFNESS, MASS, RATIO = 400.0, 0.4, 0.02
 
@@ -24,16 +29,14 @@ class Oscillator(Model):
     """m x'' + c x' + k x = f at rest or released; three gauges proportional to x; outputs x and gauges."""
 
     name = "single mass"
+    ports, shows_ports = ("x",), False
     parameters = (ParameterPrior("stiffness_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 
     def output_quantity(self, output):
-        return Quantity.DISPLACEMENT if output == "x" else Quantity.STRAIN if output in GAUGES else None
+        return Quantity.DISPLACEMENT if output == "x" else Quantity.STRAIN if output in SEEN else None
 
     def supports(self, primitive):
         return False
-
-    def ports(self):
-        return ("x",)
 
     def scales(self, campaign):
         w = float(np.sqrt(STIFFNESS / MASS))
@@ -42,7 +45,7 @@ class Oscillator(Model):
 
     def _respond(self, trial, outputs, patch, conditions):
         stiffness = STIFFNESS * float(conditions.parameters[0])
-        scale = np.array([(1.0, 0.0, 0.0) if name == "x" else GAUGES[name] for name, _ in outputs]).T
+        scale = np.array([1.0 if name == "x" else SEEN[name] for name, _ in outputs])
         if trial.is_dynamic:
             rate, zero = conditions.clock
             t = np.maximum((1.0 + rate) * trial.time + zero, 0.0)
@@ -53,9 +56,7 @@ class Oscillator(Model):
             x, v = a * e * (c + RATIO * w / wd * s), -a * e * w**2 / wd * s
         else:
             x = (trial.force if trial.kind is TrialKind.STATIC else trial.load_factor) / stiffness
-        parts = [np.outer(x, row) for row in scale]
-        rates = np.outer(v, scale[0]) if trial.is_dynamic else None
-        return Response(parts[0], rates, *(parts[1:] if conditions.components else (None, None)))
+        return Response(np.outer(x, scale), np.outer(v, scale) if trial.is_dynamic else None)
 
 
 @pytest.fixture(scope="session")

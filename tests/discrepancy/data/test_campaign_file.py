@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from discrepancy.campaign.noise import pre_trigger_record
+from discrepancy.campaign.noise import pre_trigger_record, repeated
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import (
     Campaign,
@@ -305,6 +305,13 @@ def test_noise_from_repeats_is_the_pooled_deviation(tmp_path):
     assert not alone.remarks  # the checks say it
 
 
+@pytest.mark.parametrize("what", ["force", "load_factor", "temperature", "health", "noise_factor"])
+def test_a_trial_under_something_else_is_no_repeat(what):
+    trial = Trial.plain("a", TrialKind.STATIC, ("w",), np.zeros(3), force=np.arange(3.0))
+    assert repeated([trial, trial], "w") == [[trial, trial]]
+    assert not repeated([trial, replace(trial, **{what: getattr(trial, what) + 1.0})], "w")
+
+
 # ---------------------------------------------------------------- what is wrong
 
 RELEASE = TABLES["release.csv"]
@@ -317,7 +324,7 @@ WRONG_TABLES = [
     ("tip_up", "force,g17\n1,-inf\n", CampaignDataError, "holds -inf"),
     ("tip_up", "force,g17\n1,\n", CampaignDataError, "no reading in the column 'g17'"),
     ("tip_up", "time,force,g17\n2,1,1\n1,1,1\n", CampaignDataError, "times of .* run backwards"),
-    ("turn", "load_factor,g17,z1\n1,2,7\n", CampaignFileError, "z1 is a fraction from 0 to 1, and 7 came"),
+    ("turn", "load_factor,g17,z1\n1,2,1.1\n", CampaignFileError, "z1 is a fraction from 0 to 1, and 1.1"),
     ("turn", "load_factor,g17,z2_deviation\n1,2,-1\n", CampaignFileError, "z2_deviation is a"),
     ("release", "time,w [mm]\n0,1\n1,1\n", CampaignDataError, "holds 2 samples .* at least 8"),
     ("release", RELEASE.replace("0.020,", "0.018,"), CampaignDataError, "does not increase after sample 10"),

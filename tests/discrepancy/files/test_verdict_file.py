@@ -230,7 +230,7 @@ def test_damaged_files_are_refused_in_one_sentence_and_nothing_is_written_where_
         ('"sentence"', '"sentences"', "sentence"),
         (mass, f'{mass} "colour": "red",', "effects.1.colour"),
         (mass, "", "effects.1.family"),
-        ('"passed": true', '"passed": "yes"', "gates.1.passed is 'yes'"),
+        ('"passed": true', '"passed": "yes"', "gates.1.passed: Input should be a valid boolean"),
         ('"log_bayes_factor": "Infinity"', '"log_bayes_factor": Infinity', "Infinity is no number"),
         ('"remarks": [', nested, "nested deeper"),
         ('"kind": "point_mass"', '"kind": "planet"', "planet|point_mass|kind"),

@@ -81,8 +81,8 @@ def kind(request, coarse_patch_arrays, pushed_beam, foreign_fmu, tmp_path_factor
 def test_it_says_what_it_is_and_what_it_carries(kind: Kind) -> None:
     model, groups = kind.model, {"laws": [law.kind for law in LAWS]}
     carried = [name for item in kind.carried for name in groups.get(item, [item])]
-    assert model.ports() == tuple(kind.ports)
-    assert list(model.stations() or ()) == pytest.approx(kind.stations)
+    assert model.ports == tuple(kind.ports)
+    assert list(model.stations or ()) == pytest.approx(kind.stations)
     assert [item.name for item in model.parameters] == kind.parameters
     assert all(item.low < item.mean < item.high for item in model.parameters)
     shown = {name: model.output_quantity(name) for name in kind.quantities}
@@ -96,7 +96,7 @@ def test_scales_are_those_of_stiffness_and_mass_and_of_what_acts(kind: Kind) -> 
     model = kind.model
     stiffness, mass, row, rows = np.full((1, 1), 1974.0), np.full((1, 1), 2.0), np.ones(1), [np.ones(1)]
     if isinstance(model, SystemModel):
-        state = State(kind.means, (0.0,) * len(model.regions))
+        state = State(tuple(kind.means), (0.0,) * len(model.regions))
         stiffness, mass = (getattr(model.system(state), name) for name in ("stiffness", "mass"))
         row, rows = model.force_row(kind.place, state), [model.port_rows[name] for name in kind.ports]
     loads = kind.trial(TrialKind.STATIC, force=np.array([1.0, -6.0]))
@@ -152,12 +152,21 @@ def test_a_coarse_force_does_between_its_samples_what_is_said(kind: Kind, hold: 
     assert (np.abs(straight - wanted).max() > 2e-2 * largest) == (hold is not Hold.LINEAR)
 
 
-@pytest.mark.parametrize("law", [(), (3e-2,)])
-def test_rates_are_derivatives(kind: Kind, law: tuple[float, ...]) -> None:
+@pytest.mark.parametrize("change", ["none", "spring", "drift"])
+def test_rates_are_derivatives(kind: Kind, change: str) -> None:
     what = replace(kind.trial(TrialKind.RINGDOWN), time=0.003 / kind.pace * np.arange(3000))
     outputs = [(kind.output, quantity) for quantity in Quantity.DISPLACEMENT.moving]
     outputs += [(name, Quantity(quantity)) for name, quantity in kind.quantities.items() if quantity]
-    items = patch.ModelPatch(tuple(PowerStiffness(kind.ports[-1], size, 3.0, 0, 1e-2) for size in law))
+    items = patch.ModelPatch(
+        tuple(
+            item
+            for name, item in (
+                ("spring", PowerStiffness(kind.ports[-1], 3e-2, 3.0, 0, 1e-2)),
+                ("drift", patch.StiffnessDrift(0.05 * kind.pace)),
+            )
+            if name == change and kind.model.supports(type(item))
+        )
+    )
     found = kind.model.respond(what, tuple(outputs), items, Conditions(kind.means))
     slope, seen_later = np.gradient(found.values, what.time, axis=0), slice(100, -5)  # what is left out fades
     scale = np.abs(slope).max(axis=0)
@@ -209,8 +218,10 @@ def test_what_a_kind_cannot_do_is_refused(kind: Kind, how: TrialKind, said, item
         kind.seen(replace(kind.trial(how, force=np.ones(3)), **said), *items)
 
 
-FILES = ["two_masses", "rig"]
-ROWS = [*((name, *row) for name in FILES for row in INPUTS.refused(name)), *INPUTS.refused("rigs")]
+ROWS = [
+    *((name, *row) for name in ("two_masses", "rig") for row in INPUTS.refused(name)),
+    *INPUTS.refused("rigs"),
+]
 
 
 @pytest.mark.parametrize(("name", "old", "new", "sentence"), ROWS)

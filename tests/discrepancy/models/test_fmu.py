@@ -34,7 +34,6 @@ FORCE, SPEED = STIFFNESS * AMPLITUDE, FREQUENCY * AMPLITUDE
 GIVEN: dict[str, Any] = {"parameters": np.array([1.02, 0.9])}
 OUTPUTS = (("displacement", Quantity.DISPLACEMENT), ("leaf_strain", Quantity.STRAIN))
 LAWS = laws("slide", STIFFNESS, AMPLITUDE, SPEED)
-STIFF = PowerStiffness("slide", 3e7 * FORCE, 1.0, 0, AMPLITUDE)
 
 
 def trial(kind: TrialKind, time: Any = 300, **said: Any) -> Trial:
@@ -151,8 +150,9 @@ def test_an_fmu_that_is_stepped_converges_to_the_lumped_model(stepped, lumped, n
 
 
 def test_a_law_that_is_too_stiff_for_steps_is_refused(stepped) -> None:
+    stiff = PowerStiffness("slide", 3e7 * FORCE, 1.0, 0, AMPLITUDE)
     with pytest.raises(ModelError, match=r"at slide does not converge .* halving steps of"):
-        seen(stepped, trial(TrialKind.RINGDOWN, 20, release=Release(AMPLITUDE)), STIFF)
+        seen(stepped, trial(TrialKind.RINGDOWN, 20, release=Release(AMPLITUDE)), stiff)
 
 
 def test_an_fmu_that_is_not_linear_is_noticed_and_stepped(make) -> None:
@@ -213,6 +213,5 @@ def test_the_documented_file_is_one() -> None:
 
 
 def test_an_fmu_that_never_rests_is_refused(make) -> None:
-    model = make(("step = 0.013", "step = 0.013, limit = 3.0"))
     with pytest.raises(ModelError, match=r"did not come to rest within 3 s: the output 'slide\.speed'"):
-        seen(model, LOADS)
+        seen(make(("step = 0.013", "step = 0.013, limit = 3.0")), LOADS)

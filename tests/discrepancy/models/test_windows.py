@@ -103,15 +103,6 @@ def test_without_edges_within_the_record_nothing_changes(kind: TrialKind) -> Non
         np.testing.assert_array_equal(response(given, replace(law, windows=windows)), response(given, *same))
 
 
-def test_before_a_window_and_long_after_it_the_model_is_as_it_was() -> None:
-    given, law = trial(TrialKind.FORCED), BoucWen("slide", 60.0, 0.01, 1.5)
-    windowed = replace(law, windows=(Window("a trial", 3.0, 4.0),))
-    plain, found = response(given, refinement=1), response(given, windowed)
-    before = TIME < 3.0
-    np.testing.assert_allclose(found[before], plain[before], atol=1e-9)
-    assert np.abs(found[~before] - plain[~before]).max() > 1e-3
-
-
 def test_sensors_are_wrong_within_their_windows_only() -> None:
     given = trial(TrialKind.FORCED)
     measured = campaign(given, x=Channel("x", Quantity.DISPLACEMENT, "x", None))

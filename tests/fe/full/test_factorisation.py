@@ -1,7 +1,5 @@
 """What solves for stiffness: factorisation, iteration, modes and bases, against general and dense solvers."""
 
-import itertools
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,8 +15,6 @@ from fe.full.factorisation import Factorisation, analyse, lowest_eigenpairs
 from fe.full.subspace import OrthonormalBasis, ProjectedBasis, affine_product, solved_near
 from fe.runtime.errors import SolutionError
 from fe.structure.affine import affine_sum
-
-seeds = st.integers(0, 999)
 
 
 def grid(*counts: int) -> sparse.csr_array:
@@ -49,48 +45,23 @@ def test_a_slender_body_is_cut_across():
     assert sum(own * (own + boundary) for own, boundary in sizes) < 160_000
 
 
-@settings(max_examples=25, deadline=None)
-@given(seed=seeds, size=st.integers(1, 60), share=st.floats(0.0, 0.2), copies=st.integers(1, 3))
-def test_fronts_hold_the_fill_of_the_elimination(seed, size, share, copies):
-    matrix = random_matrix(seed, size, share, copies)
-    with pytest.MonkeyPatch.context() as small:
-        small.setattr(factorisation, "LEAF_UNKNOWNS", 12)
-        found = analyse(matrix)
-    n = matrix.shape[0]
-    assert sorted(found.order) == list(range(n))
-    assert [front.start for front in found.fronts] == [0, *(front.end for front in found.fronts[:-1])]
-    # Oracle: eliminate one unknown after the other on sets.
-    pattern = (matrix[found.order][:, found.order] != 0).toarray()
-    fill = [set(np.flatnonzero(row[: k + 1 + n])) for k, row in enumerate(pattern)]
-    owner = np.repeat(range(len(found.fronts)), [front.end - front.start for front in found.fronts])
-    for k in range(n):
-        later = {j for j in fill[k] if j > k}
-        front = found.fronts[owner[k]]
-        assert later <= set(range(k + 1, front.end)) | set(front.boundary)
-        for i, j in itertools.permutations(later, 2):
-            fill[i].add(j)
-    for front in found.fronts:
-        rest = set(front.boundary)
-        if rest:
-            above = found.fronts[front.parent]
-            assert above.start <= min(rest) < above.end
-            assert rest <= set(range(above.start, above.end)) | set(above.boundary)
-
-
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(
-    seed=seeds,
+    leaf=st.sampled_from((12, 120)),
+    seed=st.integers(0, 999),
     size=st.integers(1, 400),
     share=st.floats(0.0, 0.03),
     copies=st.integers(1, 3),
     columns=st.integers(0, 4),
 )
-def test_solutions_are_those_of_a_general_solver(seed, size, share, copies, columns):
+def test_solutions_are_those_of_a_general_solver(leaf, seed, size, share, copies, columns):
     matrix = random_matrix(seed, size, share, copies)
     shape = (matrix.shape[0], columns) if columns else (matrix.shape[0],)
     right = np.random.default_rng(seed).standard_normal(shape)
     given_side = right.copy()
-    found = Factorisation(matrix).riesz(right)
+    with pytest.MonkeyPatch.context() as other:
+        other.setattr(factorisation, "LEAF_UNKNOWNS", leaf)
+        found = Factorisation(matrix).riesz(right)
     assert np.array_equal(right, given_side)
     assert found.shape == shape
     expected = spsolve(matrix.tocsc(), right).reshape(shape)

@@ -1,9 +1,19 @@
-"""Arrays in files, of every kind that is kept: reproducible, read to the last bit, or refused in words."""
+"""What is kept: arrays in files, read to the last bit or refused; entries of the cache, built once."""
 
+import errno
 import io
+import multiprocessing
+import os
+import subprocess
+import sys
+import time
 import zipfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import fields, replace
+from pathlib import Path
+from threading import Timer
 from typing import Any
 
 import numpy as np
@@ -11,12 +21,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from threadpoolctl import threadpool_limits
 
+from fe.reduction import model_cache
+from fe.reduction.built_once import built_once, cache_folder
+from fe.reduction.fields import WingFields
+from fe.reduction.model_cache import MODELLING_ROOMS, entry, patch_arrays, reduced_model, wing_fields
+from fe.reduction.settings import StructureSettings
 from fe.runtime import kept_arrays
 from fe.runtime.errors import ReducedModelFileError
 from fe.runtime.kept_arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.reduced import ReducedModel
-from tests.refusals import refused
+from fe.wing.design import WingDesign
+from tests.refusals import Inputs, refused
 
 KINDS = st.sampled_from([np.float64, np.float32, np.int64, np.uint8, np.bool_, np.dtype("U3")])
 SHAPES = hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4)
@@ -121,25 +138,182 @@ def test_arrays_of_a_wrong_kind_are_refused(kept: KeptArrays, value: np.ndarray,
             type(kept).from_bytes(b"")
 
 
-@pytest.mark.parametrize(
-    ("name", "change", "sentence"),
-    [
-        ("static_load", lambda load: load * np.nan, "finite"),
-        ("mode_count", lambda _: 0, "modes"),
-        ("rounding_allowance", lambda _: -1.0, "rounding_allowance"),
-        *((name, lambda rows: rows[:-1], "field basis") for name in ("points", "cells", "region")),
-        *((f"{kind}_displacement", lambda rows: rows[:-1], "field basis") for kind in ("static", "modal")),
-        ("load_tip", lambda _: np.full(3, np.nan), "array"),
-        ("flap_spring", lambda _: 0.0, "flap_spring"),
-        ("straight_chord_line", lambda _: 2.0, "straight_chord_line"),
-        ("weight", lambda _: np.zeros(2), "weight"),
-        ("strip_of", lambda strips: np.array([99, *strips[1:]]), "strips"),
-        ("stations", lambda stations: stations[::-1].copy(), "stations that rise"),
-    ],
-)
+SPOILT: dict[str, Callable[[Any], Any]] = {
+    "nan": lambda values: values * np.nan,
+    "zero": lambda values: 0 * values,
+    "more": lambda values: values + 99,
+    "less": lambda values: -1.0 - values,
+    "short": lambda values: values[:-1],
+    "turned": lambda values: values[::-1].copy(),
+}
+
+
+@pytest.mark.parametrize(("name", "how", "sentence"), Inputs(__file__).refused("values"))
 def test_values_that_cannot_be_are_refused(
-    coarse_fields: ReducedModel, coarse_patch_arrays, name: str, change: Any, sentence: str
+    coarse_fields: ReducedModel, coarse_patch_arrays, name: str, how: str, sentence: str
 ) -> None:
     kept = coarse_fields if hasattr(coarse_fields, name) else coarse_patch_arrays
     with refused(ReducedModelFileError, sentence):
-        replace(kept, **{name: change(getattr(kept, name))})
+        replace(kept, **{name: SPOILT[how](getattr(kept, name))})
+
+
+# ---------------------------------------------------------------- the cache
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "uav-twin"
+
+
+@pytest.fixture
+def builds(monkeypatch: pytest.MonkeyPatch, coarse_fields, coarse_patch_arrays) -> list[str]:
+    """Names of the designs that were built; the builds themselves are replaced by finished ones."""
+    built: list[str] = []
+
+    def building(made: KeptArrays) -> Callable[..., KeptArrays]:
+        def build(design: WingDesign, *_: object) -> KeptArrays:
+            built.append(design.name)
+            time.sleep(0.05)
+            return replace(made, design_hash=design.hash)
+
+        return build
+
+    monkeypatch.setattr(model_cache, "build_fields", building(coarse_fields))
+    monkeypatch.setattr(model_cache, "build_patch_arrays", building(coarse_patch_arrays))
+    return built
+
+
+def test_cache_lies_where_the_user_says(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cache_folder() == own_cache
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert cache_folder() == Path.home() / ".cache" / "uav-twin"
+
+
+def test_what_is_unchanged_is_built_once_and_what_is_changed_anew(
+    builds, coarse_design, shipped_design, monkeypatch
+) -> None:
+    first, again, wing = (
+        make(coarse_design.changed()) for make in (reduced_model, reduced_model, wing_fields)
+    )
+    assert builds == [coarse_design.name]
+    assert first.to_bytes() == again.to_bytes() == wing.model.to_bytes()
+    assert wing.static_displacement.shape[-1] == first.static_stiffness.shape[-1]
+    changed = coarse_design.changed(skin={"thickness": 0.0007})
+    for _ in range(2):
+        assert reduced_model(changed).design_hash == changed.hash != coarse_design.hash
+        reduced_model(coarse_design, settings=StructureSettings(bound_tolerance=1e-3))
+        patch_arrays(coarse_design)
+        assert reduced_model().design_hash == shipped_design.hash  # the default
+    assert len(builds) == 5
+    monkeypatch.setattr(model_cache, "modelling_hash", lambda: "another")
+    reduced_model(coarse_design)
+    assert len(builds) == 6
+
+
+@pytest.mark.parametrize(
+    ("kind", "make"), [("wing", reduced_model), ("fields", wing_fields), ("patches", patch_arrays)]
+)
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "missing"])
+def test_damaged_entry_is_built_anew(builds, coarse_design, caplog, kind, make, damage: str) -> None:
+    good, path = make(coarse_design).to_bytes(), entry(kind, coarse_design.hash, None)
+    content = bytearray(path.read_bytes())
+    if damage == "flipped":
+        content[len(content) // 3] ^= 0x55
+    path.write_bytes({"cut": content[: len(content) // 2], "flipped": content}.get(damage, b""))
+    if damage == "missing":
+        path.unlink()
+    for _ in range(2):
+        assert make(coarse_design).to_bytes() == good
+    assert damage == "missing" or "built anew" in caplog.text
+    assert len(builds) == 1 + (kind != "wing")  # the model alone is among the fields
+
+
+def test_many_at_once_build_once_and_agree(builds: list[str], coarse_design: WingDesign) -> None:
+    with ThreadPoolExecutor(6) as threads:
+        results = list(threads.map(lambda _: reduced_model(coarse_design).to_bytes(), range(6)))
+    assert len(set(results)) == len(builds) == 1
+
+
+def test_failed_build_keeps_nothing_and_the_next_succeeds(
+    builds, coarse_design, own_cache, monkeypatch
+) -> None:
+    def failing(*_: object) -> WingFields:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as broken:
+        broken.setattr(model_cache, "build_fields", failing)
+        with pytest.raises(KeyboardInterrupt):
+            reduced_model(coarse_design)
+    assert {path.suffix for path in own_cache.iterdir()} == {".lock"}
+    reduced_model(coarse_design)
+    assert len(builds) == 1
+
+
+def test_without_a_place_to_keep_it_the_model_is_still_given(
+    builds, coarse_design, tmp_path, monkeypatch, caplog
+) -> None:
+    (tmp_path / "a file").write_text("not a folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "a file"))
+    assert reduced_model(coarse_design).design_hash == coarse_design.hash
+    assert "could not be kept" in caplog.text
+
+
+def test_every_file_that_shapes_the_model_counts_for_the_key() -> None:
+    code = "import sys, fe.reduction.patch_basis; print(*(n for n in sys.modules if n.startswith('fe.')))"
+    words = [sys.executable, "-c", code]
+    result = subprocess.run(words, capture_output=True, text=True, check=True, cwd=Path(__file__).parents[3])
+    rooms = {name.split(".")[1] for name in result.stdout.split()}
+    assert rooms - {"designs", "sentences"} == set(MODELLING_ROOMS)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_a_real_build_is_reproducible_in_any_number_of_threads(
+    coarse_design, coarse_fields, own_cache
+) -> None:
+    with threadpool_limits(2):
+        wing = wing_fields(coarse_design)
+    assert wing.to_bytes() == coarse_fields.to_bytes()
+    assert wing.model.to_bytes() == reduced_model(coarse_design).to_bytes()
+    assert len(list(own_cache.glob("*.npz"))) == 2
+
+
+# ---------------------------------------------------------------- several builders
+
+
+def ours(path: Path) -> str:
+    return built_once(path, path.read_text, lambda: "ours", path.write_text)
+
+
+def theirs(path: Path, began: Any, finish: Any) -> None:
+    """Build in another process, until that is told."""
+
+    def build() -> str:
+        began.set()
+        finish.wait(60.0)
+        return "theirs"
+
+    built_once(path, path.read_text, build, path.write_text)
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_wait_is_said_and_ends_with_the_other(tmp_path: Path, caplog, killed: bool) -> None:
+    """With what it made, or, where it was killed, with what is made here."""
+    path, context = tmp_path / "cache" / "model.npz", multiprocessing.get_context("spawn")
+    began, finish = context.Event(), context.Event()
+    other = context.Process(target=theirs, args=(path, began, finish), daemon=True)
+    other.start()
+    assert began.wait(60.0)
+    Timer(0.3, other.kill if killed else finish.set).start()
+    assert ours(path) == path.read_text() == ("ours" if killed else "theirs")
+    assert caplog.messages == [f"Waiting for another process (number {other.pid}) that makes {path}."]
+    other.join(60.0)
+
+
+def test_a_full_disk_stops_no_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(handle: int, content: bytes, at: int) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", full)
+    assert ours(tmp_path / "model.npz") == "ours"

@@ -1,25 +1,41 @@
-"""The contract of reduced models of a wing, a structure, springs: the full model within certified bounds."""
+"""Reduced models: the contract of a wing's, a structure's and springs', how they are made, their fields."""
 
+import re
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+from unittest.mock import MagicMock
 
+import meshio
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymor.models.basic import StationaryModel
+from pymor.operators.constructions import LincombOperator, VectorOperator
+from pymor.operators.numpy import NumpyMatrixOperator
+from pymor.parameters.functionals import MinThetaParameterFunctional, ProjectionParameterFunctional
+from pymor.reductors.coercive import CoerciveRBReductor
 
+from benchmarks.study_regions import bracket, plate, tube
+from fe.reduction.fields import WingFields, write_modes_vtu, write_wing_vtu
+from fe.reduction.model_cache import reduced_structure
 from fe.reduction.reduced_basis import measured_errors, reduce_structure
-from fe.runtime.errors import OutsideModelError
+from fe.reduction.settings import StructureSettings
+from fe.reduction.terms import ReductionTerms
+from fe.runtime.errors import FiniteElementError, OutsideModelError
 from fe.runtime.reduced import ReducedModel
-from fe.structure.affine import AffineStructure, natural_frequencies, static_response
+from fe.structure.affine import AffineStructure, affine_sum, natural_frequencies, static_response
+from fe.structure.design import load_structure, structure_hash
+from fe.structure.mesh_file import read_mesh
 from fe.structure.operators import load_and_assemble
-from fe.wing.responses import eigenmodes
+from fe.wing.responses import eigenmodes, solve_static
+from reporting.errors import FileNotWrittenError
 from tests.fe.springs import ROUGH, SETTINGS, reduced_springs, rough_springs, springs
+from tests.refusals import Inputs, refused
 from tests.wings import tip_stiffness
-
-HURT = {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 3.0, "push": -120.0}
 
 
 class Pair(NamedTuple):
@@ -142,6 +158,7 @@ def test_the_bound_allows_for_rounding(pair: Pair) -> None:
     # Residuals do not show what rounding does to the solution itself, of which 5e-6 is the least allowed for.
     model = pair.model
     assert model.rounding_allowance >= 5e-6
+    assert model.residual_allowance >= 1e-7
     for vector in states(model, 3):
         response = model.static_response(vector)
         without = replace(model, rounding_allowance=0.0).static_response(vector)
@@ -197,7 +214,7 @@ def test_the_wing_bends_in_the_modes_of_the_full_one(coarse_operators, model: Re
 
 @pytest.mark.parametrize(
     ("full", "reduced", "count", "largest"),
-    [("beam", "beam_reduction", 6, 1e-3), ("coarse_plate", "plate_model", 20, 8e-3)],
+    [("beam", "beam_reduction", 6, 1e-3), ("coarse_plate", "plate_model", 10, 8e-3)],
 )
 def test_errors_are_measured(full: str, reduced: str, count: int, largest: float, request) -> None:
     """The bound holds at random states, nearly as asked for, and tells the error within a few times."""
@@ -215,3 +232,179 @@ def test_a_load_that_no_output_sees(write_beam: Callable[..., Path], tmp_path: P
     found = model.static_response({"load_factor": 0.0, "push": 100.0})
     upwards = model.static_response({"load_factor": 6.0, "push": 0.0}).displacement[0]
     assert abs(found.displacement[0]) <= found.displacement_error_bound < 1e-3 * abs(upwards)
+
+
+# ---------------------------------------------------------------- the search, against pyMOR's own reductor
+
+SYSTEM = springs()
+STIFFNESS = tuple(term.matrix for term in SYSTEM.stiffness_terms)
+TERMS = ReductionTerms(SYSTEM)
+
+
+def values(state: Any) -> dict[str, float]:
+    return dict(zip(("young_modulus_factor", *SYSTEM.regions), state, strict=True))
+
+
+def test_bound_is_not_wildly_pessimistic() -> None:
+    """Of a model so small that its errors are far above rounding."""
+    rough = rough_springs().model
+    ratios = []
+    for state in TERMS.training()[::5]:
+        found = rough.static_response(values(state))
+        wanted = static_response(SYSTEM, values(state) | {"load_factor": 1.0, "tip_force": 0.0}).strain
+        ratios.append(found.strain_error_bound / np.abs(found.strain - wanted).max())
+    assert min(ratios) >= 1.0
+    assert np.median(ratios) < 1.8
+
+
+def test_the_rounding_that_was_measured_is_allowed_for() -> None:
+    """On a soft first spring the chain moves far and stretches little: digits of the stretches are lost."""
+    assert reduced_springs(2).model.rounding_allowance == 5e-6  # the least
+    root = 1e-10
+    model = reduce_structure(springs(root=root), replace(SETTINGS, bound_tolerance=1e-2)).model
+    # in doubles a displacement of all is known to 2^-53 of itself, and moves by (pull / stretch) / root
+    assert 5e-6 < model.rounding_allowance < 2.0**-53 / root * 60 * 8
+    assert model.static_response({"load_factor": 1.0}).strain_error_bound > 5e-6
+
+
+def test_pymor_reduces_and_bounds_alike() -> None:
+    """On the same basis pyMOR's coercive reductor must give the same solution and the same energy bound."""
+    model, basis = reduced_springs(2).model, reduced_springs(2).static_basis
+    coefficients = [ProjectionParameterFunctional("theta", 4, k) for k in range(4)]
+    operators = [NumpyMatrixOperator(term) for term in STIFFNESS]
+    reference = {"theta": np.append(model.bound_reference, 1.0)}
+    load = VectorOperator(operators[0].range.from_numpy(SYSTEM.load_lift[:, np.newaxis]))
+    full = StationaryModel(LincombOperator(operators, coefficients), load)
+    reduced = CoerciveRBReductor(
+        full,
+        RB=full.solution_space.from_numpy(np.ascontiguousarray(basis)),
+        product=NumpyMatrixOperator(affine_sum(reference["theta"], STIFFNESS)),
+        coercivity_estimator=MinThetaParameterFunctional(coefficients, reference),
+    ).reduce()
+    for e, z1, z2 in TERMS.training()[::17]:
+        theta = np.array((e, 1 - z1, 1 - z2, 1.0))
+        mu = reduced.parameters.parse({"theta": theta})
+        ours = model.static_response({"young_modulus_factor": e, "load_factor": 1.0}, (z1, z2)).coordinates
+        np.testing.assert_allclose(reduced.solve(mu).to_numpy().ravel(), ours, rtol=1e-8)
+        change = (theta - reference["theta"])[:-1]
+        residual = model.residual_load[:, 0] - np.einsum("rqj,q,j->r", model.residual_stiffness, change, ours)
+        energy_bound = float(reduced.estimate_error(mu).ravel()[0])
+        coercivity = min(theta / reference["theta"])
+        assert np.linalg.norm(residual) / coercivity == pytest.approx(energy_bound, rel=1e-6)
+
+
+@pytest.mark.parametrize(("regions", "tolerance"), [(1, 5e-3), (2, SETTINGS.bound_tolerance), (4, 5e-3)])
+def test_search_ends_below_the_tolerance_and_starts_high(regions: int, tolerance: float) -> None:
+    """Few regions have a bound of each, and many one together."""
+    found = reduced_springs(regions)
+    assert found.bound_history[-1] <= tolerance < found.bound_history[0]
+    assert len(found.bound_history) <= len(found.snapshots) == len(set(found.snapshots))
+    assert found.model.dual_output.shape[::2] == {1: (2, 1), 2: (4, 1), 4: (1, 12)}[regions]
+
+
+def test_same_system_gives_the_same_bytes() -> None:
+    assert reduce_structure(springs(), SETTINGS).model.to_bytes() == reduced_springs(2).model.to_bytes()
+
+
+def test_progress_is_told() -> None:
+    listener = MagicMock()
+    reduce_structure(SYSTEM, SETTINGS, listener)
+    assert "Reducing the modes" in str(listener.stage.mock_calls)
+    assert "'full solution 1'" in str(listener.mock_calls)
+
+
+def test_anchors_part_the_losses_in_equal_ratios() -> None:
+    np.testing.assert_allclose(1.0 - reduced_springs(2).model.dual_split, np.sqrt(0.2))
+    kept = np.array([anchor[1:3] for (anchor,) in TERMS.anchors()])
+    np.testing.assert_allclose(
+        kept, 0.2 ** np.array([(0.25, 0.25), (0.25, 0.75), (0.75, 0.25), (0.75, 0.75)])
+    )
+
+
+# ---------------------------------------------------------------- of a structure file
+
+
+@pytest.mark.long  # what the documentation says of six regions, in minutes
+@pytest.mark.parametrize("make", [plate, bracket, tube])
+def test_six_regions_by_default(tmp_path: Path, make: Any) -> None:
+    structure = load_and_assemble(make(tmp_path, 6))
+    errors = measured_errors(structure, reduce_structure(structure).model, 60)
+    assert max(errors.strain, errors.displacement) <= errors.bound < 1e-3
+
+
+def test_the_file_says_how_well_and_the_structure_stays_the_same(plate_file: Path, tmp_path: Path) -> None:
+    design, other = load_structure(plate_file), tmp_path / "plate.toml"
+    assert StructureSettings.of(design).bound_tolerance == pytest.approx(5e-3)
+    other.write_text(plate_file.read_text(encoding="utf-8").replace("5e-3", "1e-2"), encoding="utf-8")
+    assert tomllib.loads(other.read_text(encoding="utf-8"))["reduction"] == {"tolerance": 1e-2}
+    folder = plate_file.parent
+    assert structure_hash(load_structure(other), folder) == structure_hash(design, folder)
+
+
+@pytest.mark.parametrize(("changes", "cells", "sentence"), Inputs(__file__).refused("beam"))
+def test_what_cannot_be_reduced_is_refused(changes, cells, sentence: str, write_beam, tmp_path) -> None:
+    with refused(FiniteElementError, sentence):
+        reduced_structure(write_beam(tmp_path, changes, cells=cells))
+
+
+# ---------------------------------------------------------------- fields of the wing
+
+STATE = {"young_modulus_factor": 0.95, "stiffness_loss": (0.3, 0.6), "load_factor": 3.0, "tip_force": 5.0}
+
+
+@pytest.fixture(scope="module")
+def written(coarse_fields: WingFields, coarse_operators, tmp_path_factory) -> meshio.Mesh:
+    """What two files of the same state hold, which are the same bytes, and are read as the wing's mesh."""
+    first, again = (tmp_path_factory.mktemp("vtu") / "wing.vtu" for _ in range(2))
+    for path in (first, again):
+        write_wing_vtu(path, coarse_fields, coarse_fields.vector(**STATE))
+        assert list(path.parent.iterdir()) == [path]
+    assert first.read_bytes() == again.read_bytes()
+    mesh, wanted = read_mesh(first, 1.0, "m"), coarse_operators.wing_mesh
+    assert mesh.kind is wanted.kind
+    np.testing.assert_allclose(mesh.nodes, wanted.nodes, atol=1e-12)
+    return meshio.read(first)
+
+
+def test_displacement_strain_and_damage_are_those_of_the_full_model(
+    written: meshio.Mesh, coarse_operators
+) -> None:
+    full = solve_static(coarse_operators, *STATE.values())
+    wanted = coarse_operators.full_displacement(full.displacement)
+    found = written.point_data["displacement"]
+    np.testing.assert_allclose(found, wanted, atol=1e-3 * np.abs(wanted).max())
+    assert found[:, 2].max() == pytest.approx(full.output[0], rel=0.1)
+    mesh = coarse_operators.wing_mesh
+    local = np.full((1, 3), 0.5)
+    strain, data = (
+        mesh.strains(wanted, local=local)[:, 0],
+        {name: own for name, (own,) in written.cell_data.items()},
+    )
+    np.testing.assert_allclose(data["strain"], strain, atol=1e-2 * np.abs(strain).max())
+    np.testing.assert_array_equal(data["spanwise_strain"], -data["strain"][:, 1])
+    np.testing.assert_array_equal(data["region"], mesh.region)
+    lost = np.select([mesh.region == 1, mesh.region == 2], [0.3, 0.6])
+    np.testing.assert_array_equal(data["stiffness_loss"], lost)
+
+
+def test_modes_are_those_of_the_full_model(coarse_fields, coarse_operators, tmp_path: Path) -> None:
+    write_modes_vtu(tmp_path / "modes.vtu", coarse_fields, coarse_fields.nominal)
+    written = meshio.read(tmp_path / "modes.vtu").point_data
+    full = eigenmodes(coarse_operators, 1.0, (0.0, 0.0), 0.169, 0.134)
+    assert len(written) == coarse_fields.mode_count
+    for number, name in enumerate(list(written)[:3]):
+        label, frequency = name.rsplit("_", 1)
+        assert label == f"mode_{number + 1}"
+        assert float(frequency.removesuffix("Hz")) == pytest.approx(full.frequency[number], rel=1e-4)
+        wanted = np.abs(coarse_operators.full_displacement(full.shape[:, number]))
+        np.testing.assert_allclose(np.abs(written[name]), wanted, atol=1e-2 * wanted.max())
+
+
+def test_bad_states_and_places_leave_no_file(coarse_fields: WingFields, tmp_path: Path) -> None:
+    place = tmp_path / "folder.vtu"
+    place.mkdir()
+    with refused(OutsideModelError, "load_factor must"):
+        write_wing_vtu(tmp_path / "wing.vtu", coarse_fields, coarse_fields.vector(load_factor=np.nan))
+    with refused(FileNotWrittenError, re.escape(str(place))):
+        write_wing_vtu(place, coarse_fields, coarse_fields.vector(**STATE))
+    assert list(tmp_path.iterdir()) == [place]

@@ -1,15 +1,17 @@
-"""The contract of a law of a port, each law: slopes, rest, order of steps, both loops, over the planform."""
+"""Laws of ports, by their contract and over the planform, and motion under them against closed forms."""
 
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
-from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import CubicSpline
+from scipy.linalg import expm
+from scipy.optimize import brentq
+from scipy.special import ellipk
 
 from fe.compilation import compiled_kernel
 from fe.runtime import laws as functions
@@ -18,7 +20,7 @@ from fe.runtime.arrays import FORCE
 from fe.runtime.errors import SolutionError
 from fe.runtime.laws import speed
 from fe.runtime.laws.interface import PARAMETERS, PortForce
-from fe.runtime.modal_system import ModalSystem
+from fe.runtime.modal_system import ModalSystem, rayleigh_coefficients, rayleigh_damping_ratio
 from fe.runtime.motion import (
     NO_LAWS,
     PLANFORM,
@@ -29,12 +31,13 @@ from fe.runtime.motion import (
     laws_of,
     static_solution,
 )
+from fe.runtime.motion_arrays import ModalMotion
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.static_path import settle_port
 from fe.runtime.stepwise import substeps
 from fe.runtime.wing_rows import planform_stations
-from tests.fe.runtime.stepping import force_of, rates_of, simulate, states_of
+from tests.fe.runtime.stepping import exact, force_of, rates_of, second_order, simulate, states_of
 
 A, W = 0.05, 2.0 * np.pi * np.array([5.6, 20.0, 35.0, 60.0])
 PORTS = {"tip": np.array([1.3, -1.1, 0.2, 1.2]), "root": np.array([0.8, 2.0, -0.3, 3.0])}
@@ -63,10 +66,6 @@ def moved(*items: Primitive, system: ModalSystem = WING, **options: Any) -> Any:
     return simulate(system, laws(*items), interval=0.005, **start | options)
 
 
-def test_there_is_an_example_of_each_law() -> None:
-    assert {type(item) for item in AT_EACH.values()} == set(functions.LAWS)
-
-
 @pytest.mark.parametrize("kind", AT_EACH)
 def test_the_slope_is_that_of_the_force(kind: str) -> None:
     """On ways to both sides from a place where it was never loaded, whose memory stays."""
@@ -79,6 +78,7 @@ def test_the_slope_is_that_of_the_force(kind: str) -> None:
         ]
         assert force[1][1] == pytest.approx((force[2][0] - force[0][0]) / 2e-7, rel=2e-3, abs=1e-6)
     assert not memory.any()
+    assert {type(item) for item in AT_EACH.values()} == set(functions.LAWS)
 
 
 @pytest.mark.parametrize("exponent", [0.5, 1.0, 1.5, 2.0])
@@ -133,10 +133,6 @@ def test_static_levels_are_in_equilibrium_and_follow_the_path(law: Primitive) ->
     fine = np.interp(np.linspace(0, 7, 7 * 64 + 1), np.arange(8), linear[:, 0])[:, None]
     followed = static_solution(laws(law), fine, compliance, kernel=compiled_kernel())
     np.testing.assert_allclose(followed.positions[::64], solution.positions, atol=3e-6)
-    if isinstance(law, patch.SineForce):
-        np.testing.assert_allclose(
-            solution.forces, 40.0 * np.sin(15.0 * solution.positions + 0.4), atol=1e-10
-        )
 
 
 @given(
@@ -199,12 +195,11 @@ TYPICAL: dict[str, tuple[Primitive, float, float]] = {
 TIME = 0.005 * np.arange(100)
 
 
-def integrated(law: Any, time: NDArray[np.float64]) -> Any:
+def integrated(law: Any) -> Any:
     """Displacement (N,) of the tip after its release, by a general integrator."""
     given: dict[str, Any] = {"method": "DOP853", "rtol": 1e-9, "atol": 1e-12}
-    row, rate = PORTS["tip"], getattr(law, "rate", 0.0)
+    row, rate, z = PORTS["tip"], getattr(law, "rate", 0.0), np.zeros(states_of(law))
     first = np.array([A / 1.3, 0.002, 0.0, 0.001, *np.zeros(4)])
-    z = np.zeros(states_of(law))
     x = float(row @ first[:4])
     z = solve_ivp(lambda s, z: rates_of(law, x, z), (0.0, 1.0), z, max_step=0.01, **given).y[:, -1]
 
@@ -215,17 +210,16 @@ def integrated(law: Any, time: NDArray[np.float64]) -> Any:
         return np.concatenate((v, a, rates_of(law, float(row @ v), z)))
 
     begin = np.concatenate((first, z))
-    return row @ solve_ivp(slope, (0.0, time[-1]), begin, t_eval=time, max_step=2e-3, **given).y[:4]
+    return row @ solve_ivp(slope, (0.0, TIME[-1]), begin, t_eval=TIME, max_step=2e-3, **given).y[:4]
 
 
 @pytest.mark.parametrize("name", TYPICAL)
 def test_default_steps_are_fine_and_the_order_is_two(name: str) -> None:
     law, least_order, largest = TYPICAL[name]
-    runs = (moved(law, force=np.zeros(len(TIME)), refinement=n).q @ PORTS["tip"] for n in (1, 2, 4, 8, 128))
-    *coarse, exact = runs  # of dry friction, whose closed form is that of `test_motion`
-    if name != "coulomb":
-        exact = integrated(law, TIME)
-    errors = [np.max(np.abs(one - exact)) / A for one in coarse]
+    *runs, exact = (moved(law, force=np.zeros(100), refinement=n).q @ PORTS["tip"] for n in (1, 2, 4, 8, 128))
+    if name != "coulomb":  # whose closed form is below
+        exact = integrated(law)
+    errors = [np.max(np.abs(one - exact)) / A for one in runs]
     assert errors[0] < largest
     # events fall differently into the steps of each refinement, so the order is that over a factor of eight
     assert np.log2(errors[0] / errors[-1]) / 3.0 > least_order
@@ -310,3 +304,258 @@ def test_rows_of_the_stations_are_displacements_of_the_elastic_line(coarse_patch
     assert seen == pytest.approx(between, rel=1e-2)
     # the mean over the area is that of the port "span"
     assert float(wing.planform[1] @ seen) == pytest.approx(float(wing.port_rows["span"] @ bent), rel=1e-2)
+
+
+# ---------------------------------------------------------------- one mass, by closed forms
+
+OMEGA = 2.0 * np.pi  # one second for a period
+ONE = ModalSystem(np.array([OMEGA]), np.zeros((1, 1)), {"mass": np.array([1.0])})
+STIFFNESS = OMEGA**2  # mass 1 kg
+
+
+def ring(
+    *items: Primitive, duration: float = 10.0, count: int = 1001, start: float = 1.0, **options: Any
+) -> ModalMotion:
+    """Ring-down of one mass from `start` at rest."""
+    given = {"q": np.array([start]), "v": np.zeros(1), "force": np.zeros(count), "kernel": compiled_kernel()}
+    return simulate(ONE, laws(*items), interval=duration / (count - 1), **given | options)
+
+
+def coulomb(strength: float) -> PowerDamping:
+    return PowerDamping("mass", strength, 0.0, 0.0, 1.0, 1.0)
+
+
+# ---------------------------------------------------------------- linear
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+def test_a_linear_system_under_a_force_is_the_matrix_exponential(coupled: bool) -> None:
+    """Free, overdamped and hardly damped modes, at stamps of several distances: all but rounding is exact."""
+    random, w = np.random.default_rng(3), np.array([0.0, 7.0, 60.0, 150.0])
+    damping = np.diag([0.3, 1.0, 200.0, 3.0]) + coupled * random.normal(size=(4, 4))
+    shape, constant, first, force = (random.normal(size=size) for size in (4, 4, 8, 50))
+    interval = np.resize([0.01, 0.0104, 0.01, 0.04], 49)
+    into = np.concatenate((np.zeros((4, 2)), np.stack((shape, constant), axis=1)))
+    time, inputs = np.append(0.0, np.cumsum(interval)), np.stack((force, np.ones(50)), axis=1)
+    wanted = exact(second_order(np.diag(w**2), damping), into, time, inputs, first=first)
+    for kernel in (None, compiled_kernel()):
+        moved = simulate(
+            ModalSystem(w, damping), NO_LAWS, q=first[:4], v=first[4:], force=force, interval=interval,
+            shape=shape, constant=constant, kernel=kernel,
+        )  # fmt: skip
+        np.testing.assert_allclose(moved.q, wanted[:, :4], atol=1e-11)
+        np.testing.assert_allclose(moved.v, wanted[:, 4:], atol=1e-9)
+
+
+# ---------------------------------------------------------------- damping
+
+
+@pytest.mark.parametrize("ratio", [0.01, 0.05, 0.13])
+def test_coulomb_friction_takes_the_same_from_each_half_cycle_and_stops_the_mass(ratio: float) -> None:
+    # x'' + w^2 x + Fc sgn x' = 0: half cycles about +-Fc/k, Den Hartog 1931
+    half_cycles = int(np.ceil((1.0 - ratio) / (2.0 * ratio)))
+    moved = ring(coulomb(ratio * STIFFNESS), duration=0.5 * half_cycles + 2.0, count=100 * half_cycles + 401)
+    time = np.arange(len(moved.q)) * 0.005
+    number = np.minimum(np.floor(2.0 * time + 1e-9), half_cycles)
+    sign, amplitude = (-1.0) ** number, 1.0 - 2.0 * ratio * number
+    swing = sign * ratio + sign * (amplitude - ratio) * np.cos(OMEGA * (time - 0.5 * number))
+    expected = np.where(number < half_cycles, swing, sign * amplitude)
+    np.testing.assert_allclose(moved.q[:, 0], expected, atol=2e-4)
+    stopped, rest = time > 0.5 * half_cycles + 0.05, expected[-1]
+    assert np.ptp(moved.q[stopped, 0]) < 1e-12
+    assert moved.q[-1, 0] == pytest.approx(rest, abs=1e-4)
+    assert np.all(np.abs(moved.v[stopped, 0]) < 1e-12)
+    # at rest friction holds the spring
+    assert moved.port_forces[-1, 0] == pytest.approx(-STIFFNESS * rest, abs=1e-3)
+
+
+def test_a_mass_within_the_friction_never_moves_and_leaves_under_a_larger_force() -> None:
+    force = np.concatenate((np.linspace(0.0, 0.999, 400), np.full(100, 0.999)))
+    held, moved = (
+        ring(
+            coulomb(1.0), start=0.0, duration=4.99, count=500, force=f * force, shape=np.ones(1), kernel=None
+        )
+        for f in (1.0, 2.0)
+    )
+    assert np.max(np.abs(held.q)) < 1e-12
+    np.testing.assert_allclose(held.port_forces[1:, 0], force[1:], atol=1e-9)
+    assert moved.q[-1, 0] > 0.5 / STIFFNESS
+
+
+@pytest.mark.parametrize("ratio", [0.35, 0.4, 0.49, 0.55, 0.75, 0.9])
+@pytest.mark.parametrize("steps", [11, 17, 31])
+def test_friction_stops_a_mass_where_it_stops_to_the_fourth_order_of_the_step(
+    ratio: float, steps: int
+) -> None:
+    # Half kicks at both ends of a step move about an equilibrium that is nearer by friction h^2 / 12. A mass
+    # that begins nearer by as much moves as the exact one does, always nearer, and stops where that stops:
+    # before the spring is free of load (2 ratio > 1) as well as beyond.
+    strength, duration = ratio * STIFFNESS, 0.8
+    shift = strength * (duration / steps) ** 2 / 12.0
+    moved = ring(
+        coulomb(strength), start=1.0 - shift, duration=duration, count=2, substeps=steps, kernel=None
+    )
+    assert moved.v[-1, 0] == pytest.approx(0.0, abs=1e-12)
+    assert moved.q[-1, 0] == pytest.approx(2.0 * ratio - 1.0, abs=0.03 * shift)
+
+
+def test_structural_damping_is_alike_at_all_amplitudes() -> None:
+    # k g |x| sgn v: each half cycle ends at (1 - g) / (1 + g) of the amplitude, exactly
+    g = 0.03
+    moved = ring(PowerDamping("mass", g * STIFFNESS, 0.0, 1.0, 1.0, 1.0), duration=6.0, count=6001)
+    turns = np.abs(moved.q[np.flatnonzero(np.diff(np.sign(moved.v[:, 0]))), 0])[1:]
+    # quarter cycles have frequencies w sqrt(1 +- g): outwards stiffer
+    np.testing.assert_allclose(turns[1:] / turns[:-1], np.sqrt((1 - g) / (1 + g)), atol=3e-4)
+
+
+# ---------------------------------------------------------------- stiffness
+
+
+def potential(law: Primitive, x: Any) -> Any:
+    """Energy of spring and law at a displacement."""
+    if isinstance(law, FreePlay):
+        inner = np.minimum(np.abs(x), law.half_width)
+        extra = -law.stiffness * (0.5 * inner**2 + law.half_width * (np.abs(x) - inner))
+    else:
+        size = law.coefficient * law.reference_displacement / (law.exponent + 1.0)
+        extra = size * np.abs(x / law.reference_displacement) ** (law.exponent + 1.0) * (law.side * x >= 0.0)
+    return 0.5 * STIFFNESS * x**2 + extra
+
+
+def first_integral(law: Primitive) -> float:
+    """Quarter [s] of the period of a law that is the same on both sides, released from 1 m."""
+    return float(quad(
+        lambda u: np.cos(u) / np.sqrt(2.0 * (potential(law, 1.0) - potential(law, np.sin(u)))),
+        0.0, np.pi / 2, points=[np.arcsin(0.2)], epsabs=1e-12, limit=400,
+    )[0])  # fmt: skip
+
+
+CRACK, PLAY = PowerStiffness("mass", -0.4 * STIFFNESS, 1.0, -1, 1.0), FreePlay("mass", 0.5 * STIFFNESS, 0.2)
+SOFT = 1.0 / np.sqrt(0.6)
+
+
+@pytest.mark.parametrize(
+    ("law", "period", "least", "tolerance"),
+    [
+        *(
+            (PowerStiffness("mass", share * STIFFNESS, 3.0, 0, 1.0),
+             4.0 * ellipk(-share / (2.0 + share)) / (OMEGA * np.sqrt(1.0 + share / 2.0)), -1.0, 2e-6)
+            for share in (-0.3, 0.05, 0.3, 2.0)
+        ),
+        (CRACK, (1.0 + SOFT) * np.pi / OMEGA, -SOFT, 2e-6),  # half a period of each spring
+        (PLAY, 4.0 * first_integral(PLAY), -1.0, 1e-5),
+    ],
+)  # fmt: skip
+def test_a_nonlinear_spring_has_its_period_and_keeps_its_energy(law, period, least, tolerance) -> None:
+    # in default steps it goes to and fro, and does not drift
+    moved = ring(law, duration=200.0, count=4001)
+    energies = 0.5 * moved.v[:, 0] ** 2 + potential(law, moved.q[:, 0])
+    assert np.ptp(energies) < 2e-3 * energies[0]
+    assert energies[2000:].mean() == pytest.approx(energies[:2000].mean(), rel=1e-4)
+    x = ring(law, duration=20.0, count=4001, substeps=40).q[:, 0]
+    times = []  # of rising zero crossings, from the cubic through four samples
+    for i in np.flatnonzero((x[:-1] < 0.0) & (x[1:] >= 0.0)):
+        cubic = np.polyfit(np.arange(-1.0, 3.0), x[i - 1 : i + 3], 3)
+        times.append((i + brentq(lambda u, c=cubic: np.polyval(c, u), 0.0, 1.0)) * 0.005)
+    assert np.mean(np.diff(times)) == pytest.approx(period, rel=tolerance)
+    assert x.min() == pytest.approx(least, rel=1e-4)
+    if law is not CRACK:
+        assert 4.0 * first_integral(law) == pytest.approx(period, rel=1e-10)
+
+
+# ---------------------------------------------------------------- hysteresis
+
+
+def whole_force(law: Primitive, path: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Force along a prescribed path with the spring that the law takes away.
+
+    It is a static solution of a structure without compliance.
+    """
+    found = static_solution(laws(law), path[:, None], np.zeros((1, 1)), kernel=compiled_kernel())
+    return found.forces[:, 0] + law.stiffness * path
+
+
+@pytest.mark.parametrize("chi", [0.0, -0.5])
+def test_an_iwan_joint_loses_the_energy_of_its_density_and_obeys_masing(chi: float) -> None:
+    law = MicroSlip("mass", slip_force=1.0, stiffness=4.0, chi=chi, element_count=400)
+    amplitude, most = 0.2, (2 + chi) / ((1 + chi) * 4.0)
+    up = np.linspace(0, amplitude, 401)
+    loop = np.concatenate((up, up[::-1], -up, -up[::-1], up))
+    whole = whole_force(law, loop)
+
+    def lost(d: float) -> float:
+        """An element that slips takes 4 k d (A - d), d of the density (1 + chi) d^chi / most^(1 + chi)."""
+        return float(16.0 * d * (amplitude - d) * (1 + chi) * d**chi / most ** (1 + chi))
+
+    loss = quad(lost, 0.0, amplitude)[0]
+    assert np.trapezoid(whole[401:], loop[401:]) == pytest.approx(loss, rel=5e-3)
+    # Masing 1926: unloading from the turn is the first loading, twice as large
+    down = slice(401, 3 * 401)
+    first = np.interp(0.5 * (amplitude - loop[down]), up, whole[:401])
+    np.testing.assert_allclose(whole[400] - whole[down], 2.0 * first, atol=2e-5)
+
+
+@pytest.mark.parametrize("chi", [0.0, -0.4, -0.9])
+def test_elements_of_a_joint_slip_together_at_the_slip_force(chi: float) -> None:
+    law = MicroSlip("mass", slip_force=2.0, stiffness=8.0, chi=chi)
+    assert law.elements().mean() == pytest.approx(0.25)
+    assert whole_force(law, np.array([50.0]))[0] == pytest.approx(2.0)
+
+
+def test_a_bouc_wen_law_that_yields_at_once_is_dry_friction_in_position() -> None:
+    path = np.array([0.3, 0.4, -0.2, 0.0])
+    for order in (0.1, 1.0, 30.0):
+        np.testing.assert_allclose(whole_force(BoucWen("mass", 5.0, 1e-9, order), path), 0.0, atol=1e-8)
+
+
+def test_motions_of_almost_nothing_stay_finite() -> None:
+    both = PowerDamping("mass", 1.0, 2.5, 0.0, 1.0, 1.0), PowerStiffness("mass", 1.0, 3.0, 0, 1.0)
+    moved = ring(*both, start=1e-300, v=np.array([1e-290]), duration=0.04, count=5, kernel=None)
+    assert np.all(np.isfinite(moved.q))
+
+
+# ---------------------------------------------------------------- steps of modes, and their damping
+
+
+def transition(omega: float, damping: float, duration: float, unit: float) -> np.ndarray:
+    """Of displacements times a unit, such that all entries are of order one."""
+    found, *_ = ModalSystem(np.array([omega]), np.array([[damping]])).exact_steps(np.array([duration]))
+    return np.asarray(found[0]) * np.array([unit, 1.0])[:, None] / [unit, 1.0]
+
+
+def is_the_exponential(omega: float, damping: float, duration: float) -> None:
+    unit = max(omega, 1.0)
+    wanted = expm(np.array([[0.0, unit], [-omega * omega / unit, -damping]]) * duration)
+    np.testing.assert_allclose(transition(omega, damping, duration, unit), wanted, rtol=1e-7, atol=9e-10)
+
+
+@given(omega=st.floats(0.0, 500.0), damping=st.floats(0.0, 2000.0), duration=st.floats(1e-6, 1.0))
+@settings(max_examples=60, deadline=None)
+def test_the_step_of_any_oscillator_is_the_exponential(omega: float, damping: float, duration: float) -> None:
+    is_the_exponential(omega, damping, duration)
+
+
+@pytest.mark.parametrize("zeta", [0.0, 0.03, 0.7, 1 - 1e-9, 1.0, 1 + 1e-9, 1 + 1e-4, 1.5, 20.0, 1e4])
+def test_a_step_near_critical_damping_is_the_exponential(zeta: float) -> None:
+    for duration in (1e-5, 0.01, 0.3, 2.0):
+        is_the_exponential(9.0, 18.0 * zeta, duration)
+
+
+@given(
+    alpha=st.floats(0.0, 100.0),
+    beta=st.floats(0.0, 1.0),
+    first=st.floats(0.1, 10.0),
+    factor=st.floats(1.5, 100.0),
+)
+@example(alpha=1.0735, beta=7.3124e-4, first=5.6492, factor=29.9699 / 5.6492)
+def test_rayleigh_coefficients_are_the_inverse_of_the_ratios(alpha, beta, first, factor) -> None:
+    frequency = (first, first * factor)
+    low, high = rayleigh_damping_ratio(alpha, beta, frequency)
+    found = rayleigh_coefficients(frequency, (float(low), float(high)))
+    np.testing.assert_allclose(found, (alpha, beta), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("frequency", [(1.0, 1.0), (0.0, 1.0), (-1.0, 2.0)])
+def test_two_different_positive_frequencies_are_needed(frequency: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="Two different positive frequencies"):
+        rayleigh_coefficients(frequency, (0.1, 0.1))

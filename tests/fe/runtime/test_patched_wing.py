@@ -4,8 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime import patch
@@ -40,7 +38,7 @@ class Compared:
         self.wing, self.operators, self.arrays = wing, operators, wing.arrays
         self.mesh, self.design = operators.wing_mesh, operators.wing_mesh.design
         self.place, self.row = wing.arrays.load_place, wing.force_row("tip_load")
-        self.stiffness = operators.stiffness(FACTOR, STATE[1])
+        self.factors = Factorisation(operators.stiffness(FACTOR, STATE[1]))
 
     def structure(
         self, *items: Any, state: Any = STATE, masses: Any = MASSES, temperature: float = 0.0
@@ -51,22 +49,10 @@ class Compared:
     def load(self, load_factor: float, *items: Any) -> FloatArray:
         return np.array((load_factor, load_factor**2)) @ self.wing.load_parts(ModelPatch(items))
 
-    def alike(
-        self,
-        reduced: FloatArray,
-        load: FloatArray,
-        full: Any = None,
-        operators: AffineOperators | None = None,
-    ) -> FloatArray:
-        """Compare displacements with those of the full model under a load, and return the latter."""
-        given, u = (
-            operators or self.operators,
-            Factorisation(self.stiffness if full is None else full).solve(load),
-        )
-        strain, tip = given.gauge_output @ u, float(given.tip_row @ u)
+    def alike(self, reduced: FloatArray, full: FloatArray, operators: AffineOperators) -> None:
+        strain, tip = operators.gauge_output @ full, float(operators.tip_row @ full)
         assert np.abs(self.arrays.strain_rows[0] @ reduced - strain).max() <= STRAIN * np.abs(strain).max()
         assert float(self.arrays.tip_row @ reduced) == pytest.approx(tip, rel=DISPLACEMENT)
-        return u
 
     def softened(self, operators: AffineOperators, start: float, end: float, loss: float) -> Any:
         """Stiffness with less in the skin between two lines, of the wing in `STATE` or a sound one."""
@@ -102,26 +88,6 @@ def both(coarse_patched_wing: PatchedWing, coarse_operators: AffineOperators) ->
 # ---------------------------------------------------------------- structure
 
 
-@pytest.mark.parametrize(
-    ("e", "loss", "factor", "force"), [(*SOUND, 3.0, 0.0), (0.95, (0.6, 0.3), 2.0, 10.0)]
-)
-def test_without_a_patch_it_is_the_reduced_model_within_its_error_bound(
-    both, model, e, loss, factor, force
-) -> None:
-    response = model.static_response(
-        young_modulus_factor=e, stiffness_loss=loss, load_factor=factor, tip_force=force
-    )
-    structure = both.structure(state=(e, loss))
-    u = structure.static(both.load(factor) + force * both.row)
-    strain = both.arrays.strain_rows[0] @ u
-    scale = np.abs(response.strain).max()
-    assert np.abs(strain - response.strain).max() <= response.strain_error_bound + 3e-4 * scale
-    assert float(both.arrays.tip_row @ u) == pytest.approx(response.displacement[0], rel=5e-4)
-    masses = dict(zip(("servo_mass", "pitot_mass"), MASSES, strict=True))
-    modes = model.modes({"young_modulus_factor": e, **masses}, loss)
-    assert structure.lowest(3).frequency == pytest.approx(modes.frequency[:3], rel=FREQUENCY)
-
-
 def sprung(both: Compared, share: float) -> Any:
     """A compliance of the root is a softer spring."""
     compliance = share * both.arrays.largest_compliance / 0.4
@@ -146,12 +112,10 @@ def moved(both: Compared, station: float, added: float) -> Any:
     return structure, other, None, (MASSES[0], added)
 
 
-def warm(both: Compared, coefficient: float) -> Any:
-    """A temperature is a change of the modulus factor."""
-    stiffness = both.operators.stiffness(
-        {"young_modulus_factor": STATE[0] * (1 - 25 * coefficient)}, STATE[1]
-    )
-    structure = both.structure(patch.ModulusTemperature(coefficient), temperature=25.0)
+def warm(both: Compared, coefficient: float, e: float = STATE[0], loss: Any = STATE[1]) -> Any:
+    """A temperature is a change of the modulus factor; without a coefficient nothing is changed."""
+    stiffness = both.operators.stiffness({"young_modulus_factor": e * (1.0 - 25.0 * coefficient)}, loss)
+    structure = both.structure(patch.ModulusTemperature(coefficient), state=(e, loss), temperature=25.0)
     return structure, both.operators, stiffness, MASSES
 
 
@@ -161,15 +125,18 @@ def warm(both: Compared, coefficient: float) -> Any:
         *((sprung, (share,)) for share in (0.02, 0.3)),
         *((softer, given) for given in ((5, 6, 0.5), (2, 5, 0.3), (7, 10, 0.6))),
         *((moved, given) for given in ((0.75, 0.05), (0.4, 0.2))),
-        (warm, (2e-3,)),
+        *((warm, given) for given in ((2e-3,), (0.0, *SOUND), (0.0, 0.95, (0.6, 0.3)))),
     ],
 )
 def test_a_change_of_the_structure_is_that_of_the_full_model(both: Compared, change: Any, given: Any) -> None:
     """Under the lift of 2.5 g and under a force at the tip, and in the first three modes."""
     structure, operators, stiffness, masses = change(both, *given)
     stiffness = operators.stiffness(FACTOR, STATE[1]) if stiffness is None else stiffness
-    for reduced, full in ((both.load(2.5), 2.5 * both.operators.load_lift), (both.row, operators.load_tip)):
-        both.alike(structure.static(reduced), full, stiffness, operators)
+    loads = np.column_stack((2.5 * both.operators.load_lift, operators.load_tip))
+    for reduced, full in zip(
+        (both.load(2.5), both.row), Factorisation(stiffness).solve(loads).T, strict=True
+    ):
+        both.alike(structure.static(reduced), full, operators)
     squares = lowest_eigenpairs(stiffness, operators.mass(point_masses(*masses)), 3)[0]
     found, wanted = structure.lowest(3).frequency, np.sqrt(squares) / (2.0 * np.pi)
     assert found[[0, 2]] == pytest.approx(wanted[[0, 2]], rel=FREQUENCY)  # flapwise
@@ -178,15 +145,15 @@ def test_a_change_of_the_structure_is_that_of_the_full_model(both: Compared, cha
 
 @pytest.fixture(scope="module")
 def finer(both: Compared) -> AffineOperators:
-    """The same wing in cells of 20 mm along the span."""
-    return assemble(both.design.changed(mesh={"span_size": 0.005}))
+    """The same wing in cells of 40 mm along the span."""
+    return assemble(both.design.changed(mesh={"span_size": 0.01}))
 
 
 @pytest.mark.parametrize(
     ("start", "end", "loss"),
     [
-        pytest.param(0.2, 0.45, 0.4, marks=pytest.mark.long),
-        pytest.param(0.75, 1.15, 0.3, marks=pytest.mark.long),
+        (0.2, 0.45, 0.4),
+        (0.75, 1.15, 0.3),
         (0.5, 0.6, 0.5),
     ],
 )
@@ -219,6 +186,8 @@ def test_strips_make_the_skin_and_losses_that_overlap_multiply(both: Compared) -
     start, end = both.arrays.strip_lines[[4, 6]]
     once, as_one = (LocalStiffnessLoss(loss, start, end - start) for loss in (0.3, 0.51))
     assert np.abs(both.structure(once, once).stiffness - both.structure(as_one).stiffness).max() < 1e-12
+    beyond, within = (LocalStiffnessLoss(0.3, start, end - start) for start in (-0.2, 0.0))
+    assert np.array_equal(both.structure(beyond).stiffness, both.structure(within).stiffness)
     # strains need no factor where a box ends at strips
     assert both.wing.strain_factors(ModelPatch((once,))) == pytest.approx(1.0, abs=1e-12)
     nothing = ModelPatch((PointMass(0.1, 1.0), LocalStiffnessLoss(0.0, 0.1, 0.2)))
@@ -285,8 +254,8 @@ def relieved(both: Compared, fraction: float) -> tuple[FloatArray, FloatArray]:
 )
 def test_a_change_of_the_loads_is_that_of_the_full_model(both: Compared, change: Any, given: Any) -> None:
     reduced, full = change(both, *given)
-    u = both.structure().static(reduced)
-    solution = both.alike(u, full)
+    u, solution = both.structure().static(reduced), both.factors.solve(full)
+    both.alike(u, solution, both.operators)
     if change is placed:  # the place itself yields by what the trailing edge gives way under the force, too
         assert float(reduced @ u) == pytest.approx(float(full @ solution), rel=3e-3)
 
@@ -296,7 +265,7 @@ def test_a_change_of_the_loads_is_that_of_the_full_model(both: Compared, change:
 
 @pytest.mark.parametrize("degrees", [-15.0, 8.0, 90.0])
 def test_a_turned_gauge_follows_from_the_three_components(both: Compared, degrees: float) -> None:
-    angle, full = np.deg2rad(degrees), Factorisation(both.stiffness).solve(both.operators.load_lift)
+    angle, full = np.deg2rad(degrees), both.factors.solve(both.operators.load_lift)
     wanted = gauge_output(both.mesh, angle) @ (both.operators.expansion @ full)
     along, across, shear = both.arrays.strain_rows @ both.structure().static(both.load(1.0))
     c, s = np.cos(angle), np.sin(angle)
@@ -309,34 +278,15 @@ def test_outputs_and_places_by_name(both: Compared) -> None:
     u = both.structure().static(both.load(1.0))
     tip, there = wing.output_row("tip_displacement"), wing.output_row(f"displacement[{wing.span}, {elastic}]")
     assert float(tip @ u) == pytest.approx(float(there @ u), rel=1e-9)
-    for component in (0, 1):
-        assert np.array_equal(
-            wing.output_row("strain[24]", component), both.arrays.strain_rows[component, 23]
-        )
+    components = [wing.output_row(f"strain[24]{part}") for part in ("", ".transverse", ".shear")]
+    np.testing.assert_array_equal(components, both.arrays.strain_rows[:, 23])
     unknown = "strain[0] | strain[25] | strain[-1] | displacement[1.9, 0.3] | displacement[a, b] | speed"
     assert [wing.output_row(name) for name in unknown.split(" | ")] == [None] * 6
     by_place = wing.force_row((both.place, elastic))
     assert np.abs(by_place - both.row).max() < 1e-9 * np.abs(by_place).max()
 
 
-# ---------------------------------------------------------------- no change, softer, impossible
-
-
-@settings(max_examples=25, deadline=None)
-@given(
-    loss=st.floats(0.0, 0.9),
-    start=st.floats(-0.2, 1.8),
-    length=st.floats(0.0, 1.0),
-    compliance=st.floats(0.0, 2e-4),
-)
-def test_softer_is_softer(
-    both: Compared, loss: float, start: float, length: float, compliance: float
-) -> None:
-    softer = LocalStiffnessLoss(loss, start, length), RootCompliance(compliance)
-    stiff, soft = (float(both.row @ both.structure(*items).static(both.row)) for items in ((), softer))
-    assert soft >= stiff * (1.0 - 1e-9)
-    # the full solutions of which the basis is made are good to some 1e-6
-    assert soft >= stiff + (1.0 - 1e-5) * compliance * both.place**2 - 1e-9 * stiff
+# ---------------------------------------------------------------- what cannot be
 
 
 @pytest.mark.parametrize(("kind", "values", "sentence"), Inputs(__file__).refused("wing"))

@@ -47,9 +47,6 @@ def test_no_order_where_values_do_not_settle(values):  # to and fro, running awa
 # ---------------------------------------------------------------- the wing against CalculiX
 
 
-DAMAGED = (0.4, 0.6)
-
-
 ROD = {"web": 1, "reach": 0.25, "diameter": 0.012, "young_modulus": 120e9, "density": 1600.0}
 PLACES = {"nodal displacements": 1e-5, "displacement outputs": 1e-5, "strains at integration points": 2e-5}
 
@@ -59,7 +56,7 @@ PLACES = {"nodal displacements": 1e-5, "displacement outputs": 1e-5, "strains at
     ("state", "changes", "count"),
     [
         (DigitalState(young_modulus_factor=1.0073), {}, 6),
-        (DigitalState(young_modulus_factor=1.0073, stiffness_loss=DAMAGED), {}, 6),
+        (DigitalState(young_modulus_factor=1.0073, stiffness_loss=(0.4, 0.6)), {}, 6),
         (DigitalState(), {"rods": [ROD], "skin": {"closed_leading_edge": False}}, 3),
         (DigitalState(servo_mass=0.0, pitot_mass=0.3), {}, 3),
     ],

@@ -20,7 +20,7 @@ from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, T
 from discrepancy.document import Origin
 from discrepancy.files.verdict import StoredPatch, fmu_outputs, patch_effects, read_patch, write_patch
 from discrepancy.models.high_pass import filtered_record
-from discrepancy.models.interface import Conditions
+from discrepancy.models.interface import ACROSS, Conditions
 from discrepancy.models.structures import WingModel
 from discrepancy.verdict import NamedEffect, VerdictKind
 from fe.runtime.patch import STRUCTURE, ModelPatch, SensorGain, SensorRotation
@@ -247,11 +247,12 @@ def expected(model: WingModel, given: Trial, patch: ModelPatch, health: np.ndarr
     """Return all outputs of the naming side; a rotated gauge is turned here."""
     bare = ModelPatch(tuple(item for item in patch if not isinstance(item, SensorRotation)))
     outputs = tuple((name, Quantity(quantity)) for name, quantity in CHANNELS)
-    found = model.respond(given, outputs, bare, Conditions(STATE, health=health, components=bare != patch))
-    values = found.values.copy()
+    conditions = Conditions(STATE, health=health)
+    values = model.respond(given, outputs, bare, conditions).values.copy()
     for item in patch.of(SensorRotation):
         c, s, gauge = np.cos(item.angle), np.sin(item.angle), OUTPUTS.index(item.channel)
-        across, sheared = found.transverse[:, gauge], found.shear[:, gauge]
+        turned = tuple((CHANNELS[gauge][0] + part, Quantity.STRAIN) for part in ACROSS)
+        across, sheared = model.respond(given, turned, bare, conditions).values.T
         values[:, gauge] = c**2 * values[:, gauge] + s**2 * across + s * c * sheared
     return values
 

@@ -33,7 +33,7 @@ from twin_master.network.inference import filter_sequence, predict, smooth
 from twin_master.network.memory import check_scenario_fits
 from twin_master.network.planner import evaluate_policy, given_policy, value_iteration
 from twin_master.network.sensor_model import check_noise
-from twin_master.network.transition import TransitionModel, predecessor_lists
+from twin_master.network.transition import TransitionModel
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 
 LEVELS = (0.0, 0.2, 0.4, 0.6, 0.8)
@@ -139,35 +139,6 @@ def test_the_last_level_absorbs():
     table = worsening_table(3, 0.1)
     np.testing.assert_allclose(table, [[0.9, 0.1, 0], [0, 0.9, 0.1], [0, 0, 1]], rtol=1e-15)
     np.testing.assert_array_equal(worsening_table(1, 0.3), [[1.0]])
-
-
-def test_rows_at_the_damage_limit_sum_to_one():
-    """The authors' published table leaves 0.95 and 0.90 in the rows with exactly one region at its limit."""
-    transition = TransitionModel.from_factors([[worsening_table(5, p)] * 2 for p in (0.05, 0.10)])
-    np.testing.assert_allclose(transition.matrix.sum(axis=2), 1.0, rtol=0, atol=1e-15)
-    limit = StateSpace((Factor("z1", LEVELS), Factor("z2", LEVELS)))
-    row = transition.matrix[1, limit.index((0.8, 0.2))]
-    assert row[limit.index((0.8, 0.2))] == pytest.approx(0.9)
-    assert row[limit.index((0.8, 0.4))] == pytest.approx(0.1)
-
-
-def test_predecessor_lists_hold_every_non_zero_transition_and_no_other():
-    matrix = TransitionModel.from_factors(
-        [[worsening_table(4, p), worsening_table(3, 0.5)] for p in (0.0, 1.0)]
-    )
-    _, _, start, source, probability, log_probability = predecessor_lists([matrix.matrix])
-    rebuilt = np.zeros_like(matrix.matrix)
-    for control in range(2):
-        for state in range(12):
-            row = control * 12 + state
-            for k in range(start[row], start[row + 1]):
-                rebuilt[control, source[k], state] = probability[k]
-    np.testing.assert_array_equal(rebuilt, matrix.matrix)
-    np.testing.assert_allclose(np.exp(log_probability), probability, rtol=1e-15)
-
-
-def test_deterministic_policy():
-    np.testing.assert_array_equal(deterministic_policy([1, 0], 3), [[0, 1, 0], [1, 0, 0]])
 
 
 MOVES = TransitionModel.from_factors([[worsening_table(5, 0.1), worsening_table(3, 0.1)]])

@@ -140,20 +140,6 @@ def test_stable_over_ten_thousand_steps():
     np.testing.assert_allclose(smoothed.sum(axis=1), 1.0, rtol=1e-13)
 
 
-def test_step_by_step_equals_the_sequence():
-    rng = np.random.default_rng(5)
-    control = rng.integers(0, 2, 20)
-    log_likelihood = rng.normal(size=(20, 25)) * 200
-    filtered = filter_sequence(MODEL, control, log_likelihood)
-    before = None
-    for t in range(20):
-        step = filter_sequence(MODEL, control[t : t + 1], log_likelihood[t : t + 1], before)[0]
-        for name, found in vars(step).items():
-            expected = getattr(filtered, name)[t]
-            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-300, err_msg=name)
-        before = step.log_filtered, int(control[t])
-
-
 def test_many_twins_equal_one_by_one():
     rng = np.random.default_rng(6)
     control = rng.integers(0, 2, (7, 15))

@@ -75,17 +75,6 @@ def test_likelihood_is_the_integral_and_eq_32_its_approximation(seed, spread, re
     np.testing.assert_allclose(model.noise(joint), noise, rtol=1e-13)
 
 
-@pytest.mark.parametrize(("deviation", "error"), [(0.7, 0.0), (0.7, 0.1)])
-def test_one_number_stands_for_all_sensors(deviation, error):
-    _, values, weight, _, observation = random_case(9)
-    one = GaussianSensorModel(values, deviation, weight, model_error=error)
-    given = {"model_error": np.full(SENSORS, error)} if error else {}
-    each = GaussianSensorModel(values, np.full(SENSORS, deviation), weight, **given)
-    np.testing.assert_array_equal(one.log_likelihood(observation, 0), each.log_likelihood(observation, 0))
-    np.testing.assert_array_equal(one.standard_deviation, np.full(SENSORS, deviation))
-    np.testing.assert_array_equal(one.model_error, np.full(SENSORS, error))
-
-
 @settings(deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -30,7 +30,9 @@ def test_the_mission_figure_draws_the_stored_arrays(run):
     for factor in range(2):
         axes = panel(figure, f"region {factor + 1}")
         assert_allclose(line(axes, "past")[:, 1], 100.0 * (belief @ run.model.states.coordinates)[:, factor])
-        assert_allclose(line(axes, "at the time")[:, 1], 100.0 * run["filtered/mean"][: now + 1, factor])
+        assert_allclose(
+            line(axes, "as seen at the time")[:, 1], 100.0 * run["filtered/mean"][: now + 1, factor]
+        )
         coming = line(axes, "prediction")
         assert_array_equal(coming[:, 0], np.arange(19, 29))
         assert_allclose(coming[:, 1], 100.0 * run["predicted/mean"][now, :, factor])
@@ -65,7 +67,7 @@ def test_bands_are_the_stored_intervals(run):
 def test_control_bars_have_the_height_of_the_probability(run):
     axes = panel(mission_figure(run, 18), "Control: flown")
     for control, name in enumerate(run.controls):
-        (bars,) = [c for c in axes.containers if c.get_label() == f"predicted {control}"]
+        (bars,) = [c for c in axes.containers if c.get_label() == f"_predicted {control}"]
         heights = [bar.get_height() / 0.82 for bar in bars]
         assert_allclose(heights, run["predicted/control_probability"][18, :, control])
         assert [bar.get_y() for bar in bars] == [control] * 10
@@ -93,7 +95,7 @@ def test_states_and_sensors_have_units_and_names_of_their_own(run, tmp_path):
     axes = panel(now, "Stiffness loss of region 1")
     assert axes.get_ylabel() == "z₁ (m2.K/W)"
     assert [label.get_text() for label in axes.get_yticklabels()] == ["0", "0.2", "0.4", "0.6", "0.8"]
-    assert_array_equal(line(axes, "at the time")[:, 1], run["filtered/mean"][:21, 0])
+    assert_array_equal(line(axes, "as seen at the time")[:, 1], run["filtered/mean"][:21, 0])
     assert panel(now, "Stiffness loss of region 2").get_ylabel() == "z₂ (%)"
     pressure = panel(now, "Pressure")
     assert pressure.get_ylabel() == "bar"

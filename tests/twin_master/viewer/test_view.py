@@ -33,8 +33,7 @@ from twin_master.mission.preparation import KNOWLEDGE_NAME
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Belief, Flight
-from twin_master.viewer.messages import Request, Teller
-from twin_master.viewer.scene import LATEST, scene_of
+from twin_master.viewer.messages import LATEST, Request, Teller, scene_of
 from twin_master.workflow import fly as new_run
 
 TURNS = 50

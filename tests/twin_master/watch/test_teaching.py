@@ -29,8 +29,7 @@ from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
 from twin_master.mission.replay import replay
 from twin_master.network.inference import known_control
-from twin_master.viewer.messages import Request, Teller
-from twin_master.viewer.scene import scene_of
+from twin_master.viewer.messages import Request, Teller, scene_of
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Tutor, Watch
 from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence

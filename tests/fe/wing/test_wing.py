@@ -1,6 +1,10 @@
-"""The wing's mesh and operators: geometry, rigid motions, sums, gauges."""
+"""A wing: its design and lift, its mesh and operators, and its responses against what is published."""
 
+import json
+import tomllib
 from dataclasses import replace
+from functools import reduce
+from operator import getitem
 
 import numpy as np
 import pytest
@@ -11,12 +15,139 @@ from scipy.sparse.linalg import norm
 
 from fe.elements.cells import jacobians
 from fe.elements.kinds import gauss_points
-from fe.runtime.errors import InvalidDesignError, MeshError
+from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.wing import operators as modelled
+from fe.wing.design import SHIPPED_DESIGN, load_design, parse_design, rib_interval
 from fe.wing.mesh import SKIN, build_mesh, chord_lines, straight_edged
-from fe.wing.parts import four_digit_half_thickness
-from fe.wing.turn_load import STANDARD_GRAVITY, lift_load
+from fe.wing.operators import assemble
+from fe.wing.parts import Planform, four_digit_half_thickness, four_digit_slope
+from fe.wing.responses import eigenmodes, solve_static
+from fe.wing.turn_load import DISTRIBUTIONS, STANDARD_GRAVITY, lift_load, lifting_line, schrenk
+from tests.refusals import Inputs, refused
 from tests.wings import tip_stiffness
+
+TEXT = SHIPPED_DESIGN.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def content():
+    return tomllib.loads(TEXT)
+
+
+def test_the_shipped_design_is_the_wing_as_built(shipped_design):
+    assert (shipped_design.geometry.semi_span, shipped_design.geometry.root_chord) == (1.828, 0.433)
+    assert len(shipped_design.gauges.positions) == 24
+    assert [place.kind for place in shipped_design.point_masses] == ["servo", "servo", "pitot"]
+
+
+def test_the_hash_covers_content_and_nothing_else(shipped_design, content, tmp_path):
+    other = tmp_path / "same.toml"
+    for text, encoding in (("# another comment\n" + TEXT, "utf-8"), (TEXT, "utf-8-sig")):
+        other.write_text(text, encoding=encoding)
+        assert load_design(other) == shipped_design
+        assert load_design(other).hash == shipped_design.hash
+    assert parse_design(dict(reversed(content.items()))).hash == shipped_design.hash
+    for changes in ({"skin": {"thickness": 0.00061}}, {"mesh": {"refinement": 2.0}}):
+        assert shipped_design.changed(**changes).hash != shipped_design.hash
+    assert len(shipped_design.hash) == 64
+    assert parse_design(json.loads(shipped_design.model_dump_json())) == shipped_design
+
+
+@pytest.mark.parametrize(("path", "value", "sentence"), Inputs(__file__).refused("wing"))
+def test_a_wrong_design_is_refused_with_one_sentence_that_names_the_place(content, path, value, sentence):
+    if path == ["defects", 1, "span_start"]:
+        content["defects"][1]["chord_end"] = 0.3
+    reduce(getitem, path[:-1], content)[path[-1]] = value
+    with refused(InvalidDesignError, rf"^wing\.toml: .*({sentence}).*\.$"):
+        parse_design(content, source="wing.toml")
+
+
+def test_the_modulus_runs_straight_between_stations_and_steps_between_bands(shipped_design):
+    stations = [{"station": s, "young_modulus": m} for s, m in ((0.0, 8e9), (0.5, 10e9), (1.0, 6e9))]
+    skin = shipped_design.changed(skin={"stations": stations}).skin
+    assert skin.young_modulus(np.array([0.0, 0.25, 0.5, 0.75])) == pytest.approx([8e9, 9e9, 10e9, 8e9])
+
+    def banded(*ends, moduli=(8e9, 6e9)):
+        bands = [{"end": end, "young_modulus": own} for end, own in zip(ends, moduli, strict=True)]
+        return shipped_design.changed(skin={"stations": [], "bands": bands}).skin
+
+    assert banded(0.5, 1.0).young_modulus(np.array([0.1, 0.5, 0.51])).tolist() == [8e9, 8e9, 6e9]
+    for last in (0.4, 0.9):
+        with pytest.raises(InvalidDesignError, match="the ends of the bands must rise"):
+            banded(0.5, last)
+
+
+def test_what_is_missing_or_unreadable_is_named(content, tmp_path):
+    del content["lift"]
+    with pytest.raises(InvalidDesignError, match="'lift' is missing"):
+        parse_design(content)
+    with pytest.raises(DesignFileError, match=r"none\.toml cannot be read: No such file"):
+        load_design(tmp_path / "none.toml")
+
+
+def test_ribs_at_the_ends_lie_inside_the_span(shipped_design):
+    assert rib_interval(shipped_design, 0) == (0.0, pytest.approx(0.003))
+    assert rib_interval(shipped_design, 2)[1] == pytest.approx(shipped_design.planform.semi_span)
+
+
+# ---------------------------------------------------------------- lift
+
+
+UAV = Planform(semi_span=1.828, root_chord=0.433, tip_chord=0.260, straight_chord_line=0.3)
+
+
+def _integral(values, station):
+    return float(np.trapezoid(values, station))
+
+
+@pytest.mark.parametrize("name", sorted(DISTRIBUTIONS))
+@given(span=st.floats(0.5, 10.0), root=st.floats(0.1, 1.0), taper=st.floats(0.3, 1.0))
+def test_a_distribution_integrates_to_one_over_the_half_wing(name, span, root, taper):
+    plan = Planform(semi_span=span, root_chord=root, tip_chord=root * taper, straight_chord_line=0.25)
+    angle = np.linspace(0.0, 0.5 * np.pi, 2001)
+    station = np.sin(angle)
+    lift = DISTRIBUTIONS[name](plan)(station)
+    assert _integral(lift * span, station) == pytest.approx(1.0, rel=1e-4)
+    assert np.all(lift[:-1] > 0.0)
+
+
+def test_schrenk_and_the_lifting_line_bend_the_wing_alike():
+    angle = np.linspace(0.0, 0.5 * np.pi, 2001)
+    station = np.sin(angle)
+    one, other = schrenk(UAV)(station), lifting_line(UAV)(station)
+    for power in (1, 2):  # bending moment at the root, and its spread
+        assert _integral(one * station**power, station) == pytest.approx(
+            _integral(other * station**power, station), rel=0.02
+        )
+    inner = station < 0.8
+    assert np.abs(one[inner] / other[inner] - 1.0).max() < 0.04
+
+
+def test_the_lifting_line_has_converged_and_vanishes_at_the_tip():
+    station = np.linspace(0.0, 0.99, 50)
+    assert lifting_line(UAV)(station) == pytest.approx(lifting_line(UAV, terms=120)(station), rel=2e-3)
+    assert lifting_line(UAV)(1.0) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_lifting_line_of_an_infinitely_slender_wing_follows_its_chord():
+    plan = Planform(semi_span=50.0, root_chord=0.1, tip_chord=0.05, straight_chord_line=0.25)
+    station = np.linspace(0.1, 0.9, 9)
+    chord = plan.root_chord + (plan.tip_chord - plan.root_chord) * station
+    shape = lifting_line(plan, terms=200)(station) / chord
+    assert shape == pytest.approx(shape.mean(), rel=0.01)
+
+
+def test_the_section_has_its_thickness_at_three_tenths_of_the_chord():
+    assert four_digit_half_thickness(0.3, 0.125) == pytest.approx(0.0625, rel=2e-3)
+    xi = np.linspace(0.02, 0.98, 40)
+    step = 1e-6
+    difference = (four_digit_half_thickness(xi + step, 0.12) - four_digit_half_thickness(xi - step, 0.12)) / (
+        2.0 * step
+    )
+    assert four_digit_slope(xi, 0.12) == pytest.approx(difference, abs=1e-7)
+
+
+# ---------------------------------------------------------------- mesh
 
 RIB = {"thickness": 0.003, "young_modulus": 6e9, "poisson_ratio": 0.3, "density": 500.0}
 LOCAL, WEIGHT = gauss_points(3)
@@ -33,12 +164,6 @@ def determinants(mesh):
 
 def cells_of(mesh, name):
     return np.flatnonzero(mesh.region == mesh.region_names.index(name))
-
-
-def test_every_cell_has_a_positive_jacobian_and_a_region(coarse_mesh, shipped_design):
-    for mesh in (coarse_mesh, build_mesh(shipped_design)):
-        assert determinants(mesh).min() > 0.0
-        assert set(mesh.region) == set(range(len(mesh.region_names)))
 
 
 def test_parts_have_the_edges_and_volumes_of_the_design(coarse_design, coarse_mesh):
@@ -127,8 +252,11 @@ def test_refinement_refines_the_whole_grid_and_the_shipped_one_has_the_intended_
 ):
     middle, one, fine = (build_mesh(shipped_design.changed(mesh={"refinement": r})) for r in (0.5, 1.0, 2.0))
     assert len(coarse_mesh.cells) < len(middle.cells) < len(one.cells) < len(fine.cells)
+    for mesh in (coarse_mesh, middle, one, fine):
+        assert determinants(mesh).min() > 0.0
+        assert set(mesh.region) == set(range(len(mesh.region_names)))
     assert fine.height_cells == 2
-    assert 24_000 <= build_mesh(shipped_design).unknowns <= 40_000
+    assert 24_000 <= one.unknowns <= 40_000  # the shipped one
 
 
 # ---------------------------------------------------------------- operators
@@ -220,3 +348,57 @@ def test_a_rod_stiffens_and_weighs(coarse_design, coarse_operators):
     added = heave @ ((with_rod.mass_terms[0] - coarse_operators.mass_terms[0]) @ heave)
     reach = max(c[1] for c in with_rod.wing_mesh.points if c[1] <= 0.25 * 1.828 + 1e-3)
     assert added == pytest.approx(1600.0 * np.pi * 0.005**2 * reach, rel=0.2)
+
+
+# ---------------------------------------------------------------- responses against what is published
+
+STATE = (1.0, (0.0, 0.0), 0.16875, 0.1345)
+LIBRARY_FACTOR = 1.0073  # the published library's mean strains belong to this e
+
+
+def test_lift_compresses_every_gauge_lifts_the_tip_and_is_reciprocal_to_a_force_there(coarse_operators):
+    turn = solve_static(coarse_operators, load_factor=3.0)
+    tip = solve_static(coarse_operators, load_factor=0.0, tip_force=1.0)
+    assert np.all(turn.strain > 0.0)
+    assert turn.output[0] > coarse_operators.load_tip @ turn.displacement > 0.0
+    work = 3.0 * float(coarse_operators.load_lift @ tip.displacement)
+    assert coarse_operators.load_tip @ turn.displacement == pytest.approx(work, rel=1e-5)
+
+
+def test_strains_at_3g_are_those_of_the_library(shipped_operators, published_library):
+    """Those of the healthy wing, what damage makes of them, and which gauge limits the flight."""
+    observations = json.loads(published_library.read_text())["observations"]
+    states, ours, theirs = ((0, 0), (40, 0), (80, 0), (0, 80)), {}, {}
+    for z1, z2 in states:
+        found = solve_static(shipped_operators, LIBRARY_FACTOR, (z1 / 100, z2 / 100), load_factor=3.0)
+        ours[z1, z2] = found.strain
+        theirs[z1, z2] = np.array(observations[str(z1)][str(z2)]["3g"]["mean"]) * 1e-6
+    ratio = ours[0, 0] / theirs[0, 0]
+    assert np.abs(ratio - 1.0).max() < 0.055
+    assert np.sqrt(np.mean((ratio - 1.0) ** 2)) < 0.03
+    for state in states[1:]:
+        difference = ours[state] / ours[0, 0] - theirs[state] / theirs[0, 0]
+        assert np.sqrt(np.mean(difference**2)) < 0.016
+        assert np.abs(difference).max() < 0.040
+    for state in states[:3]:
+        assert ours[state].argmax() == theirs[state].argmax() == 16
+        assert ours[state].max() == pytest.approx(theirs[state].max(), rel=0.011)
+
+
+@pytest.mark.parametrize(("yaw_spring", "place"), [(1.5e3, [1, 2]), (1e9, None)])
+def test_bending_is_found_wherever_the_lag_mode_lies(coarse_design, coarse_operators, yaw_spring, place):
+    other = assemble(coarse_design.changed(root={"yaw_spring": yaw_spring}))
+    modes, plain = (eigenmodes(wing, *STATE) for wing in (other, coarse_operators))
+    assert place in (None, modes.flapwise_bending.tolist())
+    wanted = plain.frequency[plain.flapwise_bending]
+    assert modes.frequency[modes.flapwise_bending] == pytest.approx(wanted, rel=2e-3)
+
+
+def test_the_wing_has_the_published_stiffness_and_frequencies(shipped_operators):
+    # Kapteyn et al. 2021, eq. (14): k(e) = 0.5752 e + 0.1018 N/mm.
+    for factor in (0.98, 1.02):
+        assert tip_stiffness(shipped_operators, factor) == pytest.approx(575.2 * factor + 101.8, rel=0.001)
+    # The published model after calibration: 5.632 Hz and 28.544 Hz at e = 1, one other mode between them.
+    modes = eigenmodes(shipped_operators, *STATE)
+    assert modes.frequency[modes.flapwise_bending] == pytest.approx([5.632, 28.544], rel=0.0007)
+    assert modes.flapwise_bending.tolist() == [0, 2]

@@ -1,3 +1,6 @@
+"""Sources of `fe`: compiled loops are kept by them, and those of the runtime import little."""
+
+import ast
 import importlib.util
 import sys
 from pathlib import Path
@@ -5,6 +8,8 @@ from pathlib import Path
 import numba
 import pytest
 
+import fe
+import fe.runtime
 from fe.compilation import compiled
 
 
@@ -59,3 +64,20 @@ def test_loops_are_kept_by_content_wherever_they_lie_and_a_changed_source_never_
     changed = change.get("step", 1.0) * (1.0 + change.get("added", 1.0))
     assert outer("there", **change) == (changed, 1)
     assert outer("here") == (2.0, 0)
+
+
+# ---------------------------------------------------------------- the runtime
+
+PACKAGE = Path(fe.runtime.__file__).parent
+
+
+def test_runtime_files_import_only_numpy_the_standard_library_and_each_other() -> None:
+    files = sorted(PACKAGE.rglob("*.py"))
+    assert len(files) > 15
+    for name in files:
+        for node in ast.walk(ast.parse(name.read_text(encoding="utf-8"))):
+            modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                assert node.level <= len(name.relative_to(PACKAGE).parts), name
+                modules = [str(node.module)] if node.level == 0 else []
+            assert {module.split(".")[0] for module in modules} <= {"numpy", *sys.stdlib_module_names}, name
