@@ -86,12 +86,13 @@ def residual_windows(
 ) -> tuple[GapWindow, ...]:
     """Return when the residuals of a hypothesis are more than noise, in trials of some kinds.
 
-    `with_effect`: whether it is the best one, not the model as it was.
+    `with_effect`: whether it is the best one, not the model as it was. A flight whose turns came without times
+    has none.
     """
     found: tuple[GapWindow, ...] = ()
     white = residuals.white(np.random.default_rng((seed, 1)))
     for item, series in zip(residuals.trials, white, strict=True):
-        if item.trial.kind in kinds and item.used.any() and len(series) > 1:
+        if item.trial.kind in kinds and item.used.any() and np.ptp(item.trial.time) > 0.0:
             one, pattern = of_series(item.trial.name, item.trial.time, series, item.used)
             if one.log_evidence < of_nothing(one) + GROUND:
                 continue

@@ -1,5 +1,7 @@
 """The filter with a missing force against Gaussian conditioning on dense matrices."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -297,6 +299,11 @@ def test_a_window_of_a_campaign_is_told_and_drawn():
     (axis, *_) = time_line_figure((window,)).axes
     assert [text.get_text() for text in axis.get_yticklabels()] == ["release 2"]
     assert residual_windows(Bench(count=300).fit(np.random.default_rng(4))) == ()
+    at_once = [
+        replace(item, trial=replace(item.trial, time=np.zeros_like(item.trial.time)))
+        for item in fitted.trials
+    ]
+    assert residual_windows(replace(fitted, trials=at_once)) == ()
     assert time_line_figure(()) is None
 
 
