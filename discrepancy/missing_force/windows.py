@@ -86,8 +86,8 @@ def residual_windows(
 ) -> tuple[GapWindow, ...]:
     """Return when the residuals of a hypothesis are more than noise, in trials of some kinds.
 
-    `with_effect`: whether it is the best one, not the model as it was. A flight whose turns came without times
-    has none.
+    `with_effect`: whether it is the best one, not the model as it was. A flight whose turns came without
+    times has none.
     """
     found: tuple[GapWindow, ...] = ()
     white = residuals.white(np.random.default_rng((seed, 1)))

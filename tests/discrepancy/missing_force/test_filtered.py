@@ -299,11 +299,8 @@ def test_a_window_of_a_campaign_is_told_and_drawn():
     (axis, *_) = time_line_figure((window,)).axes
     assert [text.get_text() for text in axis.get_yticklabels()] == ["release 2"]
     assert residual_windows(Bench(count=300).fit(np.random.default_rng(4))) == ()
-    at_once = [
-        replace(item, trial=replace(item.trial, time=np.zeros_like(item.trial.time)))
-        for item in fitted.trials
-    ]
-    assert residual_windows(replace(fitted, trials=at_once)) == ()
+    once = [replace(item, trial=replace(item.trial, time=0.0 * item.trial.time)) for item in fitted.trials]
+    assert residual_windows(replace(fitted, trials=once)) == ()
     assert time_line_figure(()) is None
 
 
