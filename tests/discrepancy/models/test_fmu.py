@@ -2,6 +2,7 @@
 
 import tomllib
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -169,6 +170,30 @@ def test_an_fmu_that_is_not_linear_is_noticed_and_stepped(make) -> None:
     mine = seen(model, what, PowerDamping("slide", friction, 2.0, 0.0, SPEED, 1.0), parameters=np.ones(2))
     exact = integrated(slope, what.time, [AMPLITUDE, 0.0])
     assert np.max(np.abs(mine[:, 0] - exact[:, 0])) < 5e-4 * AMPLITUDE
+
+
+def test_a_port_whose_speed_jumps_with_a_force_is_stepped(foreign_fmu) -> None:
+    """A plate in oil, x' = -2 x + 0.01 f, pulled by the spring of a law, f = -100 x."""
+    file: dict[str, Any] = {
+        "format": 1, "kind": "fmu", "name": "Plate", "fmu": str(foreign_fmu("linear2")), "isolated": False,
+        "motion": {"parameters": {"a11": -2.0, "b11": 0.01, "c11": 1.0, "c21": -2.0, "d21": 0.01}},
+        "release": {"displacement": "initial1"}, "output": [{"name": "displacement", "variable": "y1"}],
+        "port": [{"name": "plate", "force": "u1", "displacement": "y1", "velocity": "y2"}],
+    }  # fmt: skip
+    what, law = (
+        trial(TrialKind.RINGDOWN, 60, release=Release(0.1)),
+        PowerStiffness("plate", 10.0, 1.0, 0, 0.1),
+    )
+    given: dict[str, Any] = {"parameters": np.zeros(0), "outputs": {"displacement": Quantity.DISPLACEMENT}}
+    with closing(FmuModel(FmuModelDescription.parse(file))) as model:
+        found = seen(model, what, law, **given)[:, 0]
+    assert found == pytest.approx(0.1 * np.exp(-3.0 * what.time), abs=1e-5)
+    del file["port"][0]["velocity"]
+    with (
+        closing(FmuModel(FmuModelDescription.parse(file))) as model,
+        pytest.raises(ModelError, match=r"the speed of a port jumps with a force, so its port 'plate' needs"),
+    ):
+        seen(model, what, law, **given)
 
 
 def test_a_release_can_be_held_by_a_force(rig: FmuModel, make) -> None:
