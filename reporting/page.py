@@ -148,7 +148,7 @@ class Words:
             Column(filled(head["name"], **values), head.get("unit", ""), "number" in head) for head in columns
         ]
         heads += [head if isinstance(head, Column) else numbers(head) for head in values.get("more", ())]
-        if "cell" in columns[0]:
+        if columns and "cell" in columns[0]:  # a table may have no columns but `more`
             rows = [[filled(head["cell"], **self._shared, row=row) for head in columns] for row in rows]
         page.add_table(Table(heads[: len(rows[0])], rows), **self.words("tables", name, **values))
 

@@ -119,7 +119,7 @@ def test_what_an_fmu_does_not_have_is_one_sentence(bench):
         ("input = [", "input = [] # ", "does not have; it has none: name it in"),
         ('binding = "gear_pump"', 'binding = "no_binding"', "no_binding"),
         (PARAMETER, "", "has no parameter to calibrate"),
-        ("high = 1.15", "high = 1.25", "has the range 0.85 to 1.25, which the FMU"),
+        ("high = 1.15", "high = 1.25", "= 1.25 lies outside the range of 'viscosity_factor', 0.8 to 1.2"),
         ("low = 0.85", "low = 0.75", "= 0.75 lies outside the range of 'viscosity_factor', 0.8 to 1.2"),
     ):
         model = bench / "wrong.toml"
