@@ -16,6 +16,7 @@ from discrepancy.models.fmu_runs import State
 from discrepancy.models.interface import NO_PATCH, Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
+from discrepancy.sentences import said
 from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
 
@@ -195,10 +196,7 @@ class FmuModel(DescribedModel):
             or len(base.push) != len(found.push)
             or found.jumps(columns, numbers)
         ):
-            raise ModelError(
-                f"The FMU model {self.name!r} does not tell by its answers to single forces how its ports "
-                "move; it is not linear, or they are too few or too rough, or speeds jump with forces."
-            )
+            raise ModelError(said("models.unseen_ports", model=self))
         found = found.in_state_of(base)
         (position, _), (speed, _) = (found.rows(fmu.x, order) for order in (0, 1))
         rows, at_once = found.rows(*self._read(outputs))
@@ -229,18 +227,12 @@ class FmuModel(DescribedModel):
         case = fmu.case(trial, state, laws.ports)
         release = release_of(trial)
         if not fmu.release:
-            raise ModelError(
-                f"The FMU model {self.name!r} cannot ring down: state in [release] the FMU's parameter of "
-                f"the release displacement, or the force that holds it."
-            )
+            raise ModelError(said("models.no_release", model=self))
         first_mode = conditions.initial[0] if len(conditions.initial) else np.zeros(2)
         if release.at_rest:
             return case._replace(starts={fmu.release[0]: release.displacement * float(1.0 + first_mode[0])})
         if len(fmu.release) < 2:
-            raise ModelError(
-                f"The ring-down {trial.name!r} does not begin at rest, which the FMU model {self.name!r} "
-                f"can follow only if [release] names parameters of displacement and velocity."
-            )
+            raise ModelError(said("models.moving_release", trial=trial, model=self))
         first = release.displacement * first_mode * (1.0, fmu.usual(trial)[0])
         return case._replace(starts=dict(zip(fmu.release, first.tolist(), strict=True)))
 

@@ -18,6 +18,7 @@ from discrepancy.models.acting import Acting, Load
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_pace import LINEAR, RECORD, Case, FmuPace
 from discrepancy.models.fmu_runs import Run, State
+from discrepancy.sentences import said
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import PLACE
 from fe.runtime.modal_system import ModalSystem
@@ -121,10 +122,7 @@ class FmuMotion(FmuPace):
             *((self.ports[port], self.forces[port], self.x[port], self.v[port]) for port in at), strict=True
         )
         if min(v) < 0:
-            raise ModelError(
-                f"The FMU model {self.description.name!r} is not linear, or the speed of a port jumps with a "
-                f"force, so its port {ports[v.index(-1)]!r} needs a velocity output; name it in [[port]]."
-            )
+            raise ModelError(said("models.velocity_needed", model=self, port=ports[v.index(-1)]))
         count, h = len(at), run.step
         one = run._replace(steps=1, courses={name: course[:1] for name, course in run.courses.items()})
         free = self.followed(one)

@@ -17,6 +17,7 @@ from discrepancy.models.fmu_file import FmuModelDescription, ReleaseOf
 from discrepancy.models.fmu_runs import FmuRuns, Run, State
 from discrepancy.models.fmu_system import FmuSystem, fmu_system
 from discrepancy.models.interface import Memory
+from discrepancy.sentences import said
 
 LINEAR = 1e-6
 """Largest deviation from superposition, as a share of the motion, of an FMU that is taken as linear."""
@@ -187,11 +188,7 @@ class FmuPace(FmuRuns):
         first = self.size(name) if name in self._none else displacement
         amount = float(root_scalar(left, x0=0.0, x1=first, rtol=1e-10, maxiter=20).root)
         if not abs(left(amount)) <= 1e-6 * abs(displacement):
-            raise ModelError(
-                f"Nothing that [release] names puts {way.output!r} of the FMU model "
-                f"{self.description.name!r} at {displacement:g} m; correct displacement, hold or output "
-                "there."
-            )
+            raise ModelError(said("models.not_released", way=way, model=self, displacement=displacement))
         return found | {name: amount}
 
     def _run(self, case: Case, amounts: Mapping[str, float]) -> Run:

@@ -13,6 +13,7 @@ from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.scales import Scales
+from discrepancy.sentences import said
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.state import Losses
@@ -281,10 +282,7 @@ class Model(ABC):
         if trial.kind is TrialKind.FLIGHT and trial.kind not in self.kinds:
             raise ModelError(f"{name} is a flight, but {self.what} has no input load_factor: give it one.")
         if trial.kind not in self.kinds and trial.kind is TrialKind.RINGDOWN:
-            raise ModelError(
-                f"{name} is a ring-down, which {self.what} cannot begin, since it is free, driven or has "
-                'states; say kind = "driven" and begins = "unknown".'
-            )
+            raise ModelError(said("models.free_ringdown", name=name, model=self))
         driven = trial.kind is TrialKind.DRIVEN
         if TrialKind.DRIVEN not in self.kinds and (driven or trial.begins is not Start.SETTLED):
             raise ModelError(

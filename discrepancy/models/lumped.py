@@ -24,6 +24,7 @@ from discrepancy.models.lumped_file import (
 )
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.system_model import Case, State, SystemModel
+from discrepancy.sentences import said
 from fe.runtime import patch as changes
 from fe.runtime.laws import LAWS
 from fe.runtime.patch import SENSORS, ModelPatch, PortLoad, Primitive, course_of
@@ -69,19 +70,12 @@ class Loop(NamedTuple):
             return []
         item, offset = recorded[section.reference]
         if item.quantity is not section.quantity:
-            raise ModelError(
-                f"The controller {section.name!r} follows {section.quantity.value}, but the trial "
-                f"{trial.name!r} records its reference {item.name!r} as {item.quantity.value}."
-            )
+            raise ModelError(said("models.controller_quantity", section=section, trial=trial, item=item))
         course = Course(trial.time, item.values + offset, item.hold)
         found = [Load(proportional * self.acts + self.integral, course)]
         if derivative != 0.0 and section.derivative_of == "error":
             if course.hold is Hold.ZERO_ORDER:
-                raise ModelError(
-                    f"The reference {section.reference!r} of the trial {trial.name!r} goes in steps, which "
-                    f"the controller {section.name!r} cannot differentiate: say derivative_of = "
-                    "'measurement' in the model, or hold = 'linear' in the campaign."
-                )
+                raise ModelError(said("models.reference_steps", section=section, trial=trial))
             found.append(Load(derivative * self.acts, course, 1))
         return found
 
@@ -200,8 +194,7 @@ class LumpedModel(DescribedModel, SystemModel):
         for load in (item for item in patch if isinstance(item, PortLoad)):
             if load.port not in self.acts:
                 raise ModelError(
-                    f"A force acts at the port {load.port!r}, which {self.name!r} does not have; it has "
-                    f"{', '.join(self.acts) or 'none'}."
+                    said("models.no_port", load=load, model=self, known=", ".join(self.acts) or "none")
                 )
             spans = tuple(window.span for window in load.windows)
             loads.append(Load(self.acts[load.port], FormulaCourse(course_of(load.force, load.kind), spans)))
@@ -227,15 +220,10 @@ class LumpedModel(DescribedModel, SystemModel):
         moving = section.quantity.moving
         if item.quantity is not section.quantity and item.quantity not in moving:
             raise ModelError(
-                f"The input {item.name!r} of {self.what} is {section.quantity.value}, but "
-                f"the trial {trial.name!r} records {item.quantity.value}."
+                said("models.input_quantity", item=item, model=self, section=section, trial=trial)
             )
         if moving and item.hold not in (None, Hold.SMOOTH):
-            raise ModelError(
-                f"The input {item.name!r} of the trial {trial.name!r} is a motion that "
-                f"{self.name!r} prescribes, which no drive makes in steps or corners: leave "
-                "`reference` and `hold` out."
-            )
+            raise ModelError(said("models.prescribed", item=item, trial=trial, model=self))
         return section
 
     def _input_at(self, place: Place) -> InputSection:
@@ -248,10 +236,7 @@ class LumpedModel(DescribedModel, SystemModel):
         row = np.array(item.vector)
         if change.along_span or change.along_chord:
             if item.station_derivative is None:
-                raise ModelError(
-                    f"The input {item.name!r} of {self.name!r} declares no station_derivative, so its place "
-                    "cannot move."
-                )
+                raise ModelError(said("models.no_station", item=item, model=self))
             row = row + change.along_span * np.array(item.station_derivative)
         return rig.along(item, row)
 
@@ -278,10 +263,7 @@ class LumpedModel(DescribedModel, SystemModel):
                 courses = [(-float(load.row @ along), load) for load in loads]
                 found.append(Shown(np.array([*rows, 0.0 * along]), courses=courses, felt=along))
             else:
-                raise ModelError(
-                    f"The output {name!r} of {self.name!r} is the reaction of {item.reaction!r}, whose "
-                    "motion this trial does not prescribe."
-                )
+                raise ModelError(said("models.no_reaction", name=name, model=self, item=item))
         return found
 
     # ------------------------------------------------------------ ports

@@ -18,6 +18,7 @@ from discrepancy.models.interface import MOVES, NO_PATCH, TURNS, Outputs, Place
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.scales import PortScale
 from discrepancy.models.system_model import Case, State, SystemModel
+from discrepancy.sentences import said
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
@@ -86,11 +87,7 @@ class StructureModel(SystemModel):
         units = zip(model.controls, model.control_units, strict=True)
         self.forces = tuple(name for name, unit in units if unit == "N")
         if not self.forces and LOAD_FACTOR not in model.controls:
-            raise ModelError(
-                f"The structure {model.name} has no control in N and no load_factor, and a campaign needs a "
-                'load that is recorded: give a [[control]] with unit = "N" and a [[load]] of 1 N tied to it, '
-                "or a [[control]] load_factor."
-            )
+            raise ModelError(said("models.no_load", model=model))
         if LOAD_FACTOR not in model.controls:
             self.kinds -= {TrialKind.FLIGHT}
         self.reference, self.load_places = (*self.forces, LOAD_FACTOR)[0], self.forces
