@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
+from fe.runtime.state import wing_names
 from fe.structure.tables import StructureDesign
 from fe.wing.design import WingDesign, load_design, wing_structure
 from fmu_asset.door.binding import Binding
@@ -33,10 +34,11 @@ from twin_master.assets.reduced_model import (
     strains_with_effects,
 )
 from twin_master.assets.structure_source import NamedStructure, StructureFmuSource, StructureSource
-from twin_master.errors import MissionInputError
+from twin_master.errors import MissingObservationModelError, MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.asset import CALIBRATED_DESIGN_NAME, BeliefSection
 from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
+from twin_master.sentences import said
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
@@ -202,11 +204,11 @@ class _Wing(NamedStructure):
         from fe.reduction.model_cache import wing_fields
 
         name, asset = "young_modulus_factor", self._scenario.asset
-        if {*state} != {*self.wing_design.regions} or {*control} != {"load_factor"}:
+        if not {*state, *control} <= {*wing_names(self.wing_design.regions)}:
             return False
         wing = wing_fields(self.wing_design)
         e = asset.true_parameters.get(name, self._means.get(name, 1.0))
-        values = {**control, name: e, "tip_force": asset.constant_load.get("tip_force", 0.0)}
+        values = {name: e, "tip_force": asset.constant_load.get("tip_force", 0.0), **control}
         write_wing_vtu(path, wing, wing.vector(values, state))
         return True
 
@@ -260,6 +262,9 @@ class DesignSource(_Wing, StructureSource):
     def check_model(self) -> None:
         """Refuse effects that the twin cannot believe."""
         if self.patch is not None:
+            role = self._scenario.observation.role
+            if role != "strain":
+                raise MissingObservationModelError(said("assets.patched_role", role=role))
             check_model_patch(self.patch, len(self.design.gauge), str(self.patch_path))
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:

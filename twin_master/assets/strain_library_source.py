@@ -91,16 +91,16 @@ class StrainLibrary:
         InvalidStrainLibraryError
             The state lies outside the levels.
         """
-        from scipy.interpolate import interpn
-
-        levels = [factor.levels for factor in self.states.factors]
-        for name, known, value in zip(self.states.names, levels, stiffness_loss, strict=True):
+        strain = self.strain[:, control_index].reshape(*self.states.shape, -1)
+        for factor, value in zip(self.states.factors, stiffness_loss, strict=True):
+            known = factor.levels
             if not known[0] <= value <= known[-1]:
                 raise InvalidStrainLibraryError(
-                    said("assets.covers", name=name, low=known[0], high=known[-1], value=value)
+                    said("assets.covers", name=factor.name, low=known[0], high=known[-1], value=value)
                 )
-        grid = self.strain[:, control_index].reshape(*self.states.shape, -1)
-        return np.asarray(interpn(levels, grid, np.array(stiffness_loss))[0])
+            weights = [np.interp(value, known, level) for level in np.eye(len(known))]
+            strain = np.tensordot(weights, strain, axes=1)
+        return strain
 
 
 def load_strain_library(path: str | Path) -> StrainLibrary:

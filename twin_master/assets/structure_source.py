@@ -207,7 +207,7 @@ class NamedStructure(AssetSource):
         ones.
         """
         design, observation = self.design, self._scenario.observation
-        where, role, modes = f"the structure {design.name}", observation.role, observation.modes
+        where, role, modes = self.where, observation.role, observation.modes
         names = {
             "strain": [part.name for part in design.gauge],
             "displacement": [part.name for part in design.displacement],
@@ -224,7 +224,7 @@ class NamedStructure(AssetSource):
                 raise MissingObservationModelError(
                     said("assets.modes", most=most, number=max(modes.places) + 1)
                 )
-        advice = f"give it in a table [[{table}]]"
+        advice = self.advice["state"] or f"give it in a table [[{table}]]"
         check_names("the scenario has the", where, [row], MissingObservationModelError, advice)
         if observation.count != known[role]:
             raise MissingObservationModelError(

@@ -18,13 +18,16 @@ from benchmarks.misfit import find_misfit
 from benchmarks.seeds import fly_seeds
 from calibration.result.file import load_calibration, save_calibration
 from fe.reduction.model_cache import reduced_model
+from fe.runtime.patch import ModelPatch, SensorGain
 from fe.runtime.reduced import ReducedModel
+from fmu_asset.packing.patch_file import SCHEMA
 from reporting.progress import SilentProgress
+from scenarios import binding_files
 from tests.command_line import refused
 from tests.conftest import synthetic_library
 from tests.refusals import Inputs
 from tests.refusals import refused as in_one_sentence
-from tests.twin_master.runs import text_of, written
+from tests.twin_master.runs import edited, loaded_from, table_of, text_of, written
 from twin_master.assets.asset_source import AssetReading, PairedSource, StatelessAsset
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
@@ -45,6 +48,8 @@ TEXT = text_of("model_mismatch")
 FILE = '# file = "UAVconfig.json" # here, or by --strain-library\n'
 DESIGN = 'design = "uav_wing"\n'
 MODEL = '[belief]\nkind = "design"\n'
+EFFECT = {"id": "gain", "primitives": ModelPatch((SensorGain("strain[9]", 0.1),)).to_list()}
+PATCH = json.dumps({"schema": SCHEMA, "effects": [EFFECT]})
 ITSELF = '[belief]\nkind = "asset"\n'
 
 
@@ -311,6 +316,48 @@ class TestOnTheWing:
         assert np.abs(expected[1]) > 0.05
         assert np.sign(wrong.bias(1).value) == np.sign(expected[1])
         assert wrong.credible_share.value < right.credible_share.value
+
+    def test_a_belief_of_some_regions_and_one_of_frequencies_are_the_wing_itself(self, wing, tmp_path):
+        """A region that is not named is healthy, for the twin, the FMU that flies and the field."""
+        frequency = tmp_path / "frequency.toml"
+        bound = edited(
+            binding_files()["uav_wing"].read_text(), ("observation.strain", "observation.frequency")
+        )
+        outputs = ('strain[{1..24}]"\nunit = "1"', 'frequency[{1..3}]"\nunit = "Hz"')
+        frequency.write_text(edited(bound, outputs))
+        for role, changes in (
+            ("strain", {}),
+            ("frequency", {"count": 3, "unit": "Hz", "standard_deviation": 0.1}),
+        ):
+            table = table_of("level_turns") | {"reference": []}
+            table["state"], table["calibration"]["draws"] = table["state"][:1], 3
+            table["truth"]["gains"] = table["truth"]["gains"][:3]
+            if changes:
+                table["observation"] = {"role": role, **changes}
+                table["rewards"] |= {"health_limit": 100.0, "error_scale": 1.0}
+                del table["rewards"]["health_limit_microstrain"], table["rewards"]["error_scale_microstrain"]
+                table["truth"]["noise"] = {"standard_deviation": 0.1}
+                table["asset"] |= {"binding": str(frequency)}
+            table["asset"]["isolated"] = False
+            scenario = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
+            source, model = asset_source(scenario), build_graphical_model(scenario)
+            source.check()
+            source.prepare(tmp_path / role, SilentProgress())
+            draws = source.draws(0)
+            found = source.observation_table(draws, model)
+            flown, health, control = source.open(), {"z1": 0.4}, {"load_factor": 3.0}
+            shown, state = flown.step(control, health).values, model.states.index((0.4,))
+            flown.close()
+            for e, row in zip((*draws.values, 1.0073), (*found[:, state, 1], shown), strict=True):
+                losses = {"young_modulus_factor": e, "stiffness_loss": (0.4, 0.0)}
+                full = wing.static_response(load_factor=3.0, **losses).strain
+                full = full if role == "strain" else wing.modes(**losses).frequency[:3]
+                np.testing.assert_allclose(row, full, rtol=1e-9)
+            assert source.write_field(tmp_path / "wing.vtu", health, control)
+        table["belief"]["patch"] = str(written(tmp_path, PATCH, name="patch.json"))
+        patched = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
+        with pytest.raises(MissingObservationModelError, match="predicts strains, and `frequency`"):
+            asset_source(patched).check()
 
     @pytest.mark.long
     def test_the_study_prints_its_table(self, wing, twisted):

@@ -16,7 +16,7 @@ def strain(z1: float, z2: float, load: float, e: float = 1.0) -> np.ndarray:
     return (100 + 0.5 * z1 + 0.1 * z2) * load / e * np.array([1.0, 2.0, 3.0])
 
 
-def small_content() -> dict[str, Any]:
+def small_content(levels: list[list[int]] = LEVELS) -> dict[str, Any]:
     """A library in the published format."""
     draws = {"mean": 1.0, "0.99": 0.99, "1.01": 1.01}
     observations = {
@@ -25,12 +25,12 @@ def small_content() -> dict[str, Any]:
                 f"{load}g": {name: strain(z1, z2, load, e).tolist() for name, e in draws.items()}
                 for load in (2, 3)
             }
-            for z2 in LEVELS[1]
+            for z2 in levels[1]
         }
-        for z1 in LEVELS[0]
+        for z1 in levels[0]
     }
     return {
-        "states": LEVELS,
+        "states": levels,
         "controls": ["2g", "3g"],
         "observations": observations,
     }
@@ -64,6 +64,10 @@ def test_between_the_levels_strain_is_multilinear(tmp_path):
     for z1, z2 in [(0.0, 0.0), (0.4, 0.5), (0.2, 0.0), (0.07, 0.21), (0.39, 0.5)]:
         expected = 1e-6 * strain(100 * z1, 100 * z2, 3)
         np.testing.assert_allclose(library.strain_at((z1, z2), 1), expected, rtol=1e-13)
+    single = loaded(tmp_path, small_content([LEVELS[0], [0]]))  # of one region, as it were
+    np.testing.assert_allclose(single.strain_at((0.07, 0.0), 1), 1e-6 * strain(7, 0, 3), rtol=1e-13)
+    with pytest.raises(InvalidStrainLibraryError, match=r"covers z2 from 0 to 0, got 0\.1"):
+        single.strain_at((0.07, 0.1), 1)
     for bad, control, sentence in (
         ((0.41, 0.0), 0, r"covers z1 from 0 to 0\.4"),
         ((-0.01, 0.0), 0, r"covers z1 from 0 to 0\.4"),

@@ -175,7 +175,8 @@ def test_a_clock_that_is_set_after_the_first_turn_spoils_none(timed, strains, cl
     assert (twin.turns, intake.counts.rejected, intake.counts.missing) == (8, 0, 0)
     assert same(twin, watched(timed, clean[:8])[0])
     # Two turns have agreed about the time: another such clock is refused, also by a watch that is taken up.
-    again = taken_up(timed, intake.state(), b'{"time": 9e9, "strain_1": 1e-4}\n')
+    later = b'{"time": 1700000500, "strain_1": 1e-4}\n'  # near enough that a missing limit ends, too
+    again = taken_up(timed, intake.state(), later)
     assert again.read(twin) is None
     assert again.counts.rejected == 1
     twin, intake = watched(timed, lines[:1])  # taken up after its first turn the clock may still be set
