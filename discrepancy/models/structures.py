@@ -1,11 +1,12 @@
 """A structure as a model by its modes: any from a mesh or matrices, and the wing with its patches."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from calibration.errors import CalibrationError
 from calibration.joint.wing_table import wing_priors
@@ -191,6 +192,10 @@ def _system(
     )  # fmt: skip
 
 
+def _by_cholesky(stiffness: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    return partial(cho_solve, cho_factor(stiffness, check_finite=False), check_finite=False)
+
+
 class WingModel(SystemModel):
     """The wing in the states and under the structural patches that are asked for, each made once.
 
@@ -219,6 +224,7 @@ class WingModel(SystemModel):
     ) -> None:
         self.design = design
         self.wing = wing = PatchedWing(arrays)
+        wing.factorised = _by_cholesky
         box = dict(zip(wing_names(arrays.regions), arrays.validity_box.tolist(), strict=True))
         self.name, self.parameters = name, wing_priors(box, **prior)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
