@@ -60,8 +60,8 @@ class Run:
             return np.asarray(self.tree[path].values)
         except KeyError as error:
             raise RunFolderError(
-                f"{RUN_NAME} does not have the layout of a run of this version (the variable {path} is missing): "
-                "fly the run again."
+                f"{RUN_NAME} does not have the layout of a run of this version (the variable {path} is "
+                "missing): fly the run again."
             ) from error
 
     def get(self, path: str) -> Float | None:
