@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.errors import ExperimentDataError, ExperimentFileError, OutsideValidityError
+from calibration.errors import ExperimentDataError, OutsideValidityError
 from calibration.joint.measurement import PUBLISHED_MODES
 from calibration.joint.wing_table import TOTAL_MASS, tabulate_wing, weighed
 from calibration.paper.procedure import damping_coefficients, fit_masses, read_published_results
@@ -95,24 +95,3 @@ def test_our_wing_on_the_published_targets(reference):
 def test_refusals(changed, words):
     with pytest.raises(ExperimentDataError, match=words):
         fit_masses(line_model, np.ones(1), MASSES, read(**changed))
-
-
-HEADER = "e_sample,target_freq_1,target_freq_2,zeta_1,zeta_2,mass_servo_1,mass_pitot,freq_1,freq_2\n"
-
-ROW = "1,5.6,29.9,.03,.07,.17,.1,5.6,28.6\n"
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "words"),
-    [
-        ("e.csv", HEADER.replace("freq_2\n", "f\n") + ROW, "no column 'freq_2'"),
-        ("e.csv", HEADER + ROW.replace(".17,.1,", ".17,,"), "'mass_pitot' must hold a number, and nothing"),
-        ("", "", "does not hold"),
-        ("nothing", "", "does not exist"),
-    ],
-)
-def test_bad_files(tmp_path, name, text, words):
-    if text:
-        (tmp_path / name).write_text(text, encoding="utf-8")
-    with pytest.raises(ExperimentFileError, match=words):
-        read_published_results(tmp_path / name)

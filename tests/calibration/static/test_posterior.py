@@ -271,26 +271,6 @@ def test_units_do_not_matter(load_scale, displacement_scale):
     assert posterior.standard_deviation == pytest.approx(reference.standard_deviation, rel=1e-6)
 
 
-@given(repeats=st.integers(1, 40), noise=st.floats(0.01, 10.0), factor=st.floats(0.7, 1.3))
-@settings(max_examples=40, deadline=None)
-def test_more_measurements_shrink_the_variance_and_never_beyond_the_prior(repeats, noise, factor):
-    load = np.tile(DATA.load[:4], repeats)
-    data = LoadDisplacementData(
-        load=load,
-        displacement=load / PUBLISHED_LINE.stiffness(factor),
-        run=np.arange(load.size),
-        load_standard_deviation=DATA.load_standard_deviation * noise,
-        displacement_standard_deviation=DATA.displacement_standard_deviation * noise,
-    )
-    doubled = dataclasses.replace(
-        data, load=np.tile(load, 2), displacement=np.tile(data.displacement, 2), run=np.arange(2 * load.size)
-    )
-    posterior, narrower = exact_posterior(data), exact_posterior(doubled)
-    assert narrower.standard_deviation < posterior.standard_deviation
-    assert posterior.standard_deviation < 1.02 * GaussianPrior().standard_deviation
-    assert np.all(np.isfinite(posterior.density))
-
-
 def test_intervals_cover_the_truth_on_virtual_wings():
     generator = np.random.default_rng(2021)
     prior = GaussianPrior()

@@ -303,14 +303,11 @@ def test_a_damaged_run_gives_one_sentence(run, tmp_path, name):
     assert not (place / "report.html").exists()
 
 
-def test_another_layout_and_other_axes_give_one_sentence(run, tmp_path):
+@pytest.mark.usefixtures("no_drawing")
+def test_another_layout_gives_one_sentence(run, tmp_path):
     for missing in ("filtered", "filtered__probability", "observed", "policy__action_value"):
-        with pytest.raises(RunFolderError, match="layout of a run"):
-            read_run(stored(altered(run, **{missing: None}), tmp_path / missing))
-    changed = altered(run)
-    changed.tree["filtered"] = xr.DataTree(run.tree["filtered"].to_dataset().rename({"step": "time"}))
-    with pytest.raises(RunFolderError, match="has the axes"):
-        read_run(stored(changed, tmp_path / "axes"))
+        with pytest.raises(RunFolderError, match=f"layout of a run .*{missing.replace('__', '/')}"):
+            report.write_report(stored(altered(run, **{missing: None}), tmp_path / missing))
 
 
 def test_a_run_that_was_cut_off_anywhere_is_one_sentence(folder, tmp_path):
