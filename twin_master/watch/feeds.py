@@ -20,11 +20,8 @@ from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.growing import GrowingFile, Pipe, Place, found, rotated
-from twin_master.watch.intake import MISSING, LiveFeed
-from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
-
-Fed = tuple[Message | Refused | None, str]
-"""A message with the begin of its text; None where nothing more has come yet."""
+from twin_master.watch.intake import MISSING, Feed
+from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
 
 _LOST = ("", "nan", "null", "none")
 _TURN_COLUMNS = ("turn", "step")
@@ -34,11 +31,10 @@ _FIRST = 8
 _CUT = "{} was cut at byte {}, and no copy is beside it: what stood behind that and was not read yet is lost"
 
 
-class _FileFeed:
+class _FileFeed(Feed):
     """Lines of a file."""
 
     replayable = True
-    place: Place | None = None
     _path: Path
     _follow = False
 
@@ -151,7 +147,7 @@ class CsvFeed(_FileFeed):
         return parsed(self._reader, record)
 
 
-class RunFeed:
+class RunFeed(Feed):
     """A NetCDF file with the group `observed` of a run: observations and the controls that were in force.
 
     Raises
@@ -161,7 +157,6 @@ class RunFeed:
     """
 
     replayable = True
-    place: Place | None = None
 
     def __init__(self, path: Path, scenario: Scenario) -> None:
         self._role = role = scenario.observation.role
@@ -251,7 +246,7 @@ class FolderFeed(_FileFeed):
         return Message(observed, turn, None, control)
 
 
-class JsonLinesFeed(LiveFeed):
+class JsonLinesFeed(Feed):
     """JSON objects, one a line, from a stream such as standard input."""
 
     def __init__(self, scenario: Scenario, stream: IO[bytes] | None = None) -> None:
@@ -266,7 +261,7 @@ class JsonLinesFeed(LiveFeed):
             yield (None, "") if line is None else (parsed(self._reader, line), shown(line))
 
 
-class MappingFeed(LiveFeed):
+class MappingFeed(Feed):
     """Messages of a program, as mappings; arrays of numbers may stand where JSON has lists."""
 
     def __init__(self, messages: Iterable[Mapping[str, Any]], scenario: Scenario) -> None:
