@@ -40,7 +40,6 @@ from twin_master.watch.teaching import (
     Search,
     Teaching,
     both_patches,
-    check_teachable,
     notice_of,
     trial_sentence,
     verdict_of,
@@ -349,15 +348,9 @@ class Tutor:
     wait : bool
         Whether the next turn waits for an answer, as those of a recording do. Those of a live watch go on
         beside a process that searches and a thread that tries a patch.
-
-    Raises
-    ------
-    MissionInputError
-        Nothing could look into the alarms of the scenario.
     """
 
     def __init__(self, watch: Watch, search: Search, source: Stopping, *, wait: bool) -> None:
-        check_teachable(watch.scenario)
         watch.keep.taught = True
         self._watch, self._search, self._source = watch, search, source
         self._teaching, self._wait = watch.standing.teaching, wait

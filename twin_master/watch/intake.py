@@ -49,6 +49,12 @@ class Feed:
         """Return the messages behind a place, or all of them."""
         raise NotImplementedError
 
+    def decide(self, decision: Mapping[str, Any]) -> None:
+        """Tell whoever sends the messages what was decided, where they listen."""
+
+    def close(self) -> None:
+        """Let go of whoever sends the messages."""
+
 
 @dataclass
 class Counts:
