@@ -102,20 +102,23 @@ class _Turns(WebSocketHandler):
 class _Answer(RequestHandler):
     """A text that is asked for."""
 
-    def initialize(self, answer: Callable[[], str], kind: str) -> None:
+    def initialize(self, answer: Callable[..., str], kind: str) -> None:
         self._answer, self._kind = answer, kind
 
     def set_default_headers(self) -> None:
         for name, value in HEADERS.items():
             self.set_header(name, value)
 
-    def get(self) -> None:
+    def get(self, *found: str) -> None:
         self.set_header("Content-Type", f"{self._kind}; charset=utf-8")
-        self.write(self._answer())
+        try:
+            self.write(self._answer(*found))
+        except (IndexError, OSError) as error:
+            raise HTTPError(404) from error
 
 
-def handlers_of(texts: Mapping[str, tuple[Callable[[], str], str]]) -> list[tuple[str, Any, dict[str, Any]]]:
-    """Return what answers requests of paths by texts of a kind."""
+def handlers_of(texts: Mapping[str, tuple[Callable[..., str], str]]) -> list[tuple[str, Any, dict[str, Any]]]:
+    """Return what answers requests of paths, and what is in brackets there, by texts of a kind."""
     return [(path, _Answer, {"answer": text, "kind": kind}) for path, (text, kind) in texts.items()]
 
 
@@ -124,46 +127,26 @@ def text_of(package: str, name: str) -> Callable[[], str]:
     return lambda: resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
-class _Picture(_Answer):
-    """The missing force of a verdict, by its number."""
+async def _serve(flight: Flight, port: int, ready: Callable[[str], None], wanted: Callable[[], bool]) -> None:
+    scene = scene_of(flight.folder, flight.knowledge)
+    page, viewers = page_html(scene), _Viewers(flight, Teller(flight, scene))
 
-    def initialize(self, flight: Flight) -> None:  # type: ignore[override]
-        self._flight = flight
+    def picture(number: str) -> str:
+        return flight.pictures[int(number)].drawing.read_text(encoding="utf-8")
 
-    def get(self) -> None:
-        try:
-            found = self._flight.pictures[int(self.get_argument("picture"))]
-            drawing = found.drawing.read_bytes()
-        except (ValueError, IndexError, OSError) as error:
-            raise HTTPError(404) from error
-        self.set_header("Content-Type", "image/svg+xml")
-        self.write(drawing)
-
-
-def _application(flight: Flight, viewers: _Viewers) -> Application:
-    page = page_html(scene_of(flight.folder, flight.knowledge))
-    texts = {
+    texts: dict[str, tuple[Callable[..., str], str]] = {
         "/": (lambda: page, "text/html"),
         "/plots.js": (text_of("twin_master.viewer", "plots.js"), "text/javascript"),
         "/view.js": (text_of("twin_master.viewer", "view.js"), "text/javascript"),
         "/view.css": (text_of("twin_master.viewer", "view.css"), "text/css"),
+        r"/missing_force_(\d+)\.svg": (picture, "image/svg+xml"),
     }
-    own: list[Any] = [
-        ("/turns", _Turns, {"viewers": viewers}),
-        ("/missing_force.svg", _Picture, {"flight": flight}),
-    ]
     application = Application(websocket_max_message_size=LONGEST_REQUEST, websocket_ping_interval=20)
-    application.add_handlers(OWN_NAMES, [*handlers_of(texts), *own])
-    return application
-
-
-async def _serve(flight: Flight, port: int, ready: Callable[[str], None], wanted: Callable[[], bool]) -> None:
-    teller = Teller(flight, scene_of(flight.folder, flight.knowledge))
-    viewers = _Viewers(flight, teller)
+    application.add_handlers(OWN_NAMES, [*handlers_of(texts), ("/turns", _Turns, {"viewers": viewers})])
     looking = PeriodicCallback(viewers.look, POLL_MILLISECONDS)
     looking.start()
     try:
-        await serve_application(_application(flight, viewers), port, ready, wanted)
+        await serve_application(application, port, ready, wanted)
     finally:
         looking.stop()
 

@@ -162,15 +162,23 @@ def test_the_view_shows_what_was_learnt(folder, run):
     """From the posterior of each quantity alone, which the journal tells."""
     flight, filtered = Flight(folder), run["filtered"].to_dataset()
     flight.update()
-    shown, noise = flight.believed(0, TURNS).expected, filtered["noise_standard_deviation"].values
+    shown, noise = (
+        flight.believed(flight.seen(0, TURNS)).expected,
+        filtered["noise_standard_deviation"].values,
+    )
     wide = np.hypot(noise, filtered["quantity_standard_deviation"].values)
     np.testing.assert_allclose(np.hypot(shown.standard_deviation, shown.noise), wide, rtol=0.1)
     np.testing.assert_allclose(shown.reward_mean, filtered["reward_mean"].values, atol=0.03)
-    ahead = flight.predicted(TURNS - 1).expected.mean - run["predicted"]["quantity_mean"].values[-1]
+    ahead = (
+        flight.predicted(flight.seen(TURNS - 1, TURNS)[0]).expected.mean
+        - run["predicted"]["quantity_mean"].values[-1]
+    )
     assert np.abs(ahead / noise[-1]).max() < 0.06
 
     def off() -> float:
-        error = (flight.believed(0, TURNS).expected.mean - filtered["quantity_mean"].values) / noise
+        error = (
+            flight.believed(flight.seen(0, TURNS)).expected.mean - filtered["quantity_mean"].values
+        ) / noise
         return float(np.abs(error).max())
 
     learnt = off()
