@@ -12,7 +12,7 @@ from reporting.words import listing
 
 from .text import WORDS, number, unit_text
 
-HEADINGS = WORDS.headings("decide")
+HEADINGS = tuple(column.name for column in WORDS.table("decide", ())[0])
 
 
 def rows_of(found: Separability) -> list[tuple[str, ...]]:
