@@ -125,7 +125,7 @@ class Watch:
             self.models.append(patched_model(self.scenario, file, model["from_turn"], self._progress))
 
     def run(
-        self, feed: Feed, decide: Callable[[Mapping[str, Any]], None], *, turns: int | None = None,
+        self, feed: Feed, decide: Callable[[Mapping[str, Any]], object], *, turns: int | None = None,
         patched: Patched | None = None, search: Search | None = None,
         untold: Mapping[str, Any] | None = None,
     ) -> Counts:  # fmt: skip
@@ -146,20 +146,25 @@ class Watch:
         untold : dict, optional
             The last decision, to be told again first.
         """
+
+        def tell(decision: Mapping[str, Any]) -> None:
+            decide(decision)
+            feed.decide(decision)
+
         with self.begun(feed, patched) as keep:
-            source = Stopping(keep.intake, turns, lambda: self.quiet(decide))
+            source = Stopping(keep.intake, turns, lambda: self.quiet(tell))
             tutor = Tutor(self, search, source, wait=feed.replayable) if search else None
             with listening(source.ask):
                 try:
                     if untold is not None:
-                        decide(untold)
+                        tell(untold)
                     taught = True
                     while taught:  # with one twin after the other: where it is taught, another one goes on
                         taught = False
                         if tutor is not None:
                             tutor.act()
                         for decision in self.decisions(source, keep):
-                            decide(decision)
+                            tell(decision)
                             if taught := tutor is not None and tutor.due:
                                 break
                 finally:

@@ -3,7 +3,7 @@
 import math
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -249,52 +249,28 @@ def watch(
     patch = None if model_patch is None or from_turn is None else (Path(model_patch), from_turn)
     if (model_patch, from_turn) != (None, None) and (patch is None or not resume):
         raise MissionInputError("--model-patch and --from-turn go together, with --resume.")
-    if resume and (replace or given != Overrides()):
-        raise MissionInputError(
-            "a watch is taken up with what its folder holds: give nothing beside --resume that changes it."
-        )
     if loaded is None and (folder is None or not resume):
         raise MissionInputError("a scenario is needed, or --resume with the folder of a watch.")
-    if loaded is not None:
-        folder = Path("runs", loaded.scenario.mission.name) if folder is None else folder
-        known = loaded.scenario.moved(loaded.path.parent)
-    folder = Path(str(folder))
-    if loaded is None:
-        known = kept_scenario(folder, read_config(folder)).moved(folder)
+    folder, known = _read(loaded, folder, allow_unknown=allow_unknown)
     if teach:
         check_teachable(known)
-    section = known.watch.model_copy(update={"allow_unknown": known.watch.allow_unknown or allow_unknown})
-    known = known.model_copy(update={"watch": section})
     # Slips of the pen are found before a model is built and a folder made.
     feed = _feed(observations, known, follow, None if ca_file is None else Path(ca_file), otherwise)
-    if resume or loaded is None:
-        opened = resumed_watch(folder, loaded, progress)
-    else:
-        if replace and isinstance(feed, RecordedFeed) and folder.resolve() in feed.path.resolve().parents:
-            raise MissionInputError(
-                f"--replace would remove the observations in {feed.path} before they are read: choose "
-                "another --out."
-            )
-        resolved = resolve_scenario(loaded, given)
-        if loaded.remark:
-            progress.note(loaded.remark)
-        opened = begun_watch(resolved, file_record(loaded), folder, progress, replace_run=replace)
-    with opened as watched:
+    if replace and isinstance(feed, RecordedFeed) and folder.resolve() in feed.path.resolve().parents:
+        raise MissionInputError(
+            f"--replace would remove the observations in {feed.path} before they are read: choose another "
+            "--out."
+        )
+    with _opened(loaded, folder, given, progress, resume=resume, replace=replace) as watched:
         try:
             begun(watched)
             if isinstance(feed, Broker):
                 feed = MqttFeed(feed, watched, progress.note, known)
-            told = feed.decide
-
-            def tell(decision: Mapping[str, Any]) -> None:
-                decide(decision)
-                told(decision)
-
             # A kill may have left the last decision untold.
             untold = None if stored(watched.folder) else watched.last_decision()
             search = Search(watched.folder, watched.scenario.mission.seed) if teach else None
             with closing(feed):
-                counts = watched.run(feed, tell, turns=turns, patched=patch, search=search, untold=untold)
+                counts = watched.run(feed, decide, turns=turns, patched=patch, search=search, untold=untold)
             watched.store(counts, last=last, report=report)
         except Exception as error:
             error.add_note(
@@ -302,6 +278,39 @@ def watch(
             )
             raise
     return watched.folder
+
+
+def _opened(
+    loaded: LoadedScenario | None, folder: Path, given: Overrides, progress: Progress, *, resume: bool,
+    replace: bool,
+) -> AbstractContextManager[Watch]:  # fmt: skip
+    """Return the watch, begun or taken up, and what holds its folder."""
+    if resume and (replace or given != Overrides()):
+        raise MissionInputError(
+            "a watch is taken up with what its folder holds: give nothing beside --resume that changes it."
+        )
+    if resume or loaded is None:
+        return resumed_watch(folder, loaded, progress)
+    resolved = resolve_scenario(loaded, given)
+    if loaded.remark:
+        progress.note(loaded.remark)
+    return begun_watch(resolved, file_record(loaded), folder, progress, replace_run=replace)
+
+
+def _read(
+    loaded: LoadedScenario | None, folder: Path | str | None, *, allow_unknown: bool
+) -> tuple[Path, Scenario]:
+    """Return the folder of a watch, and the scenario by which observations are read."""
+    if loaded is None:
+        folder = Path(str(folder))
+        scenario = kept_scenario(folder, read_config(folder)).moved(folder)
+    else:
+        folder = Path("runs", loaded.scenario.mission.name) if folder is None else Path(folder)
+        scenario = loaded.scenario.moved(loaded.path.parent)
+    section = scenario.watch.model_copy(
+        update={"allow_unknown": scenario.watch.allow_unknown or allow_unknown}
+    )
+    return folder, scenario.model_copy(update={"watch": section})
 
 
 def _feed(
