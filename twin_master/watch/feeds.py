@@ -19,6 +19,7 @@ from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.watch.growing import GrowingFile, Pipe, Place, found, rotated
 from twin_master.watch.intake import MISSING, Feed
 from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
@@ -28,7 +29,6 @@ _TURN_COLUMNS = ("turn", "step")
 _OTHERS = ("turn", "time", "control")
 _FIRST = 8
 """First steps by which a file of steps is known again."""
-_CUT = "{} was cut at byte {}, and no copy is beside it: what stood behind that and was not read yet is lost"
 
 
 class RecordedFeed(Feed):
@@ -86,18 +86,13 @@ class CsvFeed(RecordedFeed):
         if not any(names):
             raise MissionInputError(f"{path} is empty: a CSV file begins with a line of its columns.")
         if names[0].startswith("{"):
-            raise MissionInputError(
-                f"{path} holds JSON lines, and a file of observations is CSV or NetCDF: hand them over by "
-                f"standard input, `--observations - < {path}`."
-            )
+            raise MissionInputError(said("watch.json_lines", path=path))
         called = ["turn" if name in _TURN_COLUMNS else name for name in names]
         sensors = [name for name in called if name not in _OTHERS and name[:1] != "_"]
         try:
             columns = [column for column in map(self._reader.column, sensors) if column is not None]
         except Refused as refusal:
-            raise MissionInputError(
-                f"{path}: the column {refusal}; others are `turn`, `time` and `control`."
-            ) from None
+            raise MissionInputError(said("watch.column", path=path, refusal=refusal)) from None
         once = {sensor for sensor, _ in columns}
         if len(once) < len(columns) or any(called.count(name) > 1 for name in _OTHERS):
             raise MissionInputError(f"{path}: two columns say the same; {', '.join(names)[:300]} came.")
@@ -113,7 +108,7 @@ class CsvFeed(RecordedFeed):
                 yield None, ""
                 continue
             if stream.cut:
-                yield Refused(_CUT.format(self.path.name, stream.cut)), ""
+                yield Refused(said("watch.cut", name=self.path.name, byte=stream.cut)), ""
                 stream.cut = 0
             self.place = stream.place
             if not (stream.begins and self._is_header(line)):
@@ -170,16 +165,13 @@ class RunFeed(RecordedFeed):
             )
             self._turn = np.asarray(group["step"].values, dtype=np.int64)
         except (DamagedFileError, KeyError, ValueError, TypeError, OSError) as error:
-            raise MissionInputError(
-                f"{path} is no NetCDF file with `observed/{role}` (step, sensor): {str(error).rstrip('.')}."
-            ) from None
+            reason = str(error).rstrip(".")
+            raise MissionInputError(said("watch.netcdf", path=path, role=role, reason=reason)) from None
         if self._values.shape != (len(self._turn), scenario.observation.count) or (
             self._control is not None and not np.all(np.isin(self._control, range(len(scenario.control))))
         ):
-            raise MissionInputError(
-                f"{path}: {scenario.observation.count} sensors and the controls of the scenario are "
-                f"expected, and `observed/{role}` has the shape {self._values.shape}."
-            )
+            count, shape = scenario.observation.count, self._values.shape
+            raise MissionInputError(said("watch.shape", path=path, count=count, role=role, shape=shape))
 
     def _place(self, read: int) -> Place:
         first = self._turn[: min(read, _FIRST)].tobytes() + self._values[: min(read, _FIRST)].tobytes()

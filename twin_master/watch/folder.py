@@ -29,6 +29,7 @@ from twin_master.mission.replay import BelievedModel, journalled_decision, repla
 from twin_master.network.estimator import Notice
 from twin_master.run_folder import PATCH, PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight
@@ -233,9 +234,7 @@ class Watch:
         """Believe a patch that is given from a turn on."""
         turns = self.keep.twin.turns
         if not turns or not 0 <= first <= turns:
-            raise MissionInputError(
-                f"--from-turn names one of the {turns} turns watched so far, or the next one."
-            )
+            raise MissionInputError(said("watch.from_turn", turns=turns))
         outcome = self.trial(file, first)(progress=self._progress)
         self.adopt(outcome, None, self._kept_verdict(file.parent))
 
