@@ -242,7 +242,7 @@ def _moments(weight: Float, values: Float) -> tuple[float, float]:
 
 
 def _resampled(grid: Grid, axes: tuple[Float, ...]) -> Float:
-    """Return the likelihood of a grid on finer axes of the same range, (FINE, FINE) or (FINE, 1); at most one."""
+    """Return the likelihood of a grid on finer axes of the same range, FINE points each."""
     from scipy.interpolate import RegularGridInterpolator
 
     # Far below the largest there is nothing but what would make the spline swing.
