@@ -22,7 +22,7 @@ from twin_master.scenario.section import Count, Flag, Name, NotNegative, Number,
 from twin_master.seeds import generator
 from twin_master.sentences import said
 from twin_master.watch.broker import is_broker
-from twin_master.watch.feeds import Fed
+from twin_master.watch.message import Fed
 
 SHARD = 256
 """Twins that are flown in one piece, unless the file says otherwise."""

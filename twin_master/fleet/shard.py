@@ -33,9 +33,10 @@ from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one,
 from twin_master.mission.turns import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.feeds import Fed, file_feed
+from twin_master.watch.feeds import file_feed
 from twin_master.watch.growing import Place
-from twin_master.watch.intake import Intake, LiveFeed, RejectedFile
+from twin_master.watch.intake import Feed, Intake, RejectedFile
+from twin_master.watch.message import Fed
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
@@ -52,7 +53,7 @@ def read_recording(path: Path, scenario: Scenario) -> tuple[Fed, ...]:
     return tuple(file_feed(path, scenario).messages(None))
 
 
-class _Recorded(LiveFeed):
+class _Recorded(Feed):
     """Messages as a feed."""
 
     def __init__(self, messages: Sequence[Fed]) -> None:

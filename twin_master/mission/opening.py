@@ -25,6 +25,11 @@ def file_record(loaded: LoadedScenario) -> dict[str, str]:
     return {"name": loaded.path.name, "sha256": loaded.content_hash}
 
 
+def kept_scenario(folder: Path, config: Mapping[str, Any]) -> Scenario:
+    """Return the scenario in the configuration of a folder."""
+    return parse_scenario(config["scenario"], str(folder / CONFIG_NAME))
+
+
 @contextmanager
 def begun_folder(
     resolved: Scenario,
@@ -95,7 +100,7 @@ def resumed_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
         Another process holds it.
     """
     config = read_config(folder)
-    scenario, file = parse_scenario(config["scenario"], str(folder / CONFIG_NAME)), config["scenario_file"]
+    scenario, file = kept_scenario(folder, config), config["scenario_file"]
     if loaded is not None and file.get("sha256") != loaded.content_hash:
         does = "watches" if config.get("watched") else "flies"
         raise NotResumableError(

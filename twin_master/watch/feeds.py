@@ -20,11 +20,8 @@ from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.growing import GrowingFile, Pipe, Place, found, rotated
-from twin_master.watch.intake import MISSING, LiveFeed
-from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
-
-Fed = tuple[Message | Refused | None, str]
-"""A message with the begin of its text; None where nothing more has come yet."""
+from twin_master.watch.intake import MISSING, Feed
+from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
 
 _LOST = ("", "nan", "null", "none")
 _TURN_COLUMNS = ("turn", "step")
@@ -34,20 +31,19 @@ _FIRST = 8
 _CUT = "{} was cut at byte {}, and no copy is beside it: what stood behind that and was not read yet is lost"
 
 
-class _FileFeed:
-    """Lines of a file."""
+class RecordedFeed(Feed):
+    """What a file holds, and may be read again."""
 
     replayable = True
-    place: Place | None = None
-    _path: Path
+    path: Path
     _follow = False
 
     def holds(self, place: Place) -> bool:
         """Return whether a place is in the file; where it is followed, also under its name of today."""
-        return found(self._path, place, follow=self._follow) is not None
+        return found(self.path, place, follow=self._follow) is not None
 
 
-class CsvFeed(_FileFeed):
+class CsvFeed(RecordedFeed):
     """A CSV file with a header: `turn` (or `step`) or `time`, `control`, and sensors by their names.
 
     Parameters
@@ -66,7 +62,7 @@ class CsvFeed(_FileFeed):
     """
 
     def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
-        self._path = path
+        self.path = path
         self._follow = follow
         self._reader = MessageReader(scenario)
         # A file that was begun a moment ago may have no header yet.
@@ -86,7 +82,7 @@ class CsvFeed(_FileFeed):
         raise errors[0] from None
 
     def _take_columns(self, names: list[str]) -> None:
-        path = self._path
+        path = self.path
         if not any(names):
             raise MissionInputError(f"{path} is empty: a CSV file begins with a line of its columns.")
         if names[0].startswith("{"):
@@ -110,14 +106,14 @@ class CsvFeed(_FileFeed):
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return the rows behind a place."""
         with suppress(MissionInputError):
-            self._read_header(found(self._path, place, follow=self._follow) or self._path)
-        stream = GrowingFile(self._path, place, follow=self._follow)
+            self._read_header(found(self.path, place, follow=self._follow) or self.path)
+        stream = GrowingFile(self.path, place, follow=self._follow)
         for line in stream:
             if line is None:
                 yield None, ""
                 continue
             if stream.cut:
-                yield Refused(_CUT.format(self._path.name, stream.cut)), ""
+                yield Refused(_CUT.format(self.path.name, stream.cut)), ""
                 stream.cut = 0
             self.place = stream.place
             if not (stream.begins and self._is_header(line)):
@@ -151,7 +147,7 @@ class CsvFeed(_FileFeed):
         return parsed(self._reader, record)
 
 
-class RunFeed:
+class RunFeed(RecordedFeed):
     """A NetCDF file with the group `observed` of a run: observations and the controls that were in force.
 
     Raises
@@ -160,10 +156,8 @@ class RunFeed:
         It cannot be read, or holds other sensors or controls.
     """
 
-    replayable = True
-    place: Place | None = None
-
     def __init__(self, path: Path, scenario: Scenario) -> None:
+        self.path = path
         self._role = role = scenario.observation.role
         self._reader, self._controls = MessageReader(scenario), scenario.control_names
         try:
@@ -205,7 +199,7 @@ class RunFeed:
             yield parsed(self._reader, record), f"row {row}"
 
 
-class FolderFeed(_FileFeed):
+class FolderFeed(RecordedFeed):
     """The journal of another run or watch, of whatever version: its observations as they came.
 
     A line that was damaged is refused, and those behind it are read on.
@@ -217,23 +211,23 @@ class FolderFeed(_FileFeed):
     """
 
     def __init__(self, folder: Path, scenario: Scenario) -> None:
-        self._path = folder / JOURNAL_NAME
+        self.path = folder / JOURNAL_NAME
         self._scenario = scenario
-        if not self._path.is_file():
+        if not self.path.is_file():
             raise MissionInputError(f"{folder} holds no journal of a run or a watch ({JOURNAL_NAME}).")
 
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return the observations behind a place."""
-        stream = GrowingFile(self._path, place)
+        stream = GrowingFile(self.path, place)
         stream.longest = math.inf
         for line in stream:
             if not isinstance(line, bytes) or not line.endswith(b"\n"):
                 return  # cut off by a kill
             record, self.place = whole_record(line), stream.place
             if record is None:
-                with self._path.open("rb") as journal:
+                with self.path.open("rb") as journal:
                     number = journal.read(self.place["read"]).count(b"\n")
-                yield Refused(f"line {number} of {self._path.name} was changed or is damaged"), ""
+                yield Refused(f"line {number} of {self.path.name} was changed or is damaged"), ""
             elif _came(record):
                 yield self._message(record), f"turn {record.get('turn')}"
 
@@ -251,7 +245,7 @@ class FolderFeed(_FileFeed):
         return Message(observed, turn, None, control)
 
 
-class JsonLinesFeed(LiveFeed):
+class JsonLinesFeed(Feed):
     """JSON objects, one a line, from a stream such as standard input."""
 
     def __init__(self, scenario: Scenario, stream: IO[bytes] | None = None) -> None:
@@ -266,7 +260,7 @@ class JsonLinesFeed(LiveFeed):
             yield (None, "") if line is None else (parsed(self._reader, line), shown(line))
 
 
-class MappingFeed(LiveFeed):
+class MappingFeed(Feed):
     """Messages of a program, as mappings; arrays of numbers may stand where JSON has lists."""
 
     def __init__(self, messages: Iterable[Mapping[str, Any]], scenario: Scenario) -> None:

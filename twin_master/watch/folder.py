@@ -8,7 +8,7 @@ from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
@@ -27,7 +27,6 @@ from twin_master.mission.loop import Source, operate
 from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
 from twin_master.mission.replay import BelievedModel, journalled_decision, replay
 from twin_master.network.estimator import Notice
-from twin_master.network.twin import Twin
 from twin_master.run_folder import PATCH, PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
@@ -41,15 +40,11 @@ from twin_master.watch.teaching import (
     Search,
     Teaching,
     both_patches,
-    check_teachable,
     notice_of,
     trial_sentence,
     verdict_of,
 )
 from twin_master.watch.trial import CANNOT, Outcome, judged, patched_model
-
-if TYPE_CHECKING:
-    pass
 
 STORED_TURNS = 1_000
 """The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
@@ -130,7 +125,7 @@ class Watch:
             self.models.append(patched_model(self.scenario, file, model["from_turn"], self._progress))
 
     def run(
-        self, feed: Feed, decide: Callable[[Mapping[str, Any]], None], *, turns: int | None = None,
+        self, feed: Feed, decide: Callable[[Mapping[str, Any]], object], *, turns: int | None = None,
         patched: Patched | None = None, search: Search | None = None,
         untold: Mapping[str, Any] | None = None,
     ) -> Counts:  # fmt: skip
@@ -151,20 +146,25 @@ class Watch:
         untold : dict, optional
             The last decision, to be told again first.
         """
+
+        def tell(decision: Mapping[str, Any]) -> None:
+            decide(decision)
+            feed.decide(decision)
+
         with self.begun(feed, patched) as keep:
-            source = Stopping(keep.intake, turns, lambda: self.quiet(decide))
+            source = Stopping(keep.intake, turns, lambda: self.quiet(tell))
             tutor = Tutor(self, search, source, wait=feed.replayable) if search else None
             with listening(source.ask):
                 try:
                     if untold is not None:
-                        decide(untold)
+                        tell(untold)
                     taught = True
                     while taught:  # with one twin after the other: where it is taught, another one goes on
                         taught = False
                         if tutor is not None:
                             tutor.act()
                         for decision in self.decisions(source, keep):
-                            decide(decision)
+                            tell(decision)
                             if taught := tutor is not None and tutor.due:
                                 break
                 finally:
@@ -178,18 +178,18 @@ class Watch:
         rejected = RejectedFile(self.folder / REJECTED_NAME)
         intake = Intake(self.scenario, feed, rejected)
         seconds = FLUSH_SECONDS if feed.replayable else 0.0
-        with JournalFile(self.folder, self._hash, seconds) as self._journal:
+        with JournalFile(self.folder, self._hash, seconds) as journal:
             self._take_up()
-            if patched is not None:
-                self._patch(*patched)
             found, last = replay(self._path, self.models, self.scenario.watch.lag)
             intake.restore(last.get("intake"))
             if last:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
-            self.keep = Keeper(self._journal, intake, found.twin, self.standing)
+            self.keep = Keeper(journal, intake, found.twin, self.standing)
             self.keep.quiet = "quiet" in last
+            if patched is not None:
+                self._patch(*patched)
             yield self.keep
 
     def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:
@@ -226,12 +226,12 @@ class Watch:
         believed = [m for m in range(len(self.models)) if self.models[m].from_turn <= from_turn]
         patch, models = both_patches(self._patches[max(believed)], file), tuple(self.models)
         return partial(
-            judged, self._path, self._journal.size, self.scenario, models, patch, from_turn, compared
+            judged, self._path, self.keep.journal.size, self.scenario, models, patch, from_turn, compared
         )
 
     def _patch(self, file: Path, first: int) -> None:
         """Believe a patch that is given from a turn on."""
-        turns = last_turn(self._path)[0] + 1
+        turns = self.keep.twin.turns
         if not turns or not 0 <= first <= turns:
             raise MissionInputError(
                 f"--from-turn names one of the {turns} turns watched so far, or the next one."
@@ -248,13 +248,13 @@ class Watch:
             atomic_write_bytes(self.folder / kept / name, (found / name).read_bytes())
         return kept
 
-    def adopt(self, outcome: Outcome, notice: Mapping[str, Any] | None, verdict: str = "") -> Twin:
-        """Believe a patched model; return the twin that goes on."""
+    def adopt(self, outcome: Outcome, notice: Mapping[str, Any] | None, verdict: str = "") -> None:
+        """Believe a patched model: with its twin it is gone on."""
         name, first = f"asset/model_patch_{len(self.models)}.json", outcome.model.from_turn
         atomic_write_bytes(self.folder / name, outcome.patch)
         again, _ = replay(self._path, self.models, self.scenario.watch.lag, question=outcome.model)
         alarms = [n for turn, n in again.notices if turn >= first and n.kind == "alarm"]
-        twin = again.twin
+        self.keep.twin = again.twin
         self.models.append(outcome.model)
         self._patches.append(self.folder / name)
         model: dict[str, Any] = {
@@ -263,14 +263,7 @@ class Watch:
             "policy_change": outcome.policy_change, **({} if notice is None else {"notice": dict(notice)}),
             **({"verdict": verdict} if verdict else {}),
         }  # fmt: skip
-        line = {
-            "turn": twin.turns - 1,
-            "next_control": twin.proposed_control,
-            "intake": next(records_backwards(self._path))[0]["intake"],
-            "model": model,
-        }
-        self._journal.append(line | self.standing.snapshot(twin, self._journal.size))
-        self.standing.take(line)
+        self.keep.write({"model": model})
         keep_knowledge(self.folder, outcome.model.knowledge)
         self._progress.note(
             f"The patched model is believed from {self.scenario.mission.step_name} {first} on: "
@@ -281,7 +274,6 @@ class Watch:
             )
             + f". {outcome.policy_change}".rstrip()
         )
-        return twin
 
     def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
         """Write `run.nc`, tables, summary and report of the last turns."""
@@ -361,15 +353,9 @@ class Tutor:
     wait : bool
         Whether the next turn waits for an answer, as those of a recording do. Those of a live watch go on
         beside a process that searches and a thread that tries a patch.
-
-    Raises
-    ------
-    MissionInputError
-        Nothing could look into the alarms of the scenario.
     """
 
     def __init__(self, watch: Watch, search: Search, source: Stopping, *, wait: bool) -> None:
-        check_teachable(watch.scenario)
         watch.keep.taught = True
         self._watch, self._search, self._source = watch, search, source
         self._teaching, self._wait = watch.standing.teaching, wait
@@ -418,7 +404,7 @@ class Tutor:
             sentence = f"The patch cannot be believed by this twin: {error}"
         notice = notice_of("trial", sentence)
         if outcome is not None and outcome.gained >= LEAST_GAIN:
-            watch.keep.twin = watch.adopt(outcome, notice)
+            watch.adopt(outcome, notice)
         else:
             watch.keep.write({"verdict": {**trial, "tried": False, "notice": notice}})
 

@@ -6,10 +6,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
 from twin_master.watch.growing import Place
-from twin_master.watch.message import Message, Refused
+from twin_master.watch.message import Fed, Message, Refused
 
 REJECTED_NAME = "rejected.jsonl"
 REJECTED_KEPT = 10_000
@@ -33,33 +33,27 @@ MISSING, _ASSUMED, _GIVEN = 0, 1, 2
 """Of a turn: not received; received; received with its control."""
 
 
-class Feed(Protocol):
-    """Where messages come from."""
+class Feed:
+    """Where messages come from; of itself one that is not read twice: it goes on where it is."""
 
-    replayable: bool
+    replayable = False
     """Whether it begins anew with every process, so that what was read before is read again."""
-    place: Place | None
+    place: Place | None = None
     """Where it stands behind the message that it gave last."""
 
     def holds(self, place: Place) -> bool:
         """Return whether a place is one of it, and not of another source."""
-
-    def messages(self, place: Place | None) -> Iterator[tuple[Message | Refused | None, str]]:
-        """Return the messages behind a place, or all of them, each with the begin of its text.
-
-        None in the place of a message: nothing more has come yet.
-        """
-
-
-class LiveFeed:
-    """A feed that is not read twice: it goes on where it is."""
-
-    replayable = False
-    place: Place | None = None
-
-    def holds(self, place: Place) -> bool:
-        """Return that nothing is read again."""
         return False
+
+    def messages(self, place: Place | None) -> Iterator[Fed]:
+        """Return the messages behind a place, or all of them."""
+        raise NotImplementedError
+
+    def decide(self, decision: Mapping[str, Any]) -> None:
+        """Tell whoever sends the messages what was decided, where they listen."""
+
+    def close(self) -> None:
+        """Let go of whoever sends the messages."""
 
 
 @dataclass
@@ -95,11 +89,10 @@ class RejectedFile:
         if self.path is None or not self.path.exists():
             return
         lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
-        self.kept = len(lines)
-        while self.kept and not _stays(lines[self.kept - 1], received):
-            self.kept -= 1
-        if self.kept < len(lines):
-            atomic_write_text(self.path, "".join(lines[: self.kept]))
+        staying = [line for line in lines if _stays(line, received)]
+        self.kept = len(staying)
+        if staying != lines:
+            atomic_write_text(self.path, "".join(staying))
 
     def add(self, message: int, reason: str, text: str) -> None:
         """Write down a refused message, its number from 1."""
@@ -148,8 +141,6 @@ class Intake:
         Of sensors of which no number came with the last reading, and before it did, or the other way round.
     ended : bool
         Whether the feed has ended; if not, more may come after `read` has returned None.
-    look : callable
-        Called behind each message from which no reading comes.
     """
 
     def __init__(self, scenario: Scenario, feed: Feed, rejected: RejectedFile) -> None:
@@ -157,7 +148,7 @@ class Intake:
         self._width = scenario.row_width
         self._feed = feed
         self._rejected = rejected
-        self._messages: Iterator[tuple[Message | Refused | None, str]] | None = None
+        self._messages: Iterator[Fed] | None = None
         self._place: Place | None = None  # behind the last message, and behind the one before it
         self._before_last: Place | None = None
         self._pending: deque[tuple[int, Reading, int]] = deque()
@@ -171,7 +162,6 @@ class Intake:
         self.counts = Counts()
         self.observation_turn = -1
         self.ended = False
-        self.look: Callable[[], None] = lambda: None
 
     @property
     def settled(self) -> bool:
@@ -225,8 +215,6 @@ class Intake:
                 self._sort(twin, message)
             except Refused as refusal:
                 self._refuse(str(refusal))
-            if not self._pending:
-                self.look()
         turn, reading, given = self._pending.popleft()
         self.observation_turn = turn
         self._known = self._unreadable
@@ -360,37 +348,27 @@ class Stopping:
     turns : int or None
         In all, after which it ends.
     look : callable
-        Called now and then while nothing comes, and behind messages from which no reading comes.
+        Called now and then while nothing comes.
     """
 
     def __init__(self, intake: Intake, turns: int | None, look: Callable[[], None]) -> None:
         self._intake, self._turns, self._look = intake, turns, look
-        intake.look = self._looked
         self.asked = self._waiting = False
 
     def read(self, twin: Twin) -> Reading | None:
         """Return the next reading; None once the watch is to end."""
-        if self.asked or (self._turns is not None and twin.turns >= self._turns):
-            return None
-        try:
-            while not self.asked:
-                self._waiting, begin = True, time.monotonic()
-                if (reading := self._intake.read(twin)) is not None or self._intake.ended:
+        with suppress(_Asked):
+            while not self.asked and (self._turns is None or twin.turns < self._turns):
+                begin, self._waiting = time.monotonic(), True
+                try:
+                    reading = self._intake.read(twin)
+                finally:
+                    self._waiting = False
+                if reading is not None or self._intake.ended:
                     return reading
+                self._look()
                 time.sleep(max(0.0, begin + POLL_SECONDS - time.monotonic()))
-                self._looked()
-        except _Asked:
-            pass
-        finally:
-            self._waiting = False
         return None
-
-    def _looked(self) -> None:
-        self._waiting = False
-        self._look()
-        self._waiting = True
-        if self.asked:
-            raise _Asked
 
     def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         """Return what is assimilated in the place of an observation that no state allows."""

@@ -11,19 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.mission.journal import (
-    JournalFile,
-    damaged,
-    records_backwards,
-    turn_record,
-)
+from twin_master.mission.journal import JournalFile, damaged, records_backwards, turn_record
 from twin_master.mission.turns import Turn
 from twin_master.network.twin import Twin
 from twin_master.watch.intake import Intake
 from twin_master.watch.teaching import Teaching, notice_of
 
 SNAPSHOT_TURNS = 32
-"""Turns between two lines that also hold the state of the twin and what follows from all lines before."""
+"""Turns between two lines that also hold the state of the twin."""
 
 CHECKED = 250_000
 """Bytes at the end of a journal that are read at least, so that damage there is found."""
@@ -33,7 +28,8 @@ CHECKED = 250_000
 class Standing:
     """What follows from all lines of a journal so far.
 
-    A line now and then holds it, so that the journal is read back to there alone, however long it is.
+    Each line holds what followed from those before it, so that the last one alone is read, however long the
+    journal is.
 
     Attributes
     ----------
@@ -50,40 +46,23 @@ class Standing:
         self.adopted += [record["model"]] if "model" in record else []
         self.teaching.take(record)
 
-    def snapshot(self, twin: Twin, begin: int) -> dict[str, Any]:
+    def before(self, begin: int) -> dict[str, Any]:
         """Return what a line holds that begins at so many bytes."""
-        standing = {"begin": begin, "adopted": self.adopted, "teaching": self.teaching.state()}
-        settled = twin.settled()
-        if settled is None:
-            return {"standing": standing}
-        state = base64.b64encode(zlib.compress(settled[1], 1)).decode("ascii")
-        return {"standing": standing, "settled": {"turn": settled[0], "state": state}}
+        return {"begin": begin, "adopted": self.adopted, "teaching": self.teaching.state()}
 
     def read(self, path: Path) -> None:
-        """Take in a journal, from the last line that holds all before it.
-
-        Raises
-        ------
-        NotResumableError
-            It was changed or is damaged.
-        """
-        behind: list[dict[str, Any]] = []
-        before: dict[str, Any] | None = None
-        length = 0
+        """Take in a journal; raises `NotResumableError` where its end was changed or is damaged."""
+        last, length = dict[str, Any](), 0
         for record, begin, end in records_backwards(path):
-            length = length or end
-            if length - begin > CHECKED and before is not None:
+            length, last = length or end, last or record
+            if begin and record["standing"]["begin"] != begin:
+                raise damaged(path, begin, "lines before it are missing, or not its own")
+            if length - begin > CHECKED:
                 break
-            if begin and before is None:
-                behind.append(record)
-                before = record.get("standing")
-                if before is not None and before["begin"] != begin:
-                    raise damaged(path, begin, "lines before it are missing, or not its own")
-        if before is not None:
-            self.adopted = list(before["adopted"])
-            self.teaching.restore(before["teaching"])
-        for record in reversed(behind):
-            self.take(record)
+        if "standing" in last:
+            self.adopted = last["standing"]["adopted"]
+            self.teaching.restore(last["standing"]["teaching"])
+            self.take(last)
 
 
 class Keeper:
@@ -101,6 +80,7 @@ class Keeper:
 
     Attributes
     ----------
+    journal, intake, twin
     taught : bool
         Whether the twin is taught.
     line : dict
@@ -112,7 +92,7 @@ class Keeper:
     """
 
     def __init__(self, journal: JournalFile, intake: Intake, twin: Twin, standing: Standing) -> None:
-        self._journal, self.intake, self.twin, self._standing = journal, intake, twin, standing
+        self.journal, self.intake, self.twin, self._standing = journal, intake, twin, standing
         self.taught = False
         self.line: dict[str, Any] = {}
         self.filtered: NDArray[np.float64] | None = None
@@ -134,8 +114,9 @@ class Keeper:
         }
         if reading.revises is not None:
             record["control_in_force"] = concluded.control_index
-        elif number % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1:
-            record |= self._standing.snapshot(self.twin, self._journal.size)
+        elif number % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1 and (settled := self.twin.settled()):
+            state = base64.b64encode(zlib.compress(settled[1], 1)).decode("ascii")
+            record["settled"] = {"turn": settled[0], "state": state}
         known = {(notice.kind, notice.sensors) for notice in concluded.notices}
         told = [n.as_record() for n in self.intake.notices if (n.kind, n.sensors) not in known]
         told += self._standing.teaching.untold if self.taught else []
@@ -155,5 +136,5 @@ class Keeper:
 
     def _append(self, record: Mapping[str, Any]) -> None:
         """Add a line to the journal, and take it in."""
-        self._journal.append(record)
+        self.journal.append({**record, "standing": self._standing.before(self.journal.size)})
         self._standing.take(record)

@@ -59,6 +59,10 @@ class Message:
     unreadable: Mapping[int, str] = field(default_factory=dict)
 
 
+Fed = tuple[Message | Refused | None, str]
+"""A message with the begin of its text; None where nothing more has come yet."""
+
+
 class MessageReader:
     """Reads the messages about the asset of a scenario.
 

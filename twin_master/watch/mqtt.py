@@ -22,11 +22,11 @@ from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.mission.replay import journalled_decision
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.broker import PASSWORD_VARIABLE, Broker
-from twin_master.watch.feeds import Fed, parsed, shown
+from twin_master.watch.feeds import parsed, shown
 from twin_master.watch.folder import Watch
 from twin_master.watch.growing import Place
-from twin_master.watch.intake import LiveFeed
-from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
+from twin_master.watch.intake import Feed
+from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
 
 CLIENT_SUFFIX, PUBLISHED_NAME = ".mqtt", "published"
 """Of the file with the name of the client, and of that which says how far decisions were published."""
@@ -353,7 +353,7 @@ class Outbox:
         self._session.behind[self] = None
 
 
-class MqttFeed(LiveFeed):
+class MqttFeed(Feed):
     """The observations of the topic of one asset, and its decisions; see `Session` for the errors.
 
     Parameters

@@ -266,9 +266,9 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(base, mission, tmp_path
     ran(watch, feed, 198)
     with pytest.raises(NotResumableError, match=r"line 4 .*; 3 before it are whole"):
         watch.told(0)
-    changed = lines[-2].replace(b'"turn": ', b'"turn": 1')
+    changed = lines[-2].replace(b'"turn": 1', b'"turn": 2')
     for wrong, sentence in (
-        ([*lines[:3], *lines[4:]], r"line 192 .*lines before it are missing"),
+        ([*lines[:3], *lines[4:]], r"line 196 .*lines before it are missing"),
         ([*lines[:-2], changed, lines[-1]], "line 196 .*and 1 behind it"),
     ):
         file.write_bytes(b"".join(wrong))
