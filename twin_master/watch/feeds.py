@@ -152,30 +152,28 @@ class RunFeed(RecordedFeed):
     """
 
     def __init__(self, path: Path, scenario: Scenario) -> None:
-        self.path = path
-        self._role = role = scenario.observation.role
-        self._reader, self._controls = MessageReader(scenario), scenario.control_names
+        self.path, self._reader = path, MessageReader(scenario)
+        role, names = scenario.observation.role, dict(enumerate(scenario.control_names))
         try:
             group: xr.Dataset = read_groups(path)["observed"].to_dataset()
-            self._values = np.asarray(group[role].values, dtype=np.float64)
-            self._control = (
-                np.asarray(group["control_index"].values, dtype=np.int64)
-                if "control_index" in group
-                else None
-            )
-            self._turn = np.asarray(group["step"].values, dtype=np.int64)
+            rows, turns = group[role].values.tolist(), group["step"].values.tolist()
+            controls = group["control_index"].values.tolist() if "control_index" in group else []
+            if {*map(len, rows)} - {scenario.observation.count} or {*controls} - {*names}:
+                raise ValueError(
+                    said("watch.shape", count=scenario.observation.count, came=group[role].shape)
+                )
+            self._records = [{role: row, "turn": int(turn)} for row, turn in zip(rows, turns, strict=True)]
+            for record, control in zip(self._records, controls, strict=False):
+                record["control"] = names[control]
         except (DamagedFileError, KeyError, ValueError, TypeError, OSError) as error:
             reason = str(error).rstrip(".")
             raise MissionInputError(said("watch.netcdf", path=path, role=role, reason=reason)) from None
-        if self._values.shape != (len(self._turn), scenario.observation.count) or (
-            self._control is not None and not np.all(np.isin(self._control, range(len(scenario.control))))
-        ):
-            count, shape = scenario.observation.count, self._values.shape
-            raise MissionInputError(said("watch.shape", path=path, count=count, role=role, shape=shape))
+
+        first = (json.dumps(self._records[:count]).encode() for count in range(_FIRST + 1))
+        self._beginnings = [sha256(records).hexdigest() for records in first]
 
     def _place(self, read: int) -> Place:
-        first = self._turn[: min(read, _FIRST)].tobytes() + self._values[: min(read, _FIRST)].tobytes()
-        return {"beginning": sha256(first).hexdigest(), "read": read}
+        return {"beginning": self._beginnings[min(read, _FIRST)], "read": read}
 
     def holds(self, place: Place) -> bool:
         """Return whether its first steps are those of a place."""
@@ -183,12 +181,9 @@ class RunFeed(RecordedFeed):
 
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return the steps behind a place."""
-        for row in range(place["read"] if place else 0, len(self._values)):
+        for row in range(place["read"] if place else 0, len(self._records)):
             self.place = self._place(row + 1)
-            record: dict[str, object] = {self._role: self._values[row].tolist(), "turn": int(self._turn[row])}
-            if self._control is not None:
-                record["control"] = self._controls[self._control[row]]
-            yield parsed(self._reader, record), f"row {row}"
+            yield parsed(self._reader, self._records[row]), f"row {row}"
 
 
 class FolderFeed(RecordedFeed):

@@ -21,6 +21,7 @@ from typing import Any
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.network.estimator import Notice
 from twin_master.run_folder import PATCH, TEACHING, VERDICT
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
@@ -244,7 +245,7 @@ def verdict_of(
     where = f"{step.capitalize()}s {question.from_turn} to {question.to_turn} were searched for the cause"
     if isinstance(folder, TwinMasterError):
         sentence = f"{where}, and the search ended without a verdict: {folder}"
-        return {**asked, "tried": False, "kind": "none", "notice": notice_of("verdict", sentence)}
+        return {**asked, "tried": False, "kind": "none", "notice": Notice("verdict", sentence).as_record()}
     try:
         verdict = read_json(folder / VERDICT, DamagedFileError)["verdict"]
         kind, said = str(verdict["kind"]), str(verdict["sentence"])
@@ -260,7 +261,7 @@ def verdict_of(
         sentence += f" To believe it none the less: uav-twin watch --resume --out DIR {options}"
     return {
         **asked, "tried": tried, "kind": kind, "folder": folder.relative_to(watch).as_posix(),
-        "notice": notice_of("verdict", sentence),
+        "notice": Notice("verdict", sentence).as_record(),
     }  # fmt: skip
 
 
@@ -276,11 +277,6 @@ def trial_sentence(trial: Mapping[str, Any], outcome: Outcome, step: str) -> str
     if trial["kind"] == GROUP:
         said += " It is one of a group: which of them is true these data cannot tell."
     return f"{said} {outcome.policy_change}".rstrip()
-
-
-def notice_of(kind: str, sentence: str) -> dict[str, Any]:
-    """Return a notice as it stands in the journal."""
-    return {"kind": kind, "sentence": sentence, "sensors": [], "value": None, "since": None}
 
 
 def both_patches(before: Path | None, found: Path) -> bytes:
