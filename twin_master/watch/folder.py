@@ -34,7 +34,7 @@ from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping, listening
-from twin_master.watch.keeping import Keeper, Standing
+from twin_master.watch.keeping import Keeper
 from twin_master.watch.teaching import (
     LEAST_GAIN,
     TRIAL_TURNS,
@@ -116,9 +116,9 @@ class Watch:
         """Take in the journal, and believe the patches that were adopted, as far as that is not done yet."""
         next(records(self._path, config_hash=self._hash), None)  # it is that of this configuration
         notice = self.scenario.notice
-        self.standing = Standing(Teaching(1.0 if notice is None else notice.threshold))
-        self.standing.read(self._path)
-        for model in self.standing.adopted[len(self.models) - 1 :]:
+        self.teaching = Teaching(1.0 if notice is None else notice.threshold)
+        self.teaching.read(self._path)
+        for model in self.teaching.adopted[len(self.models) - 1 :]:
             first, file = model["from_turn"], self.folder / model["patch"]
             self.models.append(patched_model(self.scenario, file, first, self._progress))
 
@@ -184,7 +184,7 @@ class Watch:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
-            self.keep = Keeper(journal, intake, found.twin, self.standing)
+            self.keep = Keeper(journal, intake, found.twin, self.teaching)
             self.keep.quiet = "quiet" in last
             if patched is not None:
                 self._patch(*patched)
@@ -281,8 +281,8 @@ class Watch:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
         result, attributes = self.result(turns, last), {}
-        if self.standing.adopted:
-            adopted = self.standing.adopted[-1]
+        if self.teaching.adopted:
+            adopted = self.teaching.adopted[-1]
             attributes = {
                 "model_patch": adopted["patch"], "model_patch_from_step": adopted["from_turn"]
             }  # fmt: skip
@@ -327,7 +327,7 @@ class Watch:
             "duplicates": ("messages that said nothing new", counts.duplicates),
             "rejected": (f"messages refused ({REJECTED_NAME})", counts.rejected),
         }
-        for model in self.standing.adopted:
+        for model in self.teaching.adopted:
             first = model["from_turn"]
             for when in ("before", "after"):
                 title = f"rms residual {when} the patch of {step} {first}"
@@ -357,7 +357,7 @@ class Tutor:
     def __init__(self, watch: Watch, search: Search, source: Stopping, *, wait: bool) -> None:
         watch.keep.taught = True
         self._watch, self._search, self._source = watch, search, source
-        self._teaching, self._wait = watch.standing.teaching, wait
+        self._teaching, self._wait = watch.teaching, wait
         self.outcome: Future[Outcome] | None = None
 
     @property
