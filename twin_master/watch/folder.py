@@ -15,7 +15,7 @@ from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
 from twin_master.assets.asset_source import FlownAndBelieved, calibrated_with
 from twin_master.assets.resolution import believed_source
-from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.errors import MissionInputError
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
@@ -156,15 +156,15 @@ class Watch:
                 try:
                     if untold is not None:
                         tell(untold)
-                    taught = True
-                    while taught:  # with one twin after the other: where it is taught, another one goes on
-                        taught = False
+                    while True:  # with one twin after the other: where it is taught, another one goes on
                         if tutor is not None:
                             tutor.act()
                         for decision in self.decisions(source, keep):
                             tell(decision)
-                            if taught := tutor is not None and tutor.due:
+                            if tutor is not None and tutor.due:
                                 break
+                        else:
+                            break
                 finally:
                     if tutor is not None:
                         tutor.end()
@@ -375,13 +375,7 @@ class Tutor:
         """Do what is due."""
         watch, teaching, step = self._watch, self._teaching, self._watch.scenario.mission.step_name
         if (question := teaching.question) is not None:
-            found: Path | TwinMasterError | None
-            try:
-                found = self._search.answer(
-                    question, wait=self._wait, asked_to_end=lambda: self._source.asked
-                )
-            except TwinMasterError as error:
-                found = error
+            found = self._search.answer(question, self._wait, lambda: self._source.asked)
             if found is not None:
                 verdict = verdict_of(watch.folder, question, found, teaching.turn, step)
                 watch.keep.write({"verdict": verdict})

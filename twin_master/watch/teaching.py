@@ -199,15 +199,12 @@ class Search:
         out = ["--out", str(question.folder(self.watch)), "--seed", str(self.seed)]
         return ["--from-run", str(self.watch), *turns, *out]
 
-    def answer(self, question: Question, *, wait: bool, asked_to_end: Callable[[], bool]) -> Path | None:
-        """Return the folder of the verdict; None while it is looked for.
+    def answer(
+        self, question: Question, wait: bool, asked_to_end: Callable[[], bool]
+    ) -> Path | TwinMasterError | None:
+        """Return the folder of the verdict, or the last that a search without one said; None before.
 
         No key of the terminal ends the process; where turns do not wait for it, it has a low priority.
-
-        Raises
-        ------
-        TwinMasterError
-            The search ended without a verdict; the sentence is the last one that it said.
         """
         folder = question.folder(self.watch)
         log = folder.with_name(folder.name + ".log")
@@ -226,7 +223,7 @@ class Search:
                 self._process = None
                 lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
                 said = (line.strip() for line in reversed(lines) if line.strip())
-                raise TwinMasterError(next(said, f"exit code {code}"))
+                return TwinMasterError(next(said, f"exit code {code}"))
             if not wait or asked_to_end():
                 return None
             time.sleep(_LOOK_AGAIN)
