@@ -19,8 +19,8 @@ from twin_master.errors import MissionInputError
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
+    check_header,
     last_turn,
-    records,
     records_backwards,
 )
 from twin_master.mission.loop import Source, operate
@@ -114,7 +114,7 @@ class Watch:
 
     def _take_up(self) -> None:
         """Take in the journal, and believe the patches that were adopted, as far as that is not done yet."""
-        next(records(self._path, config_hash=self._hash), None)  # it is that of this configuration
+        check_header(self._path, self._hash)
         notice = self.scenario.notice
         self.teaching = Teaching(1.0 if notice is None else notice.threshold)
         self.teaching.read(self._path)
