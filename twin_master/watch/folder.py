@@ -264,15 +264,13 @@ class Watch:
         }  # fmt: skip
         self.keep.write({"model": model})
         keep_knowledge(self.folder, outcome.model.knowledge)
-        self._progress.note(
-            f"The patched model is believed from {self.scenario.mission.step_name} {first} on: "
-            + ", ".join(
-                f"{what} {model['before'][key]:.4g} before, {model['after'][key]:.4g} after"
-                for key, what in (("rms_residual", "rms residual"), ("log_evidence", "log evidence"))
-                if model["before"][key] is not None
-            )
-            + f". {outcome.policy_change}".rstrip()
-        )
+        gaps = [
+            f"{name.replace('_', ' ')} {value:.4g} before, {outcome.after[name]:.4g} after"
+            for name, value in outcome.before.items()
+            if value is not None
+        ]
+        since = f"The patched model is believed from {self.scenario.mission.step_name} {first} on"
+        self._progress.note(f"{since}: {', '.join(gaps)}. {outcome.policy_change}".rstrip())
 
     def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
         """Write `run.nc`, tables, summary and report of the last turns."""
