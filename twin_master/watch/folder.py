@@ -33,7 +33,7 @@ from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight
-from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping, listening
+from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, Stopping, listening
 from twin_master.watch.keeping import Keeper
 from twin_master.watch.teaching import (
     LEAST_GAIN,
@@ -173,8 +173,7 @@ class Watch:
     @contextmanager
     def begun(self, feed: Feed, patched: Patched | None = None) -> Iterator[Keeper]:
         """Open the journal, and give what keeps the turns of the twin as it stands after it; see `run`."""
-        rejected = RejectedFile(self.folder / REJECTED_NAME)
-        intake = Intake(self.scenario, feed, rejected)
+        intake = Intake(self.scenario, feed, self.folder / REJECTED_NAME)
         seconds = FLUSH_SECONDS if feed.replayable else 0.0
         with JournalFile(self.folder, self._hash, seconds) as journal:
             self._take_up()
