@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
@@ -205,8 +205,8 @@ class _Unpacked:
         return source
 
 
-_kept: dict[bytes, _Unpacked] = {}
-"""The last kit of this process: shards of a group follow each other."""
+_unpacked = lru_cache(maxsize=1)(_Unpacked)
+"""Gives the last kit of this process again: shards of a group follow each other."""
 
 
 def with_parameters(scenario: Scenario, parameters: Mapping[str, float]) -> Scenario:
@@ -227,10 +227,7 @@ def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
     members : sequence of Member
         B of them.
     """
-    if packed not in _kept:
-        _kept.clear()
-        _kept[packed] = _Unpacked(packed)
-    kit = _kept[packed]
+    kit = _unpacked(packed)
     recorded = [member.recording for member in members if member.recording is not None]
     flights = assimilated(kit.knowledge, recorded) if recorded else _flown(kit, members)
     failures, ended = (

@@ -28,9 +28,9 @@ from twin_master.fleet.lessons import learn_from_fleet
 from twin_master.fleet.plan import ensemble, load_fleet
 from twin_master.fleet.reading import attention, group_figures, leaving
 from twin_master.fleet.reading import open_fleet as fleet_groups
-from twin_master.fleet.report import write_fleet_report
+from twin_master.fleet.report import fleet_page, write_fleet_report
 from twin_master.fleet.standing import WatchedAsset
-from twin_master.fleet.view import fleet_view, serve_fleet
+from twin_master.fleet.view import WORST, serve_fleet
 from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.opening import file_record
@@ -452,10 +452,10 @@ def test_who_needs_attention_next_comes_first(fleet_file, tmp_path):
     worst = np.lexsort((-group["mean"].values[:, -1].sum(axis=1), -printed))
     assert max(soon) > min(soon) + 0.1
     assert len(set(printed)) < len(set(soon))
-    table = fleet_view(tmp_path / "flown").partition("Who needs attention next")[2]
+    table = fleet_page(tmp_path / "flown", WORST).partition("Who needs attention next")[2]
     assert re.findall(r"seed-\d+", table) == [f"seed-{row}" for row in worst[:50]]
     with pytest.raises(FleetError, match="holds no fleet"):
-        fleet_view(tmp_path)
+        fleet_page(tmp_path, WORST)
 
 
 @pytest.fixture
@@ -504,4 +504,4 @@ def test_the_page_of_a_fleet(served, tmp_path):
     del asset["last"]["health"]
     file.write_text(json.dumps(state))
     with pytest.raises(FleetError, match="out is damaged or of another version"):
-        fleet_view(tmp_path / "out")
+        fleet_page(tmp_path / "out", WORST)
