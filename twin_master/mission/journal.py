@@ -276,7 +276,5 @@ def damaged(path: Path, begin: int, why: str) -> NotResumableError:
             number += end < begin
             whole[end < begin] += end != begin and whole_record(line) is not None
             end += len(line)
-    return NotResumableError(
-        f"line {number} of the journal {path} was changed or is damaged ({why}); {whole[True]} before it are "
-        f"whole, and {whole[False]} behind it: begin again with --replace."
-    )
+    found = {"line": number, "before": whole[True], "behind": whole[False]}
+    return NotResumableError(said("mission.damaged", path=path, why=why, **found))

@@ -25,6 +25,7 @@ from twin_master.network.estimator import Learnt
 from twin_master.network.inference import known_control, predict
 from twin_master.run_folder import PICTURE, VERDICT, read_config
 from twin_master.scenario.reading import parse_scenario
+from twin_master.sentences import said
 
 TURNS_AT_ONCE = 200
 """Turns that are read before the viewers are answered again."""
@@ -160,10 +161,8 @@ class Flight:
         if "filtered" in record:
             late = int(record.get("observation_turn", int(record["turn"])))
             if not 0 <= late <= record["turn"] == self.turns - 1:
-                raise RunFolderError(
-                    f"the journal in {self.folder} tells {self.scenario.mission.step_name} {record['turn']} "
-                    f"where {self.turns} was expected: it is of another version."
-                )
+                told = f"{self.scenario.mission.step_name} {record['turn']}"
+                raise RunFolderError(said("watch.turn", folder=self.folder, told=told, turns=self.turns))
             self._places[-1][0] = self._places[late][1] = place
         self._told[turn] += [] if "filtered" in record else record.get("notices", [])
         verdict = record.get("model", {}).get("verdict", record.get("verdict", {}).get("folder", ""))

@@ -17,6 +17,7 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 from reporting.errors import ReportingError
 from reporting.page import script_source
 from twin_master.errors import TwinMasterError, ViewError
+from twin_master.sentences import said
 from twin_master.viewer.flight import Flight
 from twin_master.viewer.messages import Request, Teller, page_html, scene_of
 
@@ -159,10 +160,8 @@ async def serve_application(
     try:
         sockets = bind_sockets(port, ADDRESS)
     except OSError as error:
-        raise ViewError(
-            f"port {port} of {ADDRESS} cannot be taken ({os.strerror(error.errno or 0)}): "
-            "choose another --port."
-        ) from error
+        reason = os.strerror(error.errno or 0)
+        raise ViewError(said("watch.port", port=port, address=ADDRESS, reason=reason)) from error
     server.add_sockets(sockets)
     ready(f"http://{ADDRESS}:{sockets[0].getsockname()[1]}/")
     try:

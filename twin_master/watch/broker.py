@@ -7,6 +7,7 @@ from ssl import create_default_context
 from urllib.parse import unquote, urlsplit
 
 from twin_master.errors import MissionInputError
+from twin_master.sentences import said
 
 PASSWORD_VARIABLE = "UAV_TWIN_MQTT_PASSWORD"
 
@@ -62,9 +63,7 @@ def broker_of(address: str, authority: Path | None = None, *, many: bool = False
     if not parts.hostname or not topic:
         raise MissionInputError(f"{address}: `mqtt://[USER@]HOST[:PORT]/TOPIC` is expected, or `mqtts://`.")
     if parts.password is not None:
-        raise MissionInputError(
-            f"every user of this machine sees a password in an address: put it into {PASSWORD_VARIABLE}."
-        )
+        raise MissionInputError(said("watch.password", variable=PASSWORD_VARIABLE))
     if many and (not topic.endswith("/+") or "+" in topic[:-1] or "#" in address):
         raise MissionInputError(f"{address}: a topic of many assets is expected, such as wings/+.")
     if not many and ("#" in address or "+" in topic):

@@ -19,6 +19,7 @@ from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.watch.growing import GrowingFile, Pipe, Place, found, rotated
 from twin_master.watch.intake import MISSING, Feed
 from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
@@ -28,7 +29,6 @@ _TURN_COLUMNS = ("turn", "step")
 _OTHERS = ("turn", "time", "control")
 _FIRST = 8
 """First steps by which a file of steps is known again."""
-_CUT = "{} was cut at byte {}, and no copy is beside it: what stood behind that and was not read yet is lost"
 
 
 class RecordedFeed(Feed):
@@ -86,18 +86,13 @@ class CsvFeed(RecordedFeed):
         if not any(names):
             raise MissionInputError(f"{path} is empty: a CSV file begins with a line of its columns.")
         if names[0].startswith("{"):
-            raise MissionInputError(
-                f"{path} holds JSON lines, and a file of observations is CSV or NetCDF: hand them over by "
-                f"standard input, `--observations - < {path}`."
-            )
+            raise MissionInputError(said("watch.json_lines", path=path))
         called = ["turn" if name in _TURN_COLUMNS else name for name in names]
         sensors = [name for name in called if name not in _OTHERS and name[:1] != "_"]
         try:
             columns = [column for column in map(self._reader.column, sensors) if column is not None]
         except Refused as refusal:
-            raise MissionInputError(
-                f"{path}: the column {refusal}; others are `turn`, `time` and `control`."
-            ) from None
+            raise MissionInputError(said("watch.column", path=path, refusal=refusal)) from None
         once = {sensor for sensor, _ in columns}
         if len(once) < len(columns) or any(called.count(name) > 1 for name in _OTHERS):
             raise MissionInputError(f"{path}: two columns say the same; {', '.join(names)[:300]} came.")
@@ -113,7 +108,7 @@ class CsvFeed(RecordedFeed):
                 yield None, ""
                 continue
             if stream.cut:
-                yield Refused(_CUT.format(self.path.name, stream.cut)), ""
+                yield Refused(said("watch.cut", name=self.path.name, byte=stream.cut)), ""
                 stream.cut = 0
             self.place = stream.place
             if not (stream.begins and self._is_header(line)):
@@ -157,33 +152,28 @@ class RunFeed(RecordedFeed):
     """
 
     def __init__(self, path: Path, scenario: Scenario) -> None:
-        self.path = path
-        self._role = role = scenario.observation.role
-        self._reader, self._controls = MessageReader(scenario), scenario.control_names
+        self.path, self._reader = path, MessageReader(scenario)
+        role, names = scenario.observation.role, dict(enumerate(scenario.control_names))
         try:
             group: xr.Dataset = read_groups(path)["observed"].to_dataset()
-            self._values = np.asarray(group[role].values, dtype=np.float64)
-            self._control = (
-                np.asarray(group["control_index"].values, dtype=np.int64)
-                if "control_index" in group
-                else None
-            )
-            self._turn = np.asarray(group["step"].values, dtype=np.int64)
+            rows, turns = group[role].values.tolist(), group["step"].values.tolist()
+            controls = group["control_index"].values.tolist() if "control_index" in group else []
+            if {*map(len, rows)} - {scenario.observation.count} or {*controls} - {*names}:
+                raise ValueError(
+                    said("watch.shape", count=scenario.observation.count, came=group[role].shape)
+                )
+            self._records = [{role: row, "turn": int(turn)} for row, turn in zip(rows, turns, strict=True)]
+            for record, control in zip(self._records, controls, strict=False):
+                record["control"] = names[control]
         except (DamagedFileError, KeyError, ValueError, TypeError, OSError) as error:
-            raise MissionInputError(
-                f"{path} is no NetCDF file with `observed/{role}` (step, sensor): {str(error).rstrip('.')}."
-            ) from None
-        if self._values.shape != (len(self._turn), scenario.observation.count) or (
-            self._control is not None and not np.all(np.isin(self._control, range(len(scenario.control))))
-        ):
-            raise MissionInputError(
-                f"{path}: {scenario.observation.count} sensors and the controls of the scenario are "
-                f"expected, and `observed/{role}` has the shape {self._values.shape}."
-            )
+            reason = str(error).rstrip(".")
+            raise MissionInputError(said("watch.netcdf", path=path, role=role, reason=reason)) from None
+
+        first = (json.dumps(self._records[:count]).encode() for count in range(_FIRST + 1))
+        self._beginnings = [sha256(records).hexdigest() for records in first]
 
     def _place(self, read: int) -> Place:
-        first = self._turn[: min(read, _FIRST)].tobytes() + self._values[: min(read, _FIRST)].tobytes()
-        return {"beginning": sha256(first).hexdigest(), "read": read}
+        return {"beginning": self._beginnings[min(read, _FIRST)], "read": read}
 
     def holds(self, place: Place) -> bool:
         """Return whether its first steps are those of a place."""
@@ -191,12 +181,9 @@ class RunFeed(RecordedFeed):
 
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return the steps behind a place."""
-        for row in range(place["read"] if place else 0, len(self._values)):
+        for row in range(place["read"] if place else 0, len(self._records)):
             self.place = self._place(row + 1)
-            record: dict[str, object] = {self._role: self._values[row].tolist(), "turn": int(self._turn[row])}
-            if self._control is not None:
-                record["control"] = self._controls[self._control[row]]
-            yield parsed(self._reader, record), f"row {row}"
+            yield parsed(self._reader, self._records[row]), f"row {row}"
 
 
 class FolderFeed(RecordedFeed):

@@ -29,6 +29,7 @@ from twin_master.mission.replay import BelievedModel, journalled_decision, repla
 from twin_master.network.estimator import Notice
 from twin_master.run_folder import PATCH, PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight
@@ -40,7 +41,6 @@ from twin_master.watch.teaching import (
     Search,
     Teaching,
     both_patches,
-    notice_of,
     trial_sentence,
     verdict_of,
 )
@@ -93,8 +93,6 @@ class Watch:
             self._source, self._inputs = like._source, like._inputs
         self._config = with_inputs(folder, config, self._inputs)
         self.models: list[BelievedModel] = [self._prepared() if like is None else like.models[0]]
-        own = getattr(scenario.belief, "patch", None)
-        self._patches: list[Path | None] = [Path(own) if own else None]  # of these models
         self._path = folder / JOURNAL_NAME
         self._hash = hash_record(self._config)
         self._take_up()
@@ -111,7 +109,8 @@ class Watch:
         told = calibrated_with(knowledge.draws.record or {}, WATCHED, origin, self._inputs)
         if told is not None:
             self._progress.note(told)
-        return BelievedModel(0, knowledge)
+        own = getattr(self.scenario.belief, "patch", None)
+        return BelievedModel(0, knowledge, Path(own) if own else None)
 
     def _take_up(self) -> None:
         """Take in the journal, and believe the patches that were adopted, as far as that is not done yet."""
@@ -120,9 +119,8 @@ class Watch:
         self.standing = Standing(Teaching(1.0 if notice is None else notice.threshold))
         self.standing.read(self._path)
         for model in self.standing.adopted[len(self.models) - 1 :]:
-            file = self.folder / model["patch"]
-            self._patches.append(file)
-            self.models.append(patched_model(self.scenario, file, model["from_turn"], self._progress))
+            first, file = model["from_turn"], self.folder / model["patch"]
+            self.models.append(patched_model(self.scenario, file, first, self._progress))
 
     def run(
         self, feed: Feed, decide: Callable[[Mapping[str, Any]], object], *, turns: int | None = None,
@@ -216,15 +214,19 @@ class Watch:
             return
         since = f"since {step} {keep.twin.turns - 1}" if keep.twin.turns else "and none before"
         sentence = f"No {step} has come for {longest:g} s, {since}: see whether logger and broker are there."
-        decision = {**(self.last_decision() or {"turn": -1}), "notices": [notice_of("quiet", sentence)]}
+        decision = {
+            **(self.last_decision() or {"turn": -1}),
+            "notices": [Notice("quiet", sentence).as_record()],
+        }
         keep.write({"notices": decision["notices"], "quiet": decision})
         keep.quiet = True
         decide(decision)
 
     def trial(self, file: Path, from_turn: int, compared: tuple[int, int] = (0, 0)) -> Callable[..., Outcome]:
         """Return what tells what comes of a patch from a turn on, after all lines of the journal so far."""
-        believed = [m for m in range(len(self.models)) if self.models[m].from_turn <= from_turn]
-        patch, models = both_patches(self._patches[max(believed)], file), tuple(self.models)
+        models = tuple(self.models)
+        believed = [model for model in models if model.from_turn <= from_turn][-1]
+        patch = both_patches(believed.patch, file)
         return partial(
             judged, self._path, self.keep.journal.size, self.scenario, models, patch, from_turn, compared
         )
@@ -233,9 +235,7 @@ class Watch:
         """Believe a patch that is given from a turn on."""
         turns = self.keep.twin.turns
         if not turns or not 0 <= first <= turns:
-            raise MissionInputError(
-                f"--from-turn names one of the {turns} turns watched so far, or the next one."
-            )
+            raise MissionInputError(said("watch.from_turn", turns=turns))
         outcome = self.trial(file, first)(progress=self._progress)
         self.adopt(outcome, None, self._kept_verdict(file.parent))
 
@@ -255,8 +255,7 @@ class Watch:
         again, _ = replay(self._path, self.models, self.scenario.watch.lag, question=outcome.model)
         alarms = [n for turn, n in again.notices if turn >= first and n.kind == "alarm"]
         self.keep.twin = again.twin
-        self.models.append(outcome.model)
-        self._patches.append(self.folder / name)
+        self.models.append(replace(outcome.model, patch=self.folder / name))
         model: dict[str, Any] = {
             "patch": name, "sha256": hash_file(self.folder / name), "from_turn": first,
             "before": outcome.before, "after": outcome.after, "alarms": [vars(alarm) for alarm in alarms],
@@ -402,7 +401,7 @@ class Tutor:
             sentence = trial_sentence(trial, outcome, step)
         except CANNOT as error:
             sentence = f"The patch cannot be believed by this twin: {error}"
-        notice = notice_of("trial", sentence)
+        notice = Notice("trial", sentence).as_record()
         if outcome is not None and outcome.gained >= LEAST_GAIN:
             watch.adopt(outcome, notice)
         else:

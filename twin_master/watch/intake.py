@@ -22,6 +22,7 @@ from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
+from twin_master.sentences import said
 from twin_master.watch.growing import Place
 from twin_master.watch.message import Fed, Message, Refused
 
@@ -236,10 +237,7 @@ class Intake:
         came, words = reading.unreadable, self._words
         when = f"{words.step.capitalize()} {self.observation_turn}"
         for g in sorted(came.keys() - self._unreadable):
-            sentence = (
-                f"{when}: {words.sensors([g])} shows {came[g]}, which is no reading; it is left out until "
-                "readings of it come back."
-            )
+            sentence = said("watch.left_out", when=when, sensor=words.sensors([g]), came=came[g])
             yield Notice("gauge_left_out", sentence, (g + 1,))
         back = {g for g in self._unreadable - came.keys() if not np.isnan(reading.observed[g])}
         for g in sorted(back):
@@ -300,11 +298,8 @@ class Intake:
             message = replace(message, observed=row)
         ahead = turn - twin.turns
         given = _ASSUMED if message.control is None else _GIVEN
-        if ahead > self._section.longest_gap:
-            raise Refused(
-                f"turn {turn} is {ahead} turns ahead of the next one, {twin.turns}, and `watch.longest_gap` "
-                f"is {self._section.longest_gap}"
-            )
+        if ahead > (most := self._section.longest_gap):
+            raise Refused(said("watch.ahead", turn=turn, ahead=ahead, next=twin.turns, most=most))
         if ahead < 0:
             self._sort_late(twin, turn, message, given)
             return
@@ -315,9 +310,8 @@ class Intake:
 
     def _sort_late(self, twin: Twin, turn: int, message: Message, given: int) -> None:
         if turn < twin.first_kept:
-            raise Refused(
-                f"turn {turn} is {twin.turns - 1 - turn} turns late, and `watch.lag` is {self._section.lag}"
-            )
+            late = twin.turns - 1 - turn
+            raise Refused(said("watch.late", turn=turn, late=late, lag=self._section.lag))
         before, known = twin.observed(turn), self._given[turn - twin.turns]
         both = ~np.isnan(before) & ~np.isnan(message.observed)
         if not np.array_equal(before[both], message.observed[both]):

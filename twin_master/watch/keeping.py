@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from twin_master.mission.journal import JournalFile, damaged, records_backwards, turn_record
 from twin_master.mission.turns import Turn
+from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.watch.intake import Intake
-from twin_master.watch.teaching import Teaching, notice_of
+from twin_master.watch.teaching import Teaching
 
 SNAPSHOT_TURNS = 32
 """Turns between two lines that also hold the state of the twin."""
@@ -122,7 +123,7 @@ class Keeper:
         told += self._standing.teaching.untold if self.taught else []
         if self.quiet:
             sentence = f"Turn {number}: observations come again, after {self.silence:.0f} s."
-            told.append(notice_of("heard", sentence))
+            told.append(Notice("heard", sentence).as_record())
         if told:
             record["notices"] = record.get("notices", []) + told
         self._append(record)

@@ -18,6 +18,7 @@ from reporting.json_file import parse_json
 from reporting.words import listing
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
+from twin_master.sentences import said
 
 LARGEST_MESSAGE = 1_000_000
 """Bytes of a message; a larger one is refused unread."""
@@ -107,11 +108,8 @@ class MessageReader:
         if base not in self._index and self._allows_unknown:
             return None
         if base not in self._index:
-            raise Refused(
-                f"`{name[:60]}` is no sensor: a sensor is called such as {_near(name[:60], *self._index)}, "
-                f"its unit behind it, and there are {len(self._units)}; what is none is passed over "
-                "with --allow-unknown, or where its name begins with `_`"
-            )
+            near = _near(name[:60], *self._index)
+            raise Refused(said("watch.no_sensor", name=name[:60], near=near, count=len(self._units)))
         sensor = self._index[base]
         found = sensor, self._factor(sensor, unit)
         if len(self._columns) < len(self._index):  # names that mean the same come without end

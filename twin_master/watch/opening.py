@@ -23,6 +23,7 @@ from twin_master.mission.opening import begun_folder, file_record, kept_scenario
 from twin_master.run_folder import CONFIG_NAME, check_versions, read_config
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.store.writing import SUMMARY_NAME
 from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.broker import Broker, broker_of, is_broker
@@ -65,18 +66,13 @@ def resumed_watch(
         The folder holds no watch, or one of another scenario or version.
     """
     if not read_config(folder).get("watched"):
-        raise NotResumableError(
-            f"{folder} holds a run, no watch: continue it with `uav-twin run --resume {folder}`."
-        )
+        raise NotResumableError(said("watch.run", folder=folder))
     with resumed_folder(folder, loaded) as (config, scenario):
         try:
             check_versions(folder, config, scenario.mission.seed)
             watched = Watch(folder, config, scenario, progress, like)
         except NotResumableError as error:
-            error.add_note(
-                "--replace would remove what was observed; another watch, in another folder, takes it in "
-                f"with `--observations {folder}`."
-            )
+            error.add_note(said("watch.another", folder=folder))
             raise
         yield watched
 
@@ -257,10 +253,7 @@ def watch(
     # Slips of the pen are found before a model is built and a folder made.
     feed = _feed(observations, known, follow, None if ca_file is None else Path(ca_file), otherwise)
     if replace and isinstance(feed, RecordedFeed) and folder.resolve() in feed.path.resolve().parents:
-        raise MissionInputError(
-            f"--replace would remove the observations in {feed.path} before they are read: choose another "
-            "--out."
-        )
+        raise MissionInputError(said("watch.replace", path=feed.path))
     with _opened(loaded, folder, given, progress, resume=resume, replace=replace) as watched:
         try:
             begun(watched)
@@ -273,9 +266,7 @@ def watch(
                 counts = watched.run(feed, decide, turns=turns, patched=patch, search=search, untold=untold)
             watched.store(counts, last=last, report=report)
         except Exception as error:
-            error.add_note(
-                f"What was observed is kept: go on with `uav-twin watch --resume --out {watched.folder}`."
-            )
+            error.add_note(said("watch.kept", folder=watched.folder))
             raise
     return watched.folder
 
@@ -286,9 +277,7 @@ def _opened(
 ) -> AbstractContextManager[Watch]:  # fmt: skip
     """Return the watch, begun or taken up, and what holds its folder."""
     if resume and (replace or given != Overrides()):
-        raise MissionInputError(
-            "a watch is taken up with what its folder holds: give nothing beside --resume that changes it."
-        )
+        raise MissionInputError(said("watch.resume"))
     if resume or loaded is None:
         return resumed_watch(folder, loaded, progress)
     resolved = resolve_scenario(loaded, given)
@@ -331,10 +320,6 @@ def _feed(
         if str(observations) != STANDARD_INPUT:
             return file_feed(Path(observations), scenario, follow=follow)
         if follow:
-            raise MissionInputError(
-                "--follow belongs to a CSV file; standard input is read to its end anyway."
-            )
+            raise MissionInputError(said("watch.follow"))
         return JsonLinesFeed(scenario)
-    raise MissionInputError(
-        f"{scenario.mission.name} names no recording: give the observations that are to be watched."
-    )
+    raise MissionInputError(said("watch.recording", name=scenario.mission.name))

@@ -21,8 +21,10 @@ from typing import Any
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.network.estimator import Notice
 from twin_master.run_folder import PATCH, TEACHING, VERDICT
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.watch.trial import Outcome
 
 SETTLE_TURNS = 10
@@ -35,12 +37,6 @@ GROUP = "group"
 TRIED = ("named", "named in part", GROUP)
 """Verdicts whose patch is tried; that of a group is its most probable member. All members explain the gap
 alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out."""
-NO_ALARMS = "--teach begins with an alarm, and this scenario gives none: `notice` is off."
-NO_WING = (
-    "--teach looks for what the model of a wing lacks: strains under the damage states z1 and z2, predicted "
-    "by a design or a calibration, are needed, and this scenario has {}: leave --teach out, alarms are given "
-    "all the same."
-)
 COURTESY = 10
 """Niceness of a search beside a live watch: the watch comes first."""
 _LOOK_AGAIN = 0.05
@@ -55,12 +51,13 @@ def check_teachable(scenario: Scenario) -> None:
         It gives no alarms, or is of another asset than a wing with a model that can be patched.
     """
     if scenario.notice is None:
-        raise MissionInputError(NO_ALARMS)
+        raise MissionInputError(said("watch.no_alarms"))
     role, states = scenario.observation.role, ", ".join(scenario.state_names)
     if not scenario.searchable:
-        raise MissionInputError(NO_WING.format(f"the role {role} under {states}"))
+        raise MissionInputError(said("watch.no_wing", what=f"the role {role} under {states}"))
     if not getattr(scenario.belief, "design", None):
-        raise MissionInputError(NO_WING.format(f"the belief `{scenario.belief.kind}` without a design"))
+        what = f"the belief `{scenario.belief.kind}` without a design"
+        raise MissionInputError(said("watch.no_wing", what=what))
 
 
 @dataclass(frozen=True)
@@ -248,7 +245,7 @@ def verdict_of(
     where = f"{step.capitalize()}s {question.from_turn} to {question.to_turn} were searched for the cause"
     if isinstance(folder, TwinMasterError):
         sentence = f"{where}, and the search ended without a verdict: {folder}"
-        return {**asked, "tried": False, "kind": "none", "notice": notice_of("verdict", sentence)}
+        return {**asked, "tried": False, "kind": "none", "notice": Notice("verdict", sentence).as_record()}
     try:
         verdict = read_json(folder / VERDICT, DamagedFileError)["verdict"]
         kind, said = str(verdict["kind"]), str(verdict["sentence"])
@@ -264,7 +261,7 @@ def verdict_of(
         sentence += f" To believe it none the less: uav-twin watch --resume --out DIR {options}"
     return {
         **asked, "tried": tried, "kind": kind, "folder": folder.relative_to(watch).as_posix(),
-        "notice": notice_of("verdict", sentence),
+        "notice": Notice("verdict", sentence).as_record(),
     }  # fmt: skip
 
 
@@ -280,11 +277,6 @@ def trial_sentence(trial: Mapping[str, Any], outcome: Outcome, step: str) -> str
     if trial["kind"] == GROUP:
         said += " It is one of a group: which of them is true these data cannot tell."
     return f"{said} {outcome.policy_change}".rstrip()
-
-
-def notice_of(kind: str, sentence: str) -> dict[str, Any]:
-    """Return a notice as it stands in the journal."""
-    return {"kind": kind, "sentence": sentence, "sensors": [], "value": None, "since": None}
 
 
 def both_patches(before: Path | None, found: Path) -> bytes:

@@ -64,8 +64,7 @@ def test_resuming_after_any_turn_is_bit_identical(name, library_file, tmp_path):
         for array in ARRAYS:
             np.testing.assert_array_equal(getattr(rest, array), getattr(whole, array))
     altered = lines[4] | {"next_control": 1 - lines[4]["next_control"]}
-    kept = content.splitlines(keepends=True)
-    kept[5] = line_of(altered)
+    kept = [*content.splitlines(keepends=True)[:5], line_of(altered)]
     (tmp_path / JOURNAL_NAME).write_bytes(b"".join(kept))
     with pytest.raises(NotResumableError, match="after turn 4"):
         part()
