@@ -40,7 +40,6 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
     """Return the page of an effect."""
     tank = effect.identifier in FLOWS
     what = "Tank" if tank else "Cantilever"
-    places = effect.places(setting)
     _, place = picture_patch(effect, setting)
     values = picture_of(effect).values
     rows = [
@@ -51,12 +50,11 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         f"- {s.symbol} (`{s.name}`): {s.description}; {s.canonical:g}, in the family {range_of(s.prior)}."
         for s in effect.shape
     ]
-    where = f" Places in the picture: {', '.join(f'`{name}`' for name in places)}." if any(places) else ""
-    shown = ", ".join(f"{name} = {value:g}" for name, value in values.items())
+    shown = ", ".join(f"{name} {value:g}" for name, value in values.items())
     lines = [
         f"# {effect.name[0].upper()}{effect.name[1:]}",
         "",
-        f"`{effect.identifier}`, family: {effect.family}.{where}",
+        f"`{effect.identifier}`, family: {effect.family}.",
         "",
         text["what"].strip(),
         "",
@@ -75,8 +73,7 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         "## Easily confused with",
         *(f"- [`{other}`]({other}.md): {text['tell'][other]}" for other in effect.confusable),
         "",
-        "## References",
-        *(f"- {reference}" for reference in text["references"]),
+        f"Sources: {'; '.join(text['references'])}",
         "",
     ]
     return "\n".join(lines)
