@@ -21,7 +21,7 @@ from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Count, Flag, Name, NotNegative, Number, Probability, Section, Seed
 from twin_master.seeds import generator
 from twin_master.sentences import said
-from twin_master.watch.broker import is_broker
+from twin_master.watch.feeds import is_broker
 from twin_master.watch.message import Fed
 
 SHARD = 256

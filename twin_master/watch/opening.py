@@ -2,7 +2,7 @@
 
 import math
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,10 +26,9 @@ from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
 from twin_master.store.writing import SUMMARY_NAME
 from twin_master.store.writing import open_run as stored_run
-from twin_master.watch.broker import Broker, broker_of, is_broker
-from twin_master.watch.feeds import JsonLinesFeed, MappingFeed, RecordedFeed, file_feed
+from twin_master.watch.feeds import Broker, Observations, RecordedFeed, feed_of
 from twin_master.watch.folder import STORED_TURNS, Watch
-from twin_master.watch.intake import Counts, Feed
+from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import BEGIN_ANEW, CLIENT_SUFFIX, MqttFeed
 from twin_master.watch.teaching import Search, check_teachable
 
@@ -158,8 +157,6 @@ def _config(folder: Path) -> dict[str, Any] | None:
 
 
 Decide = Callable[[Mapping[str, Any]], object]
-Observations = Iterable[Mapping[str, Any]] | str | Path
-STANDARD_INPUT = "-"
 
 
 def watch(
@@ -251,7 +248,7 @@ def watch(
     if teach:
         check_teachable(known)
     # Slips of the pen are found before a model is built and a folder made.
-    feed = _feed(observations, known, follow, None if ca_file is None else Path(ca_file), otherwise)
+    feed = feed_of(observations, known, follow, None if ca_file is None else Path(ca_file), otherwise)
     if replace and isinstance(feed, RecordedFeed) and folder.resolve() in feed.path.resolve().parents:
         raise MissionInputError(said("watch.replace", path=feed.path))
     with _opened(loaded, folder, given, progress, resume=resume, replace=replace) as watched:
@@ -300,26 +297,3 @@ def _read(
         update={"allow_unknown": scenario.watch.allow_unknown or allow_unknown}
     )
     return folder, scenario.model_copy(update={"watch": section})
-
-
-def _feed(
-    given: Observations | None,
-    scenario: Scenario,
-    follow: bool,
-    authority: Path | None,
-    otherwise: str | None,
-) -> Feed | Broker:
-    """Return what gives the observations, by default those of the scenario, or the broker that does."""
-    for observations in (given, scenario.watch.recording, otherwise):
-        if observations is None:
-            continue
-        if not isinstance(observations, str | Path):
-            return MappingFeed(observations, scenario)
-        if is_broker(str(observations)):
-            return broker_of(str(observations), authority)
-        if str(observations) != STANDARD_INPUT:
-            return file_feed(Path(observations), scenario, follow=follow)
-        if follow:
-            raise MissionInputError(said("watch.follow"))
-        return JsonLinesFeed(scenario)
-    raise MissionInputError(said("watch.recording", name=scenario.mission.name))
