@@ -19,8 +19,14 @@ from twin_master.assets.resolution import (
 )
 from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME, last_turn
-from twin_master.mission.opening import begun_folder, file_record, kept_scenario, resumed_folder
-from twin_master.run_folder import CONFIG_NAME, check_versions, read_config
+from twin_master.run_folder import (
+    CONFIG_NAME,
+    begun_folder,
+    check_versions,
+    kept_scenario,
+    read_config,
+    resumed_folder,
+)
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
@@ -48,7 +54,9 @@ def begun_watch(
         for path in folder.glob(f"*{CLIENT_SUFFIX}")
     }
     source = believed_source(resolved)
-    opened = begun_folder(resolved, file, folder, source, files, replace=replace_run, watched=True)
+    source.check()
+    files = source.files() | files
+    opened = begun_folder(resolved, file, folder, files, replace=replace_run, watched=True)
     with opened as (config, located):
         yield Watch(folder, config, located, progress, like)
 
@@ -112,7 +120,7 @@ def flown(folder: Path, first: int | None, last: int | None, progress: Progress)
         shutil.copytree(folder / "asset", copy / "asset")
         with (folder / JOURNAL_NAME).open("rb") as journal:
             (copy / JOURNAL_NAME).write_bytes(journal.read(end))
-        Watch(copy, config, kept_scenario(folder, config).moved(copy), progress).store(Counts(), report=False)
+        Watch(copy, config, kept_scenario(folder).moved(copy), progress).store(Counts(), report=False)
         yield copy
 
 
@@ -280,7 +288,7 @@ def _opened(
     resolved = resolve_scenario(loaded, given)
     if loaded.remark:
         progress.note(loaded.remark)
-    return begun_watch(resolved, file_record(loaded), folder, progress, replace_run=replace)
+    return begun_watch(resolved, loaded.file, folder, progress, replace_run=replace)
 
 
 def _read(
@@ -289,7 +297,7 @@ def _read(
     """Return the folder of a watch, and the scenario by which observations are read."""
     if loaded is None:
         folder = Path(str(folder))
-        scenario = kept_scenario(folder, read_config(folder)).moved(folder)
+        scenario = kept_scenario(folder).moved(folder)
     else:
         folder = Path("runs", loaded.scenario.mission.name) if folder is None else Path(folder)
         scenario = loaded.scenario.moved(loaded.path.parent)
