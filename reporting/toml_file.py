@@ -9,8 +9,8 @@ from typing import Any
 from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
 
 _PART = r"""(?:[\w-]++|"(?:[^"\\\n]++|\\.)*+"|'[^'\n]*+')"""
-_DEEP_KEY = re.compile(rf"(?:{_PART}[ \t]*+\.[ \t]*+){{{DEEPEST_NESTING}}}")
-"""A dotted key of too many parts."""
+_DEEP_KEY = re.compile(rf"(?<![\w\\.-])(?:{_PART}[ \t]*+\.[ \t]*+){{{DEEPEST_NESTING}}}")
+"""A dotted key of too many parts; it begins at no other place of a word, which is gone over once."""
 
 LONGEST_ARRAY = 90
 """Characters of an array that stands in one line."""

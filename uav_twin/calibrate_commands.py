@@ -151,7 +151,7 @@ def calibrate_wing(
     if fitted and (data is None or measured is False):
         raise typer.BadParameter("--fitted needs --data with ring-down records, and no --published.")
     from calibration.dynamics.ringdown import Frequencies
-    from calibration.paper.table_1 import HEADINGS
+    from calibration.paper.table_1 import WORDS
     from calibration.result.file import check_folder
     from calibration.wing.calibrate import calibrate
     from calibration.wing.lab_data import Targets, published_data, read_lab_folder
@@ -171,8 +171,8 @@ def calibrate_wing(
     progress = terminal.progress()
     calibration = calibrate(lab, drawn, asset=name, procedure=procedure.value, seed=seed, progress=progress)
     if not json:
-        rows = [row.cells for row in calibration.table_1]
-        terminal.print_table(HEADINGS, rows)
+        columns, rows = WORDS.table("table_1", calibration.table_1)
+        terminal.print_table([column.name for column in columns], rows)
     written = None if out is None else write_wing_folder(calibration, out, progress, report=not no_report)
     show(calibration.result, written, json=json, report=not no_report)
 
