@@ -6,7 +6,8 @@ Layout: see `docs/run_folder.md`.
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -44,14 +45,15 @@ def is_run_folder(folder: Path) -> bool:
     return isinstance(record, dict) and record.get("kind") == KIND
 
 
+@contextmanager
 def create_run_folder(
     folder: Path,
     config: Mapping[str, Any],
     files: Mapping[str, bytes] | None = None,
     *,
     replace: bool = False,
-) -> int:
-    """Make a run folder that holds its configuration and copies of what is flown, in one step.
+) -> Iterator[None]:
+    """Make a run folder that holds its configuration and copies of what is flown, in one step, and hold it.
 
     Parameters
     ----------
@@ -63,11 +65,6 @@ def create_run_folder(
         Further files: path inside the folder, content.
     replace
         Put the new folder in the place of an existing run folder. Anything else is never replaced.
-
-    Returns
-    -------
-    int
-        A file descriptor that holds the folder for this process, to close at the end.
 
     Raises
     ------
@@ -85,18 +82,13 @@ def create_run_folder(
         raise RunFolderExistsError(said("run_folder.foreign", folder=folder))
     if occupied and not replace:
         raise RunFolderExistsError(said("run_folder.there", folder=folder))
-    lock = None
-    try:
+    with ExitStack() as holding:
         with whole_folder(folder, lock_run_folder) as fresh:
-            lock = lock_run_folder(fresh)
+            holding.callback(os.close, lock_run_folder(fresh))
             for name, content in (files or {}).items():
                 atomic_write_bytes(fresh / name, content)
             atomic_write_text(fresh / CONFIG_NAME, to_json(config))
-    except BaseException:
-        if lock is not None:
-            os.close(lock)
-        raise
-    return lock
+        yield
 
 
 def read_config(folder: Path) -> dict[str, Any]:

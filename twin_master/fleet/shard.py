@@ -35,7 +35,7 @@ from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.growing import Place
-from twin_master.watch.intake import Feed, Intake, RejectedFile
+from twin_master.watch.intake import Feed, Intake
 from twin_master.watch.message import Fed
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def _history(knowledge: Knowledge, messages: Sequence[Fed]) -> History:
     scenario = knowledge.scenario
     twin = knowledge.twin(lag=scenario.watch.lag)
     history = History(twin, scenario.observation.count)
-    intake, seen, late = Intake(scenario, _Recorded(messages), RejectedFile(None)), {}, False
+    intake, seen, late = Intake(scenario, _Recorded(messages)), {}, False
     lost: list[tuple[int, Notice]] = []
     for turn in operate(twin, intake, history.add):
         at = intake.observation_turn

@@ -76,8 +76,7 @@ def begun_folder(
         "scenario_file": dict(file),
         "provenance": collect_provenance(resolved.mission.seed).as_dict(),
     }
-    lock = create_run_folder(folder, config, {**source.files(), **files}, replace=replace)
-    with held(lock):
+    with create_run_folder(folder, config, {**source.files(), **files}, replace=replace):
         yield config, resolved.portable().moved(folder)
 
 
@@ -113,8 +112,7 @@ def resumed_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
                 path=loaded.path,
             )
         )
-    lock = lock_run_folder(folder)
-    with held(lock):
+    with held(lock_run_folder(folder)):
         yield config, scenario.moved(folder)
 
 

@@ -5,7 +5,7 @@ One that was away, or is slow, asks for more at once, and nothing is kept for it
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from pathlib import Path
@@ -17,6 +17,8 @@ from markupsafe import Markup
 from pydantic import BaseModel
 
 from reporting.arrays import Float
+from reporting.errors import ReportingError
+from twin_master.errors import TwinMasterError
 from twin_master.mission.preparation import Knowledge
 from twin_master.report.structure import Planform, design_of, planform_of
 from twin_master.report.view import (
@@ -126,6 +128,10 @@ class Request(BaseModel, frozen=True, extra="forbid", strict=True):
     count: int
 
 
+Tell = Callable[[str], None]
+"""Tells a viewer an answer."""
+
+
 class Teller:
     """Answers of one flight, for any number of viewers.
 
@@ -138,8 +144,37 @@ class Teller:
     """
 
     def __init__(self, flight: Flight, scene: Scene) -> None:
-        self._flight = flight
-        self._scene = scene
+        self._flight, self._scene = flight, scene
+        self._waiting: dict[Tell, Request] = {}
+        self._fault = ""
+
+    def ask(self, tell: Tell, request: Request) -> None:
+        """Answer a viewer now or as soon as there is something new; a newer request replaces an older one."""
+        self._waiting[tell] = request
+        self._tell(tell)
+
+    def leave(self, tell: Tell) -> None:
+        """Forget a viewer."""
+        self._waiting.pop(tell, None)
+
+    def look(self) -> None:
+        """Take in what was flown, and answer those who wait for it."""
+        try:
+            if self._fault or not self._flight.update():
+                return
+        except (TwinMasterError, ReportingError) as error:
+            self._fault = str(error)
+        for tell in list(self._waiting):
+            self._tell(tell)
+
+    def _tell(self, tell: Tell) -> None:
+        if self._fault:
+            tell(json.dumps({"error": self._fault}))
+        request = self._waiting.get(tell)  # one that cannot be told any more has left
+        answer = None if request is None else self.answer(request)
+        if answer is not None:
+            del self._waiting[tell]
+            tell(answer)
 
     def answer(self, request: Request) -> str | None:
         """Return the answer to a request; None while there is nothing new to say."""

@@ -15,12 +15,12 @@ from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
 from twin_master.assets.asset_source import FlownAndBelieved, calibrated_with
 from twin_master.assets.resolution import believed_source
-from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.errors import MissionInputError
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
+    check_header,
     last_turn,
-    records,
     records_backwards,
 )
 from twin_master.mission.loop import Source, operate
@@ -33,8 +33,8 @@ from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight
-from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping, listening
-from twin_master.watch.keeping import Keeper, Standing
+from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, Stopping, listening
+from twin_master.watch.keeping import Keeper
 from twin_master.watch.teaching import (
     LEAST_GAIN,
     TRIAL_TURNS,
@@ -114,11 +114,11 @@ class Watch:
 
     def _take_up(self) -> None:
         """Take in the journal, and believe the patches that were adopted, as far as that is not done yet."""
-        next(records(self._path, config_hash=self._hash), None)  # it is that of this configuration
+        check_header(self._path, self._hash)
         notice = self.scenario.notice
-        self.standing = Standing(Teaching(1.0 if notice is None else notice.threshold))
-        self.standing.read(self._path)
-        for model in self.standing.adopted[len(self.models) - 1 :]:
+        self.teaching = Teaching(1.0 if notice is None else notice.threshold)
+        self.teaching.read(self._path)
+        for model in self.teaching.adopted[len(self.models) - 1 :]:
             first, file = model["from_turn"], self.folder / model["patch"]
             self.models.append(patched_model(self.scenario, file, first, self._progress))
 
@@ -156,15 +156,15 @@ class Watch:
                 try:
                     if untold is not None:
                         tell(untold)
-                    taught = True
-                    while taught:  # with one twin after the other: where it is taught, another one goes on
-                        taught = False
+                    while True:  # with one twin after the other: where it is taught, another one goes on
                         if tutor is not None:
                             tutor.act()
                         for decision in self.decisions(source, keep):
                             tell(decision)
-                            if taught := tutor is not None and tutor.due:
+                            if tutor is not None and tutor.due:
                                 break
+                        else:
+                            break
                 finally:
                     if tutor is not None:
                         tutor.end()
@@ -173,8 +173,7 @@ class Watch:
     @contextmanager
     def begun(self, feed: Feed, patched: Patched | None = None) -> Iterator[Keeper]:
         """Open the journal, and give what keeps the turns of the twin as it stands after it; see `run`."""
-        rejected = RejectedFile(self.folder / REJECTED_NAME)
-        intake = Intake(self.scenario, feed, rejected)
+        intake = Intake(self.scenario, feed, self.folder / REJECTED_NAME)
         seconds = FLUSH_SECONDS if feed.replayable else 0.0
         with JournalFile(self.folder, self._hash, seconds) as journal:
             self._take_up()
@@ -184,7 +183,7 @@ class Watch:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
-            self.keep = Keeper(journal, intake, found.twin, self.standing)
+            self.keep = Keeper(journal, intake, found.twin, self.teaching)
             self.keep.quiet = "quiet" in last
             if patched is not None:
                 self._patch(*patched)
@@ -264,15 +263,13 @@ class Watch:
         }  # fmt: skip
         self.keep.write({"model": model})
         keep_knowledge(self.folder, outcome.model.knowledge)
-        self._progress.note(
-            f"The patched model is believed from {self.scenario.mission.step_name} {first} on: "
-            + ", ".join(
-                f"{what} {model['before'][key]:.4g} before, {model['after'][key]:.4g} after"
-                for key, what in (("rms_residual", "rms residual"), ("log_evidence", "log evidence"))
-                if model["before"][key] is not None
-            )
-            + f". {outcome.policy_change}".rstrip()
-        )
+        gaps = [
+            f"{name.replace('_', ' ')} {value:.4g} before, {outcome.after[name]:.4g} after"
+            for name, value in outcome.before.items()
+            if value is not None
+        ]
+        since = f"The patched model is believed from {self.scenario.mission.step_name} {first} on"
+        self._progress.note(f"{since}: {', '.join(gaps)}. {outcome.policy_change}".rstrip())
 
     def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
         """Write `run.nc`, tables, summary and report of the last turns."""
@@ -281,8 +278,8 @@ class Watch:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
         result, attributes = self.result(turns, last), {}
-        if self.standing.adopted:
-            adopted = self.standing.adopted[-1]
+        if self.teaching.adopted:
+            adopted = self.teaching.adopted[-1]
             attributes = {
                 "model_patch": adopted["patch"], "model_patch_from_step": adopted["from_turn"]
             }  # fmt: skip
@@ -327,7 +324,7 @@ class Watch:
             "duplicates": ("messages that said nothing new", counts.duplicates),
             "rejected": (f"messages refused ({REJECTED_NAME})", counts.rejected),
         }
-        for model in self.standing.adopted:
+        for model in self.teaching.adopted:
             first = model["from_turn"]
             for when in ("before", "after"):
                 title = f"rms residual {when} the patch of {step} {first}"
@@ -357,7 +354,7 @@ class Tutor:
     def __init__(self, watch: Watch, search: Search, source: Stopping, *, wait: bool) -> None:
         watch.keep.taught = True
         self._watch, self._search, self._source = watch, search, source
-        self._teaching, self._wait = watch.standing.teaching, wait
+        self._teaching, self._wait = watch.teaching, wait
         self.outcome: Future[Outcome] | None = None
 
     @property
@@ -375,13 +372,7 @@ class Tutor:
         """Do what is due."""
         watch, teaching, step = self._watch, self._teaching, self._watch.scenario.mission.step_name
         if (question := teaching.question) is not None:
-            found: Path | TwinMasterError | None
-            try:
-                found = self._search.answer(
-                    question, wait=self._wait, asked_to_end=lambda: self._source.asked
-                )
-            except TwinMasterError as error:
-                found = error
+            found = self._search.answer(question, self._wait, lambda: self._source.asked)
             if found is not None:
                 verdict = verdict_of(watch.folder, question, found, teaching.turn, step)
                 watch.keep.write({"verdict": verdict})

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from twin_master.mission.turns import Reading
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import LARGEST_SEED
 from twin_master.sentences import said
 from twin_master.watch.growing import Place
 from twin_master.watch.message import Fed, Message, Refused
@@ -78,44 +77,6 @@ class Counts:
     rejected: int = 0
 
 
-@dataclass
-class RejectedFile:
-    """`rejected.jsonl`: what was refused, and why; None keeps nothing."""
-
-    path: Path | None
-    kept: int = field(default=0, init=False)
-
-    def go_back(self, received: int) -> None:
-        """Forget what was refused behind a number of messages that will be read again, and what was cut."""
-        if self.path is None or not self.path.exists():
-            return
-        lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
-        staying = [line for line in lines if _stays(line, received)]
-        self.kept = len(staying)
-        if staying != lines:
-            atomic_write_text(self.path, "".join(staying))
-
-    def add(self, message: int, reason: str, text: str) -> None:
-        """Write down a refused message, its number from 1."""
-        if self.path is None or self.kept >= REJECTED_KEPT:
-            return
-        self.kept += 1
-        record = {"message": message, "reason": reason, "text": text[:_TEXT_KEPT]}
-        try:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(record, ensure_ascii=True) + "\n")
-        except OSError as error:
-            raise write_error(error, self.path) from error
-
-
-def _stays(line: str, received: int) -> bool:
-    """Return whether a line of `rejected.jsonl` is whole, and of one of the first messages."""
-    try:
-        return bool(json.loads(line)["message"] <= received)
-    except json.JSONDecodeError:
-        return False  # cut off by a kill
-
-
 class Intake:
     """The messages of a feed as the source of a twin.
 
@@ -129,8 +90,8 @@ class Intake:
         Sensors, and how late and how far ahead a message may be.
     feed : Feed
         Of the messages.
-    rejected : RejectedFile
-        Where refused ones are written down.
+    rejected : Path or None
+        `rejected.jsonl`, where refused ones are written down; None keeps none.
 
     Attributes
     ----------
@@ -144,11 +105,11 @@ class Intake:
         Whether the feed has ended; if not, more may come after `read` has returned None.
     """
 
-    def __init__(self, scenario: Scenario, feed: Feed, rejected: RejectedFile) -> None:
+    def __init__(self, scenario: Scenario, feed: Feed, rejected: Path | None = None) -> None:
         self._section, self._words = scenario.watch, words_of(scenario)
         self._width = scenario.row_width
         self._feed = feed
-        self._rejected = rejected
+        self._rejected, self._kept = rejected, 0
         self._messages: Iterator[Fed] | None = None
         self._place: Place | None = None  # behind the last message, and behind the one before it
         self._before_last: Place | None = None
@@ -196,7 +157,13 @@ class Intake:
             self._unreadable = set(state.get("unreadable", ()))
             again &= state["source"] is not None and self._feed.holds(state["source"])
             self._place = state["source"] if again else None
-        self._rejected.go_back(self.counts.received if again else LARGEST_SEED)
+        if self._rejected is not None and self._rejected.exists():
+            lines = self._rejected.read_text(encoding="utf-8").splitlines(keepends=True)
+            kept = lines[: self.counts.rejected] if again else lines  # those behind are read again
+            kept = [line for line in kept if line.endswith("\n")]  # not cut off by a kill
+            self._kept = len(kept)
+            if kept != lines:
+                atomic_write_text(self._rejected, "".join(kept))
 
     def read(self, twin: Twin) -> Reading | None:
         """Return the next reading, see `Source.read`; None also where nothing has come yet."""
@@ -255,7 +222,15 @@ class Intake:
 
     def _refuse(self, reason: str) -> None:
         self.counts.rejected += 1
-        self._rejected.add(self.counts.received, reason, self._text)
+        if self._rejected is None or self._kept >= REJECTED_KEPT:
+            return
+        self._kept += 1
+        record = {"message": self.counts.received, "reason": reason, "text": self._text[:_TEXT_KEPT]}
+        try:
+            with self._rejected.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(record, ensure_ascii=True) + "\n")
+        except OSError as error:
+            raise write_error(error, self._rejected) from error
 
     def _turn_of(self, twin: Twin, message: Message) -> int:
         if message.turn is not None:

@@ -4,14 +4,12 @@ import base64
 import time
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.mission.journal import JournalFile, damaged, records_backwards, turn_record
+from twin_master.mission.journal import JournalFile, turn_record
 from twin_master.mission.turns import Turn
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
@@ -20,50 +18,6 @@ from twin_master.watch.teaching import Teaching
 
 SNAPSHOT_TURNS = 32
 """Turns between two lines that also hold the state of the twin."""
-
-CHECKED = 250_000
-"""Bytes at the end of a journal that are read at least, so that damage there is found."""
-
-
-@dataclass
-class Standing:
-    """What follows from all lines of a journal so far.
-
-    Each line holds what followed from those before it, so that the last one alone is read, however long the
-    journal is.
-
-    Attributes
-    ----------
-    teaching : Teaching
-    adopted : list of dict
-        The models that were adopted, as the journal has them.
-    """
-
-    teaching: Teaching
-    adopted: list[dict[str, Any]] = field(default_factory=list)
-
-    def take(self, record: Mapping[str, Any]) -> None:
-        """Take in a line."""
-        self.adopted += [record["model"]] if "model" in record else []
-        self.teaching.take(record)
-
-    def before(self, begin: int) -> dict[str, Any]:
-        """Return what a line holds that begins at so many bytes."""
-        return {"begin": begin, "adopted": self.adopted, "teaching": self.teaching.state()}
-
-    def read(self, path: Path) -> None:
-        """Take in a journal; raises `NotResumableError` where its end was changed or is damaged."""
-        last, length = dict[str, Any](), 0
-        for record, begin, end in records_backwards(path):
-            length, last = length or end, last or record
-            if begin and record["standing"]["begin"] != begin:
-                raise damaged(path, begin, "lines before it are missing, or not its own")
-            if length - begin > CHECKED:
-                break
-        if "standing" in last:
-            self.adopted = last["standing"]["adopted"]
-            self.teaching.restore(last["standing"]["teaching"])
-            self.take(last)
 
 
 class Keeper:
@@ -76,7 +30,7 @@ class Keeper:
         Of the readings.
     twin : Twin
         That is watched with; another one where it was taught.
-    standing : Standing
+    teaching : Teaching
         After all lines of the journal.
 
     Attributes
@@ -92,8 +46,8 @@ class Keeper:
         Whether the operator was told that no turn comes any more.
     """
 
-    def __init__(self, journal: JournalFile, intake: Intake, twin: Twin, standing: Standing) -> None:
-        self.journal, self.intake, self.twin, self._standing = journal, intake, twin, standing
+    def __init__(self, journal: JournalFile, intake: Intake, twin: Twin, teaching: Teaching) -> None:
+        self.journal, self.intake, self.twin, self._teaching = journal, intake, twin, teaching
         self.taught = False
         self.line: dict[str, Any] = {}
         self.filtered: NDArray[np.float64] | None = None
@@ -120,7 +74,7 @@ class Keeper:
             record["settled"] = {"turn": settled[0], "state": state}
         known = {(notice.kind, notice.sensors) for notice in concluded.notices}
         told = [n.as_record() for n in self.intake.notices if (n.kind, n.sensors) not in known]
-        told += self._standing.teaching.untold if self.taught else []
+        told += self._teaching.untold if self.taught else []
         if self.quiet:
             sentence = f"Turn {number}: observations come again, after {self.silence:.0f} s."
             told.append(Notice("heard", sentence).as_record())
@@ -137,5 +91,6 @@ class Keeper:
 
     def _append(self, record: Mapping[str, Any]) -> None:
         """Add a line to the journal, and take it in."""
-        self.journal.append({**record, "standing": self._standing.before(self.journal.size)})
-        self._standing.take(record)
+        standing = {"begin": self.journal.size, "teaching": vars(self._teaching)}
+        self.journal.append({**record, "standing": standing})
+        self._teaching.take(record)

@@ -6,7 +6,7 @@ A publisher is not trusted. Whatever it sends is an observation or a `Refused` w
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import lru_cache
@@ -160,29 +160,21 @@ class MessageReader:
         observed = np.full(self._width, np.nan)
         given: set[int] = set()
         unreadable: dict[int, str] = {}
-        unit = record.get("unit", "")
-        if not isinstance(unit, str):
-            raise Refused("`unit` is the name of a unit")
-        for name, value in record.items():
-            if name in ("turn", "time", "control", "unit") or name.startswith("_"):
-                continue
+        for name, value in self._readings(record):
             if name == "covariance" and self._observation.modes is not None:
                 observed[self._observation.count :] = self._covariance(value)
                 continue
-            if name == self._observation.role and isinstance(value, list):
-                pairs: Iterable[tuple[int, float, object]] = self._all(value, unit)
+            if (found := self.column(name)) is None:
+                continue
+            sensor, factor = found
+            if sensor in given:
+                raise Refused(f"sensor {sensor + 1} is given twice")
+            given.add(sensor)
+            shown = self._value(sensor, factor, value)
+            if isinstance(shown, str):
+                unreadable[sensor] = shown
             else:
-                found = self.column(name)
-                pairs = [] if found is None else [(*found, value)]
-            for sensor, factor, single in pairs:
-                if sensor in given:
-                    raise Refused(f"sensor {sensor + 1} is given twice")
-                given.add(sensor)
-                shown = self._value(sensor, factor, single)
-                if isinstance(shown, str):
-                    unreadable[sensor] = shown
-                else:
-                    observed[sensor] = shown
+                observed[sensor] = shown
         turn, time = record.get("turn"), record.get("time")
         if turn is not None and (type(turn) is not int or not 0 <= turn <= LARGEST_SEED):
             raise Refused("`turn` is a whole number from 0")
@@ -192,10 +184,18 @@ class MessageReader:
         control = self._control(record.get("control"))
         return Message(observed, turn if type(turn) is int else None, time, control, unreadable)
 
-    def _all(self, values: list[object], unit: str) -> list[tuple[int, float, object]]:
-        if len(values) != self._observation.count:
-            raise Refused(f"{self._observation.count} values are expected, and {len(values)} came")
-        return [(sensor, self._factor(sensor, unit), value) for sensor, value in enumerate(values)]
+    def _readings(self, record: Mapping[str, object]) -> Iterator[tuple[str, object]]:
+        """Return names and values of a record; each of a list has the name of its sensor."""
+        unit, role = record.get("unit", ""), self._observation.role
+        if not isinstance(unit, str):
+            raise Refused("`unit` is the name of a unit")
+        for name, value in record.items():
+            if name == role and isinstance(value, list):
+                if len(value) != self._observation.count:
+                    raise Refused(f"{self._observation.count} values are expected, and {len(value)} came")
+                yield from ((f"{role}_{n}_{unit}".removesuffix("_"), one) for n, one in enumerate(value, 1))
+            elif name not in ("turn", "time", "control", "unit") and not name.startswith("_"):
+                yield name, value
 
     def _covariance(self, value: object) -> Float:
         """Return the lower triangle of the covariance of all values, SI."""

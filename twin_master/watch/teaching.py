@@ -16,11 +16,12 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.mission.journal import damaged, records_backwards
 from twin_master.network.estimator import Notice
 from twin_master.run_folder import PATCH, TEACHING, VERDICT
 from twin_master.scenario.schema import Scenario
@@ -37,6 +38,8 @@ GROUP = "group"
 TRIED = ("named", "named in part", GROUP)
 """Verdicts whose patch is tried; that of a group is its most probable member. All members explain the gap
 alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out."""
+CHECKED = 250_000
+"""Bytes at the end of a journal that are read at least, so that damage there is found."""
 COURTESY = 10
 """Niceness of a search beside a live watch: the watch comes first."""
 _LOOK_AGAIN = 0.05
@@ -60,8 +63,7 @@ def check_teachable(scenario: Scenario) -> None:
         raise MissionInputError(said("watch.no_wing", what=what))
 
 
-@dataclass(frozen=True)
-class Question:
+class Question(NamedTuple):
     """What is asked: which effect the turns `from_turn` to `to_turn` hold that the model lacks."""
 
     from_turn: int
@@ -91,6 +93,8 @@ class Teaching:
         The verdict whose patch is on trial.
     untold : list
         Notices that go with the next turn.
+    adopted : list of dict
+        The models that were adopted, as the journal has them.
     """
 
     threshold: float
@@ -98,22 +102,35 @@ class Teaching:
     question: Question | None = None
     trial: dict[str, Any] | None = None
     untold: list[dict[str, Any]] = field(default_factory=list)
+    adopted: list[dict[str, Any]] = field(default_factory=list)
     _alarm: tuple[int, int] | None = None
     _ask_at: int = 0
     _since: int = 0
 
-    def state(self) -> dict[str, Any]:
-        """Return what is needed to go on, as JSON."""
-        return vars(self) | {"question": self.question and vars(self.question)}
+    def read(self, path: Path) -> None:
+        """Take in a journal, each of whose lines holds where this stood before it.
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state."""
-        question = state["question"]
-        vars(self).update(state, question=question and Question(**question))
+        Raises
+        ------
+        NotResumableError
+            Its end was changed or is damaged.
+        """
+        last, length = dict[str, Any](), 0
+        for record, begin, end in records_backwards(path):
+            length, last = length or end, last or record
+            if begin and record["standing"]["begin"] != begin:
+                raise damaged(path, begin, "lines before it are missing, or not its own")
+            if length - begin > CHECKED:
+                break
+        if "standing" in last:
+            before = last["standing"]["teaching"]
+            vars(self).update(before, question=before["question"] and Question(*before["question"]))
+            self.take(last)
 
     def take(self, record: Mapping[str, Any]) -> None:
         """Take in a line of the journal."""
         if "model" in record:
+            self.adopted.append(record["model"])
             self.question = self.trial = self._alarm = None
             self._since = int(record["model"]["from_turn"])
             self.untold += [record["model"]["notice"]] if "notice" in record["model"] else []
@@ -182,15 +199,12 @@ class Search:
         out = ["--out", str(question.folder(self.watch)), "--seed", str(self.seed)]
         return ["--from-run", str(self.watch), *turns, *out]
 
-    def answer(self, question: Question, *, wait: bool, asked_to_end: Callable[[], bool]) -> Path | None:
-        """Return the folder of the verdict; None while it is looked for.
+    def answer(
+        self, question: Question, wait: bool, asked_to_end: Callable[[], bool]
+    ) -> Path | TwinMasterError | None:
+        """Return the folder of the verdict, or the last that a search without one said; None before.
 
         No key of the terminal ends the process; where turns do not wait for it, it has a low priority.
-
-        Raises
-        ------
-        TwinMasterError
-            The search ended without a verdict; the sentence is the last one that it said.
         """
         folder = question.folder(self.watch)
         log = folder.with_name(folder.name + ".log")
@@ -209,7 +223,7 @@ class Search:
                 self._process = None
                 lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
                 said = (line.strip() for line in reversed(lines) if line.strip())
-                raise TwinMasterError(next(said, f"exit code {code}"))
+                return TwinMasterError(next(said, f"exit code {code}"))
             if not wait or asked_to_end():
                 return None
             time.sleep(_LOOK_AGAIN)

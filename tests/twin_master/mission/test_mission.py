@@ -120,9 +120,9 @@ def test_study_on_the_published_library(published_library):
     margin = (knowledge.plan.action_value[:, 1] - knowledge.plan.action_value[:, 0]).reshape(5, 5)
     np.testing.assert_allclose(margin[2:4], np.repeat([[0.007], [-0.059]], 5, axis=1), atol=5e-4)
     study = fly_seeds(knowledge.scenario, source, range(60))
-    assert study.within(2).value >= 0.95
-    assert study.early_fallback.value <= 0.2
-    assert np.all([study.rms(0).value <= 0.045, study.rms(1).value <= 0.13])
+    assert study.within.value >= 0.95
+    assert study.early.value <= 0.2
+    assert np.all([study.rms[0].value <= 0.045, study.rms[1].value <= 0.13])
 
 
 def truth_of(scenario: Scenario | str, seed: int = 1) -> Truth:

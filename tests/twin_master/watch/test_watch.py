@@ -247,7 +247,7 @@ def test_a_long_watch_goes_on_from_its_snapshot(base, mission, plain, tmp_path, 
 def test_a_watch_is_taken_up_from_the_end_of_its_journal(base, mission, tmp_path, monkeypatch):
     """It costs the same however long it is; what is not read is not missed, and what is read is checked."""
     monkeypatch.setattr("twin_master.watch.keeping.SNAPSHOT_TURNS", 8)
-    monkeypatch.setattr("twin_master.watch.keeping.CHECKED", 1)
+    monkeypatch.setattr("twin_master.watch.teaching.CHECKED", 1)
     observed, controls = np.tile(mission.observed, (4, 1)), np.tile(mission.control_index, 4)
     feed = CsvFeed(write_csv(tmp_path / "m.csv", observed, controls), base.scenario)
     watch, file = begun(base, tmp_path / "watch"), tmp_path / "watch" / JOURNAL_NAME
