@@ -25,11 +25,6 @@ def paragraphs() -> dict[str, Any]:
     return tomllib.loads((FOLDER / "paragraphs.toml").read_text(encoding="utf-8"))
 
 
-def cell(text: str) -> str:
-    """Return a text for a cell of a table."""
-    return text.replace("|", "\\|")
-
-
 def range_of(prior: Prior) -> str:
     """Return a prior in a few words."""
     name = prior.shape.replace("_", "-")
@@ -80,11 +75,11 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
 
 
 def readme() -> str:
-    """Return the table of all effects."""
+    """Return the list of all effects."""
     rows = []
     for effect in library():
         letters = "".join(LETTERS[name] for kind, name in KIND_NAMES.items() if kind in effect.acts_on)
-        rows.append(f"| [{effect.name}]({effect.identifier}.md) | {letters} | {cell(effect.signature)} |")
+        rows.append(f"- [{effect.name}]({effect.identifier}.md), {letters}: {effect.signature}")
     families = len({effect.family for effect in library()})
     numbers = {"count": len(library()), "families": families, "rows": "\n".join(rows)}
     text: str = paragraphs()["overview"]

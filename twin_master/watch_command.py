@@ -81,7 +81,7 @@ def watch(
         counts = watches[0].keep.intake.counts
         refused = f", {counts.rejected} messages refused (see rejected.jsonl)" if counts.rejected else ""
         typer.echo(f"Watch: {folder}, {counts.received} messages{refused}.", err=True)
-        if not no_report and counts.received:
+        if not no_report and (folder / REPORT_NAME).is_file():
             typer.echo(f"Report: {folder / REPORT_NAME}", err=True)
 
 
