@@ -198,7 +198,7 @@ class FleetWatch:
         if self.done(asset):
             return count
         try:
-            for decision in asset.watch.decisions(asset.keep.intake, asset.keep):
+            for decision in asset.watch.decisions():
                 if self._met.pop(asset.name, None) is not None:
                     self.note(f"{asset.name} is watched again.")
                 self._decided(asset, decision)
