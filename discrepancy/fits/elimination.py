@@ -16,7 +16,6 @@ from discrepancy.errors import FitError
 
 from .candidate import Candidate, State
 from .problem import Problem
-from .trial_data import TrialDerivatives
 
 
 def finite(values: FloatArray) -> FloatArray:
@@ -83,14 +82,9 @@ class TrialBlock:
     shared: FloatArray  # (K, K)
     local_gradient: FloatArray  # (L,)
     shared_gradient: FloatArray  # (K,)
-    derivatives: TrialDerivatives
-    products: FloatArray  # (C, M, M) of the derivatives of each channel
-    precision: FloatArray  # (C,) of each channel
-
-    @property
-    def index(self) -> IntArray:
-        """Which shared unknowns (K,) the trial knows."""
-        return self.derivatives.index
+    index: IntArray  # (K,) which shared unknowns the trial knows
+    rows: FloatArray  # (L + K, N C) derivatives of the readings over their noise
+    root: FloatArray  # (C,) of the precision of each channel
 
     @cached_property
     def factor(self) -> Cholesky:
@@ -128,12 +122,11 @@ def trial_block(
 ) -> TrialBlock:
     """Return the normal equations of a trial, by precisions of all channels, its own unknowns damped."""
     data, point = problem.trials[number], found.point
-    derivatives = problem.derivatives(number, point, found.linearisations[number], candidate)
-    products = derivatives.products()
-    weights = precision[data.groups]
-    normal = derivatives.normal(products, weights)
-    gradient = derivatives.onto(found.residuals[number].T * weights[:, np.newaxis])
-    u, prior, count = point.local[number], data.unknowns.precision, derivatives.local_size
+    columns, index = problem.columns(number, point, found.linearisations[number], candidate)
+    root = np.sqrt(precision[data.groups])
+    rows = (data.standardised(columns) * root).reshape(len(columns), -1)
+    normal, gradient = rows @ rows.T, rows @ (found.residuals[number] * root).ravel()
+    u, prior, count = point.local[number], data.unknowns.precision, data.unknowns.size
     local = normal[:count, :count] + np.diag(prior + 1e-12)
     return TrialBlock(
         local=local + damping * np.diag(np.diag(local)),
@@ -141,9 +134,9 @@ def trial_block(
         shared=normal[count:, count:],
         local_gradient=gradient[:count] - prior * u,
         shared_gradient=gradient[count:],
-        derivatives=derivatives,
-        products=products,
-        precision=weights,
+        index=index,
+        rows=rows,
+        root=root,
     )
 
 

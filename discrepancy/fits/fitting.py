@@ -286,8 +286,8 @@ def _finished(
             joint[:count, :count] = block.factor.solve(np.eye(count)) + followed @ block.followed.T
             joint[:count, count:], joint[count:, :count] = -followed, -followed.T
             joint[count:, count:] = known
-            leverage = block.derivatives.spread(block.products, block.precision, joint)
-            np.add.at(spent, data.groups, leverage)
+            leverage = ((joint @ block.rows) * block.rows).sum(axis=0).reshape(data.weight.shape)
+            np.add.at(spent, data.groups, leverage.sum(axis=0))
     return CandidateFit(
         **vars(state), candidate=candidate, log_evidence=log_evidence, covariance=covariance, spent=spent,
         converged=converged,

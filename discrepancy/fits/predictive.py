@@ -63,7 +63,7 @@ def _predicted(
     ones, counted = np.ones(len(problem.channel_names)), float(found.remainder is None)
     for number, data in enumerate(problem.trials):
         block = trial_block(problem, number, adapted, adapted.candidate, ones)
-        local, shared = block.derivatives.dense()
+        local, shared = np.split(block.rows, [data.unknowns.size])
         own = block.factor.half(local)
         # local unknowns follow the shared ones: J_s - J_l A^-1 B, then what is their own
         follow = (shared - block.followed.T @ local).T @ root[block.index]

@@ -22,13 +22,11 @@ from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.catalogue.entry import EffectParameter, ShapeParameter
 from discrepancy.errors import DiscrepancyError
 from discrepancy.search_settings import SEARCH
-from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch
 
 from .candidate import Candidate, Term
 from .elimination import Cholesky, eliminated, finite
 from .fitting import LARGEST_EFFECT, CandidateFit
 from .problem import Problem
-from .trial_data import EVERY
 
 
 @dataclass(frozen=True)
@@ -112,39 +110,29 @@ class Screen:
     def change(self, term: Term, start: FloatArray) -> Change:
         """Return what a term does at scaled parameters, besides the effects of the fit."""
         candidate = self.fit.candidate.plus(term)
-        channels = _channels_of(term.patch(self.problem.setting, start))
-        vector, fits, size = self._moved(
-            candidate, np.concatenate((self.fit.point.effect, start)), term.effect.acts_on, channels
-        )
+        effect = np.concatenate((self.fit.point.effect, start))
+        vector, fits, size = self._moved(candidate, effect, term.effect.acts_on)
         return Change(term, start, vector, fits, max(size, 0.0))
 
     def rise(self, effect: FloatArray) -> float:
         """Return by how much the misfit rises [nat] when the fit's own effect parameters (E,) are these."""
         candidate = self.fit.candidate
-        _, fits, size = self._moved(candidate, effect, candidate.acts_on, frozenset())
+        _, fits, size = self._moved(candidate, effect, candidate.acts_on)
         return 0.5 * size - fits
 
     @np.errstate(over="ignore", invalid="ignore")
     def _moved(
-        self,
-        candidate: Candidate,
-        effect: FloatArray,
-        acting: frozenset[TrialKind],
-        channels: frozenset[str],
+        self, candidate: Candidate, effect: FloatArray, acting: frozenset[TrialKind]
     ) -> tuple[FloatArray, float, float]:
-        """Return vector, b and G of the change to a candidate, in trials and channels that it touches."""
+        """Return vector, b and G of the change to a candidate, in kinds of trials that it touches."""
         problem, fit = self.problem, self.fit
         patch = candidate.patch(problem.setting, effect)
         changes: dict[int, FloatArray] = {}
         for number, data in enumerate(problem.trials):
-            names = data.trial.channels
-            touched = [column for column, name in enumerate(names) if name in channels] if channels else EVERY
-            if data.trial.kind in acting and touched:
+            if data.trial.kind in acting:
                 response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
-                gains = 1.0 + problem.shared.gains(fit.point.shared, names)
-                moved = gains[touched] * (response - fit.responses[number])[:, touched]
-                changes[number] = np.zeros(response.shape)
-                changes[number][:, touched] = data.standardised(moved, touched)
+                gains = 1.0 + problem.shared.gains(fit.point.shared, data.trial.channels)
+                changes[number] = data.standardised(gains * (response - fit.responses[number]))
         return self.projected(changes)
 
     def projected(self, changes: Mapping[int, FloatArray]) -> tuple[FloatArray, float, float]:
@@ -152,17 +140,14 @@ class Screen:
         total = np.zeros(self._size)
         parts, tail, fits, square = [], [], 0.0, 0.0
         for number, block in enumerate(self._blocks):
-            d, z = np.zeros(self.fit.residuals[number].T.shape), np.zeros(len(block.local))
+            residual = self.fit.residuals[number] * block.root
+            d, z = np.zeros(residual.shape), np.zeros(len(block.local))
             if number in changes:
-                root = np.sqrt(block.precision)[:, np.newaxis]
-                d = changes[number].T * root
-                moved = d.any(axis=1)
-                at = EVERY if moved.all() else np.flatnonzero(moved).tolist()
-                onto = block.derivatives.onto(d[at] * root[at], at)
-                local = onto[: len(z)]
+                d = changes[number] * block.root
+                local, onto = np.split(block.rows @ d.ravel(), [len(z)])
                 z = block.half @ local
-                total[block.index] += onto[len(z) :] - block.followed.T @ local
-                fits += float(np.vdot(self.fit.residuals[number].T * root, d))
+                total[block.index] += onto - block.followed.T @ local
+                fits += float(np.vdot(residual, d))
                 fits -= float(block.half @ block.local_gradient @ z)
                 square += float(np.vdot(d, d)) - float(z @ z)
             parts.append(d.reshape(-1))
@@ -239,14 +224,6 @@ class Screen:
                 yield change
         if refusal is not None and not followed:
             self.problem.refused(self.fit.candidate.plus(term), refusal)
-
-
-def _channels_of(patch: ModelPatch) -> frozenset[str]:
-    """Return the channels that a patch touches if it touches named ones only, else nothing."""
-    names = [getattr(item, "channel", EVERY_CHANNEL) for item in patch if isinstance(item, SENSORS)]
-    if len(names) < len(patch) or EVERY_CHANNEL in names or not names:
-        return frozenset()
-    return frozenset(names)
 
 
 def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Iterator[FloatArray]:

@@ -46,8 +46,9 @@ def check(problem, candidate, effect=None, tolerance=TOLERANCE, spread=0.5):
     at, first = 0, problem.shared.size + candidate.size
     for number, data in enumerate(problem.trials):
         parts = problem.linearise(number, point, candidate)
-        derivatives = problem.derivatives(number, point, parts, candidate)
-        (local, shared), index = derivatives.dense(), derivatives.index
+        found, index = problem.columns(number, point, parts, candidate)
+        rows = data.standardised(found).reshape(len(found), -1)
+        local, shared = np.split(rows, [data.unknowns.size])
         counts = (data.weight > 0.0).ravel()
         assert np.all(local[:, ~counts] == 0.0)
         assert np.all(shared[:, ~counts] == 0.0)
@@ -130,36 +131,6 @@ def test_samples_that_do_not_count_change_nothing():
             for p in (problem, other)
         )
         np.testing.assert_allclose(first, second, atol=1e-9)
-
-
-def test_products_by_channel_are_those_of_all_readings():
-    """J W J^T, J d and the trace of J^T covariance J by channel, beside the same with dense matrices."""
-    problem = kit.closed_problem(
-        bent=True, noise=coloured_record(), gain_deviation=0.1, health=True, time_zero=0.003,
-        left_out={1: ((3, 1),)}, samples=80,
-    )  # fmt: skip
-    generator, linear = np.random.default_rng(2), kit.Linear(problem, BOTH)
-    point = linear.point(generator.standard_normal(linear.size))
-    for number, data in enumerate(problem.trials):
-        found = problem.derivatives(number, point, problem.linearise(number, point, BOTH), BOTH)
-        dense, products = np.vstack(found.dense()), found.products()
-        count = len(data.trial.channels)
-        weights = generator.uniform(0.5, 2.0, count)
-        every = np.tile(weights, dense.shape[1] // count)
-        readings = generator.standard_normal((count, dense.shape[1] // count))
-        only = np.zeros_like(readings)
-        only[1] = readings[1]
-        for got, wanted in (
-            (found.normal(products, weights), (dense * every) @ dense.T),
-            (found.onto(readings), dense @ readings.T.ravel()),
-            (found.onto(readings[1:2], [1]), dense @ only.T.ravel()),
-        ):
-            np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-9)
-        root = generator.standard_normal((found.size, found.size))
-        leverage = np.einsum("kn,kl,ln->n", dense, root @ root.T, dense) * every
-        spread = found.spread(products, weights, root @ root.T)
-        wanted = leverage.reshape(-1, count).sum(axis=0)
-        np.testing.assert_allclose(spread, wanted, rtol=1e-10, atol=1e-9)
 
 
 # ---------------------------------------------------------------- evidence and posterior
