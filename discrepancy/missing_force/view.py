@@ -241,9 +241,7 @@ class View:
         def slope(logs: FloatArray) -> FloatArray:
             return np.array([lack(logs + step) - lack(logs - step) for step in steps]) / (2.0 * NEAR)
 
-        starts = [
-            np.log([(begin[port].size, begin[port].time) for port in first]).ravel() for begin in begins
-        ]
+        pairs = ([(begin[port].size, begin[port].time) for port in first] for begin in begins)
         bounds = list(zip(low.ravel(), high.ravel(), strict=True))
         how = {"jac": slope, "method": "L-BFGS-B", "bounds": bounds, "options": AT_TOP}
         tops = [minimize(lack, np.clip(np.log(pair), low, high).ravel(), **how) for pair in pairs]
