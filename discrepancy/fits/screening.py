@@ -16,6 +16,7 @@ from math import sqrt
 from typing import TypeGuard
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.special import ndtri
 
 from discrepancy.campaign.records import FloatArray, TrialKind
@@ -24,8 +25,8 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.search_settings import SEARCH
 
 from .candidate import Candidate, Term
-from .elimination import Cholesky, eliminated, finite
 from .fitting import LARGEST_EFFECT, CandidateFit
+from .normal_equations import finite, normal_equations, upper_factor
 from .problem import Problem
 
 
@@ -100,12 +101,11 @@ class Screen:
         left = problem.precisions(fit.sums)
         precision = np.where(known, 1.0, left) if record_noise else left
         following = Candidate() if effect_precision is None else fit.candidate
-        self._blocks, matrix, gradient, _ = eliminated(
-            problem, fit, following, precision, effect_precision=effect_precision
-        )
-        self._size = len(matrix)
-        self._inverse = Cholesky.of(matrix).half(np.eye(self._size))
-        self._gradient = self._inverse @ gradient
+        found = normal_equations(problem, fit, following, precision, effect_precision)
+        self._trials, self._size = found.trials, len(found.gradient)
+        factor = upper_factor(found.matrix)
+        self._inverse = solve_triangular(factor, np.eye(self._size), trans="T", check_finite=False)
+        self._gradient = self._inverse @ found.gradient
 
     def change(self, term: Term, start: FloatArray) -> Change:
         """Return what a term does at scaled parameters, besides the effects of the fit."""
@@ -138,25 +138,20 @@ class Screen:
     def projected(self, changes: Mapping[int, FloatArray]) -> tuple[FloatArray, float, float]:
         """Return vector, b and G of standardised changes (N, C) of predictions, by number of the trial."""
         total = np.zeros(self._size)
-        parts, tail, fits, square = [], [], 0.0, 0.0
-        for number, block in enumerate(self._blocks):
-            residual = self.fit.residuals[number] * block.root
-            d, z = np.zeros(residual.shape), np.zeros(len(block.local))
+        parts, fits, square = [], 0.0, 0.0
+        for number, (item, place) in enumerate(self._trials):
+            d: FloatArray = np.zeros(item.residual.shape)
             if number in changes:
-                d = changes[number] * block.root
-                local, onto = np.split(block.rows @ d.ravel(), [len(z)])
-                z = block.half @ local
-                total[block.index] += onto - block.followed.T @ local
-                fits += float(np.vdot(residual, d))
-                fits -= float(block.half @ block.local_gradient @ z)
-                square += float(np.vdot(d, d)) - float(z @ z)
-            parts.append(d.reshape(-1))
-            tail.append(z)
+                d = (changes[number] * item.root).ravel()
+                total[place] += item.rows @ d
+                fits += float(item.residual @ d)
+                square += float(d @ d)
+            parts.append(d)
         y = self._inverse @ total
         fits -= float(self._gradient @ y)
         square -= float(y @ y)
         finite(np.array((fits, square)))
-        return np.concatenate((*parts, *tail, y)), fits, square
+        return np.concatenate((*parts, y)), fits, square
 
     def shrunk(self, change: Change) -> tuple[Change, float]:
         """Return a change made so small that it is of first order, and by which factor.
@@ -204,8 +199,7 @@ class Screen:
     def sign(self) -> FloatArray:
         """Signs (D,) of the inner product: changes count, their projections are taken off."""
         samples = sum(residual.size for residual in self.fit.residuals)
-        rest = sum(len(block.local) for block in self._blocks) + self._size
-        return np.concatenate((np.ones(samples), -np.ones(rest)))
+        return np.repeat((1.0, -1.0), (samples, self._size))
 
     def changes(self, term: Term, *, fine: bool = True) -> Iterator[Change]:
         """Yield the changes of a term over the grid of its parameters, where the model can follow.

@@ -22,8 +22,8 @@ from scipy.stats import chi2, f
 
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.fits.candidate import Term
-from discrepancy.fits.elimination import trial_block
 from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.normal_equations import trial_rows
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, is_magnitude
 from discrepancy.fits.trial_data import TrialData
@@ -306,10 +306,10 @@ def sizes_by_trial(problem: Problem, found: CandidateFit) -> dict[str, dict[str,
     }
     rows: dict[str, dict[str, tuple[float, float]]] = {name: {} for name in sizes}
     for number, data in enumerate(problem.trials):
-        block = trial_block(problem, number, found, found.candidate, precision)
-        matrix, gradient = block.matrix, block.gradient
+        item = trial_rows(problem, number, found, found.candidate, precision)
+        matrix, gradient = item.of_shared()
         for name, k in sizes.items():
-            own = np.flatnonzero(block.index == problem.shared.size + k)
+            own = np.flatnonzero(item.index == problem.shared.size + k)
             prior, u = parameters[k][1].prior, float(found.effect[k])
             if not own.size or prior.value(u) == 0.0 or matrix[own[0], own[0]] <= 0.0:
                 continue

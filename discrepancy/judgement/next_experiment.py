@@ -13,8 +13,8 @@ from scipy.special import logsumexp
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Point
-from discrepancy.fits.elimination import finite
 from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.normal_equations import finite
 from discrepancy.fits.problem import Problem
 from discrepancy.sentences import SENTENCES
 from discrepancy.verdict import Experiment
