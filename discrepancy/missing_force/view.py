@@ -19,10 +19,8 @@ Processes = Mapping[int, Process]
 SIZE_DOUBT, TIME_DOUBT = 3.0, 1.2
 """Prior deviations of the logarithms of a process's size and correlation time."""
 DOUBTS = np.array([SIZE_DOUBT, TIME_DOUBT])
-NEAR = 0.02
-"""Difference of logarithms by which slopes are found."""
-AT_TOP = {"ftol": 1e-13, "gtol": 1e-3, "maxiter": 40}
-"""Where a climb ends a rounding decides; the top does not depend on it."""
+AT_TOP = {"eps": 2e-3, "ftol": 1e-6, "gtol": 0.05, "maxiter": 12}
+"""Of the descent: difference of logarithms by which slopes are found, and where it ends."""
 FARTHEST = 5.0
 """Prior deviations from which on a process is not looked at."""
 
@@ -229,7 +227,6 @@ class View:
         median = np.log([(about[port].size, about[port].time) for port in first])
         low, high = median - FARTHEST * DOUBTS, median + FARTHEST * DOUBTS
         low[:, 1], high[:, 1] = np.clip((low[:, 1], high[:, 1]), *np.log(self.times))
-        steps = NEAR * np.eye(median.size)
 
         def at(logs: FloatArray) -> dict[int, Process]:
             items = zip(first.items(), np.exp(logs.reshape(median.shape)).tolist(), strict=True)
@@ -238,12 +235,9 @@ class View:
         def lack(logs: FloatArray) -> float:
             return -self.evidence(about, at(logs))
 
-        def slope(logs: FloatArray) -> FloatArray:
-            return np.array([lack(logs + step) - lack(logs - step) for step in steps]) / (2.0 * NEAR)
-
         pairs = ([(begin[port].size, begin[port].time) for port in first] for begin in begins)
         bounds = list(zip(low.ravel(), high.ravel(), strict=True))
-        how = {"jac": slope, "method": "L-BFGS-B", "bounds": bounds, "options": AT_TOP}
+        how = {"method": "L-BFGS-B", "bounds": bounds, "options": AT_TOP}
         tops = [minimize(lack, np.clip(np.log(pair), low, high).ravel(), **how) for pair in pairs]
         best = min(tops, key=lambda top: float(top.fun))
         return at(best.x), -float(best.fun)
