@@ -19,6 +19,8 @@ Processes = Mapping[int, Process]
 SIZE_DOUBT, TIME_DOUBT = 3.0, 1.2
 """Prior deviations of the logarithms of a process's size and correlation time."""
 DOUBTS = np.array([SIZE_DOUBT, TIME_DOUBT])
+UNSOUND = -1e12
+"""Evidence of forces under which variances are lost to rounding [nat]."""
 AT_TOP = {"eps": 2e-3, "ftol": 1e-6, "gtol": 0.05, "maxiter": 12}
 """Of the descent: difference of logarithms by which slopes are found, and where it ends."""
 FARTHEST = 5.0
@@ -256,7 +258,7 @@ class View:
         ]
         filters = self.filtered(processes)
         if not all(one.is_sound for one in filters):
-            return -np.inf
+            return UNSOUND
         products = regression(filters, self.residuals, self.columns)
         value = products.solve(range(len(self.precisions)), self.precisions).evidence
         return float(value - 0.5 * np.sum(np.square(away)))
