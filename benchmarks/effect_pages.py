@@ -25,11 +25,6 @@ def paragraphs() -> dict[str, Any]:
     return tomllib.loads((FOLDER / "paragraphs.toml").read_text(encoding="utf-8"))
 
 
-def cell(text: str) -> str:
-    """Return a text for a cell of a table."""
-    return text.replace("|", "\\|")
-
-
 def range_of(prior: Prior) -> str:
     """Return a prior in a few words."""
     name = prior.shape.replace("_", "-")
@@ -40,7 +35,6 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
     """Return the page of an effect."""
     tank = effect.identifier in FLOWS
     what = "Tank" if tank else "Cantilever"
-    places = effect.places(setting)
     _, place = picture_patch(effect, setting)
     values = picture_of(effect).values
     rows = [
@@ -51,12 +45,11 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         f"- {s.symbol} (`{s.name}`): {s.description}; {s.canonical:g}, in the family {range_of(s.prior)}."
         for s in effect.shape
     ]
-    where = f" Places in the picture: {', '.join(f'`{name}`' for name in places)}." if any(places) else ""
-    shown = ", ".join(f"{name} = {value:g}" for name, value in values.items())
+    shown = ", ".join(f"{name} {value:g}" for name, value in values.items())
     lines = [
         f"# {effect.name[0].upper()}{effect.name[1:]}",
         "",
-        f"`{effect.identifier}`, family: {effect.family}.{where}",
+        f"`{effect.identifier}`, family: {effect.family}.",
         "",
         text["what"].strip(),
         "",
@@ -75,19 +68,18 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         "## Easily confused with",
         *(f"- [`{other}`]({other}.md): {text['tell'][other]}" for other in effect.confusable),
         "",
-        "## References",
-        *(f"- {reference}" for reference in text["references"]),
+        f"Sources: {'; '.join(text['references'])}",
         "",
     ]
     return "\n".join(lines)
 
 
 def readme() -> str:
-    """Return the table of all effects."""
+    """Return the list of all effects."""
     rows = []
     for effect in library():
         letters = "".join(LETTERS[name] for kind, name in KIND_NAMES.items() if kind in effect.acts_on)
-        rows.append(f"| [{effect.name}]({effect.identifier}.md) | {letters} | {cell(effect.signature)} |")
+        rows.append(f"- [{effect.name}]({effect.identifier}.md), {letters}: {effect.signature}")
     families = len({effect.family for effect in library()})
     numbers = {"count": len(library()), "families": families, "rows": "\n".join(rows)}
     text: str = paragraphs()["overview"]

@@ -197,7 +197,8 @@ def fly_mission(
         "kind": "uav-twin run", "format": 1, "scenario": portable.to_dict(),
         "scenario_file": {"name": loaded.path.name, "sha256": loaded.content_hash},
     }  # fmt: skip
-    create_run_folder(folder, config, source.files())
+    with create_run_folder(folder, config, source.files()):
+        pass
     source.prepare(folder, SilentProgress())
     return _fly(folder, portable.moved(folder), source, seed)
 

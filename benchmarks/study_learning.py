@@ -217,7 +217,7 @@ def notices(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> bool:
 def show(name: str, result: Result) -> None:
     """Print a line of the table."""
     study = result.study
-    within, early, z1, z2 = study.within(2), study.early_fallback, study.rms(0), study.rms(1)
+    within, early, z1, z2 = study.within, study.early, study.rms[0], study.rms[1]
     print(
         f"| {name} | {100 * early.value:.1f} ± {100 * early.error:.1f} % "
         f"| {100 * within.value:.1f} ± {100 * within.error:.1f} % "
@@ -232,10 +232,10 @@ def reached(result: Result) -> bool:
     """Return whether every target is reached."""
     study, covered = result.study, result.covered.value
     return (
-        study.early_fallback.value <= TARGETS["early"]
-        and study.within(2).value >= TARGETS["within"]
-        and study.rms(0).value <= TARGETS["z1"]
-        and study.rms(1).value <= TARGETS["z2"]
+        study.early.value <= TARGETS["early"]
+        and study.within.value >= TARGETS["within"]
+        and study.rms[0].value <= TARGETS["z1"]
+        and study.rms[1].value <= TARGETS["z2"]
         and TARGETS["coverage"][0] <= covered <= TARGETS["coverage"][1]
     )
 

@@ -77,19 +77,19 @@ class Row:
     def cells(self) -> list[tuple[str, bool]]:
         """Return the figures as printed, each with whether it reaches its target."""
         study = self.study
-        within, early = study.within(2), study.early_fallback
+        within, early = study.within, study.early
         cells = [
             (percent(within), within.value >= WITHIN_TARGET),
             (percent(early), early.value <= EARLY_TARGET),
         ]
         cells += [
-            (points(study.rms(factor)), study.rms(factor).value <= target)
+            (points(study.rms[factor]), study.rms[factor].value <= target)
             for factor, target in enumerate(RMS_TARGETS)
         ]
-        cells += [(signed(study.bias(factor)), True) for factor in range(len(RMS_TARGETS))]
+        cells += [(signed(study.bias[factor]), True) for factor in range(len(RMS_TARGETS))]
         evidence = study.evidence
         cells.append((f"{evidence.value:.2f} ± {evidence.error:.2f}", True))
-        cells.append((percent(study.credible_share), True))
+        cells.append((percent(study.credible), True))
         return cells
 
 

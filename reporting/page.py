@@ -107,8 +107,10 @@ class Words:
         Where the file is, such as ``twin_master.report``.
     name
         Of the file: ``[said]`` holds sentences by name, ``[figures]`` titles and captions, and ``[tables]``
-        titles, captions and columns, each a heading, or ``{ number = heading, unit = unit }``; `cell` says
-        what a column shows of each `row`, where rows are records and no ready cells.
+        titles, captions and columns, each a heading, or ``{ number = heading, unit = unit }``. `cell` says
+        what a column shows of each `row`, where rows are records and no ready cells; a column with `when` is
+        left out where the value of that name is false. `rows` are rows of templates before those that are
+        given, each left out where its last cell is empty.
     **shared
         What every template may name beside its own values, such as functions that print numbers.
     """
@@ -121,14 +123,26 @@ class Words:
         """Return a sentence of the table ``[said]``."""
         return filled(self.content["said"][name], **self._shared, **values)
 
-    def headings(self, name: str) -> tuple[str, ...]:
-        """Return the headings of a table, for a terminal."""
-        return tuple(head["name"] for head in self._columns(name))
-
-    def _columns(self, name: str) -> list[dict[str, Any]]:
-        rows = self.content["tables"][name]["columns"]
-        columns = [{"text": head} if isinstance(head, str) else head for head in rows]
-        return [{**head, "name": head.get("text") or head["number"]} for head in columns]
+    def table(self, name: str, rows: Sequence[Any], /, **values: Any) -> tuple[list[Column], list[Any]]:
+        """Return the columns of a table, and the cells of its rows; `more` are further columns."""
+        heads = self.content["tables"][name]["columns"]
+        heads = [{"text": head} if isinstance(head, str) else head for head in heads]
+        heads = [head for head in heads if values.get(head.get("when", ""), True)]
+        columns = [
+            Column(
+                filled(head.get("text") or head["number"], **values), head.get("unit", ""), "number" in head
+            )
+            for head in heads
+        ]
+        columns += [head if isinstance(head, Column) else numbers(head) for head in values.get("more", ())]
+        values |= self._shared
+        if heads and "cell" in heads[0]:  # a table may have no columns but `more`
+            rows = [[filled(head["cell"], **values, row=row) for head in heads] for row in rows]
+        fixed = [
+            [filled(cell, **values) for cell in row] for row in self.content["tables"][name].get("rows", ())
+        ]
+        rows = [*(row for row in fixed if row[-1]), *rows]
+        return columns[: len(rows[0])] if rows else columns, rows
 
     def words(self, kind: str, name: str, /, **values: Any) -> dict[str, str]:
         """Return title and caption of one of the `figures` or `tables`."""
@@ -139,18 +153,11 @@ class Words:
         """Return a figure with its words."""
         return ReportFigure(name, figure, **self.words("figures", name, **values))
 
-    def add_table(self, page: "Page", name: str, rows: Sequence[Any], /, **values: Any) -> None:
+    def add_table(self, page: "Page", name: str, rows: Sequence[Any] = (), /, **values: Any) -> None:
         """Add a table with its words to a page, if it has rows; `more` are further columns."""
-        if not rows:
-            return
-        columns = self._columns(name)
-        heads = [
-            Column(filled(head["name"], **values), head.get("unit", ""), "number" in head) for head in columns
-        ]
-        heads += [head if isinstance(head, Column) else numbers(head) for head in values.get("more", ())]
-        if columns and "cell" in columns[0]:  # a table may have no columns but `more`
-            rows = [[filled(head["cell"], **self._shared, row=row) for head in columns] for row in rows]
-        page.add_table(Table(heads[: len(rows[0])], rows), **self.words("tables", name, **values))
+        columns, cells = self.table(name, rows, **values)
+        if cells:
+            page.add_table(Table(columns, cells), **self.words("tables", name, **values))
 
 
 class Page:
@@ -253,6 +260,7 @@ def _environment(plain: bool = False) -> Environment:
     made.filters["spaced"] = lambda text: Markup(_UNIT_SPACE.sub("\u00a0", str(escape(text))))
     shared: tuple[Callable[..., str], ...] = (words.listing, words.counted, words.number, words.capital)
     made.filters |= {function.__name__: function for function in shared}
+    made.globals |= {"plus_minus": words.plus_minus, "between": words.between}
     return made
 
 

@@ -52,7 +52,7 @@ def watch(
     """
     from twin_master.store.writing import REPORT_NAME
     from twin_master.watch import opening as from_python
-    from twin_master.watch.broker import is_broker
+    from twin_master.watch.feeds import is_broker
     from twin_master.watch.folder import Watch
 
     watches: list[Watch] = []
@@ -81,7 +81,7 @@ def watch(
         counts = watches[0].keep.intake.counts
         refused = f", {counts.rejected} messages refused (see rejected.jsonl)" if counts.rejected else ""
         typer.echo(f"Watch: {folder}, {counts.received} messages{refused}.", err=True)
-        if not no_report and counts.received:
+        if not no_report and (folder / REPORT_NAME).is_file():
             typer.echo(f"Report: {folder / REPORT_NAME}", err=True)
 
 

@@ -19,15 +19,23 @@ from twin_master.assets.resolution import Overrides, asset_source, given_overrid
 from twin_master.errors import NotResumableError
 from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile
-from twin_master.mission.opening import begun_folder, file_record, restore, resumed_folder
 from twin_master.mission.planning import read_policy
 from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
 from twin_master.mission.turns import History
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
-from twin_master.run_folder import check_versions, tidy, to_json, with_inputs
+from twin_master.run_folder import (
+    begun_folder,
+    check_versions,
+    restore,
+    resumed_folder,
+    tidy,
+    to_json,
+    with_inputs,
+)
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import another_truth
 from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
@@ -92,7 +100,8 @@ def fly(
         progress.note(loaded.remark)
     restore(folder, progress)
     source = asset_source(resolved)
-    opened = begun_folder(resolved, file_record(loaded), folder, source, files, replace=replace)
+    source.check()  # what is not there costs the user no folder
+    opened = begun_folder(resolved, loaded.file, folder, source.files() | files, replace=replace)
     with opened as (config, located):
         return _run(folder, config, located, progress, begun, report=report)
 
@@ -227,9 +236,7 @@ def _given_policy(folder: Path, hashes: dict[str, str]) -> Float | BeliefPolicy 
         kept = np.load(path, allow_pickle=False)
         return np.asarray(kept, dtype=np.float64) if isinstance(kept, np.ndarray) else BeliefPolicy.of(kept)
     except (OSError, ValueError) as error:
-        raise NotResumableError(
-            f"{path} is damaged ({error}): fly the mission again with --replace."
-        ) from None
+        raise NotResumableError(said("mission.given_policy", path=path, error=error)) from None
 
 
 def _tell_of_another_truth(knowledge: Knowledge, progress: Progress) -> None:
@@ -240,10 +247,7 @@ def _tell_of_another_truth(knowledge: Knowledge, progress: Progress) -> None:
         return
     sentence = another_truth(draws.name, truth, draws.mean, draws.standard_deviation)
     if sentence is not None:
-        progress.note(
-            f"{sentence} To fly the calibrated asset, leave {draws.name} out of `parameters` in the "
-            "scenario's table `asset`."
-        )
+        progress.note(said("mission.truth", sentence=sentence, name=draws.name))
 
 
 @contextmanager
@@ -255,10 +259,7 @@ def _noted(folder: Path) -> Iterator[None]:
         raise
     except Exception as error:
         error.add_note(
-            f"What was flown is kept: continue with `uav-twin run --resume {folder}`, or, where the scenario "
-            "itself is to be changed, fly the changed one with --replace."
-            if (folder / JOURNAL_NAME).exists()
-            else "Nothing was flown yet: once this is mended, fly again with --replace."
+            said(f"mission.{'flown' if (folder / JOURNAL_NAME).exists() else 'begun'}", folder=folder)
         )
         raise
 

@@ -11,6 +11,8 @@ from uav_twin.calibrate_laboratory import calibrate_ringdown, calibrate_simulate
 from uav_twin.options import refuse_before, told
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from calibration.result.record import Calibration
 
 
@@ -99,16 +101,17 @@ def _record(result: "Calibration") -> dict[str, Any]:
 def _show(result: "Calibration") -> None:
     from calibration.result import text
 
-    def table(name: str, rows: "list[tuple[str, ...]]") -> None:
-        terminal.print_table(text.WORDS.headings(name), rows)
+    def table(name: str, rows: "Sequence[Any]") -> None:
+        if rows:
+            columns, cells = text.WORDS.table(name, rows, result=result)
+            terminal.print_table([column.name for column in columns], cells)
 
     terminal.say(text.headline(result))
-    table("parameters", text.parameter_rows(result))
+    table("parameters", result.priors)
     for line in text.correlation_lines(result):
         terminal.say(line)
-    if result.readings:
-        table("readings", text.reading_rows(result))
-    table("channels", text.channel_rows(result))
+    table("readings", result.readings)
+    table("channels", result.channels)
     for sentence in result.findings:
         terminal.say(f"- {sentence}")
 
@@ -148,7 +151,7 @@ def calibrate_wing(
     if fitted and (data is None or measured is False):
         raise typer.BadParameter("--fitted needs --data with ring-down records, and no --published.")
     from calibration.dynamics.ringdown import Frequencies
-    from calibration.paper.table_1 import HEADINGS
+    from calibration.paper.table_1 import WORDS
     from calibration.result.file import check_folder
     from calibration.wing.calibrate import calibrate
     from calibration.wing.lab_data import Targets, published_data, read_lab_folder
@@ -168,8 +171,8 @@ def calibrate_wing(
     progress = terminal.progress()
     calibration = calibrate(lab, drawn, asset=name, procedure=procedure.value, seed=seed, progress=progress)
     if not json:
-        rows = [row.cells for row in calibration.table_1]
-        terminal.print_table(HEADINGS, rows)
+        columns, rows = WORDS.table("table_1", calibration.table_1)
+        terminal.print_table([column.name for column in columns], rows)
     written = None if out is None else write_wing_folder(calibration, out, progress, report=not no_report)
     show(calibration.result, written, json=json, report=not no_report)
 

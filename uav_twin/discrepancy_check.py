@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from discrepancy.catalogue.entry import Effect
     from discrepancy.checks.fault import DataFault
     from discrepancy.judgement.separability import Separability
+    from discrepancy.models.interface import Model
 
 
 @told("discrepancy check")
@@ -42,7 +43,7 @@ def check(
     if json:
         terminal.print_json(_record(data, choice.model.name, faults, able))
     else:
-        _show(data, choice.model.name, faults, able, catalogue)
+        _show(data, choice.model, faults, able, catalogue)
     if able is None:
         typer.secho("Mend the faults first: conclusions from these data would be wrong.", fg="red", err=True)
         raise typer.Exit(1)
@@ -76,7 +77,7 @@ def _record(
 
 def _show(
     data: "Campaign",
-    model: str,
+    model: "Model",
     faults: "Sequence[DataFault]",
     able: "Separability | None",
     catalogue: "Sequence[Effect]",
@@ -94,7 +95,7 @@ def _show(
     held = [trial.name for trial in data.trials if trial.held_out]
     terminal.say(
         f"{data.name}: {counted(len(data.trials), 'trial')}, {counted(len(data.channels), 'channel')}, "
-        f"beside {model}; held out: {', '.join(held) or 'none'}."
+        f"beside {model.name}; held out: {', '.join(held) or 'none'}."
     )
     for fault in faults:
         terminal.say(f"{'Fault' if fault.fatal else 'Limit'}: {fault.sentence}")
@@ -106,5 +107,6 @@ def _show(
     rows = [[row[at] for at in shown] for row in rows_of(able)]
     terminal.print_table([HEADINGS[at] for at in shown], rows)
     told = group_lines(able, "to which is said above")
-    for line in (*untested_lines(able), *confused_lines(able), *told, *needs(able, data, catalogue)):
+    wanted = needs(able, data, catalogue, model.kinds)
+    for line in (*untested_lines(able), *confused_lines(able), *told, *wanted):
         terminal.say(line)

@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calibration.paper.load_test import StaticCalibration
-from calibration.paper.table_1 import PAPER_MEAN
+from calibration.paper.table_1 import PAPER
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import ScalarPosterior
 from reporting.figures import (
@@ -37,7 +37,9 @@ def calibration_figure(result: StaticCalibration) -> Figure:
             ls=_RUN_LINES[run % len(_RUN_LINES)], label="likelihood of one pair" if pair == 0 else None,
         )  # fmt: skip
     _draw_densities(factor, result.before, result.exact, result.particle)
-    factor.axvline(PAPER_MEAN, color=REFERENCE, lw=0.7, ls=":", label="mean in the paper")
+    factor.axvline(
+        PAPER["young_modulus_factor"].mean, color=REFERENCE, lw=0.7, ls=":", label="mean in the paper"
+    )
     factor.set_xlabel("Young's modulus factor $e$", parse_math=True)
     factor.set_ylabel("probability density")
     panel_label(factor, "b", "Prior, likelihoods, posterior")

@@ -6,21 +6,16 @@ from pathlib import Path
 from calibration.paper.load_test import ParticlePosterior
 from calibration.result.record import Calibration
 from reporting.files import atomic_write_text
+from reporting.page import Words
 from reporting.table_file import table_text
 
-PAPER_MEAN, PAPER_STANDARD_DEVIATION = 1.0073, 0.0103
-"""Posterior of e in the paper (Kapteyn et al. 2021, Table 1)."""
-
-PRINTED = "Kapteyn et al. 2021, Table 1"
-SAMPLES = "the authors' published samples (step 3), mean over 100"
-EQ_25 = "the authors' published frequencies (step 3) by eq. (25), mean over 100"
+WORDS = Words("calibration.paper", "table_1.toml")
 
 _CSV_COLUMNS = (
     "figure", "prior_mean", "prior_standard_deviation", "mean", "standard_deviation",
     "paper_procedure_mean", "paper_procedure_standard_deviation", "paper_mean", "paper_standard_deviation",
     "difference", "paper_procedure_difference", "source_of_the_papers",
 )  # fmt: skip
-HEADINGS = ("figure", "prior", "this wing", "the paper's procedure", "in the paper", "difference")
 
 
 @dataclass(frozen=True)
@@ -36,8 +31,8 @@ class PaperFigure:
     unit: str
     digits: int
     mean: float
-    standard_deviation: float | None
     source: str
+    standard_deviation: float | None = None
 
     def printed(self, mean: float, deviation: float | None = None, *, sign: str = "") -> str:
         """Return a figure as printed, without its unit."""
@@ -47,18 +42,7 @@ class PaperFigure:
         return text.replace("-", "−")
 
 
-PAPER = {
-    "semi_span": PaperFigure("semi-span", 1e3, "mm", 2, 1.8280, None, PRINTED),
-    "root_chord": PaperFigure("root chord", 1e3, "mm", 2, 0.4330, None, PRINTED),
-    "tip_chord": PaperFigure("tip chord", 1e3, "mm", 2, 0.2600, None, PRINTED),
-    "young_modulus_factor": PaperFigure(
-        "modulus factor e", 1.0, "", 4, PAPER_MEAN, PAPER_STANDARD_DEVIATION, PRINTED
-    ),
-    "servo_mass": PaperFigure("servo mass", 1e3, "g", 1, 0.1691, 0.0039, SAMPLES),
-    "pitot_mass": PaperFigure("pitot mass", 1e3, "g", 1, 0.1337, 0.0077, SAMPLES),
-    "damping_alpha": PaperFigure("alpha", 1.0, "1/s", 4, 1.0300, 0.0008, EQ_25),
-    "damping_beta": PaperFigure("beta", 1e3, "ms", 4, 7.658e-4, 0.006e-4, EQ_25),
-}
+PAPER = {name: PaperFigure(**told) for name, told in WORDS.content["paper"].items()}
 
 
 @dataclass(frozen=True)
@@ -88,17 +72,6 @@ class TableRow:
     def differences(self) -> tuple[float, float]:
         """The means of the kept samples and by the paper's own procedure, less the paper's."""
         return self.found[0] - self.paper.mean, self.paper_way[0] - self.paper.mean
-
-    @property
-    def cells(self) -> tuple[str, ...]:
-        """The row as printed, one cell for each of `HEADINGS`."""
-        paper = self.paper
-        return (
-            f"{paper.title}, {paper.unit}" if paper.unit else paper.title,
-            *(paper.printed(*pair) for pair in (self.prior, self.found, self.paper_way)),
-            paper.printed(paper.mean, paper.standard_deviation),
-            paper.printed(self.differences[0], sign="+"),
-        )
 
 
 def table_1(result: Calibration, procedure: Calibration, particle: ParticlePosterior) -> tuple[TableRow, ...]:

@@ -11,10 +11,7 @@ from calibration.result.record import Calibration
 from calibration.result.text import (
     PROCEDURES,
     WORDS,
-    channel_rows,
     correlation_lines,
-    parameter_rows,
-    reading_rows,
 )
 from reporting.figures import save_figure
 from reporting.files import atomic_write_bytes, atomic_write_text, write_error
@@ -100,7 +97,7 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     if not result.findings:
         page.add_paragraph(WORDS.say("agreed"))
     procedure = PROCEDURES[result.procedure]
-    WORDS.add_table(page, "parameters", parameter_rows(result), result=result, procedure=procedure)
+    WORDS.add_table(page, "parameters", result.priors, result=result, procedure=procedure)
     for line in correlation_lines(result):
         page.add_paragraph(f"{line}.")
     places, titles = drawn_parameters(result)
@@ -108,23 +105,14 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     for name, shown in (("posterior", sets[:1]), ("prior_and_posterior", sets)):
         add_figure(page, WORDS.figure(name, corner_figure(titles, shown)), folder)
     page.add_section("What is left of the readings")
-    WORDS.add_table(page, "readings", reading_rows(result))
+    WORDS.add_table(page, "readings", result.readings, result=result)
     if result.readings:
         add_figure(page, WORDS.figure("readings", readings_figure(result)), folder)
-    WORDS.add_table(page, "channels", channel_rows(result))
+    WORDS.add_table(page, "channels", result.channels)
     return page
 
 
 def end_page(page: Page, result: Calibration, folder: Path) -> None:
     """Write a page with where the calibration comes from at its end."""
-    versions = result.provenance["versions"].items()
-    rows = [
-        ("asset", result.asset),
-        ("model", f"{result.model}, SHA-256 {result.model_hash[:16]}"),
-        ("measured", result.source),
-        ("seed", str(result.seed)),
-        ("priors", ", ".join(f"{prior.name}: {prior.stated_by}" for prior in result.priors)),
-        ("software", ", ".join(f"{name} {version}" for name, version in versions)),
-    ]
-    WORDS.add_table(page, "origin", rows)
+    WORDS.add_table(page, "origin", result=result)
     atomic_write_text(folder / REPORT_NAME, page.render())

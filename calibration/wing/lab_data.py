@@ -245,7 +245,7 @@ def read_lab_folder(
 
 
 _PUBLISHED = {
-    1: "not measured; published lengths (Kapteyn et al. 2021, Table 1)",
-    2: "not measured; published pairs (Kapteyn et al. 2021, Fig. 5)",
+    1: "published lengths (Kapteyn et al. 2021, Table 1)",
+    2: "published pairs (Kapteyn et al. 2021, Fig. 5)",
     3: "published frequencies and damping ratios (the authors' step 3)",
 }

@@ -10,7 +10,8 @@ from matplotlib.tri import Triangulation
 from calibration.dynamics.figures import ring_down_figure
 from calibration.paper.figures import calibration_figure
 from calibration.paper.load_test import push_forward
-from calibration.paper.table_1 import HEADINGS, write_table_1
+from calibration.paper.table_1 import WORDS as TABLE_1
+from calibration.paper.table_1 import write_table_1
 from calibration.result.figures import corner_figure, drawn_parameters
 from calibration.result.file import FILE_NAME
 from calibration.result.folder import (
@@ -25,7 +26,7 @@ from fe.reduction.fields import WingFields, write_modes_vtu, write_wing_vtu
 from fe.reduction.model_cache import wing_fields
 from fe.runtime.reduced import Modes
 from reporting.figures import LEVELS, panels, publication_style
-from reporting.page import Column, Page, Words
+from reporting.page import Page, Words
 from reporting.progress import Progress
 from reporting.words import plus_minus
 
@@ -77,9 +78,7 @@ def _add_sections(page: Page, calibration: WingCalibration, fields: WingFields, 
         add = page.add_notice if measured and not origin.read else page.add_paragraph
         add(WORDS.say("origin", origin=origin))
     page.add_section("Beside the paper")
-    heads = [Column(name, numeric=at > 0) for at, name in enumerate(HEADINGS)]
-    cells = [row.cells for row in calibration.table_1]
-    WORDS.add_table(page, "table_1", cells, more=heads, source=WORDS.say("source"))
+    TABLE_1.add_table(page, "table_1", calibration.table_1)
     show("load_test", calibration_figure(calibration.static))
     rows = []
     for title, found in (

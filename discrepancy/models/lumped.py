@@ -115,6 +115,8 @@ class LumpedModel(DescribedModel, SystemModel):
         self.kinds = frozenset(TrialKind) - {TrialKind.FLIGHT}
         if not description.is_plain:
             self.kinds -= {TrialKind.RINGDOWN}
+        if description.free:  # nothing holds it at rest
+            self.kinds -= {TrialKind.STATIC}
         self.length = description.characteristic_length
         self.port_rows = {item.name: padded(item.vector) for item in description.port}
         self.acts = {item.name: padded(item.acts or item.vector) for item in description.port}

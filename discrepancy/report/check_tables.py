@@ -1,6 +1,6 @@
 """What a campaign can decide, in rows for the page and for the terminal."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from math import isfinite
 
 import numpy as np
@@ -12,7 +12,7 @@ from reporting.words import listing
 
 from .text import WORDS, number, unit_text
 
-HEADINGS = WORDS.headings("decide")
+HEADINGS = tuple(column.name for column in WORDS.table("decide", ())[0])
 
 
 def rows_of(found: Separability) -> list[tuple[str, ...]]:
@@ -77,8 +77,10 @@ def group_lines(found: Separability, told: str = "the table says to which") -> l
     return lines
 
 
-def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) -> list[str]:
-    """Return sentences on what the campaign would need to decide more."""
+def needs(
+    found: Separability, campaign: Campaign, effects: Sequence[Effect], possible: Collection[TrialKind]
+) -> list[str]:
+    """Return sentences on what the campaign would need to decide more; `possible`: what the model follows."""
     known = {effect.identifier: effect for effect in effects}
     there = {trial.kind for trial in campaign.trials}
     lines = []
@@ -86,7 +88,9 @@ def needs(found: Separability, campaign: Campaign, effects: Sequence[Effect]) ->
         acts = [known[name].acts_on for name in group if name in known]
         union: frozenset[TrialKind] = frozenset().union(*acts)
         common = frozenset(TrialKind).intersection(*acts)
-        apart = [kind for kind in TrialKind if kind in union - common and kind not in there]
+        apart = [
+            kind for kind in TrialKind if kind in union - common and kind in possible and kind not in there
+        ]
         names = listing(name.replace("_", " ") for name in group)
         kinds = " or ".join(WORDS.content["kinds"][kind.value] for kind in apart)
         lines.append(WORDS.say("add_kinds" if apart else "vary", names=names, kinds=kinds))

@@ -161,6 +161,22 @@ class CellMesh:
         """Mean (nc, 3) [m] of the corners of each cell."""
         return np.asarray(self.corners.mean(axis=1))
 
+    @cached_property
+    def outer_faces(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Faces (m,) of one cell alone, as cell and number in it, and their corners (m, 4).
+
+        The corners rise; -1 stands before those of a triangle.
+        """
+        faces = []
+        for face in self.kind.faces:
+            corners = np.sort(self.cells[:, list(face)], axis=1)
+            faces.append(np.pad(corners, ((0, 0), (4 - len(face), 0)), constant_values=-1))
+        every = np.vstack(faces)
+        _, first, count = np.unique(every, axis=0, return_index=True, return_counts=True)
+        chosen = np.sort(first[count == 1])
+        number, cell = np.divmod(chosen, len(self.cells))
+        return cell, number, every[chosen]
+
     def unknowns_of(self, cells: IntArray, components: int = 3) -> IntArray:
         """Unknowns (n, components k) of cells (n,)."""
         own = components * self.cells[cells][:, :, None] + np.arange(components)

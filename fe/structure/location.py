@@ -5,6 +5,7 @@ nodal displacements.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,8 @@ _ALONG, _ACROSS = 20, 10  # points of a gauge that has a length, a width
 _INSIDE = 1e-9
 _STEPS = 25
 _SAME_PLACE = 1e-6
+_SQUARE = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+_TRIANGLE = _SQUARE[[0, 1, 3, 3]]
 _SAME_SIDE = 0.9  # cosine between the normals of faces that are one surface
 
 
@@ -64,7 +67,7 @@ def attach(mesh: StructureMesh, point: FloatArray, where: str) -> tuple[int, Flo
     start = np.tile(np.mean(kind.corners, axis=0), (len(cells), 1))
     axes = np.tile(np.eye(3), (len(cells), 1, 1))
     local, residual, _ = _nearest(
-        mesh, cells, point, start, 0.0, axes, lambda place: np.clip(place, -2.0, 3.0)
+        mesh, cells, point, start, 0.0, axes, lambda place, _: np.clip(place, -2.0, 3.0)
     )
     inside = kind.inside(local, _INSIDE) & (np.linalg.norm(residual, axis=1) <= 1e-9 * mesh.size)
     if inside.any():
@@ -81,7 +84,7 @@ def _nearest(
     along: FloatArray,
     corner: FloatArray | float,
     tangents: FloatArray,
-    kept: Callable[[FloatArray], FloatArray],
+    kept: Callable[[FloatArray, FloatArray], FloatArray],
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Find the places in cells (n,) that are nearest to a point, by Gauss and Newton.
 
@@ -98,7 +101,7 @@ def _nearest(
     corner, tangents : (n, 3), (n, t, 3)
         Local places where the coordinates are zero, and how they go on along each.
     kept : callable
-        Returns the nearest coordinates that are allowed.
+        Returns the nearest coordinates that are allowed, by a metric (n, t, t) of theirs.
 
     Returns
     -------
@@ -119,7 +122,7 @@ def _nearest(
         ):  # outside its cell the map may fold: no solution, wherever the next step leads
             gram[np.linalg.det(gram) == 0.0] = np.eye(3)
         move = np.linalg.solve(gram, edges @ residual[..., None])[..., 0]
-        before, along = along, kept(along + move)
+        before, along = along, kept(along + move, gram)
         moved = float(np.abs(along - before).max(initial=0.0))
     return local, residual, edges
 
@@ -138,11 +141,9 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     cells, (corner, tangents) = surface.cell[near], (part[surface.face[near]] for part in kind.face_frames)
     triangle = np.array([len(face) == 3 for face in kind.faces])[surface.face[near]]
 
-    def kept(along: FloatArray) -> FloatArray:
-        return np.where(triangle[:, None], _on_triangle(along), np.clip(along, 0.0, 1.0))
-
+    corners = np.where(triangle[:, None, None], _TRIANGLE, _SQUARE)
     start = np.where(triangle[:, None], 1.0 / 3.0, [0.5, 0.5])
-    local, residual, edges = _nearest(mesh, cells, point, start, corner, tangents, kept)
+    local, residual, edges = _nearest(mesh, cells, point, start, corner, tangents, partial(_on_face, corners))
     distance, normal = np.linalg.norm(residual, axis=1), np.cross(edges[:, 0], edges[:, 1])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     best = int(distance.argmin())
@@ -158,14 +159,17 @@ def on_surface(mesh: StructureMesh, point: FloatArray, where: str) -> SurfacePoi
     return SurfacePoint(cells[same], local[same], mean / np.linalg.norm(mean), float(distance[best]))
 
 
-def _on_triangle(along: FloatArray) -> FloatArray:
-    """Nearest places (n, 2) on the unit triangle."""
-    over = along.sum(axis=1) > 1.0
-    middle = 0.5 * (along[over, 0] - along[over, 1] + 1.0)
-    along = np.clip(along, 0.0, 1.0)
-    along[over, 0] = np.clip(middle, 0.0, 1.0)
-    along[over, 1] = 1.0 - along[over, 0]
-    return along
+def _on_face(corners: FloatArray, along: FloatArray, metric: FloatArray) -> FloatArray:
+    """Nearest places (n, 2) of faces with corners (n, 4, 2), by a metric (n, 2, 2): inside, or on an edge."""
+    edge = np.roll(corners, -1, axis=1) - corners
+    aside = along[:, None] - corners
+    inside = np.all(edge[..., 0] * aside[..., 1] >= edge[..., 1] * aside[..., 0], axis=1)
+    squares = np.sum(edge @ metric * edge, axis=2)
+    share = np.sum(edge @ metric * aside, axis=2) / np.where(squares > 0.0, squares, 1.0)
+    places = corners + np.clip(share, 0.0, 1.0)[..., None] * edge
+    left = along[:, None] - places
+    best = np.sum(left @ metric * left, axis=2).argmin(axis=1)
+    return np.where(inside[:, None], along, places[np.arange(len(places)), best])
 
 
 def face_areas(mesh: CellMesh, surface: Surface) -> tuple[FloatArray, FloatArray]:

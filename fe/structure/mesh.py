@@ -84,23 +84,10 @@ class StructureMesh(CellMesh):
         """Diagonal [m] of the box around the structure."""
         return float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
-    @cached_property
-    def _boundary(self) -> tuple[Surface, IntArray]:
-        """Faces of one cell alone and their corners (m, 4), rising, -1 before those of a triangle."""
-        faces = []
-        for face in self.kind.faces:
-            corners = np.sort(self.cells[:, list(face)], axis=1)
-            faces.append(np.pad(corners, ((0, 0), (4 - len(face), 0)), constant_values=-1))
-        every = np.vstack(faces)
-        _, first, count = np.unique(every, axis=0, return_index=True, return_counts=True)
-        chosen = np.sort(first[count == 1])
-        number, cell = np.divmod(chosen, len(self.cells))
-        return Surface(cell, number), every[chosen]
-
     @property
     def boundary(self) -> Surface:
         """Faces of one cell alone: the surface of the structure."""
-        return self._boundary[0]
+        return Surface(*self.outer_faces[:2])
 
     @cached_property
     def cell_radius(self) -> FloatArray:
@@ -180,14 +167,14 @@ class StructureMesh(CellMesh):
 
     def faces_between(self, name: str, nodes: IntArray) -> Surface:
         """Faces of a set of faces, or else those of the surface all of whose corners are among nodes (m,)."""
-        surface, corners = self._boundary
+        cell, face, corners = self.outer_faces
         wanted = _named(self.face_sets, name)
         if wanted is None:
             inside = np.isin(corners, [-1, *nodes]).all(axis=1)
         else:
             rows = (tuple(row[row >= 0].tolist()) for row in corners)
             inside = np.array([row in wanted for row in rows])
-        return Surface(surface.cell[inside], surface.face[inside])
+        return Surface(cell[inside], face[inside])
 
 
 def _named(sets: dict[str, _Content], name: str) -> _Content | None:

@@ -5,13 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.errors import ExperimentDataError
 from calibration.geometry import (
-    READING_UNCERTAINTY,
-    MeasuredLength,
     published_lengths,
     read_lengths,
     tailored_design,
@@ -20,6 +16,9 @@ from calibration.geometry import (
 from fe.runtime.errors import InvalidDesignError
 from fe.wing.design import load_design
 from fe.wing.mesh import build_mesh
+from tests.refusals import Inputs
+
+INPUTS = Inputs(__file__)
 
 
 def test_the_published_lengths():
@@ -45,29 +44,9 @@ def test_posterior_by_quadrature():
     assert length.posterior.standard_deviation == pytest.approx(deviation, rel=1e-6)
 
 
-@given(designed=st.floats(0.1, 5.0), shift=st.floats(-0.05, 0.05))
-def test_posterior_lies_between_and_is_narrower(designed, shift):
-    length = MeasuredLength("semi_span", designed, designed * (1.0 + shift))
-    low, high = sorted((length.designed, length.measured))
-    assert low - 1e-12 <= length.posterior.mean <= high + 1e-12
-    assert length.posterior.standard_deviation <= READING_UNCERTAINTY / 1.96 * (1.0 + 1e-12)
-    assert length.posterior.standard_deviation <= length.prior.deviation
-
-
-GOOD = """parameter,designed,manufactured
-length,1828.8,1828.0
-chord_{root},435.61,433.0
-chord_{tip},261.112,260.0
-"""
-
-
 def test_files_of_lengths(tmp_path):
     file = tmp_path / "lengths.csv"
-    with pytest.raises(ExperimentFileError, match="does not hold"):
-        read_lengths(tmp_path)
-    with pytest.raises(ExperimentFileError, match="does not exist"):
-        read_lengths(file)
-    file.write_text(GOOD, encoding="utf-8")
+    file.write_text(INPUTS.text("lengths.csv"), encoding="utf-8")
     for own, published in zip(read_lengths(file), published_lengths(), strict=True):
         assert own.posterior.mean == pytest.approx(published.posterior.mean, rel=1e-12)
 
@@ -76,25 +55,6 @@ def test_the_published_file_gives_the_published_figures(reference):
     for read, published in zip(read_lengths(reference), published_lengths(), strict=True):
         found = read.designed, read.measured
         assert found == pytest.approx((published.designed, published.measured), rel=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("text", "error", "words"),
-    [
-        (GOOD.replace("manufactured", "as_built"), ExperimentFileError, "no column 'manufactured'"),
-        (GOOD.replace("chord_{tip}", "chord_end"), ExperimentFileError, "lacks the row chord_{tip}"),
-        (GOOD.replace("433.0", "nan"), ExperimentDataError, "line 3: column 'manufactured' holds nan"),
-        (GOOD.replace("433.0", "433,4"), ExperimentFileError, "line 3: 4 cells came, and the header has 3"),
-        (GOOD + "chord_{root},435.61,431.0\n", ExperimentFileError, "lines 3 and 5 hold the same parameter"),
-        (GOOD.replace("1828.0", "1.828"), ExperimentDataError, "looks like m"),
-        (GOOD.replace("1828.0", "182.8"), ExperimentDataError, "more than 10 % apart"),
-    ],
-)
-def test_bad_files_are_told_in_one_sentence(tmp_path, text, error, words):
-    file = tmp_path / "lengths.csv"
-    file.write_text(text, encoding="utf-8")
-    with pytest.raises(error, match=words):
-        read_lengths(file)
 
 
 # -------------------------------- the measured planform in the design, and what a wing cannot be
@@ -139,23 +99,9 @@ def test_what_moves_with_the_planform_and_what_stays():
     assert tailored.gauges.positions == drawn.gauges.positions
 
 
-@pytest.mark.parametrize(
-    ("changes", "measured", "error", "words"),
-    [
-        ({"planform": {"semi_span": 2.4}}, {}, ExperimentDataError,
-         r"semi_span measures 1828\.0 mm.*2400\.0 mm.*--design"),
-        ({"gauges": {"positions": [[1.81, 0.4]]}}, {"semi_span": 1.8}, InvalidDesignError,
-         r"does not fit the measured planform .*gauges\.positions\[0\] is 1\.81 m from the root.*\.$"),
-        ({"defects": [
-            {"span_start": 0.1, "span_end": 0.3, "chord_start": 0.2, "chord_end": 0.3},
-            {"span_start": 1.5, "span_end": 1.828, "chord_start": 0.2, "chord_end": 0.3},
-        ]}, {"semi_span": 1.8}, InvalidDesignError,
-         r"does not fit the measured planform .*defects\[1\] ends 1\.828 m from the root, off the wing.*\.$"),
-        ({"skin": {"thickness": 0.0023}}, {"tip_chord": 0.24}, InvalidDesignError,
-         r"the skin of 0\.0023 m does not fit"),
-    ],
-)  # fmt: skip
-def test_what_no_longer_fits_is_refused_with_its_place(changes, measured, error, words):
+@pytest.mark.parametrize(("changes", "measured", "kind", "words"), INPUTS.refused("planform"))
+def test_what_no_longer_fits_is_refused_with_its_place(changes, measured, kind, words):
+    error = {"Data": ExperimentDataError, "Design": InvalidDesignError}[kind]
     with pytest.raises(error, match=words) as caught:
         tailored_design(load_design().changed(**changes), lengths(**measured))
     assert "the changed design" not in str(caught.value)

@@ -9,7 +9,7 @@ from calibration import virtual_wing
 from calibration.dynamics.records import read_records
 from calibration.dynamics.ringdown import Frequencies
 from calibration.dynamics.trials import fit_trials
-from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.errors import ExperimentDataError
 from calibration.geometry import published_lengths, read_lengths
 from calibration.joint.wing_table import weighed
 from calibration.static.experiments import published_measurements, read_measurements
@@ -23,9 +23,10 @@ from calibration.virtual_wing import (
     measure_ring_down,
     weigh,
 )
-from calibration.wing.lab_data import WEIGHED_MASS_FILE, read_weighed_mass, write_lab_folder
+from calibration.wing.lab_data import read_weighed_mass, write_lab_folder
 from fe.runtime.errors import OutsideModelError
 from fe.runtime.state import TIP_FORCE, DigitalState, Geometry
+from tests.refusals import Inputs
 from tests.wings import wing_integrator
 
 TRUTH = DigitalState(young_modulus_factor=1.0073, damping_alpha=1.03, damping_beta=7.66e-4)
@@ -128,16 +129,7 @@ def test_reading_errors_are_as_stated_and_follow_the_seed():
     np.testing.assert_allclose(record.signal / 5e-5, np.round(record.signal / 5e-5), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"trials": 0}, "at least one trial"),
-        ({"sampling_rate": 1e15}, "more than 10,000,000 samples"),
-        ({"quantisation": 0.0}, "step must be positive"),
-        ({"sampling_rate": math.nan}, "positive duration and sampling rate"),
-        ({"duration": 0.01}, "samples; at least 64"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "words"), Inputs(__file__).refused("ring_down_settings"))
 def test_bad_settings(settings, words):
     with pytest.raises(ExperimentDataError, match=words):
         measure_ring_down(Beam(), 1, **settings)
@@ -165,19 +157,3 @@ def test_the_laboratory_folder_is_read_back(tmp_path, rate):
     assert measured.root_chord.designed == published_lengths().root_chord.designed
     scale = read_weighed_mass(tmp_path)
     assert (scale.value, scale.deviation) == pytest.approx((0.4711, 2e-3))
-
-
-def test_the_weighed_mass_file(tmp_path):
-    file = tmp_path / WEIGHED_MASS_FILE
-    file.parent.mkdir()
-    for text, error, words in (
-        ("mass\n472\n", ExperimentFileError, "no column 'standard_deviation', which a weighing needs"),
-        ("mass,standard_deviation\n472,1\n471,1\n", ExperimentFileError, "one row in grams, and 2 came"),
-        ("mass,standard_deviation\n0.472,0.001\n", ExperimentDataError, "looks like kg"),
-        ("mass,standard_deviation\n472000,1\n", ExperimentDataError, "looks like mg"),
-        ("mass,standard_deviation\n472,1e40\n", ExperimentDataError, "must be less than the mass, 472 g"),
-        ("mass,standard_deviation\n472,-1\n", ExperimentDataError, "column 'standard_deviation' holds -1"),
-    ):
-        file.write_text(text, encoding="utf-8")
-        with pytest.raises(error, match=words):
-            read_weighed_mass(tmp_path)

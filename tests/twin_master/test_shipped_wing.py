@@ -43,9 +43,9 @@ def test_reliability(wing):
     """Bars of 300 missions, widened for 80; `benchmarks/study_level_turns.py` flies as many as wanted."""
     scenario = load_scenario("paper_level_turns").scenario
     study = fly_seeds(scenario, ReducedModelSource(scenario, wing), range(80))
-    assert study.within(2).value >= 0.95
-    assert study.early_fallback.value <= 0.2
-    assert np.all([study.rms(0).value <= 0.045, study.rms(1).value <= 0.13])
+    assert study.within.value >= 0.95
+    assert study.early.value <= 0.2
+    assert np.all([study.rms[0].value <= 0.045, study.rms[1].value <= 0.13])
 
 
 def test_the_whole_chain_and_its_resumption(wing, tmp_path):

@@ -75,18 +75,18 @@ def whole(flown: RunOutcome, tmp_path: Path) -> Path:
 
 
 def make(folder: Path, name: str, *, replace: bool = False) -> None:
-    os.close(create_run_folder(folder, {"kind": KIND, "name": name}, replace=replace))
+    with create_run_folder(folder, {"kind": KIND, "name": name}, replace=replace):
+        pass
 
 
 def test_a_run_that_flies_is_not_replaced(tmp_path):
     folder = tmp_path / "run"
-    lock = create_run_folder(folder, {"kind": KIND, "name": "first"})
-    with pytest.raises(RunFolderError, match="another process is flying"):
-        make(folder, "second", replace=True)
-    with pytest.raises(RunFolderError, match="another process is flying"):
-        lock_run_folder(folder)
-    assert "first" in (folder / "config.json").read_text(encoding="utf-8")
-    os.close(lock)
+    with create_run_folder(folder, {"kind": KIND, "name": "first"}):
+        with pytest.raises(RunFolderError, match="another process is flying"):
+            make(folder, "second", replace=True)
+        with pytest.raises(RunFolderError, match="another process is flying"):
+            lock_run_folder(folder)
+        assert "first" in (folder / "config.json").read_text(encoding="utf-8")
     make(folder, "second", replace=True)
     assert "second" in (folder / "config.json").read_text(encoding="utf-8")
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
@@ -105,7 +105,7 @@ def renamed(self, target):
         os.kill(os.getpid(), signal.SIGKILL)
     return result
 Path.rename = renamed
-create_run_folder(Path({folder!r}), {{"kind": {kind!r}, "name": "second"}}, replace=True)
+create_run_folder(Path({folder!r}), {{"kind": {kind!r}, "name": "second"}}, replace=True).__enter__()
 """
 
 

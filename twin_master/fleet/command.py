@@ -131,24 +131,17 @@ def _heading(watched: "FleetWatch") -> str:
     return ", ".join(told)
 
 
-def worst_first(assets: "list[WatchedAsset]") -> "list[WatchedAsset]":
-    """Return assets with alarms, then those whose states are worst."""
-
-    def badness(asset: "WatchedAsset") -> tuple[int, float]:
-        health = (asset.decision or {"health": {}})["health"]
-        return asset.alarm_count, sum(known["mean"] for known in health.values())
-
-    return sorted(assets, key=badness, reverse=True)
-
-
 def _watched_table(watched: "FleetWatch") -> "Table":
     from rich import box
     from rich.table import Table
 
     from twin_master.mission.replay import health_in_words
 
-    told = [asset for asset in worst_first(list(watched.assets.values())) if asset.decision is not None]
-    rows = [(asset, asset.decision or {}) for asset in told[:ROWS]]
+    def badness(row: "tuple[WatchedAsset, dict[str, Any]]") -> tuple[int, float]:
+        return row[0].alarm_count, sum(known["mean"] for known in row[1]["health"].values())
+
+    told = [(asset, asset.decision) for asset in watched.assets.values() if asset.decision is not None]
+    rows = sorted(told, key=badness, reverse=True)[:ROWS]
     states = list(dict.fromkeys(name for _, decision in rows for name in decision["health"]))
     table = Table("asset", "turn", "control", *states, "next", "alarms", box=box.SIMPLE_HEAD)
     table.title = _heading(watched)
@@ -243,9 +236,7 @@ def fly_and_show(
     figures = _figures([outcome.folder])
     if json:
         told = {"folder": str(outcome.folder), "twins": outcome.twins, "failed": outcome.failed}
-        terminal.print_json(
-            told | {"failures": outcome.failures, "ended": outcome.ended, "groups": _plain(figures)}
-        )
+        terminal.print_json(told | {"failures": outcome.failures, "ended": outcome.ended, "groups": figures})
     else:
         _show(outcome, figures)
     return outcome
@@ -261,11 +252,13 @@ def _report(folder: Path) -> None:
 @told("compare")
 def compare(folders: list[Path], *, json: bool = False) -> None:
     """Show the figures of several fleets or ensembles side by side."""
+    from twin_master.fleet.reading import figure_rows
+
     figures = _figures(folders)
     if json:
-        terminal.print_json(_plain(figures))
+        terminal.print_json(figures)
     else:
-        _table(figures)
+        terminal.print_table(["figure", *figures], figure_rows(figures))
 
 
 Figures = dict[str, dict[str, "Estimated | int"]]
@@ -282,22 +275,11 @@ def _figures(folders: list[Path]) -> Figures:
     return found
 
 
-def _plain(figures: Figures) -> dict[str, Any]:
-    return {
-        name: {title: value if isinstance(value, int) else vars(value) for title, value in group.items()}
-        for name, group in figures.items()
-    }
-
-
-def _table(figures: Figures) -> None:
+def _show(outcome: "FleetOutcome", figures: Figures) -> None:
     from twin_master.fleet.reading import figure_rows
 
-    terminal.print_table(["figure", *figures], figure_rows(figures))
-
-
-def _show(outcome: "FleetOutcome", figures: Figures) -> None:
     console = terminal.console()
-    _table(figures)
+    terminal.print_table(["figure", *figures], figure_rows(figures))
     kept = f", {counted(outcome.shards_kept, 'shard')} there before" if outcome.shards_kept else ""
     rate = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s{kept}"
     short = f", {len(outcome.ended)} ended early" if outcome.ended else ""

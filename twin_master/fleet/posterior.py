@@ -216,22 +216,19 @@ def shared(grids: Sequence[Grid]) -> Shared:
         p = logistic(x)
         return np.asarray(np.exp(a[:, None] * np.log(p) + b[:, None] * np.log1p(-p) - betaln(a, b)[:, None]))
 
-    priors = [tuple(density(x) for x in own) for own in axes]
-    evidence = [
-        prior[0] @ likelihood if count == 1 else prior[0] @ likelihood @ prior[1].T
-        for prior, likelihood in zip(priors, likelihoods, strict=True)
-    ]
+    # One probability is two, of which the second says nothing.
+    priors = [[*(density(x) for x in own), np.ones((1, 1))][:2] for own in axes]
+    evidence = [first @ seen @ second.T for (first, second), seen in zip(priors, likelihoods, strict=True)]
     total = np.sum([np.log(np.maximum(one, 1e-300)) for one in evidence], axis=0)
     weight = np.exp(total - total.max())
     weight /= weight.sum()
     groups = []
-    for own, prior, likelihood, told in zip(axes, priors, likelihoods, evidence, strict=True):
-        share = weight / np.maximum(told, 1e-300)
-        joint = likelihood * (share @ prior[0] if count == 1 else prior[0].T @ share @ prior[1])
+    for own, (first, second), seen, told in zip(axes, priors, likelihoods, evidence, strict=True):
+        joint = seen * (first.T @ (weight / np.maximum(told, 1e-300)) @ second)
         joint /= joint.sum()
-        sums = (joint,) if count == 1 else (joint.sum(axis=1), joint.sum(axis=0))
-        groups.append(tuple(Line(x, np.asarray(one), logistic) for x, one in zip(own, sums, strict=True)))
-    hyper = (weight,) if count == 1 else (weight.sum(axis=1), weight.sum(axis=0))
+        sums = joint.sum(axis=1), joint.sum(axis=0)
+        groups.append(tuple(Line(x, np.asarray(one), logistic) for x, one in zip(own, sums, strict=False)))
+    hyper = (weight.sum(axis=1), weight.sum(axis=0))[:count]
     return Shared(
         tuple(_moments(one, means) for one in hyper),
         tuple(_moments(one, np.log10(sizes)) for one in hyper),
@@ -245,14 +242,14 @@ def _moments(weight: Float, values: Float) -> tuple[float, float]:
 
 
 def _resampled(grid: Grid, axes: tuple[Float, ...]) -> Float:
-    """Return the likelihood of a grid on finer axes of the same range; the largest is one."""
-    from scipy.interpolate import CubicSpline, RectBivariateSpline
+    """Return the likelihood of a grid on finer axes of the same range, FINE points each."""
+    from scipy.interpolate import RegularGridInterpolator
 
     # Far below the largest there is nothing but what would make the spline swing.
     log_likelihood = np.maximum(grid.log_likelihood - grid.log_likelihood.max(), -60.0)
-    if len(axes) == 1:
-        return np.asarray(np.exp(CubicSpline(grid.axes[0], log_likelihood)(axes[0])))
-    return np.asarray(np.exp(RectBivariateSpline(*grid.axes, log_likelihood)(*axes)))
+    fine = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    found = np.exp(RegularGridInterpolator(grid.axes, log_likelihood, method="cubic")(fine))
+    return np.asarray(found.reshape(FINE, -1))
 
 
 def population(nodes: Float, log_evidence: Float, scale: float) -> tuple[Line, Line]:

@@ -36,26 +36,26 @@ class Outcomes:
 
     Attributes
     ----------
-    delay : (N,)
-        Steps from the damage that calls for it to the fallback; infinite where there was none, NaN where
-        no damage called for it.
-    early : (N,)
-        Whether another control than the first was flown before the damage could be seen.
-    error, squared_error : (N, F)
-        Mean error of the filtered mean of each factor over the steps, and mean squared error, SI.
-    log_evidence : (N,)
+    within : Estimated
+        Share of the called-for fallbacks that came within `WITHIN` steps; NaN without any.
+    early : Estimated
+        Share of missions with a fallback before the damage could be seen.
+    rms, bias : tuple of Estimated
+        Of each factor, SI: root of the mean squared error of its filtered mean over all steps of all
+        missions, and the mean error.
+    evidence : Estimated
         Mean log evidence of a step.
-    credible : (N,)
+    credible : Estimated
         Share of the turns in which the true state lies in the smallest set of states that the filtered
         belief holds for `CREDIBILITY` probable.
     """
 
-    delay: Float
-    early: NDArray[np.bool_]
-    error: Float
-    squared_error: Float
-    log_evidence: Float
-    credible: Float
+    within: Estimated
+    early: Estimated
+    rms: tuple[Estimated, ...]
+    bias: tuple[Estimated, ...]
+    evidence: Estimated
+    credible: Estimated
 
     @classmethod
     def of(cls, stored: Mapping[Any, Any]) -> "Outcomes":
@@ -63,47 +63,17 @@ class Outcomes:
         flown = np.flatnonzero(np.asarray(stored["status"]) == FLOWN)
         kept = {
             name: np.asarray(stored[name])[flown].astype(np.float64)
-            for name in ("delay", "credible", "mean", "state", "log_evidence")
+            for name in ("delay", "early", "credible", "mean", "state", "log_evidence")
         }
-        error = kept["mean"] - kept["state"]
+        error = kept["mean"] - kept["state"]  # (N, T, F)
         return cls(
-            delay=kept["delay"],
-            early=np.asarray(stored["early"])[flown].astype(bool),
-            error=error.mean(axis=1),
-            squared_error=(error**2).mean(axis=1),
-            log_evidence=np.nanmean(kept["log_evidence"], axis=1),
-            credible=kept["credible"],
+            within=_share(kept["delay"][~np.isnan(kept["delay"])] <= WITHIN),
+            early=_share(kept["early"] > 0.0),
+            rms=tuple(_root(_mean(own)) for own in (error**2).mean(axis=1).T),
+            bias=tuple(_mean(own) for own in error.mean(axis=1).T),
+            evidence=_mean(np.nanmean(kept["log_evidence"], axis=1)),
+            credible=_mean(kept["credible"]),
         )
-
-    def within(self, steps: int) -> Estimated:
-        """Return the share of the called-for fallbacks that came within some steps; NaN without any."""
-        called = self.delay[~np.isnan(self.delay)]
-        return _share(called <= steps)
-
-    @property
-    def early_fallback(self) -> Estimated:
-        """Share of missions with a fallback before the damage."""
-        return _share(self.early)
-
-    def rms(self, factor: int) -> Estimated:
-        """Return the root of the mean squared error of one factor over all steps of all missions, SI."""
-        mean = _mean(self.squared_error[:, factor])
-        root = float(np.sqrt(mean.value))
-        return Estimated(root, mean.error / (2.0 * root) if root > 0.0 else 0.0)
-
-    def bias(self, factor: int) -> Estimated:
-        """Return the mean error of the filtered mean of one factor, SI."""
-        return _mean(self.error[:, factor])
-
-    @property
-    def evidence(self) -> Estimated:
-        """Mean log evidence of a step."""
-        return _mean(self.log_evidence)
-
-    @property
-    def credible_share(self) -> Estimated:
-        """Share of the turns in which the true state lies in its credible set."""
-        return _mean(self.credible)
 
 
 def _share(hits: NDArray[np.bool_]) -> Estimated:
@@ -122,6 +92,11 @@ def _mean(values: Float) -> Estimated:
     return Estimated(float(np.mean(values)), error)
 
 
+def _root(mean: Estimated) -> Estimated:
+    root = float(np.sqrt(mean.value))
+    return Estimated(root, mean.error / (2.0 * root) if root > 0.0 else 0.0)
+
+
 def open_fleet(folder: Path) -> "dict[str, xr.Dataset]":
     """Return the groups of a fleet by their names.
 
@@ -135,9 +110,7 @@ def open_fleet(folder: Path) -> "dict[str, xr.Dataset]":
 
 
 def noticed(group: "xr.Dataset", kind: str) -> NDArray[np.int64]:
-    """Return how many notices of a kind each twin gave; none in a store of a version that kept none."""
-    if "notices" not in group:
-        return np.zeros(group.sizes["twin"], dtype=np.int64)
+    """Return how many notices of a kind each twin gave."""
     return np.asarray(group["notices"].values[:, NOTICE_KINDS.index(kind)], dtype=np.int64)
 
 
@@ -213,19 +186,17 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
     if not found["flown"]:
         return found
     study = Outcomes.of(group)
-    if not len(study.error) or np.isnan(study.error).all():  # real assets: nobody knows the truth
-        return found | {"log evidence of a step": study.evidence}
-    called = bool(np.any(~np.isnan(study.delay)))
-    step = f"{group.attrs['step_name']}s"
-    if called:
-        found[f"fallback within {WITHIN} {step}, of those called for"] = study.within(WITHIN)
-    found["early fallback"] = study.early_fallback
-    for number, name in enumerate(group.attrs["factors"]):
-        found[f"filtered rms error of {name}"] = study.rms(number)
-        found[f"bias of {name}"] = study.bias(number)
-    found["log evidence of a step"] = study.evidence
-    found["true state in the 90 % set"] = study.credible_share
-    return found
+    if not np.isnan(study.bias[0].value):  # of real assets nobody knows the truth
+        if not np.isnan(study.within.value):
+            step = f"{group.attrs['step_name']}s"
+            found[f"fallback within {WITHIN} {step}, of those called for"] = study.within
+        found["early fallback"] = study.early
+        for name, rms, bias in zip(group.attrs["factors"], study.rms, study.bias, strict=True):
+            found[f"filtered rms error of {name}"], found[f"bias of {name}"] = rms, bias
+        found["log evidence of a step"] = study.evidence
+        found["true state in the 90 % set"] = study.credible
+        return found
+    return found | {"log evidence of a step": study.evidence}
 
 
 def figure_rows(groups: Mapping[str, Mapping[str, Estimated | int]]) -> list[list[str]]:

@@ -7,7 +7,7 @@ number of assets: a cell of a map for each, and tables of the few that matter.
 import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,13 +23,13 @@ from reporting.json_file import read_json
 from reporting.page import Column, Page, Words, numbers
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND as FLOWN_KIND
-from twin_master.fleet.flight import RESULT_NAME
 from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
 from twin_master.fleet.reading import WITHIN, figure_rows, group_figures, last_turns, leaving, noticed
-from twin_master.fleet.standing import STATE_NAME, read_standing
-from twin_master.fleet.store import ENDED, FAILED, has_flown, open_group
+from twin_master.fleet.standing import read_standing
+from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, has_flown, open_group
 from twin_master.fleet.watching import KIND as WATCHED_KIND
-from twin_master.mission.journal import JOURNAL_NAME, records
+from twin_master.mission.journal import JOURNAL_NAME
+from twin_master.mission.journal import records as records_of
 from twin_master.report.view import printed_factors
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.schema import Scenario
@@ -51,6 +51,7 @@ class Standing:
     `leaving` (B,) is the probability that a control is left soon; NaN where it is not known.
     """
 
+    group: str
     scenario: Scenario
     names: list[str]
     turn: NDArray[np.int64]
@@ -110,90 +111,71 @@ def fleet_page(folder: Path, most: int) -> str:
 
 def _add_flown(page: Page, folder: Path, records: list[dict[str, Any]], most: int) -> None:
     groups = {record["name"]: open_group(folder, record["name"]) for record in records}
-    page.add_paragraph(_opening(records, groups))
-    found = {name: group_figures(group) for name, group in groups.items()}
-    WORDS.add_table(page, "fared", figure_rows(found), more=list(found))
+    found = [_flown(record, groups[record["name"]]) for record in records]
+    page.add_paragraph(_opening(found, [*groups.values()]))
+    figures = {name: group_figures(group) for name, group in groups.items()}
+    WORDS.add_table(page, "fared", figure_rows(figures), more=list(figures))
     status = np.concatenate([group["status"].values for group in groups.values()])
-    failures = _failures(folder)
-    if failures:
-        _add_failures(page, failures, "All of them stand in fleet.json once the fleet has flown.",
-                      WORDS.say("lost", failed=len(failures), assets=len(status)))  # fmt: skip
+    failures: dict[str, str] = {}
+    for record, *_ in records_of(folder / JOURNAL_NAME):
+        failures |= record["failures"]
+    _add_failures(page, failures, "lost", assets=len(status))
     if ended := int(np.sum(status == ENDED)):
         page.add_notice(WORDS.say("short", ended=ended, assets=len(status)))
     _add_lessons(page, folder)
-    for record in records:
-        group, scenario = groups[record["name"]], Scenario.model_validate(record["scenarios"][0])
-        flown, last = has_flown(group["status"].values), last_turns(group)
-        at = (flown, last[flown])
+    for record, standing in zip(records, found, strict=True):
+        group = groups[record["name"]]
+        flown = has_flown(group["status"].values)
         page.add_section(f"Group {record['name']}")
         try:
-            chance = leaving(folder, record, group)[flown]
+            standing = replace(standing, leaving=leaving(folder, record, group)[flown])
         except TwinMasterError as error:
             page.add_paragraph(WORDS.say("unknown", error=error))
-            chance = np.full(len(flown), np.nan)
-        standing = Standing(
-            scenario, [record["members"][row][0] for row in flown], last[flown], group["mean"].values[at],
-            group["standard_deviation"].values[at],
-            [scenario.control_names[u] for u in group["control_index"].values[at]],
-            noticed(group, "alarm")[flown], chance,
-        )  # fmt: skip
         failed = int(np.sum(group["status"].values == FAILED))
         courses = group["mean"].values[flown], group["state"].values[flown]
         _add_group(page, standing, most, failed, courses)
 
 
-def _opening(records: list[dict[str, Any]], groups: "dict[str, xr.Dataset]") -> str:
-    """Return what a reader wants to know first: how many flew, how the control went, who is worst off."""
-    flown = {name: has_flown(group["status"].values) for name, group in groups.items()}
-    alarmed = {name: np.flatnonzero(noticed(group, "alarm")) for name, group in groups.items()}
-    turns = [groups[name]["first_notice"].values[rows, 0] for name, rows in alarmed.items() if len(rows)]
-    delay = np.concatenate([group["delay"].values[flown[name]] for name, group in groups.items()])
-    called = delay[~np.isnan(delay)]
-    worst: tuple[float, str] = (-1.0, "")
-    for record in records:
-        group, rows = groups[record["name"]], flown[record["name"]]
-        if len(rows):
-            last = group["mean"].values[rows, last_turns(group)[rows]]
-            row = int(np.argmax(last.sum(axis=1)))
-            factors = printed_factors(Scenario.model_validate(record["scenarios"][0]))
-            states = ", ".join(
-                f"{factor.title} {factor.scale * value:.3g} {factor.unit}".rstrip()
-                for factor, value in zip(factors, last[row].tolist(), strict=True)
-            )
-            told = f"{record['members'][rows[row]][0]} of {record['name']}: {states}"
-            worst = max(worst, (float(last[row].sum()), told))
-    return WORDS.say(
-        "opening", flown=sum(map(len, flown.values())), assets=sum(g.sizes["twin"] for g in groups.values()),
-        alarmed=sum(map(len, alarmed.values())), first=min((own.min() for own in turns), default=0),
-        called=len(called), share=float(np.mean(called <= WITHIN)) if len(called) else 0.0, within=WITHIN,
-        step=next(iter(groups.values())).attrs["step_name"], worst=worst[1],
+def _flown(record: dict[str, Any], group: "xr.Dataset") -> Standing:
+    """Return how the twins of a group stood after their last turn, but for what they would do next."""
+    scenario, flown = Scenario.model_validate(record["scenarios"][0]), has_flown(group["status"].values)
+    at = flown, last_turns(group)[flown]
+    return Standing(
+        record["name"], scenario, [record["members"][row][0] for row in flown], at[1],
+        group["mean"].values[at], group["standard_deviation"].values[at],
+        [scenario.control_names[u] for u in group["control_index"].values[at]],
+        noticed(group, "alarm")[flown], np.full(len(flown), np.nan),
     )  # fmt: skip
 
 
-def _failures(folder: Path) -> dict[str, str]:
-    """Return the failures of the shards that are done."""
-    found: dict[str, str] = {}
-    if not (folder / JOURNAL_NAME).is_file() and (folder / RESULT_NAME).is_file():  # of a version before
-        found = read_json(folder / RESULT_NAME, FleetError)["failures"]
-    for record, *_ in records(folder / JOURNAL_NAME):
-        found |= record["failures"]
-    return found
+def _opening(found: list[Standing], groups: "list[xr.Dataset]") -> str:
+    """Return what a reader wants to know first: how many flew, how the control went, who is worst off."""
+    delay = np.concatenate([group["delay"].values for group in groups])
+    first = np.concatenate([group["first_notice"].values[:, NOTICE_KINDS.index("alarm")] for group in groups])
+    alarmed = first[first >= 0]
+    called = delay[~np.isnan(delay)]
+    worst = max((one for one in found if one.names), key=lambda one: one.mean.sum(axis=1).max(), default=None)
+    row = 0 if worst is None else int(np.argmax(worst.mean.sum(axis=1)))
+    return WORDS.say(
+        "opening", flown=sum(len(one.names) for one in found), assets=len(delay),
+        alarmed=len(alarmed), first=min(alarmed, default=0),
+        called=len(called), share=float(np.mean(called <= WITHIN)) if len(called) else 0.0, within=WITHIN,
+        step=found[0].scenario.mission.step_name, worst=worst, row=row,
+        states=[] if worst is None else zip(printed_factors(worst.scenario), worst.mean[row], strict=True),
+    )  # fmt: skip
 
 
 def _add_watched(page: Page, folder: Path, groups: list[dict[str, Any]], most: int) -> None:
     record = read_standing(folder)
     known, failures = record["assets"], record["failures"]
     told = {name: asset for name, asset in known.items() if asset["last"] is not None}
-    silent = sorted(known.keys() - told.keys() - failures.keys())
     turns = sum(asset["last"]["turn"] + 1 for asset in told.values())
     alarms, refused = (sum(asset[name] for asset in known.values()) for name in ("alarms", "refused"))
     counts = [len(known), turns, alarms, refused, len(failures)]
     titles = ("assets", "turns", "alarms", "messages refused", "not watched")
     page.add_highlights([(str(count), title) for count, title in zip(counts, titles, strict=True)])
-    if failures:
-        notice = WORDS.say("not_watched", failed=len(failures), assets=len(known | failures))
-        _add_failures(page, failures, f"They stand in {STATE_NAME}.", notice)
-    if silent:
+    _add_failures(page, failures, "not_watched", assets=len(known | failures))
+    if silent := sorted(known.keys() - told.keys() - failures.keys()):
         page.add_notice(WORDS.say("silent", names=silent, most=most))
     _add_lessons(page, folder)
     for group in groups:
@@ -205,24 +187,25 @@ def _add_watched(page: Page, folder: Path, groups: list[dict[str, Any]], most: i
             for moment in ("mean", "standard_deviation")
         )
         turn, control = np.array([one["turn"] for one in last]), [one["control"] for one in last]
-        alarmed, leaving = (
-            np.array([asset[name] for asset in own.values()], np.float64) for name in ("alarms", "leaving")
-        )
-        standing = Standing(
-            scenario, [*own], turn, mean, deviation, control, alarmed.astype(np.int64), leaving
-        )
+        alarmed = np.array([asset["alarms"] for asset in own.values()], np.int64)
+        chance = np.array([asset["leaving"] for asset in own.values()], np.float64)
         page.add_section(f"Group {group['name']}")
-        _add_group(page, standing, most)
+        _add_group(
+            page,
+            Standing(group["name"], scenario, [*own], turn, mean, deviation, control, alarmed, chance),
+            most,
+        )
 
 
-def _add_failures(page: Page, failures: Mapping[str, str], where: str, notice: str) -> None:
-    """Add what ended flights or watches, by cause."""
-    page.add_notice(notice)
+def _add_failures(page: Page, failures: Mapping[str, str], notice: str, assets: int) -> None:
+    """Add what ended flights or watches, by cause; nothing without any."""
+    if failures:
+        page.add_notice(WORDS.say(notice, failed=len(failures), assets=assets))
     rows = []
     for sentence, count in Counter(failures.values()).most_common(FAILURES):
         names = [name for name, text in failures.items() if text == sentence]
         rows.append([sentence, str(count), ", ".join(names[:3]) + (", ..." if count > 3 else "")])
-    WORDS.add_table(page, "failures", rows, where=where)
+    WORDS.add_table(page, "failures", rows, watched=notice == "not_watched")
 
 
 def _add_lessons(page: Page, folder: Path) -> None:

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
@@ -33,9 +33,10 @@ from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one,
 from twin_master.mission.turns import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.feeds import Fed, file_feed
+from twin_master.watch.feeds import file_feed
 from twin_master.watch.growing import Place
-from twin_master.watch.intake import Intake, LiveFeed, RejectedFile
+from twin_master.watch.intake import Feed, Intake
+from twin_master.watch.message import Fed
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
@@ -52,7 +53,7 @@ def read_recording(path: Path, scenario: Scenario) -> tuple[Fed, ...]:
     return tuple(file_feed(path, scenario).messages(None))
 
 
-class _Recorded(LiveFeed):
+class _Recorded(Feed):
     """Messages as a feed."""
 
     def __init__(self, messages: Sequence[Fed]) -> None:
@@ -87,7 +88,7 @@ def _history(knowledge: Knowledge, messages: Sequence[Fed]) -> History:
     scenario = knowledge.scenario
     twin = knowledge.twin(lag=scenario.watch.lag)
     history = History(twin, scenario.observation.count)
-    intake, seen, late = Intake(scenario, _Recorded(messages), RejectedFile(None)), {}, False
+    intake, seen, late = Intake(scenario, _Recorded(messages)), {}, False
     lost: list[tuple[int, Notice]] = []
     for turn in operate(twin, intake, history.add):
         at = intake.observation_turn
@@ -204,8 +205,8 @@ class _Unpacked:
         return source
 
 
-_kept: dict[bytes, _Unpacked] = {}
-"""The last kit of this process: shards of a group follow each other."""
+_unpacked = lru_cache(maxsize=1)(_Unpacked)
+"""Gives the last kit of this process again: shards of a group follow each other."""
 
 
 def with_parameters(scenario: Scenario, parameters: Mapping[str, float]) -> Scenario:
@@ -226,10 +227,7 @@ def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
     members : sequence of Member
         B of them.
     """
-    if packed not in _kept:
-        _kept.clear()
-        _kept[packed] = _Unpacked(packed)
-    kit = _kept[packed]
+    kit = _unpacked(packed)
     recorded = [member.recording for member in members if member.recording is not None]
     flights = assimilated(kit.knowledge, recorded) if recorded else _flown(kit, members)
     failures, ended = (

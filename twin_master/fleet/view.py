@@ -13,10 +13,7 @@ from tornado.web import Application
 from reporting.errors import ReportingError
 from twin_master.errors import TwinMasterError
 from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.report import (
-    fleet_page,
-    fleet_record,
-)
+from twin_master.fleet.report import fleet_page, fleet_record
 from twin_master.fleet.standing import STATE_NAME
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.viewer.server import OWN_NAMES, handlers_of, serve_application, text_of
@@ -32,17 +29,12 @@ def is_fleet(folder: Path) -> bool:
     return fleet_record(folder) is not None
 
 
-def fleet_view(folder: Path) -> str:
-    """Return the page of a fleet as it stands; raises `FleetError` where there is none."""
-    return fleet_page(folder, WORST)
-
-
 class _Fleet:
     """The page, made again when the fleet has changed."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self.version, self._seen, self.html = 0, self._stamp(), fleet_view(folder)
+        self.version, self._seen, self.html = 0, self._stamp(), fleet_page(folder, WORST)
 
     def _stamp(self) -> str:
         names = (JOURNAL_NAME, STATE_NAME, LESSONS_NAME)
@@ -56,7 +48,7 @@ class _Fleet:
             try:
                 stamp = self._stamp()
                 if stamp != self._seen:
-                    self.html = await asyncio.to_thread(fleet_view, self._folder)
+                    self.html = await asyncio.to_thread(fleet_page, self._folder, WORST)
                     self.version, self._seen = self.version + 1, stamp
             except (TwinMasterError, ReportingError, OSError, ValueError):
                 continue  # it was just being written, or another fleet takes its place

@@ -110,7 +110,7 @@ class JournalFile:
         self.path, self._flush_seconds = folder / JOURNAL_NAME, flush_seconds
         self._flushed = time.monotonic()
         try:
-            next(records(self.path, config_hash=config_hash), None)
+            check_header(self.path, config_hash)
             self.size = next((end for _, _, end in records_backwards(self.path)), 0)
             self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
             os.truncate(self._descriptor, self.size)
@@ -166,9 +166,18 @@ def line_of(record: Mapping[str, Any]) -> bytes:
     return sha256(text).hexdigest().encode("ascii") + b" " + text + b"\n"
 
 
-def records(
-    path: Path, begin: int = 0, config_hash: str | None = None
-) -> Iterator[tuple[dict[str, Any], int, int]]:
+def check_header(path: Path, config_hash: str) -> None:
+    """Refuse a journal whose first line was changed or is damaged, or of another configuration."""
+    header = line_of({"config_hash": config_hash})
+    with suppress(FileNotFoundError), path.open("rb") as file:
+        found = file.readline()
+        if whole_record(found) is None and not header.startswith(found):  # nor cut off by a kill
+            raise damaged(path, 0, "it does not have the hash that stands before it")
+        if not header.startswith(found):
+            raise NotResumableError(said("mission.journal", path=path))
+
+
+def records(path: Path, begin: int = 0) -> Iterator[tuple[dict[str, Any], int, int]]:
     """Return the record of each whole line with where it begins and ends in bytes; the header is left out.
 
     A journal that does not exist, or whose header was cut off, has no lines.
@@ -178,35 +187,28 @@ def records(
     path : Path
     begin : int
         Of the first line, in bytes.
-    config_hash : str, optional
-        Of the configuration that it must belong to.
 
     Raises
     ------
     NotResumableError
-        A line was changed or is damaged, or the journal belongs to another configuration.
+        A line was changed or is damaged.
     """
     if path.exists():
         with path.open("rb") as file:
-            yield from records_of(file, path, begin, config_hash)
+            yield from records_of(file, path, begin)
 
 
-def records_of(
-    file: BinaryIO, path: Path, begin: int = 0, config_hash: str | None = None
-) -> Iterator[tuple[dict[str, Any], int, int]]:
+def records_of(file: BinaryIO, path: Path, begin: int = 0) -> Iterator[tuple[dict[str, Any], int, int]]:
     """Return the records of an open journal, see `records`."""
-    header = None if config_hash is None else line_of({"config_hash": config_hash})
     file.seek(begin)
     for line in file:
-        if not line.endswith(b"\n") and (begin or header is None or header.startswith(line)):
+        if not line.endswith(b"\n"):
             return  # cut off by a kill
         record = whole_record(line)
         if record is None:
             raise damaged(path, begin, "it does not have the hash that stands before it")
         if begin:
             yield record, begin, begin + len(line)
-        elif header is not None and line != header:
-            raise NotResumableError(said("mission.journal", path=path))
         begin += len(line)
 
 
@@ -276,7 +278,5 @@ def damaged(path: Path, begin: int, why: str) -> NotResumableError:
             number += end < begin
             whole[end < begin] += end != begin and whole_record(line) is not None
             end += len(line)
-    return NotResumableError(
-        f"line {number} of the journal {path} was changed or is damaged ({why}); {whole[True]} before it are "
-        f"whole, and {whole[False]} behind it: begin again with --replace."
-    )
+    found = {"line": number, "before": whole[True], "behind": whole[False]}
+    return NotResumableError(said("mission.damaged", path=path, why=why, **found))

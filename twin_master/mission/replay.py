@@ -97,10 +97,13 @@ class BelievedModel:
         The first turn that is filtered with it.
     knowledge : Knowledge
         Its predicted observations.
+    patch : Path or None
+        Of the model, where it has one.
     """
 
     from_turn: int
     knowledge: Knowledge
+    patch: Path | None = None
 
 
 def replay(
@@ -141,7 +144,6 @@ def replay(
     wanted = [] if first_turn is None else [first_turn]
     wanted += [] if question is None else [question.from_turn]
     seen: dict[int, Reading] = {}
-    decided: dict[int, int] = {}  # in a mission, where nothing that comes later changes what was known
     settled, last = (-1, b""), dict[str, Any]()
     behind, place = -1, 0  # the turn of the line behind, and where it begins
     for record, begin, _ in records_backwards(path, end):
@@ -161,24 +163,13 @@ def replay(
                 wanted.append(int(record["model"]["from_turn"]))
             elif "observed" in record:
                 seen.setdefault(int(record.get("observation_turn", turn)), reading_of(record))
-                if "intake" not in record:
-                    decided[turn] = int(record["next_control"])
         except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
             raise damaged(path, begin, f"it has another layout, {error}") from error
     found = filtered_again(seen, [*models, *([question] if question else [])], lag, settled)
-    again = {turn.concluded.turn: turn.concluded.next_control for turn in found.turns}
-    other = [turn for turn, control in decided.items() if again.get(turn, control) != control]
     if last and question is None and last["next_control"] != found.twin.proposed_control:
-        other.append(last["turn"])
-    if other:
-        begin_again = f"begin another watch, in another folder, with `--observations {path.parent}`"
-        raise NotResumableError(
-            said(
-                "mission.decided",
-                turn=min(other),
-                advice=begin_again if "intake" in last else "fly the mission again with --replace",
-            )
-        )
+        again = f"begin another watch, in another folder, with `--observations {path.parent}`"
+        advice = again if "intake" in last else "fly the mission again with --replace"
+        raise NotResumableError(said("mission.decided", turn=last["turn"], advice=advice))
     return found, last
 
 

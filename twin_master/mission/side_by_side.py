@@ -109,10 +109,14 @@ class _Stateless:
         self._truth = truths[0]  # script, drift and losses are the scenario's, the same for all
         self._before: tuple[Index | None, Index | None] = None, None
         self._seen: dict[tuple[int, int, bytes], Float | str] = {}
-        self.failure: dict[int, str] = {}
 
-    def turn(self, step: int, control: Index, flying: NDArray[np.bool_]) -> tuple[Float, Float]:
-        """Return what is observed (B, G + I) and the true states (B, F), under the controls (B,)."""
+    def turn(
+        self, step: int, control: Index, flying: NDArray[np.bool_], failure: list[str]
+    ) -> tuple[Float, Float]:
+        """Return what is observed (B, G + I) and the true states (B, F), under the controls (B,).
+
+        Why an asset shows nothing is put where the failures of the twins stand.
+        """
         place, state = self._grown(step, control)
         code = (self._asset * len(self._scenario.control) + control) * self._states.size + place
         _, first, inverse = np.unique(np.where(flying, code, -1), return_index=True, return_inverse=True)
@@ -120,7 +124,8 @@ class _Stateless:
         for row, twin in enumerate(first.tolist()):
             shown = self._shown(step, int(self._asset[twin]), int(control[twin]), state[twin])
             if isinstance(shown, str):
-                self.failure |= {int(other): shown for other in np.flatnonzero(inverse == row)}
+                for other in np.flatnonzero((inverse == row) & flying):
+                    failure[other] = shown
             else:
                 distinct[row] = shown
         observed = distinct[inverse] + self._noise[:, step] + self._truth.drift[step]
@@ -179,15 +184,15 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
                 how = decided_to_end(scenario, before[1][twin])
                 flights.ended[twin] = ended_sentence(scenario, step, how)
                 flying[twin] = False
-        observed, state = plants.turn(step, control, flying)
-        flying[[*plants.failure]] = False
+        observed, state = plants.turn(step, control, flying, flights.failure)
+        flying &= np.array(flights.failure) == ""
         observed[~flying] = np.nan
         likelihood = knowledge.sensor_model.log_likelihood_sequence(observed, control)
         found, failed = filter_many(model, control[:, None], likelihood[:, None], *before)
         now, impossible = found[:, 0], failed >= 0
         for twin in np.flatnonzero(impossible & flying).tolist():
             worst = knowledge.sensor_model.worst_residuals(observed[twin], int(control[twin]))
-            plants.failure[twin] = str(ImpossibleObservation(scenario.mission.name, step, worst))
+            flights.failure[twin] = str(ImpossibleObservation(scenario.mission.name, step, worst))
         flying &= ~impossible
         # Of a failed twin: anything that can be gone on with.
         now.filtered[impossible], now.log_filtered[impossible] = model.prior, model.log_prior
@@ -211,8 +216,6 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
                 model.transition, now.filtered[some], before[1][some], control[some], on_belief, inspecting,
                 budget,
             )  # fmt: skip
-    for twin, sentence in plants.failure.items():
-        flights.failure[twin] = sentence
     return flights
 
 

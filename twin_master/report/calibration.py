@@ -1,6 +1,6 @@
 """What the twin was told about the uncertain parameter of its model before it flew."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -9,7 +9,7 @@ from scipy.special import ndtr
 
 from reporting import figures as style
 from reporting.arrays import Float
-from reporting.words import number, parameter_title
+from reporting.words import parameter_title
 from twin_master.report.reading import Run
 
 
@@ -108,19 +108,3 @@ def _density_panel(axes: Axes, run: Run, label: str) -> None:
     axes.set_ylabel("density")
     axes.legend(loc="upper right", handlelength=1.5)
     style.panel_label(axes, label, "The uncertain parameter")
-
-
-def calibrated_rows(run: Run) -> Sequence[tuple[str, ...]]:
-    """Return title, mean, standard deviation, 95 % interval and unit of what the calibration file tells."""
-    kept = run.calibration
-    names = kept.get("correlation", {}).get("names", ()), kept.get("names", {}).get("quantities", ())
-    found = [
-        kept[group][name] for group, own in zip(("state", "quantities"), names, strict=True) for name in own
-    ]
-    return [
-        (
-            figure["title"], number(figure["mean"]), number(figure["standard_deviation"]),
-            " to ".join(map(number, figure["interval_95"])), "" if figure["unit"] == "1" else figure["unit"],
-        )
-        for figure in found
-    ]  # fmt: skip

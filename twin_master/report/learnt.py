@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from reporting import figures as style
 from reporting.arrays import Float
-from reporting.words import between, number, rounded
+from reporting.words import between, rounded
 from twin_master.report.reading import Run
 from twin_master.store.mission_result import LearntQuantity
 
@@ -33,7 +33,7 @@ def learnt_figure(run: Run) -> Figure:
     places = [axes for row in grid for axes in row]
     for axes, learnt in zip(places, whole, strict=False):
         _course(axes, run, learnt.course, learnt.prior, learnt.truth)
-        style.panel_label(axes, next(labels), label_of(learnt))
+        style.panel_label(axes, next(labels), learnt.label)
     if len(whole) % 2:
         places[len(whole)].remove()
         places[len(whole) - 1].set_subplotspec(
@@ -49,7 +49,7 @@ def learnt_figure(run: Run) -> Figure:
         )  # fmt: skip
         truth = None if learnt.truth is None else learnt.truth[chosen]
         _course(axes, run, learnt.course[:, chosen], learnt.prior[chosen], truth)
-        style.panel_label(axes, next(labels), label_of(learnt))
+        style.panel_label(axes, next(labels), learnt.label)
         axes.text(
             0.99, 0.97, run.sensors.titles[chosen], transform=axes.transAxes, ha="right", va="top",
             color=style.PRESENT,
@@ -59,11 +59,6 @@ def learnt_figure(run: Run) -> Figure:
         style.panel_label(beside, next(labels), f"After the last {run.step}")
     style.shared_legend(figure)
     return figure
-
-
-def label_of(learnt: LearntQuantity) -> str:
-    """Return title and unit of a learnt quantity."""
-    return f"{learnt.title} ({learnt.unit})" if learnt.unit else learnt.title
 
 
 def _steps(run: Run) -> Float:
@@ -108,21 +103,6 @@ def _last_panel(axes: Axes, run: Run, learnt: LearntQuantity, chosen: int) -> No
     axes.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 4, 5, 10], integer=True))
     axes.grid(axis="y")
     axes.set_xlabel(run.sensors.word, labelpad=1.0)
-
-
-def asset_rows(run: Run) -> list[tuple[str, ...]]:
-    """Return the last values of what was learnt of the whole asset, with their truths where one is known."""
-    whole = [learnt for learnt in run.learnt if not learnt.of_sensors]
-    truth = any(learnt.truth is not None for learnt in whole)
-    return [
-        (
-            label_of(learnt),
-            *(number(float(value)) for value in (*learnt.prior[:2], *learnt.course[-1, :2])),
-            between(*learnt.course[-1, 2:].tolist()),
-            *([number(None if learnt.truth is None else float(learnt.truth))] if truth else []),
-        )
-        for learnt in whole
-    ]
 
 
 def with_interval(figures: Float) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,26 +11,14 @@ from numpy.typing import ArrayLike
 from reporting.figures import to_png, to_svg
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.page import Page, ReportFigure
-from reporting.words import listing, number, parameter_title, small
+from reporting.words import listing, parameter_title, small
 from twin_master.assets.asset_source import calibrated_with
 from twin_master.assets.structure_source import FIELD_NAME
 from twin_master.errors import RunFolderError
 from twin_master.report.belief import belief_figure, policy_figure
-from twin_master.report.calibration import (
-    believed,
-    calibrated_rows,
-    calibration_figure,
-    measured,
-    true_value,
-)
+from twin_master.report.calibration import believed, calibration_figure, measured, true_value
 from twin_master.report.check import PredictiveCheck, check_figure, predictive_check
-from twin_master.report.learnt import (
-    asset_rows,
-    label_of,
-    learnt_figure,
-    sensor_rows,
-    with_interval,
-)
+from twin_master.report.learnt import learnt_figure, sensor_rows, with_interval
 from twin_master.report.mission import choose_sensors, default_now, mission_figure
 from twin_master.report.opening import WORDS, opening_sentences
 from twin_master.report.reading import Run, read_run
@@ -210,13 +198,8 @@ def _add_outcome(page: Page, run: Run) -> None:
         page.add_notice(text)
     figures = run.summary.get("figures", ())
     referred = any(figure["reference"] is not None for figure in figures)
-    rows = []
-    for figure in figures:
-        beside = "" if figure["reference"] is None else number(figure["reference"])
-        row = (figure["title"], number(figure["value"]), figure["unit"], beside, figure["reference_source"])
-        rows.append(row if referred else row[:3])
     points = " and ".join(factor.title for factor in run.factors if factor.unit == "%")
-    WORDS.add_table(page, "figures", rows, points=points, referred=referred)
+    WORDS.add_table(page, "figures", figures, points=points, referred=referred)
 
 
 def add_learnt(page: Page, run: Run) -> None:
@@ -224,28 +207,27 @@ def add_learnt(page: Page, run: Run) -> None:
     given = getattr(run.scenario.transition, "probability", {}) or {}
     plain = listing(f"{value:g} in {name}" for name, value in given.items() if isinstance(value, int | float))
     factor = any(learnt.name == "transition_factor" for learnt in run.learnt)
-    WORDS.add_table(page, "learnt_asset", asset_rows(run), run=run, factor=factor, plain=plain)
+    whole = [learnt for learnt in run.learnt if not learnt.of_sensors]
+    truth = any(learnt.truth is not None for learnt in whole)
+    WORDS.add_table(page, "learnt_asset", whole, run=run, factor=factor, plain=plain, truth=truth)
     own = [learnt for learnt in run.learnt if learnt.of_sensors]
     # The prior of the sensors is one, unless the scenario gives one for each.
     prior = "; ".join(
         f"{learnt.title.lower()} {with_interval(np.nanmedian(learnt.prior, axis=0))}" for learnt in own
     )
-    WORDS.add_table(
-        page,
-        "learnt_sensors",
-        sensor_rows(run),
-        run=run,
-        prior=prior,
-        more=[label_of(learnt) for learnt in own],
-    )
+    more = [learnt.label for learnt in own]
+    WORDS.add_table(page, "learnt_sensors", sensor_rows(run), run=run, prior=prior, more=more)
 
 
 def _add_calibrated(page: Page, run: Run) -> None:
     """Add what the calibration file says of the wing or the model, where the run flew with one."""
     kept = run.calibration
-    rows = calibrated_rows(run)
-    WORDS.add_table(page, "calibrated", rows, campaign=kept.get("campaign"), wing=kept.get("asset"))
-    for sentence in kept.get("findings", ()) if rows else ():
+    names = kept.get("correlation", {}).get("names", ()), kept.get("names", {}).get("quantities", ())
+    found = [
+        kept[group][name] for group, own in zip(("state", "quantities"), names, strict=True) for name in own
+    ]
+    WORDS.add_table(page, "calibrated", found, campaign=kept.get("campaign"), wing=kept.get("asset"))
+    for sentence in kept.get("findings", ()) if found else ():
         page.add_paragraph(sentence)
     asset, model = run.summary.get("asset"), run.summary.get("twin_model")
     told = asset and model and calibrated_with(kept, asset, model, run.config.get("inputs", {}))
@@ -300,20 +282,7 @@ def lost_ranges(run: Run) -> str:
 
 
 def _add_run(page: Page, run: Run) -> None:
-    levels, sensors = [len(factor.levels) for factor in run.factors], run.sensors
-    named = f": {', '.join(sensors.titles)}" if sensors.named else ""
-    rows: list[Sequence[str]] = [
-        (f"{run.step}s flown", str(run.steps)),
-        (f"{run.step}s predicted", str(run.horizon)),
-        ("states", f"{run.model.states.size} ({' × '.join(map(str, levels))})"),
-        ("controls", ", ".join(run.controls)),
-        (f"{sensors.word}s", f"{len(sensors.titles)}{named}"),
-        ("seed", _seed(run)),
-    ]
-    for title, key in (("asset", "asset"), ("model that the twin believes", "twin_model")):
-        if key in run.tree.attrs:
-            rows.append((title, str(run.tree.attrs[key])))
-    rows.append(("log evidence of all observations", f"{float(np.sum(run['filtered/log_evidence'])):.2f}"))
+    rows: list[Sequence[str]] = []
     monitors = run.tree["truth"].data_vars if run.truth is not None else {}
     for name, variable in monitors.items():
         strain = name == "strain_error_bound"
@@ -321,18 +290,7 @@ def _add_run(page: Page, run: Run) -> None:
         if variable.dims == ("step",) and unit != "1" and np.isfinite(variable.values).any():
             largest = scale * float(np.nanmax(variable.values))
             rows.append((f"largest {str(name).replace('_', ' ')}", f"{largest:.3g} {unit}"))
-    WORDS.add_table(page, "run", rows)
+    evidence = float(np.sum(run["filtered/log_evidence"]))
+    WORDS.add_table(page, "run", rows, run=run, seed=_seed(run), evidence=evidence)
     page.add_paragraph(WORDS.say("timing"))
-    WORDS.add_table(page, "provenance", _origin(run.config))
-
-
-def _origin(config: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return versions and hashes as the configuration keeps them."""
-    origin = config.get("provenance", {})
-    found = [("software", origin.get("versions"), 99), ("sources", origin.get("source_hashes"), 12)]
-    found += [("inputs", origin.get("input_hashes"), 12), ("inputs", config.get("inputs"), 12)]
-    return [
-        (title, ", ".join(f"{name} {str(value)[:digits]}" for name, value in sorted(own.items())))
-        for title, own, digits in found
-        if own
-    ]
+    WORDS.add_table(page, "provenance", origin=run.config.get("provenance", {}), config=run.config)

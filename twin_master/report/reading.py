@@ -19,16 +19,11 @@ from twin_master.report.view import PrintedFactor, PrintedSensors, printed_facto
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.store.mission_result import MOMENTS, SCHEMA, LearntQuantity, printed_learnt, titles_of
+from twin_master.store.mission_result import MOMENTS, LearntQuantity, printed_learnt, titles_of
 from twin_master.store.writing import RUN_NAME, SUMMARY_NAME, open_run
 
 if TYPE_CHECKING:
     import xarray as xr
-
-
-_GROUPS = ("observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth")
-"""Groups that are read; the last one not every run has."""
-_UNREAD = ("noise_standard_deviation", "residual", "sensors_received", "sensor_status")
 
 
 @dataclass(frozen=True)
@@ -54,8 +49,20 @@ class Run:
     calibration: Mapping[str, Any]
 
     def __getitem__(self, path: str) -> Float:
-        """Return a variable."""
-        return np.asarray(self.tree[path].values)
+        """Return a variable.
+
+        Raises
+        ------
+        RunFolderError
+            The run is of another version, which did not have it.
+        """
+        try:
+            return np.asarray(self.tree[path].values)
+        except KeyError as error:
+            raise RunFolderError(
+                f"{RUN_NAME} does not have the layout of a run of this version (the variable {path} is "
+                "missing): fly the run again."
+            ) from error
 
     def get(self, path: str) -> Float | None:
         """Return a variable; None where the run does not have it."""
@@ -161,7 +168,7 @@ def read_run(folder: Path, tree: "xr.DataTree | None" = None) -> Run:
     Raises
     ------
     RunFolderError
-        There is no ``run.nc``, it is damaged, or it has another layout.
+        There is no ``run.nc``, or it is damaged.
     """
     tree = open_run(folder) if tree is None else tree
     config, summary, calibration = (
@@ -171,31 +178,7 @@ def read_run(folder: Path, tree: "xr.DataTree | None" = None) -> Run:
         scenario = parse_scenario(config.get("scenario", {}), str(folder / CONFIG_NAME))
     except TwinMasterError as error:
         raise RunFolderError(f"{error} The run cannot be shown: fly it again.") from error
-    run = Run(tree, scenario, config, summary, calibration)
-    try:
-        _check(run)
-    except (KeyError, ValueError, IndexError, TypeError) as error:
-        reason = error.args[0] if error.args else error
-        raise RunFolderError(
-            f"{folder / RUN_NAME} does not have the layout of a run of this version ({reason}): fly the run "
-            "again."
-        ) from error
-    return run
-
-
-def _check(run: Run) -> None:
-    """Refuse another layout; the figures rely on it."""
-    for group in _GROUPS if "truth" in run.tree.children else _GROUPS[:-1]:
-        lead = "step horizon" if group == "predicted" else "step"
-        own = SCHEMA["belief"] if group in ("filtered", "smoothed", "predicted") else {}
-        for key, (axes, *_) in (own | SCHEMA[group]).items():
-            if key in _UNREAD or ("{" in key and key != "{role}"):
-                continue
-            name, wanted = key.format(role=run.sensors.quantity), tuple(axes.format(lead=lead).split())
-            if group not in run.tree.children or name not in run.tree[group]:
-                raise ValueError(f"the variable {group}/{name} is missing")
-            if run.tree[group][name].dims != wanted:
-                raise ValueError(f"{name} has the axes {run.tree[group][name].dims} and not {wanted}")
+    return Run(tree, scenario, config, summary, calibration)
 
 
 def _read_json(path: Path) -> dict[str, Any]:

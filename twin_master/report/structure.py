@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from fe.elements.cells import CellMesh
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.structure.design import MeshDesign, load_structure
 from fe.wing.design import WingDesign, load_design
@@ -134,14 +134,15 @@ class StructurePicture(NamedTuple):
 def mesh_figure(run: Run, folder: Path, residual: Float) -> StructurePicture:
     """Draw the surface of a structure, regions by what they have lost, gauges by residual (G,)."""
     mesh = meshio_with_wedges().read(folder / FIELD_NAME)
-    kind = KINDS[mesh.cells[0].type]
+    body = CellMesh(KINDS[mesh.cells[0].type], mesh.points, np.asarray(mesh.cells[0].data))
     loss = np.asarray(mesh.cell_data["stiffness_loss"][0], dtype=np.float64)
     region = np.asarray(mesh.cell_data["region"][0])
     displacement = np.asarray(mesh.point_data["displacement"], dtype=np.float64)
     largest = float(np.linalg.norm(displacement, axis=1).max())
     size = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
     scale = _LENGTH * size / largest if largest > 0.0 else 0.0
-    cells, corners = surface(kind.faces, np.asarray(mesh.cells[0].data))
+    cells, faces, _ = body.outer_faces
+    corners = [body.cells[cell, list(body.kind.faces[face])] for cell, face in zip(cells, faces, strict=True)]
     points = np.asarray(mesh.points + scale * displacement)
     # seen from above, in front and the right; what is farther is drawn first
     turn, tilt = np.radians(-60.0), np.radians(28.0)
@@ -176,16 +177,3 @@ def _gauge_places(folder: Path, count: int) -> Float | None:
     if not isinstance(structure, MeshDesign) or len(structure.gauge) != count:
         return None
     return structure.unit * np.array([gauge.point for gauge in structure.gauge])
-
-
-def surface(
-    faces: tuple[tuple[int, ...], ...], cells: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
-    """Return the cell and the corners of each face that belongs to one cell alone."""
-    found: dict[tuple[int, ...], tuple[int, NDArray[np.int64]] | None] = {}
-    for face in faces:
-        for number, nodes in enumerate(cells[:, list(face)]):
-            key = tuple(sorted(nodes.tolist()))
-            found[key] = None if key in found else (number, nodes)
-    outer = [entry for entry in found.values() if entry is not None]
-    return np.array([number for number, _ in outer]), [nodes for _, nodes in outer]

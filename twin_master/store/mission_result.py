@@ -63,6 +63,11 @@ class LearntQuantity:
         return self.course.ndim == 3
 
     @property
+    def label(self) -> str:
+        """Title and unit."""
+        return f"{self.title} ({self.unit})" if self.unit else self.title
+
+    @property
     def words(self) -> dict[str, str]:
         """What names it in the schema of `run.nc`."""
         of = "sensor" if self.of_sensors else ""

@@ -78,14 +78,8 @@ def tree_of(groups: Mapping[str, Group], attributes: Mapping[str, Any]) -> "Data
     """Return groups as `open_run` returns them, without a file."""
     import xarray as xr
 
-    sets = {"/": xr.Dataset(attrs=attributes)}
-    for name, group in groups.items():
-        variables, coordinates = (
-            {key: (one.dims, one.values, one.attrs) for key, one in own.items()}
-            for own in (group.variables, group.coords)
-        )
-        sets[name] = xr.Dataset(variables, coordinates, group.attrs)
-    return xr.DataTree.from_dict(sets)
+    sets = {name: xr.Dataset(one.variables, one.coords, one.attrs) for name, one in groups.items()}
+    return xr.DataTree.from_dict({"/": xr.Dataset(attrs=attributes), **sets})
 
 
 def store_flight(

@@ -5,13 +5,12 @@ from them is computed here, as the run does it, so that every number is that of 
 """
 
 import os
-from array import array
-from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -21,25 +20,18 @@ from reporting.json_file import read_json
 from twin_master.errors import RunFolderError
 from twin_master.learning.expectation import Expected, expected_of
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
-from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
+from twin_master.mission.preparation import KNOWLEDGE_NAME, kept_knowledge
 from twin_master.network.estimator import Learnt
 from twin_master.network.inference import known_control, predict
-from twin_master.run_folder import PICTURE, VERDICT, read_config
-from twin_master.scenario.reading import parse_scenario
-from twin_master.scenario.schema import Scenario
+from twin_master.run_folder import PICTURE, VERDICT, kept_scenario
+from twin_master.sentences import said
 
 TURNS_AT_ONCE = 200
 """Turns that are read before the viewers are answered again."""
-TURNS_KEPT = 512
-"""Turns in memory, those read last: more than two pages show at once."""
 
 
 Record = dict[str, Any]
 """What a line of the journal says."""
-
-
-class BegunAnewError(LookupError):
-    """Another flight has taken the place of the one that is looked at."""
 
 
 class Belief(NamedTuple):
@@ -104,23 +96,41 @@ class Flight:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        config = read_config(folder)
-        self.scenario: Scenario = parse_scenario(config["scenario"], str(folder))
-        self._knowledge_of = self._kept_at()
-        self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
-        self._path, self._end, self._file_number = folder / JOURNAL_NAME, 0, 0
-        # Where in the journal stand belief and observation of each turn; in memory are those last read.
-        self._believed, self._observed = array("q"), array("q")
-        self._kept: OrderedDict[int, Record] = OrderedDict()
-        self._told: dict[int, list[Record]] = {}  # notices behind a turn, where none came
-        self.pictures: list[Picture] = []
+        self.folder, self._path = folder, folder / JOURNAL_NAME
+        self.scenario = kept_scenario(folder)
         self.number = 0
+        self._know()
+        self._forget(0)
+
+    def _know(self) -> None:
+        """Read what the twin knows."""
+        self._known_at = self._knowledge_stamp()
+        self.knowledge = kept_knowledge(self.folder, self.scenario)
+        self.number += 1
+
+    def _knowledge_stamp(self) -> tuple[int, int] | None:
+        """Return what tells the file of what the twin knows from another that took its place."""
+        with suppress(FileNotFoundError):
+            found = (self.folder / KNOWLEDGE_NAME).stat()
+            return found.st_ino, found.st_mtime_ns
+        return None
+
+    def _forget(self, file: int) -> None:
+        """Begin with a file, by its number."""
+        self._file, self._end = file, 0
+        self._places: list[list[int]] = []  # of belief and observation of each turn, in bytes
+        self._told: defaultdict[int, list[Record]] = defaultdict(list)  # notices behind it, where none came
+        self.pictures: list[Picture] = []
+        self.number += 1
+
+    def _begun_anew(self, found: os.stat_result) -> bool:
+        """Return whether another file took the place of the journal, or lines were taken back."""
+        return found.st_ino != self._file or found.st_size < self._end
 
     @property
     def turns(self) -> int:
         """Number of turns seen so far."""
-        return len(self._believed)
+        return len(self._places)
 
     def update(self) -> bool:
         """Take in what is new in the journal, at most `TURNS_AT_ONCE`; return whether there was any.
@@ -130,95 +140,34 @@ class Flight:
         RunFolderError
             The journal was changed.
         """
-        changed = self._begun_anew()
-        if changed:
-            self._end = self._file_number = 0
-            self._believed, self._observed = array("q"), array("q")
-            self._kept.clear()
-            self._told.clear()
-            self.pictures.clear()
-            self.number += 1
-        if (kept := self._kept_at()) != self._knowledge_of:  # a patched model was adopted
-            self._knowledge_of = kept
-            self.knowledge = kept_knowledge(self.folder, self.scenario)
-            self.number += 1
-            changed = True
-        news = self._news()
-        for place, record in news:
-            if "filtered" not in record:
-                self._take_in(record)
-            elif record["turn"] == self.turns:
-                self._believed.append(place)
-                self._observed.append(place)
-                self._keep(record["turn"], record)
-            else:
-                self._revise(record, place)
-        return changed or bool(news)
-
-    def _begun_anew(self) -> bool:
-        """Return whether another file took the place of the journal, or lines were taken back."""
-        try:
-            found = self._path.stat()
-        except FileNotFoundError:
-            return False
-        return found.st_size < self._end or self._file_number not in (0, found.st_ino)
-
-    def _news(self) -> list[tuple[int, Record]]:
-        """Return whole new records, at most `TURNS_AT_ONCE`, and where each begins, in bytes."""
-        found: list[tuple[int, Record]] = []
-        if not self._path.is_file() or self._path.stat().st_size == self._end:
-            return found
+        number, end = self.number, self._end
+        if self._knowledge_stamp() != self._known_at:  # a patched model was adopted
+            self._know()
         with suppress(FileNotFoundError), self._path.open("rb") as file:
-            self._file_number = os.fstat(file.fileno()).st_ino
-            for record, begin, end in islice(records_of(file, self._path, self._end), TURNS_AT_ONCE):
-                found.append((begin, record))
-                self._end = end
-        return found
+            if self._begun_anew(found := os.fstat(file.fileno())):
+                self._forget(found.st_ino)
+            for record, begin, behind in islice(records_of(file, self._path, self._end), TURNS_AT_ONCE):
+                self._take_in(record, begin)
+                self._end = behind
+        return (self.number, self._end) != (number, end)
 
-    def _read(self, places: Sequence[int]) -> list[Record]:
-        """Return records that were news; `BegunAnewError` where the journal was begun anew since."""
-        with suppress(FileNotFoundError), self._path.open("rb") as file:
-            if os.fstat(file.fileno()).st_ino == self._file_number:
-                return [next(records_of(file, self._path, place))[0] for place in places]
-        raise BegunAnewError
-
-    def _take_in(self, record: Mapping[str, Any]) -> None:
-        """Take in what a watch noted where no turn came: notices, a verdict, a model that was adopted."""
+    def _take_in(self, record: Record, place: int) -> None:
+        """Take in a turn, an observation that came late, or what a watch noted where none came."""
+        if "filtered" in record and record["turn"] == self.turns:
+            self._places.append([place, place])
+            return
         turn = max(self.turns - 1, 0)
-        if notices := record.get("notices"):
-            self._told[turn] = self._told.get(turn, []) + notices
-            self.number += 1
+        if "filtered" in record:
+            late = int(record.get("observation_turn", int(record["turn"])))
+            if not 0 <= late <= record["turn"] == self.turns - 1:
+                told = f"{self.scenario.mission.step_name} {record['turn']}"
+                raise RunFolderError(said("watch.turn", folder=self.folder, told=told, turns=self.turns))
+            self._places[-1][0] = self._places[late][1] = place
+        self._told[turn] += [] if "filtered" in record else record.get("notices", [])
         verdict = record.get("model", {}).get("verdict", record.get("verdict", {}).get("folder", ""))
-        if verdict and (found := _picture(turn, self.folder / verdict)):
-            self.pictures.append(found)
-            self.number += 1
-
-    def _kept_at(self) -> tuple[int, int] | None:
-        """Return what tells the file of what the twin knows from another that took its place."""
-        try:
-            found = (self.folder / KNOWLEDGE_NAME).stat()
-        except FileNotFoundError:
-            return None
-        return found.st_ino, found.st_mtime_ns
-
-    def _revise(self, record: Record, place: int) -> None:
-        """Take in an observation that came late: it stands in its turn, and the last belief has changed."""
-        turn = int(record["turn"])
-        observed = int(record.get("observation_turn", turn))
-        if not 0 <= observed <= turn == self.turns - 1:
-            raise RunFolderError(
-                f"the journal in {self.folder} tells {self.scenario.mission.step_name} {turn} where "
-                f"{self.turns} was expected: it is of another version."
-            )
-        self._believed[-1] = self._observed[observed] = place
-        self._kept.pop(turn, None)
-        self._kept.pop(observed, None)
+        picture = _picture(turn, self.folder / verdict) if verdict else None
+        self.pictures += [picture] if picture else []
         self.number += 1
-
-    def _keep(self, turn: int, record: Record) -> None:
-        self._kept[turn] = record
-        if len(self._kept) > TURNS_KEPT:
-            self._kept.popitem(last=False)
 
     def seen(self, first: int, end: int) -> list[Record]:
         """Return what the journal says of the turns first..end - 1.
@@ -227,44 +176,41 @@ class Flight:
 
         Raises
         ------
-        BegunAnewError
+        FileNotFoundError
             Another flight has taken the place of this one; `update` tells it.
         """
-        found = {turn: self._kept[turn] for turn in range(first, end) if turn in self._kept}
-        missing = [turn for turn in range(first, end) if turn not in found]
-        late = [turn for turn in missing if self._observed[turn] != self._believed[turn]]
-        found |= zip(missing, self._read([self._believed[turn] for turn in missing]), strict=True)
-        for turn, own in zip(late, self._read([self._observed[turn] for turn in late]), strict=True):
-            found[turn] = found[turn] | {name: own[name] for name in ("observed", "control_index")}
-        for turn in missing:
-            self._keep(turn, found[turn])
-        for turn in found.keys() & self._told.keys():
-            found[turn] = found[turn] | {"notices": found[turn].get("notices", []) + self._told[turn]}
-        return [found[turn] for turn in range(first, end)]
+        with self._path.open("rb") as file:
+            if self._begun_anew(os.fstat(file.fileno())):
+                raise FileNotFoundError(self._path)
+            return [self._turn(file, turn) for turn in range(first, end)]
 
-    def observed(self, first: int, end: int) -> Float:
-        """Return what the sensors said in turns first..end - 1: (n, G), SI; NaN where lost."""
+    def _turn(self, file: BinaryIO, turn: int) -> Record:
+        believed, observed = self._places[turn]
+        record = next(records_of(file, self._path, believed))[0]
+        if observed != believed:
+            own = next(records_of(file, self._path, observed))[0]
+            record |= {name: own[name] for name in ("observed", "control_index")}
+        return record | {"notices": record.get("notices", []) + self._told.get(turn, [])}
+
+    def observed(self, turns: Sequence[Record]) -> Float:
+        """Return what the sensors said in n turns: (n, G), SI; NaN where lost."""
         sensors = self.scenario.observation.count
-        return np.array([array_of(turn["observed"][:sensors]) for turn in self.seen(first, end)])
+        return np.array([array_of(turn["observed"][:sensors]) for turn in turns])
 
-    def truth(self, first: int, end: int) -> Float:
-        """Return the true state of turns first..end - 1: (n, K), SI; NaN where nobody knows it."""
-        unknown = np.full(len(self.scenario.state), np.nan)
-        return np.array(
-            [array_of(turn["state"]) if "state" in turn else unknown for turn in self.seen(first, end)]
-        )
+    def truth(self, turns: Sequence[Record]) -> Float:
+        """Return the true state of n turns: (n, K), SI; NaN where nobody knows it."""
+        unknown = [None] * len(self.scenario.state)
+        return np.array([array_of(turn.get("state", unknown)) for turn in turns])
 
-    def believed(self, first: int, end: int) -> Belief:
-        """Return what the twin believed of each of the turns first..end - 1 when it was flown."""
-        turns = self.seen(first, end)
+    def believed(self, turns: Sequence[Record]) -> Belief:
+        """Return what the twin believed of each of n turns when it was flown."""
         joint = known_control(
             np.array([turn["filtered"] for turn in turns]),
             [turn["control_index"] for turn in turns],
             len(self.knowledge.model.controls),
         )
-        decided = np.array([turn["decision_probability"] for turn in turns])
-        observed = self.observed(first, end)
-        if self.knowledge.expectation is None or not turns:
+        decided, observed = np.array([turn["decision_probability"] for turn in turns]), self.observed(turns)
+        if self.knowledge.expectation is None:
             return self._belief(joint, observed, decided)
         parts = []
         for turn, own, seen in zip(turns, joint, observed, strict=True):
@@ -273,15 +219,14 @@ class Flight:
         together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
         return Belief(joint.sum(axis=-1), Expected(**together), decided)
 
-    def predicted(self, turn: int) -> Belief:
+    def predicted(self, turn: Record) -> Belief:
         """Return what the twin expected after a turn of the H turns to come."""
         model, plan = self.knowledge.model, self.knowledge.plan
-        seen = self.seen(turn, turn + 1)[0]
-        horizon, filtered = self.scenario.mission.prediction_steps, array_of(seen["filtered"])
-        coming = predict(model, filtered, seen["control_index"], plan.policy, horizon)
+        horizon, filtered = self.scenario.mission.prediction_steps, array_of(turn["filtered"])
+        coming = predict(model, filtered, turn["control_index"], plan.policy, horizon)
         if self.knowledge.expectation is None:
             return self._belief(coming.joint, None, coming.control_probability)
-        expected = self.knowledge.expectation.of_marginals(_learnt(seen), coming.joint, slice(None), None)
+        expected = self.knowledge.expectation.of_marginals(_learnt(turn), coming.joint, slice(None), None)
         return Belief(coming.joint.sum(axis=-1), expected, coming.control_probability)
 
     def _belief(self, joint: Float, observed: Float | None, control_probability: Float) -> Belief:

@@ -5,6 +5,7 @@ One that was away, or is slow, asks for more at once, and nothing is kept for it
 """
 
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from pathlib import Path
@@ -16,6 +17,8 @@ from markupsafe import Markup
 from pydantic import BaseModel
 
 from reporting.arrays import Float
+from reporting.errors import ReportingError
+from twin_master.errors import TwinMasterError
 from twin_master.mission.preparation import Knowledge
 from twin_master.report.structure import Planform, design_of, planform_of
 from twin_master.report.view import (
@@ -26,7 +29,7 @@ from twin_master.report.view import (
     printed_sensors,
 )
 from twin_master.scenario.schema import REWARD_NAMES, Scenario
-from twin_master.viewer.flight import BegunAnewError, Belief, Flight
+from twin_master.viewer.flight import Belief, Flight, Record
 
 WINDOW = 240
 """Turns that a page shows at once."""
@@ -125,6 +128,10 @@ class Request(BaseModel, frozen=True, extra="forbid", strict=True):
     count: int
 
 
+Tell = Callable[[str], None]
+"""Tells a viewer an answer."""
+
+
 class Teller:
     """Answers of one flight, for any number of viewers.
 
@@ -137,9 +144,37 @@ class Teller:
     """
 
     def __init__(self, flight: Flight, scene: Scene) -> None:
-        self._flight = flight
-        self._scene = scene
-        self._kept: dict[tuple[str, int, int, int], str] = {}
+        self._flight, self._scene = flight, scene
+        self._waiting: dict[Tell, Request] = {}
+        self._fault = ""
+
+    def ask(self, tell: Tell, request: Request) -> None:
+        """Answer a viewer now or as soon as there is something new; a newer request replaces an older one."""
+        self._waiting[tell] = request
+        self._tell(tell)
+
+    def leave(self, tell: Tell) -> None:
+        """Forget a viewer."""
+        self._waiting.pop(tell, None)
+
+    def look(self) -> None:
+        """Take in what was flown, and answer those who wait for it."""
+        try:
+            if self._fault or not self._flight.update():
+                return
+        except (TwinMasterError, ReportingError) as error:
+            self._fault = str(error)
+        for tell in list(self._waiting):
+            self._tell(tell)
+
+    def _tell(self, tell: Tell) -> None:
+        if self._fault:
+            tell(json.dumps({"error": self._fault}))
+        request = self._waiting.get(tell)  # one that cannot be told any more has left
+        answer = None if request is None else self.answer(request)
+        if answer is not None:
+            del self._waiting[tell]
+            tell(answer)
 
     def answer(self, request: Request) -> str | None:
         """Return the answer to a request; None while there is nothing new to say."""
@@ -153,56 +188,43 @@ class Teller:
         first, end = max(0, turn + 1 - WINDOW), turn + 1
         if same and request.first <= first <= request.end:  # what is missing follows what it holds
             first = min(request.end, end)
-        heading = {
+        try:
+            seen = self._flight.seen(min(first, turn), end)
+        except FileNotFoundError:
+            return None
+        answer: dict[str, Any] = {
             "number": request.number,
             "flight": self._flight.number,
             "count": count,
             "turn": turn,
             "first": first,
             "picture": self._picture(turn),
+            "past": self._past(seen) if first < end else None,
+            "ahead": None,
         }
-        try:
-            past = self._text("past", first, end) if first < end else "null"
-            ahead = "null" if same and request.shown == turn else self._text("ahead", turn, turn + 1)
-        except BegunAnewError:
-            return None
-        return f'{json.dumps(heading)[:-1]}, "past": {past}, "ahead": {ahead}}}'
+        if not (same and request.shown == turn):
+            answer["ahead"] = self._printed(self._flight.predicted(seen[-1]), None)
+        return json.dumps(answer, allow_nan=False)
 
     def _picture(self, turn: int) -> dict[str, str] | None:
         """Return the missing force that was known at a turn: where it is drawn, and what the verdict says."""
         known = [number for number, item in enumerate(self._flight.pictures) if item.turn <= turn]
         if not known:
             return None
-        address = f"missing_force.svg?flight={self._flight.number}&picture={known[-1]}"
+        address = f"missing_force_{known[-1]}.svg?flight={self._flight.number}"
         return {"address": address, "said": self._flight.pictures[known[-1]].said}
 
-    def _text(self, what: str, first: int, end: int) -> str:
-        """Return a part of an answer; viewers that follow a flight ask for the same one."""
-        key = (what, self._flight.number, first, end)
-        if key not in self._kept:
-            if len(self._kept) > 8:
-                self._kept.clear()
-            record = self._past(first, end) if what == "past" else self._ahead(first)
-            self._kept[key] = json.dumps(record, allow_nan=False)
-        return self._kept[key]
-
-    def _past(self, first: int, end: int) -> dict[str, Any]:
-        flight, scene = self._flight, self._scene
-        believed, observed = flight.believed(first, end), flight.observed(first, end)
-        seen, folder = flight.seen(first, end), f" {flight.folder}"
-        scales = np.array([factor.scale for factor in scene.factors])
-        return self._printed(believed, observed) | {
+    def _past(self, seen: Sequence[Record]) -> dict[str, Any]:
+        flight, folder = self._flight, f" {self._flight.folder}"
+        scales = np.array([factor.scale for factor in self._scene.factors])
+        return self._printed(flight.believed(seen), flight.observed(seen)) | {
             "control": [turn["control_index"] for turn in seen],
             "notices": [
-                [notice["sentence"].replace(" DIR", folder) for notice in turn.get("notices", ())]
-                for turn in seen
+                [notice["sentence"].replace(" DIR", folder) for notice in turn["notices"]] for turn in seen
             ],
             "learnt": [turn.get("learnt", {}) for turn in seen],
-            "truth": _plain(scales * flight.truth(first, end)),
+            "truth": _plain(scales * flight.truth(seen)),
         }
-
-    def _ahead(self, turn: int) -> dict[str, Any]:
-        return self._printed(self._flight.predicted(turn), None)
 
     def _printed(self, belief: Belief, observed: Float | None) -> dict[str, Any]:
         """Return lists, a row for each turn, in printed units; None stands for what there is not."""

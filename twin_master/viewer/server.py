@@ -1,7 +1,6 @@
 """The server of the page: on the loopback only, everything from the package, nothing from outside."""
 
 import asyncio
-import json
 import os
 from collections.abc import Callable, Mapping
 from importlib import resources
@@ -14,9 +13,9 @@ from tornado.netutil import bind_sockets
 from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
-from reporting.errors import ReportingError
 from reporting.page import script_source
-from twin_master.errors import TwinMasterError, ViewError
+from twin_master.errors import ViewError
+from twin_master.sentences import said
 from twin_master.viewer.flight import Flight
 from twin_master.viewer.messages import Request, Teller, page_html, scene_of
 
@@ -37,85 +36,48 @@ HEADERS = {
 }
 
 
-class _Viewers:
-    """The pages that are open, and what each waits for."""
-
-    def __init__(self, flight: Flight, teller: Teller) -> None:
-        self._flight = flight
-        self._teller = teller
-        self._waiting: dict[_Turns, Request] = {}
-        self._fault = ""
-
-    def ask(self, viewer: "_Turns", request: Request) -> None:
-        """Answer a viewer now or as soon as there is something new; a newer request replaces an older one."""
-        self._waiting[viewer] = request
-        self._answer(viewer)
-
-    def leave(self, viewer: "_Turns") -> None:
-        """Forget a viewer."""
-        self._waiting.pop(viewer, None)
-
-    def look(self) -> None:
-        """Take in what was flown, and answer those who wait for it."""
-        if self._fault:
-            return
-        try:
-            if not self._flight.update():
-                return
-        except (TwinMasterError, ReportingError) as error:
-            self._fault = str(error)
-        for viewer in list(self._waiting):
-            self._answer(viewer)
-
-    def _answer(self, viewer: "_Turns") -> None:
-        if self._fault:
-            viewer.tell(json.dumps({"error": self._fault}))
-        request = self._waiting.get(viewer)  # one that cannot be told any more has left
-        answer = None if request is None else self._teller.answer(request)
-        if answer is not None:
-            del self._waiting[viewer]
-            viewer.tell(answer)
-
-
 class _Turns(WebSocketHandler):
     """One open page."""
 
-    def initialize(self, viewers: _Viewers) -> None:
-        self._viewers = viewers
+    def initialize(self, teller: Teller) -> None:
+        self._teller = teller
 
     def on_message(self, message: str | bytes) -> None:
         try:
-            self._viewers.ask(self, Request.model_validate_json(message))
+            self._teller.ask(self.tell, Request.model_validate_json(message))
         except ValueError as error:
             self.close(1003, str(error)[:100])
 
     def on_close(self) -> None:
-        self._viewers.leave(self)
+        self._teller.leave(self.tell)
 
     def tell(self, text: str) -> None:
         try:
             self.write_message(text)
         except WebSocketClosedError:
-            self._viewers.leave(self)
+            self._teller.leave(self.tell)
 
 
 class _Answer(RequestHandler):
     """A text that is asked for."""
 
-    def initialize(self, answer: Callable[[], str], kind: str) -> None:
+    def initialize(self, answer: Callable[..., str], kind: str) -> None:
         self._answer, self._kind = answer, kind
 
     def set_default_headers(self) -> None:
         for name, value in HEADERS.items():
             self.set_header(name, value)
 
-    def get(self) -> None:
+    def get(self, *found: str) -> None:
         self.set_header("Content-Type", f"{self._kind}; charset=utf-8")
-        self.write(self._answer())
+        try:
+            self.write(self._answer(*found))
+        except (IndexError, OSError) as error:
+            raise HTTPError(404) from error
 
 
-def handlers_of(texts: Mapping[str, tuple[Callable[[], str], str]]) -> list[tuple[str, Any, dict[str, Any]]]:
-    """Return what answers requests of paths by texts of a kind."""
+def handlers_of(texts: Mapping[str, tuple[Callable[..., str], str]]) -> list[tuple[str, Any, dict[str, Any]]]:
+    """Return what answers requests of paths, and what is in brackets there, by texts of a kind."""
     return [(path, _Answer, {"answer": text, "kind": kind}) for path, (text, kind) in texts.items()]
 
 
@@ -124,46 +86,26 @@ def text_of(package: str, name: str) -> Callable[[], str]:
     return lambda: resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
-class _Picture(_Answer):
-    """The missing force of a verdict, by its number."""
+async def _serve(flight: Flight, port: int, ready: Callable[[str], None], wanted: Callable[[], bool]) -> None:
+    scene = scene_of(flight.folder, flight.knowledge)
+    page, teller = page_html(scene), Teller(flight, scene)
 
-    def initialize(self, flight: Flight) -> None:  # type: ignore[override]
-        self._flight = flight
+    def picture(number: str) -> str:
+        return flight.pictures[int(number)].drawing.read_text(encoding="utf-8")
 
-    def get(self) -> None:
-        try:
-            found = self._flight.pictures[int(self.get_argument("picture"))]
-            drawing = found.drawing.read_bytes()
-        except (ValueError, IndexError, OSError) as error:
-            raise HTTPError(404) from error
-        self.set_header("Content-Type", "image/svg+xml")
-        self.write(drawing)
-
-
-def _application(flight: Flight, viewers: _Viewers) -> Application:
-    page = page_html(scene_of(flight.folder, flight.knowledge))
-    texts = {
+    texts: dict[str, tuple[Callable[..., str], str]] = {
         "/": (lambda: page, "text/html"),
         "/plots.js": (text_of("twin_master.viewer", "plots.js"), "text/javascript"),
         "/view.js": (text_of("twin_master.viewer", "view.js"), "text/javascript"),
         "/view.css": (text_of("twin_master.viewer", "view.css"), "text/css"),
+        r"/missing_force_(\d+)\.svg": (picture, "image/svg+xml"),
     }
-    own: list[Any] = [
-        ("/turns", _Turns, {"viewers": viewers}),
-        ("/missing_force.svg", _Picture, {"flight": flight}),
-    ]
     application = Application(websocket_max_message_size=LONGEST_REQUEST, websocket_ping_interval=20)
-    application.add_handlers(OWN_NAMES, [*handlers_of(texts), *own])
-    return application
-
-
-async def _serve(flight: Flight, port: int, ready: Callable[[str], None], wanted: Callable[[], bool]) -> None:
-    teller = Teller(flight, scene_of(flight.folder, flight.knowledge))
-    viewers = _Viewers(flight, teller)
-    looking = PeriodicCallback(viewers.look, POLL_MILLISECONDS)
+    application.add_handlers(OWN_NAMES, [*handlers_of(texts), ("/turns", _Turns, {"teller": teller})])
+    looking = PeriodicCallback(teller.look, POLL_MILLISECONDS)
     looking.start()
     try:
-        await serve_application(_application(flight, viewers), port, ready, wanted)
+        await serve_application(application, port, ready, wanted)
     finally:
         looking.stop()
 
@@ -176,10 +118,8 @@ async def serve_application(
     try:
         sockets = bind_sockets(port, ADDRESS)
     except OSError as error:
-        raise ViewError(
-            f"port {port} of {ADDRESS} cannot be taken ({os.strerror(error.errno or 0)}): "
-            "choose another --port."
-        ) from error
+        reason = os.strerror(error.errno or 0)
+        raise ViewError(said("watch.port", port=port, address=ADDRESS, reason=reason)) from error
     server.add_sockets(sockets)
     ready(f"http://{ADDRESS}:{sockets[0].getsockname()[1]}/")
     try:

@@ -1,4 +1,4 @@
-"""Messages from files, recorded or growing, from standard input, and from a program."""
+"""Messages from files, recorded or growing, from standard input, from a program; addresses of brokers."""
 
 import csv
 import json
@@ -7,9 +7,13 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
+from ssl import create_default_context
 from typing import IO, Any
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import xarray as xr
@@ -19,35 +23,35 @@ from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.watch.growing import GrowingFile, Pipe, Place, found, rotated
-from twin_master.watch.intake import MISSING, LiveFeed
-from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
-
-Fed = tuple[Message | Refused | None, str]
-"""A message with the begin of its text; None where nothing more has come yet."""
+from twin_master.watch.intake import MISSING, Feed
+from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
 
 _LOST = ("", "nan", "null", "none")
 _TURN_COLUMNS = ("turn", "step")
 _OTHERS = ("turn", "time", "control")
 _FIRST = 8
 """First steps by which a file of steps is known again."""
-_CUT = "{} was cut at byte {}, and no copy is beside it: what stood behind that and was not read yet is lost"
 
 
-class _FileFeed:
-    """Lines of a file."""
+Observations = Iterable[Mapping[str, Any]] | str | Path
+STANDARD_INPUT = "-"
+
+
+class RecordedFeed(Feed):
+    """What a file holds, and may be read again."""
 
     replayable = True
-    place: Place | None = None
-    _path: Path
+    path: Path
     _follow = False
 
     def holds(self, place: Place) -> bool:
         """Return whether a place is in the file; where it is followed, also under its name of today."""
-        return found(self._path, place, follow=self._follow) is not None
+        return found(self.path, place, follow=self._follow) is not None
 
 
-class CsvFeed(_FileFeed):
+class CsvFeed(RecordedFeed):
     """A CSV file with a header: `turn` (or `step`) or `time`, `control`, and sensors by their names.
 
     Parameters
@@ -66,7 +70,7 @@ class CsvFeed(_FileFeed):
     """
 
     def __init__(self, path: Path, scenario: Scenario, *, follow: bool = False) -> None:
-        self._path = path
+        self.path = path
         self._follow = follow
         self._reader = MessageReader(scenario)
         # A file that was begun a moment ago may have no header yet.
@@ -86,22 +90,17 @@ class CsvFeed(_FileFeed):
         raise errors[0] from None
 
     def _take_columns(self, names: list[str]) -> None:
-        path = self._path
+        path = self.path
         if not any(names):
             raise MissionInputError(f"{path} is empty: a CSV file begins with a line of its columns.")
         if names[0].startswith("{"):
-            raise MissionInputError(
-                f"{path} holds JSON lines, and a file of observations is CSV or NetCDF: hand them over by "
-                f"standard input, `--observations - < {path}`."
-            )
+            raise MissionInputError(said("watch.json_lines", path=path))
         called = ["turn" if name in _TURN_COLUMNS else name for name in names]
         sensors = [name for name in called if name not in _OTHERS and name[:1] != "_"]
         try:
             columns = [column for column in map(self._reader.column, sensors) if column is not None]
         except Refused as refusal:
-            raise MissionInputError(
-                f"{path}: the column {refusal}; others are `turn`, `time` and `control`."
-            ) from None
+            raise MissionInputError(said("watch.column", path=path, refusal=refusal)) from None
         once = {sensor for sensor, _ in columns}
         if len(once) < len(columns) or any(called.count(name) > 1 for name in _OTHERS):
             raise MissionInputError(f"{path}: two columns say the same; {', '.join(names)[:300]} came.")
@@ -110,14 +109,14 @@ class CsvFeed(_FileFeed):
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return the rows behind a place."""
         with suppress(MissionInputError):
-            self._read_header(found(self._path, place, follow=self._follow) or self._path)
-        stream = GrowingFile(self._path, place, follow=self._follow)
+            self._read_header(found(self.path, place, follow=self._follow) or self.path)
+        stream = GrowingFile(self.path, place, follow=self._follow)
         for line in stream:
             if line is None:
                 yield None, ""
                 continue
             if stream.cut:
-                yield Refused(_CUT.format(self._path.name, stream.cut)), ""
+                yield Refused(said("watch.cut", name=self.path.name, byte=stream.cut)), ""
                 stream.cut = 0
             self.place = stream.place
             if not (stream.begins and self._is_header(line)):
@@ -151,7 +150,7 @@ class CsvFeed(_FileFeed):
         return parsed(self._reader, record)
 
 
-class RunFeed:
+class RunFeed(RecordedFeed):
     """A NetCDF file with the group `observed` of a run: observations and the controls that were in force.
 
     Raises
@@ -160,36 +159,29 @@ class RunFeed:
         It cannot be read, or holds other sensors or controls.
     """
 
-    replayable = True
-    place: Place | None = None
-
     def __init__(self, path: Path, scenario: Scenario) -> None:
-        self._role = role = scenario.observation.role
-        self._reader, self._controls = MessageReader(scenario), scenario.control_names
+        self.path, self._reader = path, MessageReader(scenario)
+        role, names = scenario.observation.role, dict(enumerate(scenario.control_names))
         try:
             group: xr.Dataset = read_groups(path)["observed"].to_dataset()
-            self._values = np.asarray(group[role].values, dtype=np.float64)
-            self._control = (
-                np.asarray(group["control_index"].values, dtype=np.int64)
-                if "control_index" in group
-                else None
-            )
-            self._turn = np.asarray(group["step"].values, dtype=np.int64)
+            rows, turns = group[role].values.tolist(), group["step"].values.tolist()
+            controls = group["control_index"].values.tolist() if "control_index" in group else []
+            if {*map(len, rows)} - {scenario.observation.count} or {*controls} - {*names}:
+                raise ValueError(
+                    said("watch.shape", count=scenario.observation.count, came=group[role].shape)
+                )
+            self._records = [{role: row, "turn": int(turn)} for row, turn in zip(rows, turns, strict=True)]
+            for record, control in zip(self._records, controls, strict=False):
+                record["control"] = names[control]
         except (DamagedFileError, KeyError, ValueError, TypeError, OSError) as error:
-            raise MissionInputError(
-                f"{path} is no NetCDF file with `observed/{role}` (step, sensor): {str(error).rstrip('.')}."
-            ) from None
-        if self._values.shape != (len(self._turn), scenario.observation.count) or (
-            self._control is not None and not np.all(np.isin(self._control, range(len(scenario.control))))
-        ):
-            raise MissionInputError(
-                f"{path}: {scenario.observation.count} sensors and the controls of the scenario are "
-                f"expected, and `observed/{role}` has the shape {self._values.shape}."
-            )
+            reason = str(error).rstrip(".")
+            raise MissionInputError(said("watch.netcdf", path=path, role=role, reason=reason)) from None
+
+        first = (json.dumps(self._records[:count]).encode() for count in range(_FIRST + 1))
+        self._beginnings = [sha256(records).hexdigest() for records in first]
 
     def _place(self, read: int) -> Place:
-        first = self._turn[: min(read, _FIRST)].tobytes() + self._values[: min(read, _FIRST)].tobytes()
-        return {"beginning": sha256(first).hexdigest(), "read": read}
+        return {"beginning": self._beginnings[min(read, _FIRST)], "read": read}
 
     def holds(self, place: Place) -> bool:
         """Return whether its first steps are those of a place."""
@@ -197,15 +189,12 @@ class RunFeed:
 
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return the steps behind a place."""
-        for row in range(place["read"] if place else 0, len(self._values)):
+        for row in range(place["read"] if place else 0, len(self._records)):
             self.place = self._place(row + 1)
-            record: dict[str, object] = {self._role: self._values[row].tolist(), "turn": int(self._turn[row])}
-            if self._control is not None:
-                record["control"] = self._controls[self._control[row]]
-            yield parsed(self._reader, record), f"row {row}"
+            yield parsed(self._reader, self._records[row]), f"row {row}"
 
 
-class FolderFeed(_FileFeed):
+class FolderFeed(RecordedFeed):
     """The journal of another run or watch, of whatever version: its observations as they came.
 
     A line that was damaged is refused, and those behind it are read on.
@@ -217,23 +206,23 @@ class FolderFeed(_FileFeed):
     """
 
     def __init__(self, folder: Path, scenario: Scenario) -> None:
-        self._path = folder / JOURNAL_NAME
+        self.path = folder / JOURNAL_NAME
         self._scenario = scenario
-        if not self._path.is_file():
+        if not self.path.is_file():
             raise MissionInputError(f"{folder} holds no journal of a run or a watch ({JOURNAL_NAME}).")
 
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return the observations behind a place."""
-        stream = GrowingFile(self._path, place)
+        stream = GrowingFile(self.path, place)
         stream.longest = math.inf
         for line in stream:
             if not isinstance(line, bytes) or not line.endswith(b"\n"):
                 return  # cut off by a kill
             record, self.place = whole_record(line), stream.place
             if record is None:
-                with self._path.open("rb") as journal:
+                with self.path.open("rb") as journal:
                     number = journal.read(self.place["read"]).count(b"\n")
-                yield Refused(f"line {number} of {self._path.name} was changed or is damaged"), ""
+                yield Refused(f"line {number} of {self.path.name} was changed or is damaged"), ""
             elif _came(record):
                 yield self._message(record), f"turn {record.get('turn')}"
 
@@ -251,7 +240,7 @@ class FolderFeed(_FileFeed):
         return Message(observed, turn, None, control)
 
 
-class JsonLinesFeed(LiveFeed):
+class JsonLinesFeed(Feed):
     """JSON objects, one a line, from a stream such as standard input."""
 
     def __init__(self, scenario: Scenario, stream: IO[bytes] | None = None) -> None:
@@ -266,7 +255,7 @@ class JsonLinesFeed(LiveFeed):
             yield (None, "") if line is None else (parsed(self._reader, line), shown(line))
 
 
-class MappingFeed(LiveFeed):
+class MappingFeed(Feed):
     """Messages of a program, as mappings; arrays of numbers may stand where JSON has lists."""
 
     def __init__(self, messages: Iterable[Mapping[str, Any]], scenario: Scenario) -> None:
@@ -343,3 +332,96 @@ def _cells(line: bytes) -> list[str]:
 def shown(line: bytes | Refused) -> str:
     """Return the begin of a message, for people."""
     return "" if isinstance(line, Refused) else line[:300].decode("utf-8", "replace").rstrip(os.linesep)
+
+
+PASSWORD_VARIABLE = "UAV_TWIN_MQTT_PASSWORD"
+
+
+@dataclass(frozen=True)
+class Broker:
+    """Where observations come from.
+
+    Attributes
+    ----------
+    host, port, topic : str, int, str
+        Of the broker, and of the observations; decisions go to `TOPIC/decision`, how the twin is to
+        `TOPIC/heartbeat`.
+    user : str or None
+        Who the twin is; the password is in the environment, `UAV_TWIN_MQTT_PASSWORD`.
+    tls : bool
+        `mqtts://`: encrypted, the broker known by its certificate.
+    authority : Path or None
+        Certificate of the authority, where the system does not know it.
+    """
+
+    host: str
+    port: int
+    topic: str
+    user: str | None = None
+    tls: bool = False
+    authority: Path | None = None
+
+
+def is_broker(observations: str) -> bool:
+    """Return whether observations come from a broker, and not from a file."""
+    return observations.startswith(("mqtt://", "mqtts://"))
+
+
+def broker_of(address: str, authority: Path | None = None, *, many: bool = False) -> Broker:
+    """Return the broker of `mqtt://[USER@]HOST[:PORT]/TOPIC`, or `mqtts://` with TLS.
+
+    Of many assets the topic ends with `/+`, which stands for the name of each.
+
+    Raises
+    ------
+    MissionInputError
+        paho-mqtt is not installed, or it is no such address, has a password in it, or a topic of many assets;
+        the authority's file holds no certificate.
+    """
+    if find_spec("paho") is None:
+        raise MissionInputError("observations over MQTT need paho-mqtt: pip install 'uav-twin[mqtt]'.")
+    try:
+        parts = urlsplit(address)
+        port, topic = parts.port, unquote(parts.path.lstrip("/"))
+    except ValueError:
+        parts, port, topic = urlsplit("mqtt:"), None, ""
+    if not parts.hostname or not topic:
+        raise MissionInputError(f"{address}: `mqtt://[USER@]HOST[:PORT]/TOPIC` is expected, or `mqtts://`.")
+    if parts.password is not None:
+        raise MissionInputError(said("watch.password", variable=PASSWORD_VARIABLE))
+    if many and (not topic.endswith("/+") or "+" in topic[:-1] or "#" in address):
+        raise MissionInputError(f"{address}: a topic of many assets is expected, such as wings/+.")
+    if not many and ("#" in address or "+" in topic):
+        raise MissionInputError(f"{address}: a topic of one asset is expected, without `#` and `+`.")
+    tls, user = parts.scheme == "mqtts", None if parts.username is None else unquote(parts.username)
+    if authority is not None:
+        if not (tls and authority.is_file()):
+            raise MissionInputError(f"the certificate {authority} is a file, and belongs to mqtts://.")
+        try:
+            create_default_context(cafile=authority)
+        except OSError as error:
+            raise MissionInputError(f"{authority} holds no certificate: {error}.") from None
+    return Broker(parts.hostname, port or (8883 if tls else 1883), topic, user, tls, authority)
+
+
+def feed_of(
+    given: Observations | None,
+    scenario: Scenario,
+    follow: bool,
+    authority: Path | None,
+    otherwise: str | None,
+) -> Feed | Broker:
+    """Return what gives the observations, by default those of the scenario, or the broker that does."""
+    for observations in (given, scenario.watch.recording, otherwise):
+        if observations is None:
+            continue
+        if not isinstance(observations, str | Path):
+            return MappingFeed(observations, scenario)
+        if is_broker(str(observations)):
+            return broker_of(str(observations), authority)
+        if str(observations) != STANDARD_INPUT:
+            return file_feed(Path(observations), scenario, follow=follow)
+        if follow:
+            raise MissionInputError(said("watch.follow"))
+        return JsonLinesFeed(scenario)
+    raise MissionInputError(said("watch.recording", name=scenario.mission.name))

@@ -8,48 +8,43 @@ from functools import partial
 from itertools import takewhile
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
 from twin_master.assets.asset_source import FlownAndBelieved, calibrated_with
 from twin_master.assets.resolution import believed_source
-from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.errors import MissionInputError
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
+    check_header,
     last_turn,
-    records,
     records_backwards,
 )
-from twin_master.mission.loop import Source, operate
+from twin_master.mission.loop import operate
 from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
 from twin_master.mission.replay import BelievedModel, journalled_decision, replay
 from twin_master.network.estimator import Notice
-from twin_master.network.twin import Twin
 from twin_master.run_folder import PATCH, PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight
-from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, RejectedFile, Stopping, listening
-from twin_master.watch.keeping import Keeper, Standing
+from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, listening
+from twin_master.watch.keeping import Keeper
 from twin_master.watch.teaching import (
     LEAST_GAIN,
     TRIAL_TURNS,
     Search,
     Teaching,
     both_patches,
-    check_teachable,
-    notice_of,
     trial_sentence,
     verdict_of,
 )
 from twin_master.watch.trial import CANNOT, Outcome, judged, patched_model
-
-if TYPE_CHECKING:
-    pass
 
 STORED_TURNS = 1_000
 """The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
@@ -98,8 +93,6 @@ class Watch:
             self._source, self._inputs = like._source, like._inputs
         self._config = with_inputs(folder, config, self._inputs)
         self.models: list[BelievedModel] = [self._prepared() if like is None else like.models[0]]
-        own = getattr(scenario.belief, "patch", None)
-        self._patches: list[Path | None] = [Path(own) if own else None]  # of these models
         self._path = folder / JOURNAL_NAME
         self._hash = hash_record(self._config)
         self._take_up()
@@ -116,21 +109,21 @@ class Watch:
         told = calibrated_with(knowledge.draws.record or {}, WATCHED, origin, self._inputs)
         if told is not None:
             self._progress.note(told)
-        return BelievedModel(0, knowledge)
+        own = getattr(self.scenario.belief, "patch", None)
+        return BelievedModel(0, knowledge, Path(own) if own else None)
 
     def _take_up(self) -> None:
         """Take in the journal, and believe the patches that were adopted, as far as that is not done yet."""
-        next(records(self._path, config_hash=self._hash), None)  # it is that of this configuration
+        check_header(self._path, self._hash)
         notice = self.scenario.notice
-        self.standing = Standing(Teaching(1.0 if notice is None else notice.threshold))
-        self.standing.read(self._path)
-        for model in self.standing.adopted[len(self.models) - 1 :]:
-            file = self.folder / model["patch"]
-            self._patches.append(file)
-            self.models.append(patched_model(self.scenario, file, model["from_turn"], self._progress))
+        self.teaching = Teaching(1.0 if notice is None else notice.threshold)
+        self.teaching.read(self._path)
+        for model in self.teaching.adopted[len(self.models) - 1 :]:
+            first, file = model["from_turn"], self.folder / model["patch"]
+            self.models.append(patched_model(self.scenario, file, first, self._progress))
 
     def run(
-        self, feed: Feed, decide: Callable[[Mapping[str, Any]], None], *, turns: int | None = None,
+        self, feed: Feed, decide: Callable[[Mapping[str, Any]], object], *, turns: int | None = None,
         patched: Patched | None = None, search: Search | None = None,
         untold: Mapping[str, Any] | None = None,
     ) -> Counts:  # fmt: skip
@@ -151,22 +144,27 @@ class Watch:
         untold : dict, optional
             The last decision, to be told again first.
         """
+
+        def tell(decision: Mapping[str, Any]) -> None:
+            decide(decision)
+            feed.decide(decision)
+
         with self.begun(feed, patched) as keep:
-            source = Stopping(keep.intake, turns, lambda: self.quiet(decide))
-            tutor = Tutor(self, search, source, wait=feed.replayable) if search else None
-            with listening(source.ask):
+            keep.intake.turns, keep.intake.look = turns, lambda: self.quiet(tell)
+            tutor = Tutor(self, search, wait=feed.replayable) if search else None
+            with listening(keep.intake.ask):
                 try:
                     if untold is not None:
-                        decide(untold)
-                    taught = True
-                    while taught:  # with one twin after the other: where it is taught, another one goes on
-                        taught = False
+                        tell(untold)
+                    while True:  # with one twin after the other: where it is taught, another one goes on
                         if tutor is not None:
                             tutor.act()
-                        for decision in self.decisions(source, keep):
-                            decide(decision)
-                            if taught := tutor is not None and tutor.due:
+                        for decision in self.decisions():
+                            tell(decision)
+                            if tutor is not None and tutor.due:
                                 break
+                        else:
+                            break
                 finally:
                     if tutor is not None:
                         tutor.end()
@@ -175,27 +173,26 @@ class Watch:
     @contextmanager
     def begun(self, feed: Feed, patched: Patched | None = None) -> Iterator[Keeper]:
         """Open the journal, and give what keeps the turns of the twin as it stands after it; see `run`."""
-        rejected = RejectedFile(self.folder / REJECTED_NAME)
-        intake = Intake(self.scenario, feed, rejected)
+        intake = Intake(self.scenario, feed, self.folder / REJECTED_NAME)
         seconds = FLUSH_SECONDS if feed.replayable else 0.0
-        with JournalFile(self.folder, self._hash, seconds) as self._journal:
+        with JournalFile(self.folder, self._hash, seconds) as journal:
             self._take_up()
-            if patched is not None:
-                self._patch(*patched)
             found, last = replay(self._path, self.models, self.scenario.watch.lag)
             intake.restore(last.get("intake"))
             if last:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
-            self.keep = Keeper(self._journal, intake, found.twin, self.standing)
+            self.keep = Keeper(journal, intake, found.twin, self.teaching)
             self.keep.quiet = "quiet" in last
+            if patched is not None:
+                self._patch(*patched)
             yield self.keep
 
-    def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:
-        """Yield what the operator is told of each turn, once it is written down, until the source ends."""
-        for _ in operate(keep.twin, source, keep):
-            yield journalled_decision(keep.line, self.scenario, self.models[-1].knowledge.model)
+    def decisions(self) -> Iterator[dict[str, Any]]:
+        """Yield what the operator is told of each turn, once it is written down, until no more comes."""
+        for _ in operate(self.keep.twin, self.keep.intake, self.keep):
+            yield journalled_decision(self.keep.line, self.scenario, self.models[-1].knowledge.model)
 
     def last_decision(self) -> dict[str, Any] | None:
         """Return the last decision in the journal; None without any.
@@ -216,26 +213,28 @@ class Watch:
             return
         since = f"since {step} {keep.twin.turns - 1}" if keep.twin.turns else "and none before"
         sentence = f"No {step} has come for {longest:g} s, {since}: see whether logger and broker are there."
-        decision = {**(self.last_decision() or {"turn": -1}), "notices": [notice_of("quiet", sentence)]}
+        decision = {
+            **(self.last_decision() or {"turn": -1}),
+            "notices": [Notice("quiet", sentence).as_record()],
+        }
         keep.write({"notices": decision["notices"], "quiet": decision})
         keep.quiet = True
         decide(decision)
 
     def trial(self, file: Path, from_turn: int, compared: tuple[int, int] = (0, 0)) -> Callable[..., Outcome]:
         """Return what tells what comes of a patch from a turn on, after all lines of the journal so far."""
-        believed = [m for m in range(len(self.models)) if self.models[m].from_turn <= from_turn]
-        patch, models = both_patches(self._patches[max(believed)], file), tuple(self.models)
+        models = tuple(self.models)
+        believed = [model for model in models if model.from_turn <= from_turn][-1]
+        patch = both_patches(believed.patch, file)
         return partial(
-            judged, self._path, self._journal.size, self.scenario, models, patch, from_turn, compared
+            judged, self._path, self.keep.journal.size, self.scenario, models, patch, from_turn, compared
         )
 
     def _patch(self, file: Path, first: int) -> None:
         """Believe a patch that is given from a turn on."""
-        turns = last_turn(self._path)[0] + 1
+        turns = self.keep.twin.turns
         if not turns or not 0 <= first <= turns:
-            raise MissionInputError(
-                f"--from-turn names one of the {turns} turns watched so far, or the next one."
-            )
+            raise MissionInputError(said("watch.from_turn", turns=turns))
         outcome = self.trial(file, first)(progress=self._progress)
         self.adopt(outcome, None, self._kept_verdict(file.parent))
 
@@ -248,40 +247,29 @@ class Watch:
             atomic_write_bytes(self.folder / kept / name, (found / name).read_bytes())
         return kept
 
-    def adopt(self, outcome: Outcome, notice: Mapping[str, Any] | None, verdict: str = "") -> Twin:
-        """Believe a patched model; return the twin that goes on."""
+    def adopt(self, outcome: Outcome, notice: Mapping[str, Any] | None, verdict: str = "") -> None:
+        """Believe a patched model: with its twin it is gone on."""
         name, first = f"asset/model_patch_{len(self.models)}.json", outcome.model.from_turn
         atomic_write_bytes(self.folder / name, outcome.patch)
         again, _ = replay(self._path, self.models, self.scenario.watch.lag, question=outcome.model)
         alarms = [n for turn, n in again.notices if turn >= first and n.kind == "alarm"]
-        twin = again.twin
-        self.models.append(outcome.model)
-        self._patches.append(self.folder / name)
+        self.keep.twin = again.twin
+        self.models.append(replace(outcome.model, patch=self.folder / name))
         model: dict[str, Any] = {
             "patch": name, "sha256": hash_file(self.folder / name), "from_turn": first,
             "before": outcome.before, "after": outcome.after, "alarms": [vars(alarm) for alarm in alarms],
             "policy_change": outcome.policy_change, **({} if notice is None else {"notice": dict(notice)}),
             **({"verdict": verdict} if verdict else {}),
         }  # fmt: skip
-        line = {
-            "turn": twin.turns - 1,
-            "next_control": twin.proposed_control,
-            "intake": next(records_backwards(self._path))[0]["intake"],
-            "model": model,
-        }
-        self._journal.append(line | self.standing.snapshot(twin, self._journal.size))
-        self.standing.take(line)
+        self.keep.write({"model": model})
         keep_knowledge(self.folder, outcome.model.knowledge)
-        self._progress.note(
-            f"The patched model is believed from {self.scenario.mission.step_name} {first} on: "
-            + ", ".join(
-                f"{what} {model['before'][key]:.4g} before, {model['after'][key]:.4g} after"
-                for key, what in (("rms_residual", "rms residual"), ("log_evidence", "log evidence"))
-                if model["before"][key] is not None
-            )
-            + f". {outcome.policy_change}".rstrip()
-        )
-        return twin
+        gaps = [
+            f"{name.replace('_', ' ')} {value:.4g} before, {outcome.after[name]:.4g} after"
+            for name, value in outcome.before.items()
+            if value is not None
+        ]
+        since = f"The patched model is believed from {self.scenario.mission.step_name} {first} on"
+        self._progress.note(f"{since}: {', '.join(gaps)}. {outcome.policy_change}".rstrip())
 
     def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
         """Write `run.nc`, tables, summary and report of the last turns."""
@@ -290,8 +278,8 @@ class Watch:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
         result, attributes = self.result(turns, last), {}
-        if self.standing.adopted:
-            adopted = self.standing.adopted[-1]
+        if self.teaching.adopted:
+            adopted = self.teaching.adopted[-1]
             attributes = {
                 "model_patch": adopted["patch"], "model_patch_from_step": adopted["from_turn"]
             }  # fmt: skip
@@ -336,7 +324,7 @@ class Watch:
             "duplicates": ("messages that said nothing new", counts.duplicates),
             "rejected": (f"messages refused ({REJECTED_NAME})", counts.rejected),
         }
-        for model in self.standing.adopted:
+        for model in self.teaching.adopted:
             first = model["from_turn"]
             for when in ("before", "after"):
                 title = f"rms residual {when} the patch of {step} {first}"
@@ -356,23 +344,15 @@ class Tutor:
         With its turns kept, see `Watch.begun`.
     search : Search
         Looks for causes.
-    source : Stopping
-        Says whether the watch was asked to end.
     wait : bool
         Whether the next turn waits for an answer, as those of a recording do. Those of a live watch go on
         beside a process that searches and a thread that tries a patch.
-
-    Raises
-    ------
-    MissionInputError
-        Nothing could look into the alarms of the scenario.
     """
 
-    def __init__(self, watch: Watch, search: Search, source: Stopping, *, wait: bool) -> None:
-        check_teachable(watch.scenario)
+    def __init__(self, watch: Watch, search: Search, *, wait: bool) -> None:
         watch.keep.taught = True
-        self._watch, self._search, self._source = watch, search, source
-        self._teaching, self._wait = watch.standing.teaching, wait
+        self._watch, self._search = watch, search
+        self._teaching, self._wait = watch.teaching, wait
         self.outcome: Future[Outcome] | None = None
 
     @property
@@ -390,13 +370,7 @@ class Tutor:
         """Do what is due."""
         watch, teaching, step = self._watch, self._teaching, self._watch.scenario.mission.step_name
         if (question := teaching.question) is not None:
-            found: Path | TwinMasterError | None
-            try:
-                found = self._search.answer(
-                    question, wait=self._wait, asked_to_end=lambda: self._source.asked
-                )
-            except TwinMasterError as error:
-                found = error
+            found = self._search.answer(question, self._wait, lambda: watch.keep.intake.asked)
             if found is not None:
                 verdict = verdict_of(watch.folder, question, found, teaching.turn, step)
                 watch.keep.write({"verdict": verdict})
@@ -416,9 +390,9 @@ class Tutor:
             sentence = trial_sentence(trial, outcome, step)
         except CANNOT as error:
             sentence = f"The patch cannot be believed by this twin: {error}"
-        notice = notice_of("trial", sentence)
+        notice = Notice("trial", sentence).as_record()
         if outcome is not None and outcome.gained >= LEAST_GAIN:
-            watch.keep.twin = watch.adopt(outcome, notice)
+            watch.adopt(outcome, notice)
         else:
             watch.keep.write({"verdict": {**trial, "tried": False, "notice": notice}})
 

@@ -6,10 +6,10 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,10 +21,12 @@ from twin_master.mission.turns import Reading
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import LARGEST_SEED
+from twin_master.sentences import said
 from twin_master.watch.growing import Place
-from twin_master.watch.message import Message, Refused
+from twin_master.watch.message import Fed, Message, Refused
 
+POLL_SECONDS = 0.05
+"""Between two looks at a feed that may go on."""
 REJECTED_NAME = "rejected.jsonl"
 REJECTED_KEPT = 10_000
 """Refused messages that are written down; further ones are counted only, so that a flood fills no disk."""
@@ -33,33 +35,27 @@ MISSING, _ASSUMED, _GIVEN = 0, 1, 2
 """Of a turn: not received; received; received with its control."""
 
 
-class Feed(Protocol):
-    """Where messages come from."""
+class Feed:
+    """Where messages come from; of itself one that is not read twice: it goes on where it is."""
 
-    replayable: bool
+    replayable = False
     """Whether it begins anew with every process, so that what was read before is read again."""
-    place: Place | None
+    place: Place | None = None
     """Where it stands behind the message that it gave last."""
 
     def holds(self, place: Place) -> bool:
         """Return whether a place is one of it, and not of another source."""
-
-    def messages(self, place: Place | None) -> Iterator[tuple[Message | Refused | None, str]]:
-        """Return the messages behind a place, or all of them, each with the begin of its text.
-
-        None in the place of a message: nothing more has come yet.
-        """
-
-
-class LiveFeed:
-    """A feed that is not read twice: it goes on where it is."""
-
-    replayable = False
-    place: Place | None = None
-
-    def holds(self, place: Place) -> bool:
-        """Return that nothing is read again."""
         return False
+
+    def messages(self, place: Place | None) -> Iterator[Fed]:
+        """Return the messages behind a place, or all of them."""
+        raise NotImplementedError
+
+    def decide(self, decision: Mapping[str, Any]) -> None:
+        """Tell whoever sends the messages what was decided, where they listen."""
+
+    def close(self) -> None:
+        """Let go of whoever sends the messages."""
 
 
 @dataclass
@@ -83,45 +79,6 @@ class Counts:
     rejected: int = 0
 
 
-@dataclass
-class RejectedFile:
-    """`rejected.jsonl`: what was refused, and why; None keeps nothing."""
-
-    path: Path | None
-    kept: int = field(default=0, init=False)
-
-    def go_back(self, received: int) -> None:
-        """Forget what was refused behind a number of messages that will be read again, and what was cut."""
-        if self.path is None or not self.path.exists():
-            return
-        lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
-        self.kept = len(lines)
-        while self.kept and not _stays(lines[self.kept - 1], received):
-            self.kept -= 1
-        if self.kept < len(lines):
-            atomic_write_text(self.path, "".join(lines[: self.kept]))
-
-    def add(self, message: int, reason: str, text: str) -> None:
-        """Write down a refused message, its number from 1."""
-        if self.path is None or self.kept >= REJECTED_KEPT:
-            return
-        self.kept += 1
-        record = {"message": message, "reason": reason, "text": text[:_TEXT_KEPT]}
-        try:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(record, ensure_ascii=True) + "\n")
-        except OSError as error:
-            raise write_error(error, self.path) from error
-
-
-def _stays(line: str, received: int) -> bool:
-    """Return whether a line of `rejected.jsonl` is whole, and of one of the first messages."""
-    try:
-        return bool(json.loads(line)["message"] <= received)
-    except json.JSONDecodeError:
-        return False  # cut off by a kill
-
-
 class Intake:
     """The messages of a feed as the source of a twin.
 
@@ -135,8 +92,8 @@ class Intake:
         Sensors, and how late and how far ahead a message may be.
     feed : Feed
         Of the messages.
-    rejected : RejectedFile
-        Where refused ones are written down.
+    rejected : Path or None
+        `rejected.jsonl`, where refused ones are written down; None keeps none.
 
     Attributes
     ----------
@@ -148,16 +105,20 @@ class Intake:
         Of sensors of which no number came with the last reading, and before it did, or the other way round.
     ended : bool
         Whether the feed has ended; if not, more may come after `read` has returned None.
-    look : callable
-        Called behind each message from which no reading comes.
+    look : callable or None
+        Called now and then while nothing comes; without it nothing is waited for.
+    turns : int or None
+        In all, after which it ends.
+    asked : bool
+        Whether the end was asked for.
     """
 
-    def __init__(self, scenario: Scenario, feed: Feed, rejected: RejectedFile) -> None:
+    def __init__(self, scenario: Scenario, feed: Feed, rejected: Path | None = None) -> None:
         self._section, self._words = scenario.watch, words_of(scenario)
         self._width = scenario.row_width
         self._feed = feed
-        self._rejected = rejected
-        self._messages: Iterator[tuple[Message | Refused | None, str]] | None = None
+        self._rejected, self._kept = rejected, 0
+        self._messages: Iterator[Fed] | None = None
         self._place: Place | None = None  # behind the last message, and behind the one before it
         self._before_last: Place | None = None
         self._pending: deque[tuple[int, Reading, int]] = deque()
@@ -170,8 +131,9 @@ class Intake:
         self._before: Float = np.empty(0)
         self.counts = Counts()
         self.observation_turn = -1
-        self.ended = False
-        self.look: Callable[[], None] = lambda: None
+        self.ended = self.asked = self._waiting = False
+        self.look: Callable[[], None] | None = None
+        self.turns: int | None = None
 
     @property
     def settled(self) -> bool:
@@ -205,10 +167,37 @@ class Intake:
             self._unreadable = set(state.get("unreadable", ()))
             again &= state["source"] is not None and self._feed.holds(state["source"])
             self._place = state["source"] if again else None
-        self._rejected.go_back(self.counts.received if again else LARGEST_SEED)
+        if self._rejected is not None and self._rejected.exists():
+            lines = self._rejected.read_text(encoding="utf-8").splitlines(keepends=True)
+            kept = lines[: self.counts.rejected] if again else lines  # those behind are read again
+            kept = [line for line in kept if line.endswith("\n")]  # not cut off by a kill
+            self._kept = len(kept)
+            if kept != lines:
+                atomic_write_text(self._rejected, "".join(kept))
+
+    def ask(self) -> None:
+        """Ask for the end: between two turns, never within one."""
+        self.asked = True
+        if self._waiting:
+            raise _Asked
 
     def read(self, twin: Twin) -> Reading | None:
-        """Return the next reading, see `Source.read`; None also where nothing has come yet."""
+        """Return the next reading, see `Source.read`; None also where the end was asked for."""
+        with suppress(_Asked):
+            while not self.asked and (self.turns is None or twin.turns < self.turns):
+                begin, self._waiting = time.monotonic(), self.look is not None
+                try:
+                    reading = self._next(twin)
+                finally:
+                    self._waiting = False
+                if reading is not None or self.ended or self.look is None:
+                    return reading
+                self.look()
+                time.sleep(max(0.0, begin + POLL_SECONDS - time.monotonic()))
+        return None
+
+    def _next(self, twin: Twin) -> Reading | None:
+        """Return the next reading; None where nothing has come yet."""
         if self._messages is None:
             self._messages = self._feed.messages(self._place)
         while not self._pending:
@@ -225,8 +214,6 @@ class Intake:
                 self._sort(twin, message)
             except Refused as refusal:
                 self._refuse(str(refusal))
-            if not self._pending:
-                self.look()
         turn, reading, given = self._pending.popleft()
         self.observation_turn = turn
         self._known = self._unreadable
@@ -248,10 +235,7 @@ class Intake:
         came, words = reading.unreadable, self._words
         when = f"{words.step.capitalize()} {self.observation_turn}"
         for g in sorted(came.keys() - self._unreadable):
-            sentence = (
-                f"{when}: {words.sensors([g])} shows {came[g]}, which is no reading; it is left out until "
-                "readings of it come back."
-            )
+            sentence = said("watch.left_out", when=when, sensor=words.sensors([g]), came=came[g])
             yield Notice("gauge_left_out", sentence, (g + 1,))
         back = {g for g in self._unreadable - came.keys() if not np.isnan(reading.observed[g])}
         for g in sorted(back):
@@ -269,7 +253,15 @@ class Intake:
 
     def _refuse(self, reason: str) -> None:
         self.counts.rejected += 1
-        self._rejected.add(self.counts.received, reason, self._text)
+        if self._rejected is None or self._kept >= REJECTED_KEPT:
+            return
+        self._kept += 1
+        record = {"message": self.counts.received, "reason": reason, "text": self._text[:_TEXT_KEPT]}
+        try:
+            with self._rejected.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(record, ensure_ascii=True) + "\n")
+        except OSError as error:
+            raise write_error(error, self._rejected) from error
 
     def _turn_of(self, twin: Twin, message: Message) -> int:
         if message.turn is not None:
@@ -312,11 +304,8 @@ class Intake:
             message = replace(message, observed=row)
         ahead = turn - twin.turns
         given = _ASSUMED if message.control is None else _GIVEN
-        if ahead > self._section.longest_gap:
-            raise Refused(
-                f"turn {turn} is {ahead} turns ahead of the next one, {twin.turns}, and `watch.longest_gap` "
-                f"is {self._section.longest_gap}"
-            )
+        if ahead > (most := self._section.longest_gap):
+            raise Refused(said("watch.ahead", turn=turn, ahead=ahead, next=twin.turns, most=most))
         if ahead < 0:
             self._sort_late(twin, turn, message, given)
             return
@@ -327,80 +316,21 @@ class Intake:
 
     def _sort_late(self, twin: Twin, turn: int, message: Message, given: int) -> None:
         if turn < twin.first_kept:
-            raise Refused(
-                f"turn {turn} is {twin.turns - 1 - turn} turns late, and `watch.lag` is {self._section.lag}"
-            )
-        before, known = twin.observed(turn), self._given[turn - twin.turns]
+            late = twin.turns - 1 - turn
+            raise Refused(said("watch.late", turn=turn, late=late, lag=self._section.lag))
+        before, control = twin.observed(turn), message.control
         both = ~np.isnan(before) & ~np.isnan(message.observed)
         if not np.array_equal(before[both], message.observed[both]):
             raise Refused(f"it contradicts what was received of turn {turn} before")
-        control = message.control
-        if control is not None and control != twin.control_of(turn) and known != MISSING:
+        another = control not in (None, twin.control_of(turn))
+        if another and self._given[turn - twin.turns] != MISSING:
             raise Refused(f"it contradicts the control of turn {turn}")
-        new = np.isnan(before) & ~np.isnan(message.observed)
-        if not new.any() and (control is None or control == twin.control_of(turn)):
+        merged = np.where(np.isnan(before), message.observed, before)
+        if not another and np.array_equal(merged, before, equal_nan=True):
             self.counts.duplicates += 1
             return
         self._before = before
-        merged = np.where(np.isnan(before), message.observed, before)
         self._pending.append((turn, Reading(merged, control, turn, message.unreadable), given))
-
-
-POLL_SECONDS = 0.05
-"""Between two looks at a feed that may go on."""
-
-
-class Stopping:
-    """A source that ends when SIGINT or SIGTERM ask for it: between two turns, never within one.
-
-    Parameters
-    ----------
-    intake : Intake
-        Of the readings.
-    turns : int or None
-        In all, after which it ends.
-    look : callable
-        Called now and then while nothing comes, and behind messages from which no reading comes.
-    """
-
-    def __init__(self, intake: Intake, turns: int | None, look: Callable[[], None]) -> None:
-        self._intake, self._turns, self._look = intake, turns, look
-        intake.look = self._looked
-        self.asked = self._waiting = False
-
-    def read(self, twin: Twin) -> Reading | None:
-        """Return the next reading; None once the watch is to end."""
-        if self.asked or (self._turns is not None and twin.turns >= self._turns):
-            return None
-        try:
-            while not self.asked:
-                self._waiting, begin = True, time.monotonic()
-                if (reading := self._intake.read(twin)) is not None or self._intake.ended:
-                    return reading
-                time.sleep(max(0.0, begin + POLL_SECONDS - time.monotonic()))
-                self._looked()
-        except _Asked:
-            pass
-        finally:
-            self._waiting = False
-        return None
-
-    def _looked(self) -> None:
-        self._waiting = False
-        self._look()
-        self._waiting = True
-        if self.asked:
-            raise _Asked
-
-    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        """Return what is assimilated in the place of an observation that no state allows."""
-        return self._intake.impossible(reading, error)
-
-    def ask(self) -> None:
-        """Ask for the end."""
-        self.asked = True
-        if self._waiting:
-            raise _Asked
 
 
 class _Asked(BaseException):

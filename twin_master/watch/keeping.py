@@ -4,86 +4,20 @@ import base64
 import time
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.mission.journal import (
-    JournalFile,
-    damaged,
-    records_backwards,
-    turn_record,
-)
+from twin_master.mission.journal import JournalFile, turn_record
 from twin_master.mission.turns import Turn
+from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.watch.intake import Intake
-from twin_master.watch.teaching import Teaching, notice_of
+from twin_master.watch.teaching import Teaching
 
 SNAPSHOT_TURNS = 32
-"""Turns between two lines that also hold the state of the twin and what follows from all lines before."""
-
-CHECKED = 250_000
-"""Bytes at the end of a journal that are read at least, so that damage there is found."""
-
-
-@dataclass
-class Standing:
-    """What follows from all lines of a journal so far.
-
-    A line now and then holds it, so that the journal is read back to there alone, however long it is.
-
-    Attributes
-    ----------
-    teaching : Teaching
-    adopted : list of dict
-        The models that were adopted, as the journal has them.
-    """
-
-    teaching: Teaching
-    adopted: list[dict[str, Any]] = field(default_factory=list)
-
-    def take(self, record: Mapping[str, Any]) -> None:
-        """Take in a line."""
-        self.adopted += [record["model"]] if "model" in record else []
-        self.teaching.take(record)
-
-    def snapshot(self, twin: Twin, begin: int) -> dict[str, Any]:
-        """Return what a line holds that begins at so many bytes."""
-        standing = {"begin": begin, "adopted": self.adopted, "teaching": self.teaching.state()}
-        settled = twin.settled()
-        if settled is None:
-            return {"standing": standing}
-        state = base64.b64encode(zlib.compress(settled[1], 1)).decode("ascii")
-        return {"standing": standing, "settled": {"turn": settled[0], "state": state}}
-
-    def read(self, path: Path) -> None:
-        """Take in a journal, from the last line that holds all before it.
-
-        Raises
-        ------
-        NotResumableError
-            It was changed or is damaged.
-        """
-        behind: list[dict[str, Any]] = []
-        before: dict[str, Any] | None = None
-        length = 0
-        for record, begin, end in records_backwards(path):
-            length = length or end
-            if length - begin > CHECKED and before is not None:
-                break
-            if begin and before is None:
-                behind.append(record)
-                before = record.get("standing")
-                if before is not None and before["begin"] != begin:
-                    raise damaged(path, begin, "lines before it are missing, or not its own")
-        if before is not None:
-            self.adopted = list(before["adopted"])
-            self.teaching.restore(before["teaching"])
-        for record in reversed(behind):
-            self.take(record)
+"""Turns between two lines that also hold the state of the twin."""
 
 
 class Keeper:
@@ -96,11 +30,12 @@ class Keeper:
         Of the readings.
     twin : Twin
         That is watched with; another one where it was taught.
-    standing : Standing
+    teaching : Teaching
         After all lines of the journal.
 
     Attributes
     ----------
+    journal, intake, twin
     taught : bool
         Whether the twin is taught.
     line : dict
@@ -111,8 +46,8 @@ class Keeper:
         Whether the operator was told that no turn comes any more.
     """
 
-    def __init__(self, journal: JournalFile, intake: Intake, twin: Twin, standing: Standing) -> None:
-        self._journal, self.intake, self.twin, self._standing = journal, intake, twin, standing
+    def __init__(self, journal: JournalFile, intake: Intake, twin: Twin, teaching: Teaching) -> None:
+        self.journal, self.intake, self.twin, self._teaching = journal, intake, twin, teaching
         self.taught = False
         self.line: dict[str, Any] = {}
         self.filtered: NDArray[np.float64] | None = None
@@ -134,14 +69,15 @@ class Keeper:
         }
         if reading.revises is not None:
             record["control_in_force"] = concluded.control_index
-        elif number % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1:
-            record |= self._standing.snapshot(self.twin, self._journal.size)
+        elif number % SNAPSHOT_TURNS == SNAPSHOT_TURNS - 1 and (settled := self.twin.settled()):
+            state = base64.b64encode(zlib.compress(settled[1], 1)).decode("ascii")
+            record["settled"] = {"turn": settled[0], "state": state}
         known = {(notice.kind, notice.sensors) for notice in concluded.notices}
         told = [n.as_record() for n in self.intake.notices if (n.kind, n.sensors) not in known]
-        told += self._standing.teaching.untold if self.taught else []
+        told += self._teaching.untold if self.taught else []
         if self.quiet:
             sentence = f"Turn {number}: observations come again, after {self.silence:.0f} s."
-            told.append(notice_of("heard", sentence))
+            told.append(Notice("heard", sentence).as_record())
         if told:
             record["notices"] = record.get("notices", []) + told
         self._append(record)
@@ -155,5 +91,6 @@ class Keeper:
 
     def _append(self, record: Mapping[str, Any]) -> None:
         """Add a line to the journal, and take it in."""
-        self._journal.append(record)
-        self._standing.take(record)
+        standing = {"begin": self.journal.size, "teaching": vars(self._teaching)}
+        self.journal.append({**record, "standing": standing})
+        self._teaching.take(record)

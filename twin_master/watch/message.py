@@ -6,7 +6,7 @@ A publisher is not trusted. Whatever it sends is an observation or a `Refused` w
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from functools import lru_cache
@@ -18,6 +18,7 @@ from reporting.json_file import parse_json
 from reporting.words import listing
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
+from twin_master.sentences import said
 
 LARGEST_MESSAGE = 1_000_000
 """Bytes of a message; a larger one is refused unread."""
@@ -57,6 +58,10 @@ class Message:
     time: float | None = None
     control: int | None = None
     unreadable: Mapping[int, str] = field(default_factory=dict)
+
+
+Fed = tuple[Message | Refused | None, str]
+"""A message with the begin of its text; None where nothing more has come yet."""
 
 
 class MessageReader:
@@ -103,11 +108,8 @@ class MessageReader:
         if base not in self._index and self._allows_unknown:
             return None
         if base not in self._index:
-            raise Refused(
-                f"`{name[:60]}` is no sensor: a sensor is called such as {_near(name[:60], *self._index)}, "
-                f"its unit behind it, and there are {len(self._units)}; what is none is passed over "
-                "with --allow-unknown, or where its name begins with `_`"
-            )
+            near = _near(name[:60], *self._index)
+            raise Refused(said("watch.no_sensor", name=name[:60], near=near, count=len(self._units)))
         sensor = self._index[base]
         found = sensor, self._factor(sensor, unit)
         if len(self._columns) < len(self._index):  # names that mean the same come without end
@@ -158,29 +160,21 @@ class MessageReader:
         observed = np.full(self._width, np.nan)
         given: set[int] = set()
         unreadable: dict[int, str] = {}
-        unit = record.get("unit", "")
-        if not isinstance(unit, str):
-            raise Refused("`unit` is the name of a unit")
-        for name, value in record.items():
-            if name in ("turn", "time", "control", "unit") or name.startswith("_"):
-                continue
+        for name, value in self._readings(record):
             if name == "covariance" and self._observation.modes is not None:
                 observed[self._observation.count :] = self._covariance(value)
                 continue
-            if name == self._observation.role and isinstance(value, list):
-                pairs: Iterable[tuple[int, float, object]] = self._all(value, unit)
+            if (found := self.column(name)) is None:
+                continue
+            sensor, factor = found
+            if sensor in given:
+                raise Refused(f"sensor {sensor + 1} is given twice")
+            given.add(sensor)
+            shown = self._value(sensor, factor, value)
+            if isinstance(shown, str):
+                unreadable[sensor] = shown
             else:
-                found = self.column(name)
-                pairs = [] if found is None else [(*found, value)]
-            for sensor, factor, single in pairs:
-                if sensor in given:
-                    raise Refused(f"sensor {sensor + 1} is given twice")
-                given.add(sensor)
-                shown = self._value(sensor, factor, single)
-                if isinstance(shown, str):
-                    unreadable[sensor] = shown
-                else:
-                    observed[sensor] = shown
+                observed[sensor] = shown
         turn, time = record.get("turn"), record.get("time")
         if turn is not None and (type(turn) is not int or not 0 <= turn <= LARGEST_SEED):
             raise Refused("`turn` is a whole number from 0")
@@ -190,10 +184,18 @@ class MessageReader:
         control = self._control(record.get("control"))
         return Message(observed, turn if type(turn) is int else None, time, control, unreadable)
 
-    def _all(self, values: list[object], unit: str) -> list[tuple[int, float, object]]:
-        if len(values) != self._observation.count:
-            raise Refused(f"{self._observation.count} values are expected, and {len(values)} came")
-        return [(sensor, self._factor(sensor, unit), value) for sensor, value in enumerate(values)]
+    def _readings(self, record: Mapping[str, object]) -> Iterator[tuple[str, object]]:
+        """Return names and values of a record; each of a list has the name of its sensor."""
+        unit, role = record.get("unit", ""), self._observation.role
+        if not isinstance(unit, str):
+            raise Refused("`unit` is the name of a unit")
+        for name, value in record.items():
+            if name == role and isinstance(value, list):
+                if len(value) != self._observation.count:
+                    raise Refused(f"{self._observation.count} values are expected, and {len(value)} came")
+                yield from ((f"{role}_{n}_{unit}".removesuffix("_"), one) for n, one in enumerate(value, 1))
+            elif name not in ("turn", "time", "control", "unit") and not name.startswith("_"):
+                yield name, value
 
     def _covariance(self, value: object) -> Float:
         """Return the lower triangle of the covariance of all values, SI."""

@@ -21,12 +21,12 @@ from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.mission.replay import journalled_decision
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.broker import PASSWORD_VARIABLE, Broker
-from twin_master.watch.feeds import Fed, parsed, shown
+from twin_master.sentences import said
+from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, parsed, shown
 from twin_master.watch.folder import Watch
 from twin_master.watch.growing import Place
-from twin_master.watch.intake import LiveFeed
-from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
+from twin_master.watch.intake import Feed
+from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
 
 CLIENT_SUFFIX, PUBLISHED_NAME = ".mqtt", "published"
 """Of the file with the name of the client, and of that which says how far decisions were published."""
@@ -122,10 +122,7 @@ class Session:
         from paho.mqtt.subscribeoptions import SubscribeOptions
 
         if reason.is_failure:
-            self._failure = (
-                f"the {self._where} refuses the twin: {reason}; give a user in the address and the password "
-                f"in {PASSWORD_VARIABLE}"
-            )
+            self._failure = said("watch.user", where=self._where, why=reason, variable=PASSWORD_VARIABLE)
             return
         self._connected = True
         if self._clean:
@@ -138,10 +135,8 @@ class Session:
 
     def _on_subscribe(self, _client: Any, _data: Any, _mid: Any, reasons: Any, _properties: Any) -> None:
         if reasons[0].is_failure:
-            self._failure = (
-                f"the {self._where} does not let the twin read {self._broker.topic}: {reasons[0]}; grant its "
-                "user that right"
-            )
+            topic = self._broker.topic
+            self._failure = said("watch.topic", where=self._where, topic=topic, why=reasons[0])
             return
         atomic_write_text(self._path, self._name + "\n")  # which also ends the wish to begin anew
         self._begun = self._kept = True
@@ -353,7 +348,7 @@ class Outbox:
         self._session.behind[self] = None
 
 
-class MqttFeed(LiveFeed):
+class MqttFeed(Feed):
     """The observations of the topic of one asset, and its decisions; see `Session` for the errors.
 
     Parameters

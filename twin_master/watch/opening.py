@@ -2,8 +2,8 @@
 
 import math
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -19,16 +19,22 @@ from twin_master.assets.resolution import (
 )
 from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME, last_turn
-from twin_master.mission.opening import begun_folder, file_record, resumed_folder
-from twin_master.run_folder import CONFIG_NAME, check_versions, read_config
-from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
+from twin_master.run_folder import (
+    CONFIG_NAME,
+    begun_folder,
+    check_versions,
+    kept_scenario,
+    read_config,
+    resumed_folder,
+)
+from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.store.writing import SUMMARY_NAME
 from twin_master.store.writing import open_run as stored_run
-from twin_master.watch.broker import Broker, broker_of, is_broker
-from twin_master.watch.feeds import JsonLinesFeed, MappingFeed, file_feed
+from twin_master.watch.feeds import Broker, Observations, RecordedFeed, feed_of
 from twin_master.watch.folder import STORED_TURNS, Watch
-from twin_master.watch.intake import Counts, Feed
+from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import BEGIN_ANEW, CLIENT_SUFFIX, MqttFeed
 from twin_master.watch.teaching import Search, check_teachable
 
@@ -48,7 +54,9 @@ def begun_watch(
         for path in folder.glob(f"*{CLIENT_SUFFIX}")
     }
     source = believed_source(resolved)
-    opened = begun_folder(resolved, file, folder, source, files, replace=replace_run, watched=True)
+    source.check()
+    files = source.files() | files
+    opened = begun_folder(resolved, file, folder, files, replace=replace_run, watched=True)
     with opened as (config, located):
         yield Watch(folder, config, located, progress, like)
 
@@ -65,18 +73,13 @@ def resumed_watch(
         The folder holds no watch, or one of another scenario or version.
     """
     if not read_config(folder).get("watched"):
-        raise NotResumableError(
-            f"{folder} holds a run, no watch: continue it with `uav-twin run --resume {folder}`."
-        )
+        raise NotResumableError(said("watch.run", folder=folder))
     with resumed_folder(folder, loaded) as (config, scenario):
         try:
             check_versions(folder, config, scenario.mission.seed)
             watched = Watch(folder, config, scenario, progress, like)
         except NotResumableError as error:
-            error.add_note(
-                "--replace would remove what was observed; another watch, in another folder, takes it in "
-                f"with `--observations {folder}`."
-            )
+            error.add_note(said("watch.another", folder=folder))
             raise
         yield watched
 
@@ -117,8 +120,7 @@ def flown(folder: Path, first: int | None, last: int | None, progress: Progress)
         shutil.copytree(folder / "asset", copy / "asset")
         with (folder / JOURNAL_NAME).open("rb") as journal:
             (copy / JOURNAL_NAME).write_bytes(journal.read(end))
-        scenario = parse_scenario(config["scenario"], str(folder / CONFIG_NAME))
-        Watch(copy, config, scenario.moved(copy), progress).store(Counts(), report=False)
+        Watch(copy, config, kept_scenario(folder).moved(copy), progress).store(Counts(), report=False)
         yield copy
 
 
@@ -163,8 +165,6 @@ def _config(folder: Path) -> dict[str, Any] | None:
 
 
 Decide = Callable[[Mapping[str, Any]], object]
-Observations = Iterable[Mapping[str, Any]] | str | Path
-STANDARD_INPUT = "-"
 
 
 def watch(
@@ -247,101 +247,61 @@ def watch(
     """
     loaded = scenario if isinstance(scenario, LoadedScenario | None) else load_scenario(scenario)
     given, progress = given_overrides(overrides), progress or SilentProgress()
-    authority = None if ca_file is None else Path(ca_file)
     patch = None if model_patch is None or from_turn is None else (Path(model_patch), from_turn)
     if (model_patch, from_turn) != (None, None) and (patch is None or not resume):
         raise MissionInputError("--model-patch and --from-turn go together, with --resume.")
-    if loaded is not None:
-        if teach:
-            check_teachable(loaded.scenario)
-        observations = _source(observations, loaded.scenario.moved(loaded.path.parent), otherwise)
-        # Slips of the pen are found before a model is built and a folder made.
-        _feed(observations, _allowing(loaded.scenario, allow_unknown), follow, authority)
-    opened = _opened(loaded, observations, folder, given, progress, resume=resume, replace=replace)
-    with opened as watched:
+    if loaded is None and (folder is None or not resume):
+        raise MissionInputError("a scenario is needed, or --resume with the folder of a watch.")
+    folder, known = _read(loaded, folder, allow_unknown=allow_unknown)
+    if teach:
+        check_teachable(known)
+    # Slips of the pen are found before a model is built and a folder made.
+    feed = feed_of(observations, known, follow, None if ca_file is None else Path(ca_file), otherwise)
+    if replace and isinstance(feed, RecordedFeed) and folder.resolve() in feed.path.resolve().parents:
+        raise MissionInputError(said("watch.replace", path=feed.path))
+    with _opened(loaded, folder, given, progress, resume=resume, replace=replace) as watched:
         try:
             begun(watched)
-            known = _allowing(watched.scenario, allow_unknown)
-            feed = _feed(_source(observations, known, otherwise), known, follow, authority)
             if isinstance(feed, Broker):
                 feed = MqttFeed(feed, watched, progress.note, known)
-
-            def tell(decision: Mapping[str, Any]) -> None:
-                decide(decision)
-                if isinstance(feed, MqttFeed):
-                    feed.decide(decision)
-
-            try:
-                # A kill may have left the last decision untold.
-                untold = None if stored(watched.folder) else watched.last_decision()
-                search = Search(watched.folder, watched.scenario.mission.seed) if teach else None
-                counts = watched.run(feed, tell, turns=turns, patched=patch, search=search, untold=untold)
-            finally:
-                if isinstance(feed, MqttFeed):
-                    feed.close()
+            # A kill may have left the last decision untold.
+            untold = None if stored(watched.folder) else watched.last_decision()
+            search = Search(watched.folder, watched.scenario.mission.seed) if teach else None
+            with closing(feed):
+                counts = watched.run(feed, decide, turns=turns, patched=patch, search=search, untold=untold)
             watched.store(counts, last=last, report=report)
         except Exception as error:
-            error.add_note(
-                f"What was observed is kept: go on with `uav-twin watch --resume --out {watched.folder}`."
-            )
+            error.add_note(said("watch.kept", folder=watched.folder))
             raise
     return watched.folder
 
 
-def _source(observations: Observations | None, scenario: Scenario, otherwise: str | None) -> Observations:
-    """Return where observations come from: what is given, else the recording of the scenario."""
-    for source in (observations, scenario.watch.recording, otherwise):
-        if source is not None:
-            return source
-    raise MissionInputError(
-        f"{scenario.mission.name} names no recording: give the observations that are to be watched."
-    )
-
-
-def _allowing(scenario: Scenario, unknown: bool) -> Scenario:
-    """Return a scenario that passes over keys and columns that are no sensor, if that is asked."""
-    section = scenario.watch.model_copy(update={"allow_unknown": scenario.watch.allow_unknown or unknown})
-    return scenario.model_copy(update={"watch": section})
-
-
 def _opened(
-    loaded: LoadedScenario | None, observations: Observations | None, out: Path | str | None,
-    overrides: Overrides, progress: Progress, *, resume: bool, replace: bool,
+    loaded: LoadedScenario | None, folder: Path, given: Overrides, progress: Progress, *, resume: bool,
+    replace: bool,
 ) -> AbstractContextManager[Watch]:  # fmt: skip
     """Return the watch, begun or taken up, and what holds its folder."""
-    if resume and (replace or overrides != Overrides()):
-        raise MissionInputError(
-            "a watch is taken up with what its folder holds: give nothing beside --resume that changes it."
-        )
-    if out is None and loaded is not None:
-        out = Path("runs") / loaded.scenario.mission.name
-    if out is None or (loaded is None and not resume):
-        raise MissionInputError("a scenario is needed, or --resume with the folder of a watch.")
-    folder = Path(out)
+    if resume and (replace or given != Overrides()):
+        raise MissionInputError(said("watch.resume"))
     if resume or loaded is None:
         return resumed_watch(folder, loaded, progress)
-    source = Path(observations).resolve() if isinstance(observations, str | Path) else None
-    if replace and source is not None and folder.resolve() in (source, *source.parents):
-        raise MissionInputError(
-            f"--replace would remove the observations in {observations} before they are read: choose another "
-            "--out."
-        )
-    resolved = resolve_scenario(loaded, overrides)
+    resolved = resolve_scenario(loaded, given)
     if loaded.remark:
         progress.note(loaded.remark)
-    return begun_watch(resolved, file_record(loaded), folder, progress, replace_run=replace)
+    return begun_watch(resolved, loaded.file, folder, progress, replace_run=replace)
 
 
-def _feed(
-    observations: Observations, scenario: Scenario, follow: bool, authority: Path | None
-) -> Feed | Broker:
-    """Return what gives the observations, or the broker that does."""
-    if not isinstance(observations, str | Path):
-        return MappingFeed(observations, scenario)
-    if is_broker(str(observations)):
-        return broker_of(str(observations), authority)
-    if str(observations) != STANDARD_INPUT:
-        return file_feed(Path(observations), scenario, follow=follow)
-    if follow:
-        raise MissionInputError("--follow belongs to a CSV file; standard input is read to its end anyway.")
-    return JsonLinesFeed(scenario)
+def _read(
+    loaded: LoadedScenario | None, folder: Path | str | None, *, allow_unknown: bool
+) -> tuple[Path, Scenario]:
+    """Return the folder of a watch, and the scenario by which observations are read."""
+    if loaded is None:
+        folder = Path(str(folder))
+        scenario = kept_scenario(folder).moved(folder)
+    else:
+        folder = Path("runs", loaded.scenario.mission.name) if folder is None else Path(folder)
+        scenario = loaded.scenario.moved(loaded.path.parent)
+    section = scenario.watch.model_copy(
+        update={"allow_unknown": scenario.watch.allow_unknown or allow_unknown}
+    )
+    return folder, scenario.model_copy(update={"watch": section})

@@ -16,13 +16,16 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from reporting.errors import DamagedFileError
 from reporting.json_file import read_json
 from twin_master.errors import MissionInputError, TwinMasterError
+from twin_master.mission.journal import damaged, records_backwards
+from twin_master.network.estimator import Notice
 from twin_master.run_folder import PATCH, TEACHING, VERDICT
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.watch.trial import Outcome
 
 SETTLE_TURNS = 10
@@ -35,12 +38,8 @@ GROUP = "group"
 TRIED = ("named", "named in part", GROUP)
 """Verdicts whose patch is tried; that of a group is its most probable member. All members explain the gap
 alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out."""
-NO_ALARMS = "--teach begins with an alarm, and this scenario gives none: `notice` is off."
-NO_WING = (
-    "--teach looks for what the model of a wing lacks: strains under the damage states z1 and z2, predicted "
-    "by a design or a calibration, are needed, and this scenario has {}: leave --teach out, alarms are given "
-    "all the same."
-)
+CHECKED = 250_000
+"""Bytes at the end of a journal that are read at least, so that damage there is found."""
 COURTESY = 10
 """Niceness of a search beside a live watch: the watch comes first."""
 _LOOK_AGAIN = 0.05
@@ -55,16 +54,16 @@ def check_teachable(scenario: Scenario) -> None:
         It gives no alarms, or is of another asset than a wing with a model that can be patched.
     """
     if scenario.notice is None:
-        raise MissionInputError(NO_ALARMS)
+        raise MissionInputError(said("watch.no_alarms"))
     role, states = scenario.observation.role, ", ".join(scenario.state_names)
     if not scenario.searchable:
-        raise MissionInputError(NO_WING.format(f"the role {role} under {states}"))
+        raise MissionInputError(said("watch.no_wing", what=f"the role {role} under {states}"))
     if not getattr(scenario.belief, "design", None):
-        raise MissionInputError(NO_WING.format(f"the belief `{scenario.belief.kind}` without a design"))
+        what = f"the belief `{scenario.belief.kind}` without a design"
+        raise MissionInputError(said("watch.no_wing", what=what))
 
 
-@dataclass(frozen=True)
-class Question:
+class Question(NamedTuple):
     """What is asked: which effect the turns `from_turn` to `to_turn` hold that the model lacks."""
 
     from_turn: int
@@ -94,6 +93,8 @@ class Teaching:
         The verdict whose patch is on trial.
     untold : list
         Notices that go with the next turn.
+    adopted : list of dict
+        The models that were adopted, as the journal has them.
     """
 
     threshold: float
@@ -101,22 +102,35 @@ class Teaching:
     question: Question | None = None
     trial: dict[str, Any] | None = None
     untold: list[dict[str, Any]] = field(default_factory=list)
+    adopted: list[dict[str, Any]] = field(default_factory=list)
     _alarm: tuple[int, int] | None = None
     _ask_at: int = 0
     _since: int = 0
 
-    def state(self) -> dict[str, Any]:
-        """Return what is needed to go on, as JSON."""
-        return vars(self) | {"question": self.question and vars(self.question)}
+    def read(self, path: Path) -> None:
+        """Take in a journal, each of whose lines holds where this stood before it.
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state."""
-        question = state["question"]
-        vars(self).update(state, question=question and Question(**question))
+        Raises
+        ------
+        NotResumableError
+            Its end was changed or is damaged.
+        """
+        last, length = dict[str, Any](), 0
+        for record, begin, end in records_backwards(path):
+            length, last = length or end, last or record
+            if begin and record["standing"]["begin"] != begin:
+                raise damaged(path, begin, "lines before it are missing, or not its own")
+            if length - begin > CHECKED:
+                break
+        if "standing" in last:
+            before = last["standing"]["teaching"]
+            vars(self).update(before, question=before["question"] and Question(*before["question"]))
+            self.take(last)
 
     def take(self, record: Mapping[str, Any]) -> None:
         """Take in a line of the journal."""
         if "model" in record:
+            self.adopted.append(record["model"])
             self.question = self.trial = self._alarm = None
             self._since = int(record["model"]["from_turn"])
             self.untold += [record["model"]["notice"]] if "notice" in record["model"] else []
@@ -185,15 +199,12 @@ class Search:
         out = ["--out", str(question.folder(self.watch)), "--seed", str(self.seed)]
         return ["--from-run", str(self.watch), *turns, *out]
 
-    def answer(self, question: Question, *, wait: bool, asked_to_end: Callable[[], bool]) -> Path | None:
-        """Return the folder of the verdict; None while it is looked for.
+    def answer(
+        self, question: Question, wait: bool, asked_to_end: Callable[[], bool]
+    ) -> Path | TwinMasterError | None:
+        """Return the folder of the verdict, or the last that a search without one said; None before.
 
         No key of the terminal ends the process; where turns do not wait for it, it has a low priority.
-
-        Raises
-        ------
-        TwinMasterError
-            The search ended without a verdict; the sentence is the last one that it said.
         """
         folder = question.folder(self.watch)
         log = folder.with_name(folder.name + ".log")
@@ -212,7 +223,7 @@ class Search:
                 self._process = None
                 lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
                 said = (line.strip() for line in reversed(lines) if line.strip())
-                raise TwinMasterError(next(said, f"exit code {code}"))
+                return TwinMasterError(next(said, f"exit code {code}"))
             if not wait or asked_to_end():
                 return None
             time.sleep(_LOOK_AGAIN)
@@ -248,7 +259,7 @@ def verdict_of(
     where = f"{step.capitalize()}s {question.from_turn} to {question.to_turn} were searched for the cause"
     if isinstance(folder, TwinMasterError):
         sentence = f"{where}, and the search ended without a verdict: {folder}"
-        return {**asked, "tried": False, "kind": "none", "notice": notice_of("verdict", sentence)}
+        return {**asked, "tried": False, "kind": "none", "notice": Notice("verdict", sentence).as_record()}
     try:
         verdict = read_json(folder / VERDICT, DamagedFileError)["verdict"]
         kind, said = str(verdict["kind"]), str(verdict["sentence"])
@@ -264,7 +275,7 @@ def verdict_of(
         sentence += f" To believe it none the less: uav-twin watch --resume --out DIR {options}"
     return {
         **asked, "tried": tried, "kind": kind, "folder": folder.relative_to(watch).as_posix(),
-        "notice": notice_of("verdict", sentence),
+        "notice": Notice("verdict", sentence).as_record(),
     }  # fmt: skip
 
 
@@ -280,11 +291,6 @@ def trial_sentence(trial: Mapping[str, Any], outcome: Outcome, step: str) -> str
     if trial["kind"] == GROUP:
         said += " It is one of a group: which of them is true these data cannot tell."
     return f"{said} {outcome.policy_change}".rstrip()
-
-
-def notice_of(kind: str, sentence: str) -> dict[str, Any]:
-    """Return a notice as it stands in the journal."""
-    return {"kind": kind, "sentence": sentence, "sensors": [], "value": None, "since": None}
 
 
 def both_patches(before: Path | None, found: Path) -> bytes:

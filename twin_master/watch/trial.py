@@ -69,7 +69,7 @@ def patched_model(
         raise MissionInputError("only a twin that believes a design can be given a patch of its model.")
     scenario = scenario.model_copy(update={"belief": belief.model_copy(update={"patch": str(file)})})
     source: AssetSource = scenario.belief.source(scenario, None)
-    return BelievedModel(from_turn, prepared_alone(scenario, source, progress))
+    return BelievedModel(from_turn, prepared_alone(scenario, source, progress), file)
 
 
 def judged(

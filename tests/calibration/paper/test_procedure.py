@@ -2,17 +2,19 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calibration.errors import ExperimentDataError, ExperimentFileError, OutsideValidityError
+from calibration.errors import ExperimentDataError, OutsideValidityError
 from calibration.joint.measurement import PUBLISHED_MODES
 from calibration.joint.wing_table import TOTAL_MASS, tabulate_wing, weighed
 from calibration.paper.procedure import damping_coefficients, fit_masses, read_published_results
 from fe.runtime.modal_system import rayleigh_damping_ratio
+from tests.refusals import Inputs
 
 MASSES = {"servo_mass": (0.05, 0.3), "pitot_mass": (0.0, 0.3)}
 READ = (weighed(), *PUBLISHED_MODES)
@@ -83,36 +85,7 @@ def test_our_wing_on_the_published_targets(reference):
         fit_masses(wing.frequency, np.array([1.0, 1.5]), wing.validity, READ)
 
 
-@pytest.mark.parametrize(
-    ("changed", "words"),
-    [
-        ({"weighed_mass": 2.0}, "cannot weigh 2 kg"),
-        ({"weighed_mass": math.nan}, "cannot weigh nan"),
-        ({"frequency_1": 7.0}, "at the limit of the model"),
-        ({"damping_ratio_1": 0.02, "damping_ratio_2": 0.5}, "neither may be negative"),
-    ],
-)
+@pytest.mark.parametrize(("changed", "words"), Inputs(Path(__file__).parents[1]).refused("masses"))
 def test_refusals(changed, words):
     with pytest.raises(ExperimentDataError, match=words):
         fit_masses(line_model, np.ones(1), MASSES, read(**changed))
-
-
-HEADER = "e_sample,target_freq_1,target_freq_2,zeta_1,zeta_2,mass_servo_1,mass_pitot,freq_1,freq_2\n"
-
-ROW = "1,5.6,29.9,.03,.07,.17,.1,5.6,28.6\n"
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "words"),
-    [
-        ("e.csv", HEADER.replace("freq_2\n", "f\n") + ROW, "no column 'freq_2'"),
-        ("e.csv", HEADER + ROW.replace(".17,.1,", ".17,,"), "'mass_pitot' must hold a number, and nothing"),
-        ("", "", "does not hold"),
-        ("nothing", "", "does not exist"),
-    ],
-)
-def test_bad_files(tmp_path, name, text, words):
-    if text:
-        (tmp_path / name).write_text(text, encoding="utf-8")
-    with pytest.raises(ExperimentFileError, match=words):
-        read_published_results(tmp_path / name)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calibration.errors import ExperimentDataError, ExperimentFileError
+from calibration.errors import ExperimentDataError
 from calibration.static.experiments import (
     LOAD_STANDARD_DEVIATION,
     published_measurements,
@@ -61,63 +61,6 @@ def test_folders_files_columns_and_runs(tmp_path, above):
     assert read_measurements(write(tmp_path / above, runs)).run.tolist() == [0, 0, 1, 1]
     numbered = "reading,load,displacement\n1,9.81,14.5\n2,9.81,14.5\n"
     assert read_measurements(write(tmp_path / above, numbered)).count == 2
-
-
-def refusal(sentence, *lines, head="load,displacement"):
-    return pytest.param("\n".join([head, *lines]) + "\n", sentence, id=sentence)
-
-
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        refusal("no column 'load', which a load test needs; its columns are force, disp", "1,2",
-                head="force,displacement"),
-        refusal("line 2: column 'displacement' holds nan, and a finite number is", "2.4525,nan"),
-        refusal("leave out readings of zero", "0,0", "2.4525,3.9"),
-        refusal("column 'load' holds -2.4525, and a positive number is needed", "-2.4525,3.9"),
-        # A decimal comma makes two cells of one number; half of it is a displacement that looks sound.
-        refusal("line 2: 3 cells came, and the header has 2 columns", "9.81,14,5542"),
-        refusal("the lines 3 and 4 hold the same row", "4.905,7.6", "9.81,14.5", "9.810,14.5"),
-    ],
-)  # fmt: skip
-def test_bad_files_get_one_sentence(tmp_path, text, sentence):
-    with pytest.raises((ExperimentFileError, ExperimentDataError), match=r"\.$") as caught:
-        read_measurements(write(tmp_path, text))
-    assert sentence in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("load_factor", "displacement_factor", "sentence"),
-    [
-        (1.0 / 9.80665, 1.0, "looks like kgf"),
-        (1000.0 / 9.80665, 1.0, "looks like grams"),
-        (1.0 / 9.80665, 1e-3, "kgf beside a displacement in m"),
-        (1.0 / 4.44822, 1.0, "looks like lbf"),
-        (1e-3, 1.0, "looks like kN"),
-        (1.0, 1e-3, "displacement looks like m"),
-        (1.0, 0.1, "displacement looks like cm"),
-        (1.0, 1.0 / 25.4, "displacement looks like inches"),
-        (3.0, 1.0, "check the columns"),
-        (0.0, 0.0, ""),  # exchanged
-    ],
-)
-def test_wrong_units_are_recognised(tmp_path, load_factor, displacement_factor, sentence):
-    pairs = PAIRS * [load_factor, displacement_factor] if load_factor else PAIRS[:, ::-1]
-    with pytest.raises(ExperimentDataError, match="expected before calibration") as caught:
-        read_measurements(write(tmp_path, table(pairs)))
-    assert sentence in str(caught.value)
-
-
-def test_missing_places(tmp_path):
-    with pytest.raises(ExperimentFileError, match="does not exist"):
-        read_measurements(tmp_path / "nowhere")
-    with pytest.raises(ExperimentFileError, match="does not hold"):
-        read_measurements(tmp_path)
-    binary = tmp_path / "picture.csv"
-    binary.write_bytes(bytes(range(128, 256)))
-    with pytest.raises(ExperimentFileError, match="not text in UTF-8"):
-        read_measurements(binary)
 
 
 def test_the_hash_sees_figures_and_not_names():

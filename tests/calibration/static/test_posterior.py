@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal, norm
 
 from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.static.errors_in_variables import exact_posterior, log_likelihood, pair_log_likelihoods
-from calibration.static.experiments import LoadDisplacementData, published_measurements
+from calibration.static.experiments import published_measurements
 from calibration.static.posterior import GaussianPrior, ScalarPosterior, child_seed
 from calibration.static.stiffness_curve import (
     PUBLISHED_LINE,
@@ -47,14 +47,6 @@ def test_quantile_inverts_the_distribution_function(density, probability):
     value = posterior.quantile(probability)
     assert 0.0 <= value <= 1.0
     assert posterior.cumulative(value) == pytest.approx(probability, abs=1e-9)
-
-
-@given(scale=st.floats(1e-290, 1e290))
-def test_the_scale_of_the_density_does_not_matter(scale):
-    _, posterior = gaussian(size=201)
-    scaled = ScalarPosterior(posterior.grid, posterior.density / posterior.density.max() * scale)
-    assert scaled.mean == pytest.approx(posterior.mean)
-    assert np.trapezoid(scaled.density, scaled.grid) == pytest.approx(1.0)
 
 
 def test_samples_repeat_bit_for_bit_and_follow_the_density():
@@ -124,13 +116,6 @@ class Springs:
     def tip_stiffness(self, young_modulus_factor):
         self.calls += 1
         return 1.0 / (1.0 / (640.0 * young_modulus_factor + 100.0) + 1.0 / 8000.0)
-
-
-def test_published_line():
-    assert PUBLISHED_LINE.stiffness(1.0) == pytest.approx(677.0)
-    assert PUBLISHED_LINE.stiffness([0.9, 1.1]) == pytest.approx([619.48, 734.52])
-    assert PUBLISHED_LINE.young_modulus_factor(677.0) == pytest.approx(1.0)
-    assert PUBLISHED_LINE.slope([0.9, 1.1]) == pytest.approx(575.2)
 
 
 def test_a_table_meets_its_model_within_the_stated_error():
@@ -252,55 +237,3 @@ def test_published_pairs():
         exact_posterior(DATA, curve=curve)
     with pytest.raises(PosteriorError, match="zero offset"):
         log_likelihood(PUBLISHED_LINE, DATA, FACTORS, measure="ratio", zero_offset_standard_deviation=1e-4)
-
-
-@given(load_scale=st.floats(1e-4, 1e4), displacement_scale=st.floats(1e-4, 1e4))
-@settings(max_examples=30, deadline=None)
-def test_units_do_not_matter(load_scale, displacement_scale):
-    data = LoadDisplacementData(
-        load=DATA.load * load_scale,
-        displacement=DATA.displacement * displacement_scale,
-        run=DATA.run,
-        load_standard_deviation=DATA.load_standard_deviation * load_scale,
-        displacement_standard_deviation=DATA.displacement_standard_deviation * displacement_scale,
-    )
-    scale = load_scale / displacement_scale
-    curve = stiffness_line(575.2 * scale, 101.8 * scale)
-    posterior, reference = exact_posterior(data, curve=curve), exact_posterior(DATA)
-    assert posterior.mean == pytest.approx(reference.mean, abs=1e-9)
-    assert posterior.standard_deviation == pytest.approx(reference.standard_deviation, rel=1e-6)
-
-
-@given(repeats=st.integers(1, 40), noise=st.floats(0.01, 10.0), factor=st.floats(0.7, 1.3))
-@settings(max_examples=40, deadline=None)
-def test_more_measurements_shrink_the_variance_and_never_beyond_the_prior(repeats, noise, factor):
-    load = np.tile(DATA.load[:4], repeats)
-    data = LoadDisplacementData(
-        load=load,
-        displacement=load / PUBLISHED_LINE.stiffness(factor),
-        run=np.arange(load.size),
-        load_standard_deviation=DATA.load_standard_deviation * noise,
-        displacement_standard_deviation=DATA.displacement_standard_deviation * noise,
-    )
-    doubled = dataclasses.replace(
-        data, load=np.tile(load, 2), displacement=np.tile(data.displacement, 2), run=np.arange(2 * load.size)
-    )
-    posterior, narrower = exact_posterior(data), exact_posterior(doubled)
-    assert narrower.standard_deviation < posterior.standard_deviation
-    assert posterior.standard_deviation < 1.02 * GaussianPrior().standard_deviation
-    assert np.all(np.isfinite(posterior.density))
-
-
-def test_intervals_cover_the_truth_on_virtual_wings():
-    generator = np.random.default_rng(2021)
-    prior = GaussianPrior()
-    repetitions, covered = 200, 0
-    for _ in range(repetitions):
-        truth = generator.normal(prior.mean, prior.standard_deviation)
-        load = DATA.load + DATA.load_standard_deviation * generator.standard_normal(DATA.count)
-        displacement = DATA.load / PUBLISHED_LINE.stiffness(truth)
-        displacement += DATA.displacement_standard_deviation * generator.standard_normal(DATA.count)
-        data = dataclasses.replace(DATA, load=load, displacement=displacement)
-        lower, upper = exact_posterior(data, grid_size=401).interval(0.90)
-        covered += lower <= truth <= upper
-    assert 0.85 <= covered / repetitions <= 0.95

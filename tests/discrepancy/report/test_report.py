@@ -177,7 +177,7 @@ def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     )
     (told,) = (
         line
-        for line in needs(Separability(hidden, (), np.zeros((0, 0)), ()), drag.campaign, FEW)
+        for line in needs(Separability(hidden, (), np.zeros((0, 0)), ()), drag.campaign, FEW, TrialKind)
         if "would not be seen" in line
     )
     first = FEW[0].identifier.replace("_", " ")
@@ -194,9 +194,10 @@ def test_rows_of_what_can_be_decided(drag, able):
         near[row] = False
         assert neighbours(able, name) == [able.identifiers[place] for place in np.flatnonzero(near)]
     assert group_lines(able)
-    text = " ".join(needs(able, drag.campaign, FEW))
+    text = " ".join(needs(able, drag.campaign, FEW, TrialKind))
     for group in able.groups:
         assert group[0].replace("_", " ") in text
+    assert " add " not in " ".join(needs(able, drag.campaign, FEW, ()))  # trials that its model cannot follow
 
 
 def test_what_is_named_in_part_shows_shares_remainder_and_what_was_not_fitted(drag):

@@ -132,8 +132,7 @@ def test_a_point_inside_is_found_and_one_outside_on_the_surface(distorted: Struc
         aside[[number % 3, number // 3 % 3]] = -0.004  # beside a face or an edge
         found = on_surface(distorted, aside, "here")
         nearest = np.clip(aside, 0.0, size)
-        # beside the slanting edge of a triangle it is only near the nearest
-        assert found.distance < 2.0 * np.linalg.norm(aside - nearest)
+        assert found.distance == pytest.approx(np.linalg.norm(aside - nearest))
         places += [(*on_face, nearest, 1e-2) for on_face in zip(found.cell, found.local, strict=True)]
         for cell, local, wanted, tolerance in places:
             values, _ = distorted.kind.shape_functions(local[None])

@@ -197,24 +197,27 @@ def test_the_credible_set_by_enumeration(weights, truth):
 def test_standard_errors_of_a_study():
     random = np.random.default_rng(1)
     error = random.standard_normal((50, 2))
-    study = Outcomes(
-        delay=np.r_[np.ones(40), np.full(5, np.inf), np.full(5, np.nan)],
-        early=np.arange(50) < 10,
-        error=error,
-        squared_error=error**2,
-        log_evidence=np.full(50, 3.0),
-        credible=np.r_[np.zeros(25), np.ones(25)],
+    study = Outcomes.of(
+        {
+            "status": np.ones(50),
+            "delay": np.r_[np.ones(40), np.full(5, np.inf), np.full(5, np.nan)],
+            "early": np.arange(50) < 10,
+            "mean": error[:, None] + 1.0,
+            "state": np.ones((50, 1, 2)),
+            "log_evidence": np.full((50, 1), 3.0),
+            "credible": np.r_[np.zeros(25), np.ones(25)],
+        }
     )
-    assert study.within(2).value == pytest.approx(40 / 45)
-    assert study.within(2).error == pytest.approx(scipy.stats.beta(41, 6).std())
-    assert study.early_fallback.error == pytest.approx(scipy.stats.beta(11, 41).std())
+    assert study.within.value == pytest.approx(40 / 45)
+    assert study.within.error == pytest.approx(scipy.stats.beta(41, 6).std())
+    assert study.early.error == pytest.approx(scipy.stats.beta(11, 41).std())
     assert study.evidence.value == 3.0
     assert study.evidence.error == 0.0
-    assert study.credible_share.error == pytest.approx(0.5 / 7.0)
+    assert study.credible.error == pytest.approx(0.5 / 7.0)
     again = [np.sqrt(np.mean(random.choice(error[:, 0], 50) ** 2)) for _ in range(4000)]
-    assert study.rms(0).value == pytest.approx(study.rms(0).value)
-    assert study.rms(0).error == pytest.approx(np.std(again), rel=0.1)  # the bootstrap
-    assert study.bias(1).value == pytest.approx(error[:, 1].mean())
+    assert study.rms[0].value == pytest.approx(np.sqrt(np.mean(error[:, 0] ** 2)))
+    assert study.rms[0].error == pytest.approx(np.std(again), rel=0.1)  # the bootstrap
+    assert study.bias[1].value == pytest.approx(error[:, 1].mean())
 
 
 def test_a_model_error_reaches_the_twin(library_file, tmp_path):
@@ -311,11 +314,11 @@ class TestOnTheWing:
         seeds = range(12)
         right, wrong = (fly_seeds(scenario, source, seeds, calibration_seed=0) for source in (own, mixed))
         assert wrong.evidence.value < right.evidence.value - 1.0
-        assert wrong.rms(1).value > right.rms(1).value + 0.02
+        assert wrong.rms[1].value > right.rms[1].value + 0.02
         expected = misfit.bias[knowledge.model.states.index((0.2, 0.4)), 1]
         assert np.abs(expected[1]) > 0.05
-        assert np.sign(wrong.bias(1).value) == np.sign(expected[1])
-        assert wrong.credible_share.value < right.credible_share.value
+        assert np.sign(wrong.bias[1].value) == np.sign(expected[1])
+        assert wrong.credible.value < right.credible.value
 
     def test_a_belief_of_some_regions_and_one_of_frequencies_are_the_wing_itself(self, wing, tmp_path):
         """A region that is not named is healthy, for the twin, the FMU that flies and the field."""
@@ -390,8 +393,8 @@ class TestOnTheWing:
         observation = scenario.observation.model_copy(update={"model_error": 0.03})
         doubting = scenario.model_copy(update={"observation": observation})
         certain, doubtful = (fly_seeds(chosen, mixed, range(30)) for chosen in (scenario, doubting))
-        assert certain.within(2).value >= 0.9
-        assert certain.rms(0).value <= 0.055
-        assert doubtful.early_fallback.value <= certain.early_fallback.value
+        assert certain.within.value >= 0.9
+        assert certain.rms[0].value <= 0.055
+        assert doubtful.early.value <= certain.early.value
         assert doubtful.evidence.value > certain.evidence.value
-        assert certain.rms(1).value < 0.2
+        assert certain.rms[1].value < 0.2

@@ -179,19 +179,6 @@ def test_a_model_error_counts_in_the_predictive_check(run, error):
     assert report._check_words(run, without)["error"] == ""
 
 
-def test_predictive_check_of_a_right_twin_is_uniform(run):
-    random, expected = np.random.default_rng(3), run["filtered/quantity_mean"]
-    check = predictive_check(
-        altered(
-            run, filtered__quantity_standard_deviation=np.zeros((50, 24)),
-            observed__strain=expected + 125e-6 * random.standard_normal((50, 24)),
-        )
-    )  # fmt: skip
-    assert abs(check.overall_coverage - 0.95) < 0.02
-    assert abs(check.standard_deviation - 1.0) < 0.05
-    assert np.all(np.abs(np.histogram(check.transform, 10)[0] - 120) < 45)
-
-
 def test_calibration_shows_draws_posterior_and_measurements(run):
     assert measured(run) is None
     assert len(calibration_figure(run).axes) == 1

@@ -94,6 +94,11 @@ def teller_of(flight: Flight) -> Teller:
     return Teller(flight, scene_of(flight.folder, flight.knowledge))
 
 
+def of_turns(flight: Flight, first: int, end: int) -> Belief:
+    """Return what the twin believed of turns when they were flown."""
+    return flight.believed(flight.seen(first, end))
+
+
 def asked(first: int = 0, end: int = 0, turn: int = LATEST, **changed: int) -> Request:
     given = {"number": 1, "flight": -1, "shown": -1, "count": -1} | changed
     return Request(first=first, end=end, turn=turn, **given)
@@ -102,7 +107,7 @@ def asked(first: int = 0, end: int = 0, turn: int = LATEST, **changed: int) -> R
 def test_every_number_is_that_of_the_run(run):
     flight, stored = whole(run), open_run(run)
     assert flight.turns == TURNS
-    believed, expected = flight.believed(0, TURNS), flight.predicted(28)
+    believed, expected = of_turns(flight, 0, TURNS), flight.predicted(flight.seen(28, 29)[0])
     for belief, group, part in ((believed, "filtered", slice(None)), (expected, "predicted", 28)):
         values = {name: stored[group][name].values[part] for name in stored[group].data_vars}
         np.testing.assert_array_equal(belief.probability, values["probability"])
@@ -123,7 +128,7 @@ def test_every_number_is_that_of_the_run(run):
     np.testing.assert_array_equal(
         expected.control_probability, stored["predicted"]["control_probability"].values[28]
     )
-    np.testing.assert_array_equal(flight.truth(0, TURNS), stored["truth"]["state"].values)
+    np.testing.assert_array_equal(flight.truth(flight.seen(0, TURNS)), stored["truth"]["state"].values)
 
 
 def test_turns_are_seen_as_soon_as_their_lines_are_whole(run, begun, lines):
@@ -137,7 +142,7 @@ def test_turns_are_seen_as_soon_as_their_lines_are_whole(run, begun, lines):
     assert flight.update()
     assert flight.turns == TURNS
     np.testing.assert_array_equal(
-        flight.believed(0, TURNS).probability, whole(run).believed(0, TURNS).probability
+        of_turns(flight, 0, TURNS).probability, of_turns(whole(run), 0, TURNS).probability
     )
 
 
@@ -159,8 +164,7 @@ def test_a_changed_line_ends_the_view_with_its_turn(begun, lines):
         whole(begun)
 
 
-def test_an_observation_that_came_late_stands_in_its_turn(begun, lines, monkeypatch):
-    """And turns beyond those kept are read again and are the same."""
+def test_an_observation_that_came_late_stands_in_its_turn(begun, lines):
     turns = [json.loads(line[65:]) for line in lines[1:]]
     missed = turns[6] | {"observed": [None] * 24}
     late = turns[9] | {"observation_turn": 6, "observed": turns[6]["observed"]}
@@ -171,37 +175,27 @@ def test_an_observation_that_came_late_stands_in_its_turn(begun, lines, monkeypa
     assert flight.update()
     assert (flight.turns, flight.number) == (10, number + 1)
     expected = [turn["observed"] for turn in turns[:10]]
-    np.testing.assert_array_equal(flight.observed(0, 10), np.array(expected, dtype=float))
+    np.testing.assert_array_equal(flight.observed(flight.seen(0, 10)), np.array(expected, dtype=float))
     last = [turn["filtered"] for turn in flight.seen(8, 10)]
     assert last == [turns[8]["filtered"], turns[20]["filtered"]]
     add(begun, *map(line_of, [{"model": {}}, *turns[10:20]]))
-    flight, parts = whole(begun), ((0, 20), (5, 8), (0, 2), (18, 20))
-    believed, seen = [flight.believed(*part) for part in parts], flight.seen(0, 20)
-    monkeypatch.setattr("twin_master.viewer.flight.TURNS_KEPT", 3)
-    few = whole(begun)
-    assert few.turns == flight.turns == 20
-    for part, belief in zip(parts, believed, strict=True):
-        again = few.believed(*part)
-        np.testing.assert_array_equal(again.probability, belief.probability)
-        np.testing.assert_array_equal(again.control_probability, belief.control_probability)
-        np.testing.assert_array_equal(again.expected.reward_mean, belief.expected.reward_mean)
-    assert few.seen(0, 20) == seen
-    assert len(few._kept) == 3
+    assert whole(begun).turns == 20
+    flight.update()
     add(begun, line_of(turns[30]))
     with pytest.raises(RunFolderError, match="tells turn 30 where 20 was expected"):
         flight.update()
     journal = begun / JOURNAL_NAME
     journal.rename(begun / "before")
     journal.write_bytes(b"".join(lines[:4]))  # another flight
-    assert teller_of(few).answer(asked()) is None  # until it is seen
-    assert few.update()
-    assert few.turns == 3
+    assert teller_of(flight).answer(asked()) is None  # until it is seen
+    assert flight.update()
+    assert flight.turns == 3
 
 
 def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown(begun, lines):
     add(begun, *lines)
     flight = whole(begun)
-    before, number = flight.believed(0, 5).expected.mean, flight.number
+    before, number = of_turns(flight, 0, 5).expected.mean, flight.number
     with np.load(begun / KNOWLEDGE_NAME) as kept:
         arrays = dict(kept)
     content = io.BytesIO()
@@ -209,7 +203,7 @@ def test_a_model_that_is_adopted_while_the_view_is_open_is_the_one_that_is_shown
     atomic_write_bytes(begun / KNOWLEDGE_NAME, content.getvalue())
     assert flight.update()
     assert flight.number > number
-    np.testing.assert_allclose(flight.believed(0, 5).expected.mean, 1.1 * before)
+    np.testing.assert_allclose(of_turns(flight, 0, 5).expected.mean, 1.1 * before)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PK\x05\x06" + bytes(18), b"no archive"])
@@ -241,11 +235,11 @@ def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
     assert len(back["ahead"]["state"]) == 10
     # In printed units, with their bands.
     answer = told(teller, turn=28)
-    past, believed = answer["past"], flight.believed(0, 29)
+    past, believed = answer["past"], of_turns(flight, 0, 29)
     np.testing.assert_allclose(
         past["state"], 100.0 * flight.knowledge.model.states.mean(believed.probability)
     )
-    np.testing.assert_allclose(past["observed"], 1e6 * flight.observed(0, 29))
+    np.testing.assert_allclose(past["observed"], 1e6 * flight.observed(flight.seen(0, 29)))
     width = np.subtract(past["sensor_upper"], past["sensor_lower"])
     np.testing.assert_allclose(
         width,
@@ -358,7 +352,7 @@ def test_the_page_in_a_browser(begun, lines, tmp_path):
         tabs[2].value("connect()")
         tabs[2].wait("window.painted.at(-1)[0] === 49 && held.rows.length === 50")
         flown = whole(begun)
-        expected = 100.0 * flown.knowledge.model.states.mean(flown.believed(0, TURNS).probability)
+        expected = 100.0 * flown.knowledge.model.states.mean(of_turns(flown, 0, TURNS).probability)
         for tab in tabs[1:]:
             np.testing.assert_allclose(tab.value("held.rows.map((row) => row.state)"), expected)
         assert first.value("element('told').hidden && element('learning').hidden")

@@ -19,7 +19,7 @@ from tests.twin_master.runs import journal
 from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, killed_at, soon_quiet, wait_until
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.watch.broker import PASSWORD_VARIABLE, Broker, broker_of
+from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, broker_of
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import MqttFeed
@@ -63,7 +63,7 @@ def watching(where: Broker, watch: Watch, turns: int) -> Iterator[list[str]]:
     """Watch so many turns in a thread, from when the twin is connected on; yields what it notes."""
     notes = list[str]()
     feed = MqttFeed(where, watch, notes.append)
-    thread = threading.Thread(target=watch.run, args=(feed, feed.decide), kwargs={"turns": turns})
+    thread = threading.Thread(target=watch.run, args=(feed, str), kwargs={"turns": turns})
     thread.start()
     wait_until(lambda: notes)
     yield notes
@@ -136,7 +136,7 @@ def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_kil
 
     def run(turns: int, note: Any = str) -> None:
         feed = MqttFeed(where, watch, note)
-        watch.run(feed, feed.decide, turns=turns)
+        watch.run(feed, str, turns=turns)
         feed.close()
 
     run(1, lambda _note: publish(listener, *range(turns)))  # all but the first wait at the broker
@@ -171,7 +171,7 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
             publish(publisher, *sent)
 
         feed = MqttFeed(where_of(broker), watch, note)
-        counts = watch.run(feed, feed.decide, turns=turns)
+        counts = watch.run(feed, str, turns=turns)
         feed.close()
         return counts
 
@@ -261,7 +261,7 @@ def test_a_subscription_that_is_refused(base, broker, tmp_path):
     watch = begun(base, tmp_path / "watch")
     feed = MqttFeed(broker_of(f"mqtt://127.0.0.1:{broker.port}/{TOPIC}"), watch, str)
     with pytest.raises(MissionInputError, match=r"does not let the twin read wing/7: Not authorized"):
-        watch.run(feed, feed.decide)
+        watch.run(feed, str)
 
 
 def test_a_watch_that_hears_nothing_says_so(base, broker, tmp_path, monkeypatch):
@@ -272,7 +272,7 @@ def test_a_watch_that_hears_nothing_says_so(base, broker, tmp_path, monkeypatch)
         if not (child := os.fork()):
             try:
                 feed = MqttFeed(where_of(broker), watch, str)
-                watch.run(feed, feed.decide)
+                watch.run(feed, str)
                 feed.close()
             finally:
                 os._exit(1)

@@ -21,7 +21,7 @@ from twin_master.network.twin import Twin
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import WatchSection
 from twin_master.watch import feeds
-from twin_master.watch.intake import Feed, Intake, RejectedFile
+from twin_master.watch.intake import Feed, Intake
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused
 
 TURNS = 60
@@ -61,7 +61,7 @@ def intake_of(
     knowledge: Knowledge, lines: list[bytes], rejected: Path | None = None, feed: Feed | None = None
 ) -> Intake:
     feed = feed or feeds.JsonLinesFeed(knowledge.scenario, io.BytesIO(b"".join(lines)))
-    return Intake(knowledge.scenario, feed, RejectedFile(rejected))
+    return Intake(knowledge.scenario, feed, rejected)
 
 
 def watched(knowledge: Knowledge, lines: list[bytes], rejected: Path | None = None) -> tuple[Twin, Intake]:

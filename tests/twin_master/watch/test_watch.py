@@ -247,7 +247,7 @@ def test_a_long_watch_goes_on_from_its_snapshot(base, mission, plain, tmp_path, 
 def test_a_watch_is_taken_up_from_the_end_of_its_journal(base, mission, tmp_path, monkeypatch):
     """It costs the same however long it is; what is not read is not missed, and what is read is checked."""
     monkeypatch.setattr("twin_master.watch.keeping.SNAPSHOT_TURNS", 8)
-    monkeypatch.setattr("twin_master.watch.keeping.CHECKED", 1)
+    monkeypatch.setattr("twin_master.watch.teaching.CHECKED", 1)
     observed, controls = np.tile(mission.observed, (4, 1)), np.tile(mission.control_index, 4)
     feed = CsvFeed(write_csv(tmp_path / "m.csv", observed, controls), base.scenario)
     watch, file = begun(base, tmp_path / "watch"), tmp_path / "watch" / JOURNAL_NAME
@@ -266,9 +266,9 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(base, mission, tmp_path
     ran(watch, feed, 198)
     with pytest.raises(NotResumableError, match=r"line 4 .*; 3 before it are whole"):
         watch.told(0)
-    changed = lines[-2].replace(b'"turn": ', b'"turn": 1')
+    changed = lines[-2].replace(b'"turn": 1', b'"turn": 2')
     for wrong, sentence in (
-        ([*lines[:3], *lines[4:]], r"line 192 .*lines before it are missing"),
+        ([*lines[:3], *lines[4:]], r"line 196 .*lines before it are missing"),
         ([*lines[:-2], changed, lines[-1]], "line 196 .*and 1 behind it"),
     ):
         file.write_bytes(b"".join(wrong))

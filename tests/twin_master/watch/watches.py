@@ -42,7 +42,6 @@ def begun(base: Watch, folder: Path) -> Watch:
     shutil.copytree(base.folder, folder)
     watch = copy.copy(base)
     watch.folder, watch._path, watch.models = folder, folder / JOURNAL_NAME, list(base.models)
-    watch._patches = [None]
     return watch
 
 
