@@ -18,6 +18,8 @@ from fe.wing.design import load_design
 from fe.wing.mesh import build_mesh
 from tests.refusals import Inputs
 
+INPUTS = Inputs(__file__)
+
 
 def test_the_published_lengths():
     result = published_lengths()
@@ -44,7 +46,7 @@ def test_posterior_by_quadrature():
 
 def test_files_of_lengths(tmp_path):
     file = tmp_path / "lengths.csv"
-    file.write_text(Inputs(__file__).text("lengths.csv"), encoding="utf-8")
+    file.write_text(INPUTS.text("lengths.csv"), encoding="utf-8")
     for own, published in zip(read_lengths(file), published_lengths(), strict=True):
         assert own.posterior.mean == pytest.approx(published.posterior.mean, rel=1e-12)
 
@@ -97,23 +99,9 @@ def test_what_moves_with_the_planform_and_what_stays():
     assert tailored.gauges.positions == drawn.gauges.positions
 
 
-@pytest.mark.parametrize(
-    ("changes", "measured", "error", "words"),
-    [
-        ({"planform": {"semi_span": 2.4}}, {}, ExperimentDataError,
-         r"semi_span measures 1828\.0 mm.*2400\.0 mm.*--design"),
-        ({"gauges": {"positions": [[1.81, 0.4]]}}, {"semi_span": 1.8}, InvalidDesignError,
-         r"does not fit the measured planform .*gauges\.positions\[0\] is 1\.81 m from the root.*\.$"),
-        ({"defects": [
-            {"span_start": 0.1, "span_end": 0.3, "chord_start": 0.2, "chord_end": 0.3},
-            {"span_start": 1.5, "span_end": 1.828, "chord_start": 0.2, "chord_end": 0.3},
-        ]}, {"semi_span": 1.8}, InvalidDesignError,
-         r"does not fit the measured planform .*defects\[1\] ends 1\.828 m from the root, off the wing.*\.$"),
-        ({"skin": {"thickness": 0.0023}}, {"tip_chord": 0.24}, InvalidDesignError,
-         r"the skin of 0\.0023 m does not fit"),
-    ],
-)  # fmt: skip
-def test_what_no_longer_fits_is_refused_with_its_place(changes, measured, error, words):
+@pytest.mark.parametrize(("changes", "measured", "kind", "words"), INPUTS.refused("planform"))
+def test_what_no_longer_fits_is_refused_with_its_place(changes, measured, kind, words):
+    error = {"Data": ExperimentDataError, "Design": InvalidDesignError}[kind]
     with pytest.raises(error, match=words) as caught:
         tailored_design(load_design().changed(**changes), lengths(**measured))
     assert "the changed design" not in str(caught.value)

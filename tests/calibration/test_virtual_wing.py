@@ -26,6 +26,7 @@ from calibration.virtual_wing import (
 from calibration.wing.lab_data import read_weighed_mass, write_lab_folder
 from fe.runtime.errors import OutsideModelError
 from fe.runtime.state import TIP_FORCE, DigitalState, Geometry
+from tests.refusals import Inputs
 from tests.wings import wing_integrator
 
 TRUTH = DigitalState(young_modulus_factor=1.0073, damping_alpha=1.03, damping_beta=7.66e-4)
@@ -128,16 +129,7 @@ def test_reading_errors_are_as_stated_and_follow_the_seed():
     np.testing.assert_allclose(record.signal / 5e-5, np.round(record.signal / 5e-5), atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"trials": 0}, "at least one trial"),
-        ({"sampling_rate": 1e15}, "more than 10,000,000 samples"),
-        ({"quantisation": 0.0}, "step must be positive"),
-        ({"sampling_rate": math.nan}, "positive duration and sampling rate"),
-        ({"duration": 0.01}, "samples; at least 64"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "words"), Inputs(__file__).refused("ring_down_settings"))
 def test_bad_settings(settings, words):
     with pytest.raises(ExperimentDataError, match=words):
         measure_ring_down(Beam(), 1, **settings)

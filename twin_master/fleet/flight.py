@@ -25,10 +25,9 @@ from twin_master.fleet.plan import Fleet, Group, load_fleet
 from twin_master.fleet.shard import Kit, ShardResult, read_recording, with_parameters
 from twin_master.fleet.store import FAILED, STORE_NAME, check_installed, create_store, sizes_of, written
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
-from twin_master.mission.opening import held
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
-from twin_master.run_folder import CONFIG_NAME, check_versions, to_json
+from twin_master.run_folder import CONFIG_NAME, check_versions, held, to_json
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
 from twin_master.watch.feeds import file_feed

@@ -15,13 +15,12 @@ from reporting.toml_file import read_toml
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.opening import file_record
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Count, Flag, Name, NotNegative, Number, Probability, Section, Seed
 from twin_master.seeds import generator
 from twin_master.sentences import said
-from twin_master.watch.broker import is_broker
+from twin_master.watch.feeds import is_broker
 from twin_master.watch.message import Fed
 
 SHARD = 256
@@ -268,7 +267,7 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
         members = tuple(Member(row, asset_name(path), seed, {}) for row, path in enumerate(paths))
         return Group(
             section.name, (watched,), {}, members, observations=where, recordings=paths,
-            file=file_record(loaded),
+            file=loaded.file,
         )  # fmt: skip
     if section.count is not None:
         scenarios: list[Scenario] = [resolve_scenario(loaded, common)]

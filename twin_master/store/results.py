@@ -1,8 +1,7 @@
 """A flown mission as labelled arrays, and as tables for people."""
 
-import csv
-import io
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import cycle
 from types import MappingProxyType
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.groups import Group, Variable
+from reporting.table_file import table_text
 from twin_master.learning.expectation import expected_of
 from twin_master.mission.truth import SensorStatus, Truth
 from twin_master.network.inference import known_control
@@ -211,19 +211,21 @@ def tables_of(groups: Mapping[str, Group], role: str) -> dict[str, str]:
         "decisions": steps | _decisions(groups),
         "policy": _policy(groups),
     }
-    return {name: _csv(columns) for name, columns in tables.items()}
+    return {
+        name: table_text({title: _cells(values) for title, values in columns.items()})
+        for name, columns in tables.items()
+    }
 
 
 def _observations(group: Group, variable: str, role: str) -> Columns:
-    values, sensors = group[variable].values, group["sensor"].values
-    units = [group[variable].attrs["units"]] * len(sensors)
+    sensors, units = group["sensor"].values, [group[variable].attrs["units"]]
     if "sensor_unit" in group.coords:
-        units = [str(unit) for unit in group["sensor_unit"].values]
+        units = group["sensor_unit"].values.tolist()
     columns = {}
-    for place, (sensor, unit) in enumerate(zip(sensors, units, strict=True)):
+    for values, sensor, unit in zip(group[variable].values.T, sensors, cycle(units), strict=False):
         strain = role == "strain" and unit == "1"
         factor, name = (MICROSTRAIN, "microstrain") if strain else (1.0, unit)
-        columns[f"{role}_{sensor}_{name}"] = factor * values[:, place]
+        columns[f"{role}_{sensor}_{name}"] = factor * values
     return columns
 
 
@@ -262,17 +264,8 @@ def _policy(groups: Mapping[str, Group]) -> Columns:
     return columns | {f"action_value_{name}": action for name, action in values}
 
 
-def _csv(columns: Columns) -> str:
-    """Return columns as text for people; a cell is empty where nothing was received."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*map(_cells, columns.values()), strict=True))
-    return buffer.getvalue()
-
-
 def _cells(values: Any) -> list[str]:
-    """Return the cells of a column."""
+    """Return the cells of a column, for people; empty where nothing was received."""
     if isinstance(values[0], str):
         return [str(value) for value in values]
     return ["" if np.isnan(value) else f"{value:.6g}" for value in values]

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
@@ -26,6 +27,7 @@ from calibration.static.errors_in_variables import exact_posterior
 from calibration.static.experiments import published_measurements
 from calibration.static.stiffness_curve import PUBLISHED_LINE, stiffness_curve_of, stiffness_line
 from fe.runtime.modal_system import rayleigh_damping_ratio
+from tests.refusals import Inputs
 
 FloatArray = NDArray[np.float64]
 LIMITS = np.array([[0.85, 1.15], [0.05, 0.3], [0.0, 0.3]])
@@ -251,12 +253,7 @@ def test_refusals(tables, changed, kind, sentence):
 
 
 def test_readings_and_states_that_cannot_be(tables):
-    for value, deviation, sentence in (
-        ({"frequency_2": math.nan}, {}, "frequency_2 and its standard deviation must be positive"),
-        ({"damping_ratio_2": 16.0}, {}, "damping ratio of 16 lets nothing swing"),
-        ({"frequency_1": 30.0, "frequency_2": 5.6}, {}, "must lie below the second"),
-        ({}, {"damping_ratio_1": 0.0}, "damping_ratio_1 and its standard deviation"),
-    ):
+    for value, deviation, sentence in Inputs(Path(__file__).parents[1]).refused("modes"):
         with pytest.raises(ExperimentDataError, match=sentence):
             modes(value, deviation)
     with pytest.raises(OutsideValidityError, match=r"mass of each servo is 0\.4 kg, .* 0\.05 to 0\.3 kg"):

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from calibration.joint.measurement import PUBLISHED_MODES
 from calibration.joint.wing_table import TOTAL_MASS, tabulate_wing, weighed
 from calibration.paper.procedure import damping_coefficients, fit_masses, read_published_results
 from fe.runtime.modal_system import rayleigh_damping_ratio
+from tests.refusals import Inputs
 
 MASSES = {"servo_mass": (0.05, 0.3), "pitot_mass": (0.0, 0.3)}
 READ = (weighed(), *PUBLISHED_MODES)
@@ -83,15 +85,7 @@ def test_our_wing_on_the_published_targets(reference):
         fit_masses(wing.frequency, np.array([1.0, 1.5]), wing.validity, READ)
 
 
-@pytest.mark.parametrize(
-    ("changed", "words"),
-    [
-        ({"weighed_mass": 2.0}, "cannot weigh 2 kg"),
-        ({"weighed_mass": math.nan}, "cannot weigh nan"),
-        ({"frequency_1": 7.0}, "at the limit of the model"),
-        ({"damping_ratio_1": 0.02, "damping_ratio_2": 0.5}, "neither may be negative"),
-    ],
-)
+@pytest.mark.parametrize(("changed", "words"), Inputs(Path(__file__).parents[1]).refused("masses"))
 def test_refusals(changed, words):
     with pytest.raises(ExperimentDataError, match=words):
         fit_masses(line_model, np.ones(1), MASSES, read(**changed))

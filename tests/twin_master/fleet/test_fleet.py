@@ -10,6 +10,7 @@ import pytest
 
 from calibration.errors import PosteriorError
 from tests.command_line import refused, said
+from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, edited, text_of, written
 from twin_master.assets.resolution import Overrides
 from twin_master.errors import FleetError, NotResumableError, RunFolderExistsError
@@ -110,20 +111,8 @@ def test_a_folder_keeps_what_it_holds(library_file, tmp_path):
     assert fly_fleet(other, folder, replace_old=True).twins == 3
 
 
-FLEET = """
-format = 1
-fleet = { name = "two", seed = 5 }
-[[group]]
-name = "north"
-scenario = "north.toml"
-count = 3
-[[group]]
-name = "south"
-scenario = "growing_damage"
-count = 2
-steps = 9
-parameters = { young_modulus_factor = { mean = 1.0, standard_deviation = 0.05 } }
-"""
+INPUTS = Inputs(__file__)
+FLEET = INPUTS.text("fleet.toml")
 
 
 @pytest.fixture
@@ -149,17 +138,7 @@ def test_a_twin_has_a_seed_of_its_own_whatever_else_flies(fleet_file):
     assert fleet.groups[0].scenarios[0].mission.seed == 5
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "sentence"),
-    [
-        ("count = 3", "", "one of `count`"),
-        ("count = 3", 'count = 3\nfmus = "*.fmu"', "one of `count`"),
-        ('"north.toml"', '"nowhere.toml"', "group north: There is no scenario `nowhere.toml`"),
-        ("count = 3", 'fmus = "*.fmu"', "no file fits"),
-        ('name = "south"', 'name = "north"', "name of its own"),
-        ("seed = 5", "sead = 5", "sead"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "sentence"), INPUTS.refused("fleet"))
 def test_a_wrong_fleet_file_is_refused(fleet_file, old, new, sentence):
     with pytest.raises(FleetError, match=sentence):
         changed(fleet_file, (old, new))

@@ -7,6 +7,7 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from calibration.result.plain import run_record
 from reporting.errors import DiskFullError
 from reporting.figures import to_svg
 from reporting.words import number
+from tests.refusals import Inputs
 from tests.twin_master.report.drawn import altered, flown, line, panel, rescripted, stored
 from twin_master.errors import RunFolderError
 from twin_master.report import page as report
@@ -42,8 +44,6 @@ def text_of(run: Run, place: Path) -> str:
 # ------------------------------------------------------------------------- the sentences at its head
 
 REGION = "the stiffness loss of region 1"
-KEPT = "The twin kept 3g at every turn"
-REACHED = f"; {REGION} reached the 60 % from which the policy leaves 3g at turn 30."
 
 
 def test_the_page_begins_with_what_was_decided_believed_and_explained(run):
@@ -70,34 +70,20 @@ def first_sentence(run: Run, *gentle: int, level: float = 0.6, **changes: np.nda
     return opening_sentences(altered(run, **given, **changes))[0]
 
 
+OTHERWISE: dict[str, dict[str, Any]] = {
+    "": {},
+    "healthy": {"truth__state": np.zeros((50, 2))},
+    "always": {"level": 0.0},
+    "no truth": {"truth": None},
+}
+
+
 @pytest.mark.parametrize(
-    ("gentle", "changes", "said"),
-    [
-        (range(30, 50), {}, f"The twin fell back from 3g to 2g at turn 30, when {REGION} had reached 60 %."),
-        ((), {}, f"{KEPT}{REACHED}"),
-        (
-            (), {"truth__state": np.zeros((50, 2))},
-            f"{KEPT}; {REGION} never reached the 60 % from which the policy leaves 3g.",
-        ),
-        (range(12, 50), {}, f"The twin left 3g for 2g at turn 12{REACHED}"),
-        (
-            range(31, 50), {},
-            f"The twin fell back from 3g to 2g at turn 31, one turn after {REGION} had reached 60 %.",
-        ),
-        (
-            (33, *range(40, 50)), {},
-            "The twin left 3g for 2g at turn 33, left 2g for 3g at turn 34, left 3g for 2g at turn 40; "
-            f"the first change came 3 turns after {REGION} had reached 60 %.",
-        ),
-        (
-            range(1, 50), {"level": 0.0},
-            "The twin left 3g for 2g at turn 1; the policy leaves 3g in every state.",
-        ),
-        ((), {"truth": None}, f"{KEPT}."),
-    ],
-)  # fmt: skip
-def test_the_first_sentence_follows_the_record(run, gentle, changes, said):
-    assert first_sentence(run, *gentle, **changes) == said  # type: ignore[arg-type]
+    ("gentle", "otherwise", "said"), Inputs(__file__).table("first_sentences.toml")["rows"]
+)
+def test_the_first_sentence_follows_the_record(run, gentle, otherwise, said):
+    turns = (turn for begin, end in gentle for turn in range(begin, end))
+    assert first_sentence(run, *turns, **OTHERWISE[otherwise]) == said
 
 
 def test_of_a_real_asset_nothing_is_said_but_what_was_recorded(run):
