@@ -13,7 +13,6 @@ import numpy as np
 from benchmarks.measurement import Measurement
 from reporting.progress import SilentProgress
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.opening import file_record
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
@@ -74,7 +73,7 @@ def run() -> list[Measurement]:
         for turns in (1, 99, TURNS + 19):  # 32 turns between two lines with all that is needed
             folder = place / str(turns)
             loaded = load_scenario(SCENARIO)
-            with begun_watch(loaded.scenario, file_record(loaded), folder, SilentProgress()) as watch:
+            with begun_watch(loaded.scenario, loaded.file, folder, SilentProgress()) as watch:
                 if not log.exists():
                     record(watch, log, TURNS + 20)
                 watch.run(file_feed(log, watch.scenario), lambda _decision: None, turns=turns)

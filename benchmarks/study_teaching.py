@@ -23,7 +23,6 @@ from reporting.files import atomic_write_text
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from twin_master.mission.journal import JOURNAL_NAME, records
-from twin_master.mission.opening import file_record
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch import teaching
 from twin_master.watch.feeds import file_feed
@@ -71,7 +70,7 @@ def scenario_of(place: Path, known: tuple[Primitive, ...]) -> Path:
 def watched(run: Path, folder: Path, scenario: Path, *, teach: bool) -> Watched:
     """Watch the strains of a run."""
     loaded = load_scenario(scenario)
-    with begun_watch(loaded.scenario, file_record(loaded), folder, SilentProgress()) as watch:
+    with begun_watch(loaded.scenario, loaded.file, folder, SilentProgress()) as watch:
         search = teaching.Search(folder, watch.scenario.mission.seed) if teach else None
         watch.run(file_feed(run / "run.nc", watch.scenario), lambda _decision: None, search=search)
     lines = [record for record, *_ in records(folder / JOURNAL_NAME)]

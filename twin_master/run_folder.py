@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from reporting.files import atomic_write_bytes, atomic_write_text, remove_leftovers
-from reporting.folders import lock_folder, whole_folder
+from reporting.folders import lock_folder, restore_folder, whole_folder
 from reporting.json_file import read_json
+from reporting.progress import Progress
 from reporting.provenance import collect_provenance
 from twin_master.errors import NotResumableError, RunFolderError, RunFolderExistsError
+from twin_master.scenario.reading import LoadedScenario, parse_scenario
+from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
 
 CONFIG_NAME = "config.json"
@@ -175,3 +178,107 @@ def with_inputs(folder: Path, config: dict[str, Any], hashes: Mapping[str, str])
         config = {**config, "inputs": dict(hashes)}
         atomic_write_text(folder / CONFIG_NAME, to_json(config))
     return config
+
+
+Held = Iterator[tuple[dict[str, Any], Scenario]]
+"""Configuration of a folder that this process holds, and its scenario located in it."""
+
+
+def kept_scenario(folder: Path) -> Scenario:
+    """Return the scenario in the configuration of a folder."""
+    return parse_scenario(read_config(folder)["scenario"], str(folder / CONFIG_NAME))
+
+
+@contextmanager
+def begun_folder(
+    resolved: Scenario,
+    file: Mapping[str, str],
+    folder: Path,
+    files: Mapping[str, bytes],
+    *,
+    replace: bool,
+    watched: bool = False,
+) -> Held:
+    """Make the folder of a run or a watch.
+
+    Parameters
+    ----------
+    resolved
+        The scenario with all that was given beside its file.
+    file
+        Name and hash of its file, see `LoadedScenario.file`.
+    folder
+        Where.
+    files
+        Of what is believed or flown, and further ones: path inside the folder, content.
+    replace
+        Take the place of an existing run folder.
+    watched
+        Whether a real asset is watched.
+
+    Raises
+    ------
+    RunFolderExistsError
+        The folder exists.
+    """
+    config = {
+        "kind": KIND,
+        "format": 1,
+        **({"watched": True} if watched else {}),
+        "scenario": resolved.portable().to_dict(),
+        "scenario_file": dict(file),
+        "provenance": collect_provenance(resolved.mission.seed).as_dict(),
+    }
+    with create_run_folder(folder, config, files, replace=replace):
+        yield config, resolved.portable().moved(folder)
+
+
+@contextmanager
+def resumed_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
+    """Take up the folder of a run or a watch.
+
+    Parameters
+    ----------
+    folder
+        The folder.
+    loaded
+        The scenario that the user believes to be there; checked against the folder.
+
+    Raises
+    ------
+    NotResumableError
+        The folder holds no run, or one of another scenario.
+    RunFolderError
+        Another process holds it.
+    """
+    config = read_config(folder)
+    scenario, file = kept_scenario(folder), config["scenario_file"]
+    if loaded is not None and file.get("sha256") != loaded.content_hash:
+        does = "watches" if config.get("watched") else "flies"
+        raise NotResumableError(
+            said(
+                "mission.another",
+                folder=folder,
+                does=does,
+                name=scenario.mission.name,
+                scenario_name=file.get("name"),
+                path=loaded.path,
+            )
+        )
+    with held(lock_run_folder(folder)):
+        yield config, scenario.moved(folder)
+
+
+@contextmanager
+def held(lock: int) -> Iterator[None]:
+    """Let go of a folder at the end."""
+    try:
+        yield
+    finally:
+        os.close(lock)
+
+
+def restore(folder: Path, progress: Progress) -> None:
+    """Put back a run that a killed --replace had moved aside."""
+    if restore_folder(folder):
+        progress.note(f"A replacement of {folder} was interrupted: the run that was there is back.")

@@ -52,7 +52,7 @@ def watch(
     """
     from twin_master.store.writing import REPORT_NAME
     from twin_master.watch import opening as from_python
-    from twin_master.watch.broker import is_broker
+    from twin_master.watch.feeds import is_broker
     from twin_master.watch.folder import Watch
 
     watches: list[Watch] = []

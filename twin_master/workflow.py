@@ -19,13 +19,20 @@ from twin_master.assets.resolution import Overrides, asset_source, given_overrid
 from twin_master.errors import NotResumableError
 from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile
-from twin_master.mission.opening import begun_folder, file_record, restore, resumed_folder
 from twin_master.mission.planning import read_policy
 from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
 from twin_master.mission.turns import History
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
-from twin_master.run_folder import check_versions, tidy, to_json, with_inputs
+from twin_master.run_folder import (
+    begun_folder,
+    check_versions,
+    restore,
+    resumed_folder,
+    tidy,
+    to_json,
+    with_inputs,
+)
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
@@ -93,7 +100,8 @@ def fly(
         progress.note(loaded.remark)
     restore(folder, progress)
     source = asset_source(resolved)
-    opened = begun_folder(resolved, file_record(loaded), folder, source, files, replace=replace)
+    source.check()  # what is not there costs the user no folder
+    opened = begun_folder(resolved, loaded.file, folder, source.files() | files, replace=replace)
     with opened as (config, located):
         return _run(folder, config, located, progress, begun, report=report)
 

@@ -17,7 +17,6 @@ from tests.command_line import said
 from tests.twin_master.runs import loaded_from, table_of
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.errors import MissionInputError
-from twin_master.mission.opening import file_record
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.watch.opening import begun_watch
@@ -106,7 +105,7 @@ def test_the_twin_flies_with_it(calibrated, tmp_path):
 
     said.clear()
     own = resolve_scenario(mission(), Overrides(calibration=calibrated))
-    with begun_watch(own, file_record(mission()), tmp_path / "watch", _Noted(said)):
+    with begun_watch(own, mission().file, tmp_path / "watch", _Noted(said)):
         pass
     assert any("flown is the watched asset" in note and note.endswith(believed) for note in said)
 

@@ -22,8 +22,7 @@ from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
-from twin_master.watch.broker import broker_of, is_broker
-from twin_master.watch.feeds import file_feed
+from twin_master.watch.feeds import broker_of, file_feed, is_broker
 from twin_master.watch.folder import Watch
 from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed
@@ -199,7 +198,7 @@ class FleetWatch:
         if self.done(asset):
             return count
         try:
-            for decision in asset.watch.decisions(asset.keep.intake, asset.keep):
+            for decision in asset.watch.decisions():
                 if self._met.pop(asset.name, None) is not None:
                     self.note(f"{asset.name} is watched again.")
                 self._decided(asset, decision)

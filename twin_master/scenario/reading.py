@@ -70,6 +70,11 @@ class LoadedScenario:
     def __repr__(self) -> str:
         return brief(self, name=self.scenario.mission.name, file=self.path.name)
 
+    @property
+    def file(self) -> dict[str, str]:
+        """Name and hash of the file, by which folders of the scenario are known."""
+        return {"name": self.path.name, "sha256": self.content_hash}
+
 
 def find_scenario(name: str) -> Path:
     """Return the file of a shipped scenario, or of a path to a TOML file.

@@ -23,8 +23,7 @@ from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME, kept_knowledge
 from twin_master.network.estimator import Learnt
 from twin_master.network.inference import known_control, predict
-from twin_master.run_folder import PICTURE, VERDICT, read_config
-from twin_master.scenario.reading import parse_scenario
+from twin_master.run_folder import PICTURE, VERDICT, kept_scenario
 from twin_master.sentences import said
 
 TURNS_AT_ONCE = 200
@@ -98,7 +97,7 @@ class Flight:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self._path = folder, folder / JOURNAL_NAME
-        self.scenario = parse_scenario(read_config(folder)["scenario"], str(folder))
+        self.scenario = kept_scenario(folder)
         self.number = 0
         self._know()
         self._forget(0)

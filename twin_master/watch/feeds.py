@@ -1,4 +1,4 @@
-"""Messages from files, recorded or growing, from standard input, and from a program."""
+"""Messages from files, recorded or growing, from standard input, from a program; addresses of brokers."""
 
 import csv
 import json
@@ -7,9 +7,13 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
+from ssl import create_default_context
 from typing import IO, Any
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import xarray as xr
@@ -29,6 +33,10 @@ _TURN_COLUMNS = ("turn", "step")
 _OTHERS = ("turn", "time", "control")
 _FIRST = 8
 """First steps by which a file of steps is known again."""
+
+
+Observations = Iterable[Mapping[str, Any]] | str | Path
+STANDARD_INPUT = "-"
 
 
 class RecordedFeed(Feed):
@@ -324,3 +332,96 @@ def _cells(line: bytes) -> list[str]:
 def shown(line: bytes | Refused) -> str:
     """Return the begin of a message, for people."""
     return "" if isinstance(line, Refused) else line[:300].decode("utf-8", "replace").rstrip(os.linesep)
+
+
+PASSWORD_VARIABLE = "UAV_TWIN_MQTT_PASSWORD"
+
+
+@dataclass(frozen=True)
+class Broker:
+    """Where observations come from.
+
+    Attributes
+    ----------
+    host, port, topic : str, int, str
+        Of the broker, and of the observations; decisions go to `TOPIC/decision`, how the twin is to
+        `TOPIC/heartbeat`.
+    user : str or None
+        Who the twin is; the password is in the environment, `UAV_TWIN_MQTT_PASSWORD`.
+    tls : bool
+        `mqtts://`: encrypted, the broker known by its certificate.
+    authority : Path or None
+        Certificate of the authority, where the system does not know it.
+    """
+
+    host: str
+    port: int
+    topic: str
+    user: str | None = None
+    tls: bool = False
+    authority: Path | None = None
+
+
+def is_broker(observations: str) -> bool:
+    """Return whether observations come from a broker, and not from a file."""
+    return observations.startswith(("mqtt://", "mqtts://"))
+
+
+def broker_of(address: str, authority: Path | None = None, *, many: bool = False) -> Broker:
+    """Return the broker of `mqtt://[USER@]HOST[:PORT]/TOPIC`, or `mqtts://` with TLS.
+
+    Of many assets the topic ends with `/+`, which stands for the name of each.
+
+    Raises
+    ------
+    MissionInputError
+        paho-mqtt is not installed, or it is no such address, has a password in it, or a topic of many assets;
+        the authority's file holds no certificate.
+    """
+    if find_spec("paho") is None:
+        raise MissionInputError("observations over MQTT need paho-mqtt: pip install 'uav-twin[mqtt]'.")
+    try:
+        parts = urlsplit(address)
+        port, topic = parts.port, unquote(parts.path.lstrip("/"))
+    except ValueError:
+        parts, port, topic = urlsplit("mqtt:"), None, ""
+    if not parts.hostname or not topic:
+        raise MissionInputError(f"{address}: `mqtt://[USER@]HOST[:PORT]/TOPIC` is expected, or `mqtts://`.")
+    if parts.password is not None:
+        raise MissionInputError(said("watch.password", variable=PASSWORD_VARIABLE))
+    if many and (not topic.endswith("/+") or "+" in topic[:-1] or "#" in address):
+        raise MissionInputError(f"{address}: a topic of many assets is expected, such as wings/+.")
+    if not many and ("#" in address or "+" in topic):
+        raise MissionInputError(f"{address}: a topic of one asset is expected, without `#` and `+`.")
+    tls, user = parts.scheme == "mqtts", None if parts.username is None else unquote(parts.username)
+    if authority is not None:
+        if not (tls and authority.is_file()):
+            raise MissionInputError(f"the certificate {authority} is a file, and belongs to mqtts://.")
+        try:
+            create_default_context(cafile=authority)
+        except OSError as error:
+            raise MissionInputError(f"{authority} holds no certificate: {error}.") from None
+    return Broker(parts.hostname, port or (8883 if tls else 1883), topic, user, tls, authority)
+
+
+def feed_of(
+    given: Observations | None,
+    scenario: Scenario,
+    follow: bool,
+    authority: Path | None,
+    otherwise: str | None,
+) -> Feed | Broker:
+    """Return what gives the observations, by default those of the scenario, or the broker that does."""
+    for observations in (given, scenario.watch.recording, otherwise):
+        if observations is None:
+            continue
+        if not isinstance(observations, str | Path):
+            return MappingFeed(observations, scenario)
+        if is_broker(str(observations)):
+            return broker_of(str(observations), authority)
+        if str(observations) != STANDARD_INPUT:
+            return file_feed(Path(observations), scenario, follow=follow)
+        if follow:
+            raise MissionInputError(said("watch.follow"))
+        return JsonLinesFeed(scenario)
+    raise MissionInputError(said("watch.recording", name=scenario.mission.name))

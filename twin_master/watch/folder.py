@@ -23,7 +23,7 @@ from twin_master.mission.journal import (
     last_turn,
     records_backwards,
 )
-from twin_master.mission.loop import Source, operate
+from twin_master.mission.loop import operate
 from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
 from twin_master.mission.replay import BelievedModel, journalled_decision, replay
 from twin_master.network.estimator import Notice
@@ -33,7 +33,7 @@ from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight
-from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, Stopping, listening
+from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, listening
 from twin_master.watch.keeping import Keeper
 from twin_master.watch.teaching import (
     LEAST_GAIN,
@@ -150,16 +150,16 @@ class Watch:
             feed.decide(decision)
 
         with self.begun(feed, patched) as keep:
-            source = Stopping(keep.intake, turns, lambda: self.quiet(tell))
-            tutor = Tutor(self, search, source, wait=feed.replayable) if search else None
-            with listening(source.ask):
+            keep.intake.turns, keep.intake.look = turns, lambda: self.quiet(tell)
+            tutor = Tutor(self, search, wait=feed.replayable) if search else None
+            with listening(keep.intake.ask):
                 try:
                     if untold is not None:
                         tell(untold)
                     while True:  # with one twin after the other: where it is taught, another one goes on
                         if tutor is not None:
                             tutor.act()
-                        for decision in self.decisions(source, keep):
+                        for decision in self.decisions():
                             tell(decision)
                             if tutor is not None and tutor.due:
                                 break
@@ -189,10 +189,10 @@ class Watch:
                 self._patch(*patched)
             yield self.keep
 
-    def decisions(self, source: Source, keep: Keeper) -> Iterator[dict[str, Any]]:
-        """Yield what the operator is told of each turn, once it is written down, until the source ends."""
-        for _ in operate(keep.twin, source, keep):
-            yield journalled_decision(keep.line, self.scenario, self.models[-1].knowledge.model)
+    def decisions(self) -> Iterator[dict[str, Any]]:
+        """Yield what the operator is told of each turn, once it is written down, until no more comes."""
+        for _ in operate(self.keep.twin, self.keep.intake, self.keep):
+            yield journalled_decision(self.keep.line, self.scenario, self.models[-1].knowledge.model)
 
     def last_decision(self) -> dict[str, Any] | None:
         """Return the last decision in the journal; None without any.
@@ -344,16 +344,14 @@ class Tutor:
         With its turns kept, see `Watch.begun`.
     search : Search
         Looks for causes.
-    source : Stopping
-        Says whether the watch was asked to end.
     wait : bool
         Whether the next turn waits for an answer, as those of a recording do. Those of a live watch go on
         beside a process that searches and a thread that tries a patch.
     """
 
-    def __init__(self, watch: Watch, search: Search, source: Stopping, *, wait: bool) -> None:
+    def __init__(self, watch: Watch, search: Search, *, wait: bool) -> None:
         watch.keep.taught = True
-        self._watch, self._search, self._source = watch, search, source
+        self._watch, self._search = watch, search
         self._teaching, self._wait = watch.teaching, wait
         self.outcome: Future[Outcome] | None = None
 
@@ -372,7 +370,7 @@ class Tutor:
         """Do what is due."""
         watch, teaching, step = self._watch, self._teaching, self._watch.scenario.mission.step_name
         if (question := teaching.question) is not None:
-            found = self._search.answer(question, self._wait, lambda: self._source.asked)
+            found = self._search.answer(question, self._wait, lambda: watch.keep.intake.asked)
             if found is not None:
                 verdict = verdict_of(watch.folder, question, found, teaching.turn, step)
                 watch.keep.write({"verdict": verdict})

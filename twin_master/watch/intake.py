@@ -25,6 +25,8 @@ from twin_master.sentences import said
 from twin_master.watch.growing import Place
 from twin_master.watch.message import Fed, Message, Refused
 
+POLL_SECONDS = 0.05
+"""Between two looks at a feed that may go on."""
 REJECTED_NAME = "rejected.jsonl"
 REJECTED_KEPT = 10_000
 """Refused messages that are written down; further ones are counted only, so that a flood fills no disk."""
@@ -103,6 +105,12 @@ class Intake:
         Of sensors of which no number came with the last reading, and before it did, or the other way round.
     ended : bool
         Whether the feed has ended; if not, more may come after `read` has returned None.
+    look : callable or None
+        Called now and then while nothing comes; without it nothing is waited for.
+    turns : int or None
+        In all, after which it ends.
+    asked : bool
+        Whether the end was asked for.
     """
 
     def __init__(self, scenario: Scenario, feed: Feed, rejected: Path | None = None) -> None:
@@ -123,7 +131,9 @@ class Intake:
         self._before: Float = np.empty(0)
         self.counts = Counts()
         self.observation_turn = -1
-        self.ended = False
+        self.ended = self.asked = self._waiting = False
+        self.look: Callable[[], None] | None = None
+        self.turns: int | None = None
 
     @property
     def settled(self) -> bool:
@@ -165,8 +175,29 @@ class Intake:
             if kept != lines:
                 atomic_write_text(self._rejected, "".join(kept))
 
+    def ask(self) -> None:
+        """Ask for the end: between two turns, never within one."""
+        self.asked = True
+        if self._waiting:
+            raise _Asked
+
     def read(self, twin: Twin) -> Reading | None:
-        """Return the next reading, see `Source.read`; None also where nothing has come yet."""
+        """Return the next reading, see `Source.read`; None also where the end was asked for."""
+        with suppress(_Asked):
+            while not self.asked and (self.turns is None or twin.turns < self.turns):
+                begin, self._waiting = time.monotonic(), self.look is not None
+                try:
+                    reading = self._next(twin)
+                finally:
+                    self._waiting = False
+                if reading is not None or self.ended or self.look is None:
+                    return reading
+                self.look()
+                time.sleep(max(0.0, begin + POLL_SECONDS - time.monotonic()))
+        return None
+
+    def _next(self, twin: Twin) -> Reading | None:
+        """Return the next reading; None where nothing has come yet."""
         if self._messages is None:
             self._messages = self._feed.messages(self._place)
         while not self._pending:
@@ -287,67 +318,19 @@ class Intake:
         if turn < twin.first_kept:
             late = twin.turns - 1 - turn
             raise Refused(said("watch.late", turn=turn, late=late, lag=self._section.lag))
-        before, known = twin.observed(turn), self._given[turn - twin.turns]
+        before, control = twin.observed(turn), message.control
         both = ~np.isnan(before) & ~np.isnan(message.observed)
         if not np.array_equal(before[both], message.observed[both]):
             raise Refused(f"it contradicts what was received of turn {turn} before")
-        control = message.control
-        if control is not None and control != twin.control_of(turn) and known != MISSING:
+        another = control not in (None, twin.control_of(turn))
+        if another and self._given[turn - twin.turns] != MISSING:
             raise Refused(f"it contradicts the control of turn {turn}")
-        new = np.isnan(before) & ~np.isnan(message.observed)
-        if not new.any() and (control is None or control == twin.control_of(turn)):
+        merged = np.where(np.isnan(before), message.observed, before)
+        if not another and np.array_equal(merged, before, equal_nan=True):
             self.counts.duplicates += 1
             return
         self._before = before
-        merged = np.where(np.isnan(before), message.observed, before)
         self._pending.append((turn, Reading(merged, control, turn, message.unreadable), given))
-
-
-POLL_SECONDS = 0.05
-"""Between two looks at a feed that may go on."""
-
-
-class Stopping:
-    """A source that ends when SIGINT or SIGTERM ask for it: between two turns, never within one.
-
-    Parameters
-    ----------
-    intake : Intake
-        Of the readings.
-    turns : int or None
-        In all, after which it ends.
-    look : callable
-        Called now and then while nothing comes.
-    """
-
-    def __init__(self, intake: Intake, turns: int | None, look: Callable[[], None]) -> None:
-        self._intake, self._turns, self._look = intake, turns, look
-        self.asked = self._waiting = False
-
-    def read(self, twin: Twin) -> Reading | None:
-        """Return the next reading; None once the watch is to end."""
-        with suppress(_Asked):
-            while not self.asked and (self._turns is None or twin.turns < self._turns):
-                begin, self._waiting = time.monotonic(), True
-                try:
-                    reading = self._intake.read(twin)
-                finally:
-                    self._waiting = False
-                if reading is not None or self._intake.ended:
-                    return reading
-                self._look()
-                time.sleep(max(0.0, begin + POLL_SECONDS - time.monotonic()))
-        return None
-
-    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        """Return what is assimilated in the place of an observation that no state allows."""
-        return self._intake.impossible(reading, error)
-
-    def ask(self) -> None:
-        """Ask for the end."""
-        self.asked = True
-        if self._waiting:
-            raise _Asked
 
 
 class _Asked(BaseException):

@@ -22,8 +22,7 @@ from twin_master.mission.journal import JOURNAL_NAME, records
 from twin_master.mission.replay import journalled_decision
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
-from twin_master.watch.broker import PASSWORD_VARIABLE, Broker
-from twin_master.watch.feeds import parsed, shown
+from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, parsed, shown
 from twin_master.watch.folder import Watch
 from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed

@@ -2,7 +2,7 @@
 
 import math
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,17 +19,22 @@ from twin_master.assets.resolution import (
 )
 from twin_master.errors import MissionInputError, NotResumableError
 from twin_master.mission.journal import JOURNAL_NAME, last_turn
-from twin_master.mission.opening import begun_folder, file_record, kept_scenario, resumed_folder
-from twin_master.run_folder import CONFIG_NAME, check_versions, read_config
+from twin_master.run_folder import (
+    CONFIG_NAME,
+    begun_folder,
+    check_versions,
+    kept_scenario,
+    read_config,
+    resumed_folder,
+)
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
 from twin_master.store.writing import SUMMARY_NAME
 from twin_master.store.writing import open_run as stored_run
-from twin_master.watch.broker import Broker, broker_of, is_broker
-from twin_master.watch.feeds import JsonLinesFeed, MappingFeed, RecordedFeed, file_feed
+from twin_master.watch.feeds import Broker, Observations, RecordedFeed, feed_of
 from twin_master.watch.folder import STORED_TURNS, Watch
-from twin_master.watch.intake import Counts, Feed
+from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import BEGIN_ANEW, CLIENT_SUFFIX, MqttFeed
 from twin_master.watch.teaching import Search, check_teachable
 
@@ -49,7 +54,9 @@ def begun_watch(
         for path in folder.glob(f"*{CLIENT_SUFFIX}")
     }
     source = believed_source(resolved)
-    opened = begun_folder(resolved, file, folder, source, files, replace=replace_run, watched=True)
+    source.check()
+    files = source.files() | files
+    opened = begun_folder(resolved, file, folder, files, replace=replace_run, watched=True)
     with opened as (config, located):
         yield Watch(folder, config, located, progress, like)
 
@@ -113,7 +120,7 @@ def flown(folder: Path, first: int | None, last: int | None, progress: Progress)
         shutil.copytree(folder / "asset", copy / "asset")
         with (folder / JOURNAL_NAME).open("rb") as journal:
             (copy / JOURNAL_NAME).write_bytes(journal.read(end))
-        Watch(copy, config, kept_scenario(folder, config).moved(copy), progress).store(Counts(), report=False)
+        Watch(copy, config, kept_scenario(folder).moved(copy), progress).store(Counts(), report=False)
         yield copy
 
 
@@ -158,8 +165,6 @@ def _config(folder: Path) -> dict[str, Any] | None:
 
 
 Decide = Callable[[Mapping[str, Any]], object]
-Observations = Iterable[Mapping[str, Any]] | str | Path
-STANDARD_INPUT = "-"
 
 
 def watch(
@@ -251,7 +256,7 @@ def watch(
     if teach:
         check_teachable(known)
     # Slips of the pen are found before a model is built and a folder made.
-    feed = _feed(observations, known, follow, None if ca_file is None else Path(ca_file), otherwise)
+    feed = feed_of(observations, known, follow, None if ca_file is None else Path(ca_file), otherwise)
     if replace and isinstance(feed, RecordedFeed) and folder.resolve() in feed.path.resolve().parents:
         raise MissionInputError(said("watch.replace", path=feed.path))
     with _opened(loaded, folder, given, progress, resume=resume, replace=replace) as watched:
@@ -283,7 +288,7 @@ def _opened(
     resolved = resolve_scenario(loaded, given)
     if loaded.remark:
         progress.note(loaded.remark)
-    return begun_watch(resolved, file_record(loaded), folder, progress, replace_run=replace)
+    return begun_watch(resolved, loaded.file, folder, progress, replace_run=replace)
 
 
 def _read(
@@ -292,7 +297,7 @@ def _read(
     """Return the folder of a watch, and the scenario by which observations are read."""
     if loaded is None:
         folder = Path(str(folder))
-        scenario = kept_scenario(folder, read_config(folder)).moved(folder)
+        scenario = kept_scenario(folder).moved(folder)
     else:
         folder = Path("runs", loaded.scenario.mission.name) if folder is None else Path(folder)
         scenario = loaded.scenario.moved(loaded.path.parent)
@@ -300,26 +305,3 @@ def _read(
         update={"allow_unknown": scenario.watch.allow_unknown or allow_unknown}
     )
     return folder, scenario.model_copy(update={"watch": section})
-
-
-def _feed(
-    given: Observations | None,
-    scenario: Scenario,
-    follow: bool,
-    authority: Path | None,
-    otherwise: str | None,
-) -> Feed | Broker:
-    """Return what gives the observations, by default those of the scenario, or the broker that does."""
-    for observations in (given, scenario.watch.recording, otherwise):
-        if observations is None:
-            continue
-        if not isinstance(observations, str | Path):
-            return MappingFeed(observations, scenario)
-        if is_broker(str(observations)):
-            return broker_of(str(observations), authority)
-        if str(observations) != STANDARD_INPUT:
-            return file_feed(Path(observations), scenario, follow=follow)
-        if follow:
-            raise MissionInputError(said("watch.follow"))
-        return JsonLinesFeed(scenario)
-    raise MissionInputError(said("watch.recording", name=scenario.mission.name))

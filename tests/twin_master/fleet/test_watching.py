@@ -33,7 +33,6 @@ from twin_master.fleet.standing import WatchedAsset
 from twin_master.fleet.view import WORST, serve_fleet
 from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.opening import file_record
 from twin_master.mission.preparation import kept_knowledge
 from twin_master.scenario.reading import load_scenario
 from twin_master.watch.feeds import file_feed
@@ -81,7 +80,7 @@ def alone(fleet_file: Path, tmp_path: Path) -> list[bytes]:
     for number in range(3):
         folder = tmp_path / "alone" / f"wing-{number}"
         resolved = resolve_scenario(loaded, Overrides(seed=7))
-        with begun_watch(resolved, file_record(loaded), folder, SilentProgress()) as watch:
+        with begun_watch(resolved, loaded.file, folder, SilentProgress()) as watch:
             watch.run(file_feed(log_of(tmp_path, number), watch.scenario), str)
         found.append((folder / JOURNAL_NAME).read_bytes())
     return found

@@ -9,7 +9,6 @@ import pytest
 from reporting.progress import SilentProgress
 from tests.twin_master.watch.watches import begun, write_csv
 from twin_master.mission.loop import fly
-from twin_master.mission.opening import file_record
 from twin_master.mission.turns import History
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.watch.feeds import CsvFeed
@@ -50,7 +49,7 @@ def recorded(mission: History, tmp_path_factory: pytest.TempPathFactory) -> Path
 def base(scenario: LoadedScenario, tmp_path_factory: pytest.TempPathFactory) -> Watch:
     """A watch that has seen nothing."""
     folder = tmp_path_factory.mktemp("base") / "watch"
-    with begun_watch(scenario.scenario, file_record(scenario), folder, SilentProgress()) as watch:
+    with begun_watch(scenario.scenario, scenario.file, folder, SilentProgress()) as watch:
         return watch
 
 

@@ -19,7 +19,7 @@ from tests.twin_master.runs import journal
 from tests.twin_master.watch.watches import PASSWORD, Mosquitto, begun, killed_at, soon_quiet, wait_until
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.watch.broker import PASSWORD_VARIABLE, Broker, broker_of
+from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, broker_of
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import MqttFeed
