@@ -133,6 +133,14 @@ def test_a_column_of_no_channel_is_one_remark(tmp_path):
     assert said.startswith("tip_up.csv and 1 more: no channel has the column 'g71'")
 
 
+def test_an_event_is_in_all_trials_that_are_samples_in_time(tmp_path):
+    told = f'{TOML}[[event]]\nname = "knock"\ntime = 0.01\n'
+    (event,) = read_campaign(folder_of(tmp_path, told)).events
+    assert (event.trials, event.trial) == (("release",), None)
+    with pytest.raises(CampaignFileError, match="'turn', which is flight and has no course in time"):
+        read_campaign(folder_of(tmp_path, f'{told}trial = "turn"\n'))
+
+
 def test_hash_follows_every_file(tmp_path):
     folder = folder_of(tmp_path)
     before = read_campaign(folder).data_hash
