@@ -22,8 +22,8 @@ from discrepancy.campaign.records import (
 from discrepancy.catalogue.entry import Setting
 from discrepancy.checks.quality import rest_faults
 from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.elimination import eliminated
 from discrepancy.fits.fitting import fit
+from discrepancy.fits.normal_equations import normal_equations
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.separability import begun
 from discrepancy.models.interface import Conditions, Model
@@ -47,7 +47,7 @@ def prior_left(campaign: Campaign, model: Model) -> dict[str, float]:
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     known, weights = len(problem.shared.parameter_mean), np.ones(len(problem.channel_names))
     found = fit(problem, Candidate(), begun(problem), iterations=0, evidence=False)
-    matrix = eliminated(problem, found, Candidate(), weights).matrix
+    matrix = normal_equations(problem, found, Candidate(), weights).matrix
     left = np.sqrt(np.diag(np.linalg.pinv(matrix, hermitian=True))[:known])
     return {
         item.name: float(value)

@@ -5,6 +5,7 @@ fit that it extends.
 """
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
 
 from .candidate import Candidate, Linearisation, Point, Remainder, State
-from .elimination import Cholesky, eliminated, finite
+from .normal_equations import finite, normal_equations, solved, upper_factor
 from .problem import Problem
 
 LARGEST_EFFECT = 8.0
@@ -224,24 +225,19 @@ class _Descent:
 
     def step(self, state: State, damping: float) -> tuple[Point, float]:
         """Return the step and the decrease it promises [nat], and keep the deviations of the effects."""
-        problem, shared = self.problem, self.problem.shared.size
-        blocks, matrix, gradient, prior = eliminated(
-            problem, state, self.candidate, problem.precisions(state.sums), damping=damping
-        )
-        size, diagonal = len(prior), prior.copy()
-        for block in blocks:
-            np.add.at(diagonal, block.index, np.diag(block.shared))
-        variance = np.diag(Cholesky.of(matrix).solve(np.eye(size)[:, shared:])[shared:])
-        self.deviation = np.sqrt(variance)
-        damped = Cholesky.of(matrix + damping * np.diag(diagonal))
-        step = np.zeros(size) if self.local_only else damped.solve(finite(gradient))
-        promised = 0.5 * float(gradient @ step)
-        local_steps = []
-        for block in blocks:
-            own = block.factor.solve(block.local_gradient)
-            promised += 0.5 * float(block.local_gradient @ own)
-            local_steps.append(np.asarray(own - block.followed @ step[block.index]))
-        return Point(step[:shared], tuple(local_steps), step[shared:]), promised
+        problem, first = self.problem, self.problem.shared.size
+        own = first + self.candidate.size
+        found = normal_equations(problem, state, self.candidate, problem.precisions(state.sums))
+        size = len(found.gradient)
+        effects = np.eye(size)[:, first:own]
+        self.deviation = np.sqrt(np.diag(solved(upper_factor(found.matrix), effects)[first:own]))
+        free = slice(own if self.local_only else 0, size)
+        damped = (found.matrix + damping * np.diag(np.diag(found.matrix)))[free, free]
+        step = np.zeros(size)
+        step[free] = solved(upper_factor(damped), finite(found.gradient)[free])
+        ends = np.cumsum([own, *(data.unknowns.size for data in problem.trials)])
+        local = tuple(step[a:b] for a, b in pairwise(ends.tolist()))
+        return Point(step[:first], local, step[first:own]), 0.5 * float(found.gradient @ step)
 
     def following(self, state: State, step: Point, damping: float) -> State | None:
         """Return the state after a step, or None if none better was found.
@@ -273,21 +269,14 @@ def _finished(
     covariance, log_evidence = np.zeros((size, size)), -state.objective
     spent = np.zeros(len(problem.channel_names))
     if evidence:
-        blocks, matrix, *_ = eliminated(problem, state, candidate, problem.precisions(state.sums))
-        factor = Cholesky.of(matrix)
-        covariance = factor.solve(np.eye(size))
-        log_evidence -= 0.5 * sum(item.log_determinant for item in (factor, *(b.factor for b in blocks)))
-        for data, block in zip(problem.trials, blocks, strict=True):
-            # leverage of each channel: trace of J Cov J^T; local unknowns follow the shared ones
-            count = len(block.local)
-            known = covariance[np.ix_(block.index, block.index)]
-            joint = np.empty((count + len(known), count + len(known)))
-            followed = block.followed @ known
-            joint[:count, :count] = block.factor.solve(np.eye(count)) + followed @ block.followed.T
-            joint[:count, count:], joint[count:, :count] = -followed, -followed.T
-            joint[count:, count:] = known
-            leverage = block.derivatives.spread(block.products, block.precision, joint)
-            np.add.at(spent, data.groups, leverage)
+        equations = normal_equations(problem, state, candidate, problem.precisions(state.sums))
+        factor = upper_factor(equations.matrix)
+        whole = solved(factor, np.eye(len(factor)))
+        covariance = whole[:size, :size]
+        log_evidence -= float(np.log(np.diag(factor)).sum())
+        for data, (item, place) in zip(problem.trials, equations.trials, strict=True):
+            leverage = ((whole[np.ix_(place, place)] @ item.rows) * item.rows).sum(axis=0)
+            np.add.at(spent, data.groups, leverage.reshape(data.weight.shape).sum(axis=0))
     return CandidateFit(
         **vars(state), candidate=candidate, log_evidence=log_evidence, covariance=covariance, spent=spent,
         converged=converged,

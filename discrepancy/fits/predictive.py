@@ -4,12 +4,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import NINETY
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.elimination import trial_block
 from discrepancy.fits.fitting import LARGEST_EFFECT, CandidateFit, fit
+from discrepancy.fits.normal_equations import trial_rows
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
 from discrepancy.location.residuals import FittedTrial, ResidualSet
@@ -62,11 +63,12 @@ def _predicted(
     total = at + sum(data.unknowns.size for data in problem.trials)
     ones, counted = np.ones(len(problem.channel_names)), float(found.remainder is None)
     for number, data in enumerate(problem.trials):
-        block = trial_block(problem, number, adapted, adapted.candidate, ones)
-        local, shared = block.derivatives.dense()
-        own = block.factor.half(local)
+        item = trial_rows(problem, number, adapted, adapted.candidate, ones)
+        local, shared = np.split(item.rows, [data.unknowns.size])
+        factor, along = item.followed()
+        own = solve_triangular(factor, local, trans="T")
         # local unknowns follow the shared ones: J_s - J_l A^-1 B, then what is their own
-        follow = (shared - block.followed.T @ local).T @ root[block.index]
+        follow = (shared - along.T @ local).T @ root[item.index]
         taken, carried = np.einsum("kn,kn->n", own, own), np.einsum("nk,nk->n", follow, follow)
         shape = adapted.residuals[number].shape
         if held_out:

@@ -14,6 +14,7 @@ import numpy as np
 
 from discrepancy.campaign.noise import NoiseModel, noise_model
 from discrepancy.campaign.records import Campaign, FloatArray, Trial
+from discrepancy.campaign.sampling import IntArray
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
 from discrepancy.models.interface import Memory, Model
@@ -21,7 +22,7 @@ from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
 
 from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Candidate, Linearisation, Point, moved
-from .trial_data import GlobalUnknowns, TrialData, TrialDerivatives, global_unknowns, stand_in
+from .trial_data import GlobalUnknowns, TrialData, global_unknowns, stand_in
 
 KEPT = 2000
 """Responses that a problem keeps."""
@@ -270,49 +271,34 @@ class Problem:
         shape = (-1, *response.shape)
         return np.array(parameters).reshape(shape), np.array(columns).reshape(shape)
 
-    def derivatives(
+    def columns(
         self, number: int, point: Point, parts: Linearisation, candidate: Candidate
-    ) -> TrialDerivatives:
-        """Return standardised derivatives of the prediction of a trial, channel by channel."""
-        data = self.trials[number]
-        channels, zeros = data.trial.channels, data.unknowns.zeros
-        gains = 1.0 + self.shared.gains(point.shared, channels)
-        known = [name for name in self.shared.gain_channels if name in channels]
-        position = np.array([self.shared.gain_channels.index(name) for name in known], dtype=np.int64)
-        column = [channels.index(name) for name in known]
-        acting = [k for k in range(candidate.size) if data.trial.kind in candidate.acting(k)]
-        own, count = len(parts.local), len(parts.parameters)
-        blocks = [parts.local * gains, parts.parameters * gains]
-        if acting:
-            blocks.append(parts.effect[acting] * gains)
-        if len(position):
-            scale = np.zeros(len(channels))
-            scale[column] = self.shared.gain_scale[position]
-            blocks.append((parts.response * scale)[np.newaxis])
-        dense = data.standardised(np.concatenate(blocks))
+    ) -> tuple[FloatArray, IntArray]:
+        """Return derivatives of the prediction of a trial [channel's unit], and whose the later ones are.
 
-        # order of the unknowns: zeros, own, calibrated parameters, gains, effect; rows: zero, own,
-        # calibrated parameters, effect, gain
-        local = zeros + own
-        first_effect = local + count + len(position)
-        size = first_effect + len(acting)
-        everywhere = np.array(
-            [*range(zeros, local), *range(local, local + count), *range(first_effect, size)], dtype=np.int64
+        Returns
+        -------
+        columns : (L + K, N, C) ndarray
+            By the L unknowns of the trial, and by the K shared ones and effect parameters that touch it.
+        index : (K,) ndarray of int
+            Which these are, global unknowns first.
+        """
+        data, shared = self.trials[number], self.shared
+        channels, unknowns = data.trial.channels, data.unknowns
+        gains = 1.0 + shared.gains(point.shared, channels)
+        known = np.array([k for k, name in enumerate(shared.gain_channels) if name in channels], dtype=int)
+        column = [channels.index(shared.gain_channels[k]) for k in known]
+        acting = np.array(
+            [k for k in range(candidate.size) if data.trial.kind in candidate.acting(k)], dtype=int
         )
-        head = int(zeros > 0)
-        rows = np.empty((len(channels), head + len(dense), dense.shape[1]))
-        owners = np.full(rows.shape[:2], size)
-        if head:
-            rows[:, 0] = data.by_zero
-            owners[data.unknowns.zero_columns, 0] = np.arange(zeros)
-        rows[:, head:] = dense.transpose(2, 0, 1)
-        owners[:, head : head + len(everywhere)] = everywhere
-        if len(position):
-            owners[column, -1] = local + count + np.arange(len(position))
-        index = np.array(
-            [*range(count), *(count + position), *(self.shared.size + k for k in acting)], dtype=np.int64
-        )
-        return TrialDerivatives(rows, owners, local, index)
+        shape = parts.response.shape
+        zeros, of_gains = np.zeros((unknowns.zeros, *shape)), np.zeros((len(known), *shape))
+        zeros[np.arange(len(zeros)), :, unknowns.zero_columns] = unknowns.zero_scale[:, np.newaxis]
+        of_gains[np.arange(len(known)), :, column] = (parts.response[:, column] * shared.gain_scale[known]).T
+        found = (zeros, parts.local * gains, parts.parameters * gains, of_gains, parts.effect[acting] * gains)
+        count = len(parts.parameters)
+        index = np.concatenate((np.arange(count), count + known, shared.size + acting))
+        return np.concatenate(found), index
 
     # -------------------------------------------------------------------------- likelihood
 

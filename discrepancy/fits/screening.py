@@ -16,19 +16,18 @@ from math import sqrt
 from typing import TypeGuard
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.special import ndtri
 
 from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.catalogue.entry import EffectParameter, ShapeParameter
 from discrepancy.errors import DiscrepancyError
 from discrepancy.search_settings import SEARCH
-from fe.runtime.patch import EVERY_CHANNEL, SENSORS, ModelPatch
 
 from .candidate import Candidate, Term
-from .elimination import Cholesky, eliminated, finite
 from .fitting import LARGEST_EFFECT, CandidateFit
+from .normal_equations import finite, normal_equations, upper_factor
 from .problem import Problem
-from .trial_data import EVERY
 
 
 @dataclass(frozen=True)
@@ -102,76 +101,57 @@ class Screen:
         left = problem.precisions(fit.sums)
         precision = np.where(known, 1.0, left) if record_noise else left
         following = Candidate() if effect_precision is None else fit.candidate
-        self._blocks, matrix, gradient, _ = eliminated(
-            problem, fit, following, precision, effect_precision=effect_precision
-        )
-        self._size = len(matrix)
-        self._inverse = Cholesky.of(matrix).half(np.eye(self._size))
-        self._gradient = self._inverse @ gradient
+        found = normal_equations(problem, fit, following, precision, effect_precision)
+        self._trials, self._size = found.trials, len(found.gradient)
+        factor = upper_factor(found.matrix)
+        self._inverse = solve_triangular(factor, np.eye(self._size), trans="T", check_finite=False)
+        self._gradient = self._inverse @ found.gradient
 
     def change(self, term: Term, start: FloatArray) -> Change:
         """Return what a term does at scaled parameters, besides the effects of the fit."""
         candidate = self.fit.candidate.plus(term)
-        channels = _channels_of(term.patch(self.problem.setting, start))
-        vector, fits, size = self._moved(
-            candidate, np.concatenate((self.fit.point.effect, start)), term.effect.acts_on, channels
-        )
+        effect = np.concatenate((self.fit.point.effect, start))
+        vector, fits, size = self._moved(candidate, effect, term.effect.acts_on)
         return Change(term, start, vector, fits, max(size, 0.0))
 
     def rise(self, effect: FloatArray) -> float:
         """Return by how much the misfit rises [nat] when the fit's own effect parameters (E,) are these."""
         candidate = self.fit.candidate
-        _, fits, size = self._moved(candidate, effect, candidate.acts_on, frozenset())
+        _, fits, size = self._moved(candidate, effect, candidate.acts_on)
         return 0.5 * size - fits
 
     @np.errstate(over="ignore", invalid="ignore")
     def _moved(
-        self,
-        candidate: Candidate,
-        effect: FloatArray,
-        acting: frozenset[TrialKind],
-        channels: frozenset[str],
+        self, candidate: Candidate, effect: FloatArray, acting: frozenset[TrialKind]
     ) -> tuple[FloatArray, float, float]:
-        """Return vector, b and G of the change to a candidate, in trials and channels that it touches."""
+        """Return vector, b and G of the change to a candidate, in kinds of trials that it touches."""
         problem, fit = self.problem, self.fit
         patch = candidate.patch(problem.setting, effect)
         changes: dict[int, FloatArray] = {}
         for number, data in enumerate(problem.trials):
-            names = data.trial.channels
-            touched = [column for column, name in enumerate(names) if name in channels] if channels else EVERY
-            if data.trial.kind in acting and touched:
+            if data.trial.kind in acting:
                 response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
-                gains = 1.0 + problem.shared.gains(fit.point.shared, names)
-                moved = gains[touched] * (response - fit.responses[number])[:, touched]
-                changes[number] = np.zeros(response.shape)
-                changes[number][:, touched] = data.standardised(moved, touched)
+                gains = 1.0 + problem.shared.gains(fit.point.shared, data.trial.channels)
+                changes[number] = data.standardised(gains * (response - fit.responses[number]))
         return self.projected(changes)
 
     def projected(self, changes: Mapping[int, FloatArray]) -> tuple[FloatArray, float, float]:
         """Return vector, b and G of standardised changes (N, C) of predictions, by number of the trial."""
         total = np.zeros(self._size)
-        parts, tail, fits, square = [], [], 0.0, 0.0
-        for number, block in enumerate(self._blocks):
-            d, z = np.zeros(self.fit.residuals[number].T.shape), np.zeros(len(block.local))
+        parts, fits, square = [], 0.0, 0.0
+        for number, (item, place) in enumerate(self._trials):
+            d: FloatArray = np.zeros(item.residual.shape)
             if number in changes:
-                root = np.sqrt(block.precision)[:, np.newaxis]
-                d = changes[number].T * root
-                moved = d.any(axis=1)
-                at = EVERY if moved.all() else np.flatnonzero(moved).tolist()
-                onto = block.derivatives.onto(d[at] * root[at], at)
-                local = onto[: len(z)]
-                z = block.half @ local
-                total[block.index] += onto[len(z) :] - block.followed.T @ local
-                fits += float(np.vdot(self.fit.residuals[number].T * root, d))
-                fits -= float(block.half @ block.local_gradient @ z)
-                square += float(np.vdot(d, d)) - float(z @ z)
-            parts.append(d.reshape(-1))
-            tail.append(z)
+                d = (changes[number] * item.root).ravel()
+                total[place] += item.rows @ d
+                fits += float(item.residual @ d)
+                square += float(d @ d)
+            parts.append(d)
         y = self._inverse @ total
         fits -= float(self._gradient @ y)
         square -= float(y @ y)
         finite(np.array((fits, square)))
-        return np.concatenate((*parts, *tail, y)), fits, square
+        return np.concatenate((*parts, y)), fits, square
 
     def shrunk(self, change: Change) -> tuple[Change, float]:
         """Return a change made so small that it is of first order, and by which factor.
@@ -219,8 +199,7 @@ class Screen:
     def sign(self) -> FloatArray:
         """Signs (D,) of the inner product: changes count, their projections are taken off."""
         samples = sum(residual.size for residual in self.fit.residuals)
-        rest = sum(len(block.local) for block in self._blocks) + self._size
-        return np.concatenate((np.ones(samples), -np.ones(rest)))
+        return np.repeat((1.0, -1.0), (samples, self._size))
 
     def changes(self, term: Term, *, fine: bool = True) -> Iterator[Change]:
         """Yield the changes of a term over the grid of its parameters, where the model can follow.
@@ -239,14 +218,6 @@ class Screen:
                 yield change
         if refusal is not None and not followed:
             self.problem.refused(self.fit.candidate.plus(term), refusal)
-
-
-def _channels_of(patch: ModelPatch) -> frozenset[str]:
-    """Return the channels that a patch touches if it touches named ones only, else nothing."""
-    names = [getattr(item, "channel", EVERY_CHANNEL) for item in patch if isinstance(item, SENSORS)]
-    if len(names) < len(patch) or EVERY_CHANNEL in names or not names:
-        return frozenset()
-    return frozenset(names)
 
 
 def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Iterator[FloatArray]:

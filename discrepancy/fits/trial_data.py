@@ -1,4 +1,4 @@
-"""A trial ready to be compared: noise of its channels, samples that count, unknowns and derivatives by them.
+"""A trial ready to be compared: noise of its channels, samples that count, unknowns.
 
 Each unknown is a scaled variable u with prior N(0, 1), or flat where nothing is known; the value is
 centre + scale u. Global ones, which every hypothesis shares: calibrated parameters, gains of channels. Local
@@ -18,8 +18,6 @@ from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Start, 
 from discrepancy.campaign.sampling import IntArray
 from discrepancy.models.interface import Conditions, Model
 
-EVERY = slice(None)
-"""All channels of a trial."""
 FREE_MOTION = 3.0
 """Prior deviation of a free initial state, in units of the release displacement."""
 LEAST_LOSS, LARGEST_LOSS = -0.5, 0.95
@@ -241,68 +239,6 @@ def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray, mode
     )
 
 
-@dataclass(frozen=True)
-class TrialDerivatives:
-    """Standardised derivatives of the prediction of a trial.
-
-    Attributes
-    ----------
-    rows : (C, M, N) ndarray
-        Of each channel, by the M unknowns that touch it.
-    owners : (C, M) ndarray of int
-        Whose derivatives the rows are: unknowns of the trial from 0, then the K shared ones and effect
-        parameters of `index`; the number after the last stands for none.
-    local_size : int
-        L, number of unknowns of the trial.
-    index : (K,) ndarray of int
-        Which shared unknowns (global ones first, then effect parameters) touch the trial.
-    """
-
-    rows: FloatArray
-    owners: IntArray
-    local_size: int
-    index: IntArray
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns that touch the trial, L + K."""
-        return self.local_size + len(self.index)
-
-    def products(self) -> FloatArray:
-        """Return the inner products (C, M, M) of the rows of each channel."""
-        return np.asarray(np.matmul(self.rows, self.rows.transpose(0, 2, 1)))
-
-    def normal(self, products: FloatArray, weights: FloatArray) -> FloatArray:
-        """Return J W J^T (L + K, L + K), from the products and the weights (C,) of the channels."""
-        count = self.size + 1
-        at = self.owners[:, :, np.newaxis] * count + self.owners[:, np.newaxis, :]
-        weighted = products * weights[:, np.newaxis, np.newaxis]
-        total = np.bincount(at.ravel(), weighted.ravel(), minlength=count * count)
-        return np.asarray(total.reshape(count, count)[:-1, :-1])
-
-    def onto(self, columns: FloatArray, channels: list[int] | slice = EVERY) -> FloatArray:
-        """Return J d (L + K,) of readings d (C, N), or of some channels' only."""
-        found = np.matmul(self.rows[channels], columns[:, :, np.newaxis])[:, :, 0]
-        owners = self.owners[channels].ravel()
-        return np.asarray(np.bincount(owners, found.ravel(), minlength=self.size + 1)[:-1])
-
-    def spread(self, products: FloatArray, weights: FloatArray, covariance: FloatArray) -> FloatArray:
-        """Return for each channel (C,) the trace of W J^T covariance J, of all L + K unknowns."""
-        padded = np.zeros((self.size + 1, self.size + 1))
-        padded[:-1, :-1] = covariance
-        chosen = padded[self.owners[:, :, np.newaxis], self.owners[:, np.newaxis, :]]
-        return np.asarray(weights * np.einsum("cij,cij->c", chosen, products))
-
-    def dense(self) -> tuple[FloatArray, FloatArray]:
-        """Return J by the trial's own unknowns (L, N C) and by the others (K, N C), as (N, C) is ordered."""
-        channels, _, samples = self.rows.shape
-        found = np.zeros((self.size + 1, samples, channels))
-        for channel in range(channels):
-            found[self.owners[channel], :, channel] = self.rows[channel]
-        whole = found[:-1].reshape(self.size, samples * channels)
-        return whole[: self.local_size], whole[self.local_size :]
-
-
 @dataclass(frozen=True, eq=False)
 class TrialData:
     """One trial, ready to be compared.
@@ -329,13 +265,6 @@ class TrialData:
     noise: tuple[NoiseModel, ...]
 
     @cached_property
-    def by_zero(self) -> FloatArray:
-        """Standardised derivatives (C, N) by each channel's zero, nought without one; they never change."""
-        scale = np.zeros(len(self.deviation))
-        scale[self.unknowns.zero_columns] = self.unknowns.zero_scale
-        return np.ascontiguousarray(self.standardised(np.broadcast_to(scale, self.weight.shape)).T)
-
-    @cached_property
     def steps(self) -> FloatArray:
         """Time since the sample before (N,) [s], of a dynamic trial; nought at the first."""
         trial = self.trial
@@ -345,19 +274,15 @@ class TrialData:
         found = even if np.all(np.abs(given[1:] - even[1:]) < 1e-3 * even[1:]) else given
         return np.concatenate((np.zeros(1), found[1:]))
 
-    def standardised(self, columns: FloatArray, channels: list[int] | slice = EVERY) -> FloatArray:
-        """Return columns (..., N, C) over s0, whitened in time, zero where a sample does not count.
-
-        With `channels`, the columns are theirs only.
-        """
-        scaled = columns / self.deviation[channels]
+    def standardised(self, columns: FloatArray) -> FloatArray:
+        """Return columns (..., N, C) over s0, whitened in time, zero where a sample does not count."""
+        scaled = columns / self.deviation
         interval = self.trial.whitened_at
         if interval is not None:
-            for number, channel in enumerate(np.arange(len(self.deviation))[channels]):
-                noise = self.noise[channel]
+            for number, noise in enumerate(self.noise):
                 if noise.applies(interval):
                     scaled[..., number] = noise.whiten(scaled[..., number], interval)
-        return np.asarray(scaled * self.weight[:, channels])
+        return np.asarray(scaled * self.weight)
 
     @classmethod
     def of(

@@ -22,8 +22,8 @@ from scipy.stats import chi2, f
 
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
 from discrepancy.fits.candidate import Term
-from discrepancy.fits.elimination import trial_block
 from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.normal_equations import trial_rows
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, is_magnitude
 from discrepancy.fits.trial_data import TrialData
@@ -286,89 +286,51 @@ TELLING = 0.5
 DIFFERENCE = 1e-4
 
 
-@dataclass(frozen=True)
-class SizeByTrial:
-    """Sizes of an effect in separate trials.
+def scatter_of(shares: FloatArray, deviations: FloatArray) -> tuple[float, float]:
+    """Return the p-value of Cochran's Q of sizes (T,), and their scatter beyond their deviations."""
+    weights, freedom = deviations**-2, len(shares) - 1
+    statistic = float(weights @ (shares - weights @ shares / weights.sum()) ** 2)
+    spread = weights.sum() - float(weights @ weights) / weights.sum()
+    return float(chi2.sf(statistic, freedom)), float(np.sqrt(max(statistic - freedom, 0.0) / spread))
 
-    Attributes
-    ----------
-    name : str
-        The effect's standard name.
-    trials : tuple of str
-        That say something of it.
-    shares, deviations : (T,) ndarray
-        Size in each trial over the common one, less one, and the standard deviation of that.
+
+def sizes_by_trial(problem: Problem, found: CandidateFit) -> dict[str, dict[str, tuple[float, float]]]:
+    """Return for each effect of a fit by name, for each trial that says something of its size, two numbers.
+
+    Size in the trial over the common one, less one, and the standard deviation of that.
     """
-
-    name: str
-    trials: tuple[str, ...]
-    shares: FloatArray
-    deviations: FloatArray
-
-    @property
-    def statistic(self) -> float:
-        """Cochran's Q."""
-        weights = self.deviations**-2
-        mean = float(weights @ self.shares / weights.sum())
-        return float(weights @ (self.shares - mean) ** 2)
-
-    @property
-    def p_value(self) -> float:
-        """Probability of a Q this large where the sizes agree."""
-        return float(chi2.sf(self.statistic, len(self.trials) - 1))
-
-    @property
-    def scatter(self) -> float:
-        """Standard deviation of the sizes beyond their own deviations, over the common size."""
-        weights = self.deviations**-2
-        freedom = weights.sum() - float(weights @ weights) / weights.sum()
-        return float(np.sqrt(max(self.statistic - (len(self.trials) - 1), 0.0) / freedom))
-
-    @property
-    def follows(self) -> bool:
-        """Whether the effect follows the trial."""
-        return self.p_value < LEVEL and self.scatter > LARGE_SCATTER
-
-    def sentence(self) -> str:
-        """Return what is said of an effect that follows the trial."""
-        low, high = int(np.argmin(self.shares)), int(np.argmax(self.shares))
-        ends = [f"{100.0 * (1.0 + self.shares[at]):.0f} % of it in {self.trials[at]!r}" for at in (low, high)]
-        return said("remarks.follows_trial", name=self.name, low=ends[0], high=ends[1], p=self.p_value)
-
-
-def sizes_by_trial(problem: Problem, found: CandidateFit) -> list[SizeByTrial]:
-    """Return for each effect of a fit that has a size what the trials say of it, where two or more do."""
     precision = problem.precisions(found.sums)
-    rows: list[list[tuple[str, float, float]]] = [[] for _ in found.candidate.terms]
-    first = problem.shared.size
+    parameters = [(term, item) for term in found.candidate.terms for item in term.parameters]
+    sizes = {
+        term.effect.name: k for k, (term, item) in reversed([*enumerate(parameters)]) if is_magnitude(item)
+    }
+    rows: dict[str, dict[str, tuple[float, float]]] = {name: {} for name in sizes}
     for number, data in enumerate(problem.trials):
-        block = trial_block(problem, number, found, found.candidate, precision)
-        matrix, gradient = block.matrix, block.gradient
-        at = first
-        for row, term in zip(rows, found.candidate.terms, strict=True):
-            for place, item in enumerate(term.parameters):
-                own = np.flatnonzero(block.index == at + place)
-                if not is_magnitude(item) or not own.size:
-                    continue
-                information = float(matrix[own[0], own[0]])
-                u = float(found.point.effect[at - first + place])
-                value = item.prior.value(u)
-                slope = (
-                    (item.prior.value(u + DIFFERENCE) - item.prior.value(u - DIFFERENCE)) / DIFFERENCE / 2.0
-                )
-                if information <= 0.0 or value == 0.0:
-                    break
-                deviation = abs(slope / value) / np.sqrt(information)
-                if deviation < TELLING:
-                    step = slope / value * float(gradient[own[0]]) / information
-                    row.append((data.trial.name, step, deviation))
-                break
-            at += len(term.parameters)
-    return [
-        SizeByTrial(
-            term.effect.name, tuple(item[0] for item in row), np.array([item[1] for item in row]),
-            np.array([item[2] for item in row]),
-        )
-        for term, row in zip(found.candidate.terms, rows, strict=True)
-        if len(row) > 1
-    ]  # fmt: skip
+        item = trial_rows(problem, number, found, found.candidate, precision)
+        matrix, gradient = item.of_shared()
+        for name, k in sizes.items():
+            own = np.flatnonzero(item.index == problem.shared.size + k)
+            prior, u = parameters[k][1].prior, float(found.effect[k])
+            if not own.size or prior.value(u) == 0.0 or matrix[own[0], own[0]] <= 0.0:
+                continue
+            slope = (prior.value(u + DIFFERENCE) - prior.value(u - DIFFERENCE)) / DIFFERENCE / 2.0
+            relative, information = slope / prior.value(u), float(matrix[own[0], own[0]])
+            deviation = abs(relative) / np.sqrt(information)
+            if deviation < TELLING:
+                rows[name][data.trial.name] = relative * float(gradient[own[0]]) / information, deviation
+    return rows
+
+
+def follows_trial(problem: Problem, found: CandidateFit) -> str:
+    """Return what is said of effects of a fit that follow the trial; empty where none does."""
+    told = []
+    for name, row in sizes_by_trial(problem, found).items():
+        shares, deviations = np.array([*row.values()]).reshape(-1, 2).T
+        if len(shares) < 2:
+            continue
+        p, scatter = scatter_of(shares, deviations)
+        if p < LEVEL and scatter > LARGE_SCATTER:
+            ends = (int(np.argmin(shares)), int(np.argmax(shares)))
+            low, high = (f"{100.0 * (1.0 + shares[at]):.0f} % of it in {list(row)[at]!r}" for at in ends)
+            told.append(said("remarks.follows_trial", name=name, low=low, high=high, p=p))
+    return " ".join(told)

@@ -30,7 +30,7 @@ from discrepancy.sentences import said
 from discrepancy.verdict import Gate
 
 from .conclusion import Hypothetic
-from .consistency_gate import consistency_gate, sizes_by_trial
+from .consistency_gate import consistency_gate, follows_trial
 from .proof import held_out_gate
 
 COUNTER = -0.1
@@ -155,9 +155,9 @@ class Court:
 
     def beside(self, item: Any) -> str:
         """Return what else speaks against a name: sizes that follow the trial, a gate that noise fails."""
-        following = [one.sentence() for one in sizes_by_trial(self.problem, item) if one.follows]
+        following = follows_trial(self.problem, item)
         if following or item.remainder is not None:
-            return " ".join(following)
+            return following
         gates: list[Gate] = [consistency_gate(self.problem, item), held_out_gate(self.residuals(item))]
         return next((gate.reason for gate in gates if gate.passed is False), "")
 

@@ -13,8 +13,8 @@ from scipy.special import logsumexp
 from discrepancy.campaign.records import Campaign, FloatArray, Trial, TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Point
-from discrepancy.fits.elimination import finite
 from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.normal_equations import finite
 from discrepancy.fits.problem import Problem
 from discrepancy.sentences import SENTENCES
 from discrepancy.verdict import Experiment
@@ -111,9 +111,9 @@ def mutual_information(
     for item in fits:
         point = Point(item.point.shared, (np.zeros(data.unknowns.size),), item.point.effect)
         parts = there.linearise(0, point, item.candidate)
-        derivatives = there.derivatives(0, point, parts, item.candidate)
-        index = derivatives.index
-        local, shared = (part * noise_units for part in derivatives.dense())
+        columns, index = there.columns(0, point, parts, item.candidate)
+        rows = data.standardised(columns).reshape(len(columns), -1) * noise_units
+        local, shared = np.split(rows, [data.unknowns.size])
         means.append(data.standardised(there.prediction(0, point, parts.response)).ravel() * noise_units)
         root = np.linalg.cholesky(item.covariance[np.ix_(index, index)] + 1e-12 * np.eye(len(index)))
         precision = np.maximum(data.unknowns.precision, 1e-4)  # a free zero is known to a hundred s0

@@ -17,7 +17,7 @@ from discrepancy.sentences import said
 from .dependence import Disagreement, excess, explanations, kinds, mode_shares, predicted_frequencies
 from .map import Cell, residual_map
 from .omnibus_tests import OmnibusTest, coloured_noise, mean_square, noise_groups, serial_tests, variance_test
-from .residuals import FittedTrial, ResidualSet, at_own_scale
+from .residuals import FittedTrial, ResidualSet
 
 ALIKE = 0.9
 """Squared cosine from which two patterns over the channels count as the same."""
@@ -139,8 +139,8 @@ class Location:
     disagreements : tuple of Disagreement
         Findings in words, largest first; empty if nothing disagrees.
     remarks : tuple of str
-        Limits: a missing noise record, noise that is not white, residuals smaller than the noise, a map by
-        the residuals' own scale.
+        Limits: a missing noise record, noise that is not white, residuals smaller than the noise, a model so
+        far off that no cell can be judged.
     """
 
     disagrees: bool
@@ -181,18 +181,18 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     tests = tuple(replace(test, rejected=flag) for test, flag in zip(tests, rejected, strict=True))
     patterns = singular_patterns(fitted, white, generator)
     disagrees = any(rejected)
-    own: tuple[str, ...] = ()
     cells = residual_map(fitted, white, MAP_RATE)
     judged = any(cell.axis != "frequency" for cell in cells)
-    if not judged and (scaled := at_own_scale(fitted)) is not None:
-        cells = residual_map(scaled, scaled.white(generator), MAP_RATE)
-        own = (said("location.own_scale"),)
     return Location(
         disagrees=disagrees,
         tests=tests,
         cells=cells,
         disagreements=_disagreements(fitted, white, patterns) if disagrees else (),
-        remarks=(*coloured.values(), *_noise_remarks(fitted), *own),
+        remarks=(
+            *coloured.values(),
+            *_noise_remarks(fitted),
+            *(() if judged else (said("location.not_judged"),)),
+        ),
     )
 
 

@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
-from discrepancy.campaign.records import BoolArray, Channel, FloatArray, NoiseRecord, Trial
+from discrepancy.campaign.records import BoolArray, Channel, FloatArray, Trial
 from discrepancy.errors import FitError
 
 
@@ -173,38 +173,6 @@ class ResidualSet:
                 along += part.T @ item.standardised[item.used]
         root = np.linalg.cholesky(precision)
         return np.asarray(np.linalg.solve(precision, along) + np.linalg.solve(root.T, draw))
-
-
-def at_own_scale(residuals: ResidualSet) -> ResidualSet | None:
-    """Return a set whose noise is what is left in each channel (rms), None where that is nothing.
-
-    Far from the truth what was fitted is so uncertain, by the size of what is left, that beside the noise
-    records no variance is expected anywhere; beside what is left there is.
-    """
-    squares: dict[str, list[FloatArray]] = {}
-    for item in residuals.trials:
-        for column, name in enumerate(item.trial.channels):
-            squares.setdefault(name, []).append(item.residual[item.used[:, column], column] ** 2)
-    joined = {name: np.concatenate(parts) for name, parts in squares.items()}
-    size = {name: float(np.sqrt(values.mean())) if values.size else 0.0 for name, values in joined.items()}
-    if min(size.values()) <= 0.0:
-        return None
-    channels = {
-        name: replace(residuals.channels[name], noise=NoiseRecord(size[name], float(len(values))))
-        for name, values in joined.items()
-    }
-    trials = []
-    for item in residuals.trials:
-        own = np.array([size[name] for name in item.trial.channels])
-        share = item.noise_deviation / own
-        leverage, sensitive = item.leverage * share**2, item.sensitivity
-        if sensitive is not None:  # the leverage itself may be cut at one
-            sensitive = sensitive * share[:, np.newaxis]
-            leverage = np.einsum("ncp,ncp->nc", sensitive, sensitive)
-        trials.append(
-            replace(item, noise_deviation=own, leverage=np.minimum(leverage, 1.0), sensitivity=sensitive)
-        )
-    return ResidualSet({**residuals.channels, **channels}, tuple(trials))
 
 
 def quadratic_moments(

@@ -35,9 +35,8 @@ WORK = 4000
 """Samples of all records between which events are looked for; of more, some are left out until the last."""
 MOST_EVENTS = 6
 """Stretches of a record: more are no events, but a force that varies."""
-STARTS_FROM = ((3.0, False, 0.003), (3.0, True, 0.1), (5.0, False, 1.0))
-"""Forces of which the search begins, over the process: size of the event's force, whether it hardly varies
-within a record, size of the other one."""
+LARGER, LITTLE = 3.0, 0.003
+"""Sizes of both forces with which the search begins, over the process: of the event's, of the other."""
 NONE = 1e-3
 """Size of no force over one."""
 GROUND = 3.0
@@ -345,16 +344,14 @@ def events(view: View, port: int, process: Process, least: float = -np.inf) -> E
     """
     every = -(-sum(len(trial.time) for trial in view.trials) // WORK)
     coarse = thinned(view, every)
-    length = max(float(np.ptp(trial.time)) for trial in view.trials)
     off = [np.zeros(len(trial.time), dtype=bool) for trial in coarse.trials]
     always, tried = [], []
     for with_speed, flips in enumerate(turns(coarse, port)):
         search = EventSearch(coarse, port, process, flips)
         always.append((_throughout(search, off), with_speed))
-        for size, slow, rest in STARTS_FROM:
-            event = Process(process.size * size, length if slow else process.time, rough=True)
-            acting = Acting(event, replace(process, size=process.size * rest))
-            tried.append((_round(search, acting, off, FEW_PASSES), with_speed))
+        event = Process(LARGER * process.size, process.time, rough=True)
+        acting = Acting(event, replace(process, size=LITTLE * process.size))
+        tried.append((_round(search, acting, off, FEW_PASSES), with_speed))
     best, turning = max(tried, key=lambda item: item[0].score)
     for _ in range(ROUNDS):
         again = _round(best.search, best.acting, best.paths, MOST_PASSES)

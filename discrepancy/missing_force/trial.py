@@ -232,17 +232,14 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     trial, shared, unknowns = data.trial, problem.shared, data.unknowns
     parts = problem.linearise(number, point, Candidate())
     gains = 1.0 + shared.gains(point.shared, trial.channels)
-    of_gains = np.zeros((len(shared.gain_channels), *parts.response.shape))
     gain_unknowns = []
     for row, name in enumerate(shared.gain_channels):
         if name in trial.channels:
             column, scale = trial.channels.index(name), float(shared.gain_scale[row])
-            of_gains[row, :, column] = scale * parts.response[:, column]
             gain_unknowns.append((len(shared.parameter_mean) + row, column, scale / float(gains[column])))
-    zeros = np.zeros((unknowns.zeros, *parts.response.shape))
-    zeros[np.arange(unknowns.zeros), :, unknowns.zero_columns] = unknowns.zero_scale[:, None]
-    by_shared = np.concatenate((parts.parameters * gains, of_gains))
-    by_local = np.concatenate((zeros, parts.local * gains))
+    columns, index = problem.columns(number, point, parts, Candidate())
+    by_local, by_shared = columns[: unknowns.size], np.zeros((shared.size, *parts.response.shape))
+    by_shared[index] = columns[unknowns.size :]
     residual = trial.values - problem.prediction(number, point, parts.response)
     residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(point.local[number], by_local, 1)
     outputs = tuple(

@@ -96,7 +96,10 @@ def residual_windows(
             one, pattern = of_series(item.trial.name, item.trial.time, series, item.used)
             if one.log_evidence < of_nothing(one) + GROUND:
                 continue
-            best = events(one.view, 0, one.processes[0])
+            try:
+                best = events(one.view, 0, one.processes[0])
+            except np.linalg.LinAlgError:  # a hypothesis that leaves millions of noises is off throughout
+                continue
             shown = one.motions[0].forces[0][:, None] * pattern
             found += _windows(best, [item.trial.channels], [shown], with_effect=with_effect)
     return found

@@ -130,17 +130,6 @@ def test_any_two_separate_modes_are_recovered(first, second, ratios, share, phas
     assert [m.damping_ratio for m in fit.modes] == pytest.approx(ratios, rel=1e-4)
 
 
-@given(scale=st.floats(1e-6, 1e6))
-def test_the_scale_of_the_signal_changes_nothing(scale):
-    time = np.arange(0.0, 4.0, 1.0 / 125.0)
-    one, other = (
-        fit_ring_down(RingDownRecord(time, factor * ring_down(time)), start=None) for factor in (1.0, scale)
-    )
-    for a, b in zip(one.modes, other.modes, strict=True):
-        assert b.damping_ratio == pytest.approx(a.damping_ratio, rel=1e-6)
-        assert b.amplitude == pytest.approx(scale * a.amplitude, rel=1e-6)
-
-
 def test_covariance_against_a_jacobian_by_differences():
     time = np.arange(0.0, 3.0, 1.0 / 125.0)
     generator = np.random.default_rng(1)

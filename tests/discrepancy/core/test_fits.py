@@ -11,8 +11,8 @@ from scipy.stats import multivariate_normal
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import FitError
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Term
-from discrepancy.fits.elimination import Cholesky
 from discrepancy.fits.fitting import fit
+from discrepancy.fits.normal_equations import solved, upper_factor
 
 from . import kit
 
@@ -46,8 +46,9 @@ def check(problem, candidate, effect=None, tolerance=TOLERANCE, spread=0.5):
     at, first = 0, problem.shared.size + candidate.size
     for number, data in enumerate(problem.trials):
         parts = problem.linearise(number, point, candidate)
-        derivatives = problem.derivatives(number, point, parts, candidate)
-        (local, shared), index = derivatives.dense(), derivatives.index
+        found, index = problem.columns(number, point, parts, candidate)
+        rows = data.standardised(found).reshape(len(found), -1)
+        local, shared = np.split(rows, [data.unknowns.size])
         counts = (data.weight > 0.0).ravel()
         assert np.all(local[:, ~counts] == 0.0)
         assert np.all(shared[:, ~counts] == 0.0)
@@ -130,36 +131,6 @@ def test_samples_that_do_not_count_change_nothing():
             for p in (problem, other)
         )
         np.testing.assert_allclose(first, second, atol=1e-9)
-
-
-def test_products_by_channel_are_those_of_all_readings():
-    """J W J^T, J d and the trace of J^T covariance J by channel, beside the same with dense matrices."""
-    problem = kit.closed_problem(
-        bent=True, noise=coloured_record(), gain_deviation=0.1, health=True, time_zero=0.003,
-        left_out={1: ((3, 1),)}, samples=80,
-    )  # fmt: skip
-    generator, linear = np.random.default_rng(2), kit.Linear(problem, BOTH)
-    point = linear.point(generator.standard_normal(linear.size))
-    for number, data in enumerate(problem.trials):
-        found = problem.derivatives(number, point, problem.linearise(number, point, BOTH), BOTH)
-        dense, products = np.vstack(found.dense()), found.products()
-        count = len(data.trial.channels)
-        weights = generator.uniform(0.5, 2.0, count)
-        every = np.tile(weights, dense.shape[1] // count)
-        readings = generator.standard_normal((count, dense.shape[1] // count))
-        only = np.zeros_like(readings)
-        only[1] = readings[1]
-        for got, wanted in (
-            (found.normal(products, weights), (dense * every) @ dense.T),
-            (found.onto(readings), dense @ readings.T.ravel()),
-            (found.onto(readings[1:2], [1]), dense @ only.T.ravel()),
-        ):
-            np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-9)
-        root = generator.standard_normal((found.size, found.size))
-        leverage = np.einsum("kn,kl,ln->n", dense, root @ root.T, dense) * every
-        spread = found.spread(products, weights, root @ root.T)
-        wanted = leverage.reshape(-1, count).sum(axis=0)
-        np.testing.assert_allclose(spread, wanted, rtol=1e-10, atol=1e-9)
 
 
 # ---------------------------------------------------------------- evidence and posterior
@@ -307,11 +278,8 @@ def test_a_factor_solves_and_a_curvature_that_is_none_is_refused():
     generator = np.random.default_rng(4)
     root = generator.standard_normal((4, 6))
     matrix, right = root @ root.T, generator.standard_normal((4, 2))
-    found = Cholesky.of(matrix)
-    np.testing.assert_allclose(matrix @ found.solve(right), right, atol=1e-10)
-    np.testing.assert_allclose(found.half(right).T @ found.half(right), right.T @ found.solve(right))
-    assert found.log_determinant == pytest.approx(np.linalg.slogdet(matrix)[1])
-    assert Cholesky.of(np.zeros((0, 0))).solve(np.zeros((0, 2))).shape == (0, 2)
+    np.testing.assert_allclose(matrix @ solved(upper_factor(matrix), right), right, atol=1e-10)
+    assert solved(upper_factor(np.zeros((0, 0))), np.zeros((0, 2))).shape == (0, 2)
     for wrong in (np.nan, np.inf, -1.0):
         with pytest.raises(FitError, match=r"not finite|singular"):
-            Cholesky.of(np.diag([1.0, wrong]))
+            upper_factor(np.diag([1.0, wrong]))
