@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from discrepancy.campaign.noise import pre_trigger_record, repeated
+from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import (
     Campaign,
@@ -18,7 +19,6 @@ from discrepancy.campaign.records import (
     NoiseRecord,
     Quantity,
     RecordedInput,
-    Release,
     Trial,
     TrialKind,
 )

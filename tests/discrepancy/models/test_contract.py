@@ -11,7 +11,8 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 
-from discrepancy.campaign.records import Hold, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Hold, Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Conditions, Model
