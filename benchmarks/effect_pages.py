@@ -68,7 +68,7 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         "## Confused with",
         *(f"- [`{other}`]({other}.md): {text['tell'][other]}" for other in effect.confusable),
         "",
-        f"Sources: {'; '.join(text['references'])}",
+        f"Sources: {'; '.join(source.rstrip('.') for source in text['references'])}.",
         "",
     ]
     return "\n".join(lines)
