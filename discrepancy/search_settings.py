@@ -46,7 +46,7 @@ class SearchSettings:
     """Starts of the fit of each effect close to the truth."""
     far_starts: int = 2
     """The same far from it, of the best values tried."""
-    far_points: tuple[int, ...] = (1, 7, 25, 60, 80)
+    far_points: tuple[int, ...] = (1, 5, 20, 60, 80)
     """Values that are tried there, by the number of parameters from none on."""
     few_places: int = 3
     """Effects with more places than this are those of single channels, which are linear in their size."""
