@@ -45,9 +45,9 @@ class SearchSettings:
     starts: int = 2
     """Starts of the fit of each effect close to the truth."""
     far_starts: int = 2
-    """The same far from it, of the best values tried."""
-    far_points: tuple[int, ...] = (1, 5, 20, 60, 80)
-    """Values that are tried there, by the number of parameters from none on."""
+    """The same far from it, of the best on a grid."""
+    far_levels: tuple[int, ...] = (1, 5, 5, 5, 3)
+    """Levels of each parameter on it, by their number from none on."""
     few_places: int = 3
     """Effects with more places than this are those of single channels, which are linear in their size."""
     worth_fitting: float = 2.0

@@ -3,11 +3,11 @@
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
+from itertools import product
 
 import numpy as np
 from scipy.special import ndtri
-from scipy.stats import qmc
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
@@ -107,7 +107,7 @@ class Search(Hypotheses):
         return self._best_of(starts, base, least if base.candidate.terms else 0.0)
 
     def _scan_far(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
-        """Fit effects from the best of values all over their priors, nuisances as the missing force has them.
+        """Fit effects from the best of a grid of their parameters, nuisances as the missing force has them.
 
         Those of a wrong model are far off and make a bad start; beside a force that is free they are where
         they belong. Beside trials at rest, which know no force, they are as expected before the data.
@@ -381,21 +381,16 @@ def _beside(base: CandidateFit, term: Term, values: FloatArray) -> Start:
     return base.candidate.plus(term), replace(base.point, effect=effect)
 
 
-@cache
-def _spread(size: int) -> FloatArray:
-    """Return standard normal values (N, size) spread evenly over a prior: points of Halton's sequence."""
-    count = SEARCH.far_points[min(size, len(SEARCH.far_points) - 1)]
-    points = qmc.Halton(size, scramble=False).random(count + 1)[1:] if size else np.zeros((1, 0))
-    return np.asarray(ndtri(points))
-
-
 def _tried(problem: Problem, base: CandidateFit, effect: Effect) -> Starts:
-    """Return the most promising values of an effect's parameters, beside a base."""
+    """Return the most promising points of a grid of an effect's parameters, beside a base."""
     found = []
     for place in effect.places(problem.setting):
         term = Term(effect, place)
-        for values in _spread(len(term.parameters)):
-            candidate, start = _beside(base, term, values)
+        known, size = SEARCH.far_levels, len(term.parameters)
+        count = known[min(size, len(known) - 1)]
+        levels = ndtri((np.arange(count) + 0.5) / max(count, 1))
+        for values in product(levels, repeat=size):
+            candidate, start = _beside(base, term, np.array(values))
             with suppress(DiscrepancyError):  # more than the structure can carry
                 found.append((objective(problem, candidate, start), candidate, start))
     found.sort(key=lambda row: row[0])
