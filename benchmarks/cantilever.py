@@ -11,15 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.result.record import ParameterPrior
-from discrepancy.campaign.records import (
-    Campaign,
-    Channel,
-    NoiseRecord,
-    Quantity,
-    Release,
-    Trial,
-    TrialKind,
-)
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.models.acting import Acting, Course, Load, Shown, release_of
 from discrepancy.models.interface import ACROSS, Conditions, Model, Outputs, Response
 from discrepancy.models.linear_system import LinearSystem

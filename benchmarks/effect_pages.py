@@ -37,10 +37,10 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
     what = "Tank" if tank else "Cantilever"
     _, place = picture_patch(effect, setting)
     values = picture_of(effect).values
-    rows = [
-        f"- {p.symbol} (`{p.name}`, {p.unit}): {p.description}; {range_of(p.prior)}."
-        for p in effect.parameters
-    ]
+    rows = []
+    for p in effect.parameters:
+        unit = "" if p.unit == "1" else f", {p.unit}"
+        rows.append(f"- {p.symbol} (`{p.name}`{unit}): {p.description}; {range_of(p.prior)}.")
     free = [
         f"- {s.symbol} (`{s.name}`): {s.description}; {s.canonical:g}, in the family {range_of(s.prior)}."
         for s in effect.shape
@@ -61,14 +61,14 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         *free,
         "",
         *([text["unit"], ""] if text["unit"] else []),
-        f"![{effect.name}](images/{effect.identifier}.png)",
+        f"![{effect.identifier}](images/{effect.identifier}.png)",
         "",
         f"{what}: {shown}" + (f", place `{place}`." if place else "."),
         "",
-        "## Easily confused with",
+        "## Confused with",
         *(f"- [`{other}`]({other}.md): {text['tell'][other]}" for other in effect.confusable),
         "",
-        f"Sources: {'; '.join(text['references'])}",
+        f"Sources: {'; '.join(source.rstrip('.') for source in text['references'])}.",
         "",
     ]
     return "\n".join(lines)

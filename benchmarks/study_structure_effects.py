@@ -18,7 +18,8 @@ from time import process_time
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.model_choice import load_model
 from discrepancy.models.acting import Acting, Shown
 from discrepancy.models.linear_system import LinearSystem

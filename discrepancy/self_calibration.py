@@ -8,12 +8,12 @@ verdicts are compared with what was hidden. Motion is simulated with half the ti
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
@@ -219,34 +219,28 @@ def self_calibrate(
             if found is None:
                 absent[effect.identifier] = None
         hidden.append(found)
-    jobs = list(zip(hidden, own, strict=True))
     cases: list[CalibrationCase] = []
-
-    def collect(found: Iterable[CalibrationCase]) -> None:
-        for case in found:
+    with ProcessPoolExecutor(
+        max(workers, 1), get_context("spawn"), _begin, (campaign, model, effects)
+    ) as pool:
+        own_work = partial(_investigated, simulator, effects)
+        apart = workers > 1 and count > 1
+        for case in pool.map(_one, hidden, own) if apart else map(own_work, hidden, own):
             cases.append(case)
             if advance is not None:
                 advance()
-
-    if workers <= 1 or count == 1:
-        collect(_investigated(simulator, effects, *job) for job in jobs)
-    else:
-        with ProcessPoolExecutor(
-            workers, get_context("spawn"), initializer=_begin, initargs=(campaign, model, tuple(effects))
-        ) as pool:
-            collect(pool.map(_one, jobs, chunksize=1))
     return SelfCalibration(tuple(cases), tuple(absent), seed)
 
 
-_worker: dict[str, Any] = {}
+_worker: list[Callable[..., CalibrationCase]] = []
 
 
-def _begin(campaign: Campaign, model: Model, effects: tuple[Effect, ...]) -> None:
-    _worker["simulator"], _worker["effects"] = Simulator(campaign, model), effects
+def _begin(campaign: Campaign, model: Model, effects: Sequence[Effect]) -> None:
+    _worker.append(partial(_investigated, Simulator(campaign, model), effects))
 
 
-def _one(job: tuple[Hidden | None, np.random.SeedSequence]) -> CalibrationCase:
-    return _investigated(_worker["simulator"], _worker["effects"], *job)
+def _one(hidden: Hidden | None, seed: np.random.SeedSequence) -> CalibrationCase:
+    return _worker[0](hidden, seed)
 
 
 def _investigated(

@@ -9,17 +9,16 @@ import numpy as np
 
 from discrepancy.campaign import schema
 from discrepancy.campaign.noise import pre_trigger_record, with_noise
+from discrepancy.campaign.protocol import Event
 from discrepancy.campaign.records import (
     USUAL_REGIONS,
     BoolArray,
     Campaign,
     Channel,
-    Event,
     FloatArray,
     NoiseRecord,
     Quantity,
     RecordedInput,
-    Release,
     Start,
     Trial,
     TrialKind,
@@ -129,16 +128,31 @@ def _unused(section: schema.CampaignSection, tables: Mapping[str, TextTable]) ->
 
 
 def _events(section: schema.CampaignSection, trials: tuple[Trial, ...]) -> Iterator[Event]:
-    """Yield the events; each must lie within the records of its trials."""
-    records = {trial.name: trial.time for trial in trials}
+    """Yield the events in the trials in which they happened, once each and within their records in time."""
+    known, seen = {trial.name: trial for trial in trials}, set[tuple[str, str]]()
+    courses = tuple(trial.name for trial in trials if trial.is_dynamic)
     for event in section.event:
-        found = Event(event.name, event.among(section.trial), event.time, event.until)
+        found = replace(event, trial=None, trials=(event.trial,) if event.trial else event.trials or courses)
         for name in found.trials:
-            first, last = records[name][0], records[name][-1]
-            for key, moment in (("time", event.time), ("until", event.until)):
-                if moment is not None and not first <= moment <= last:
-                    told = {"event": event, "key": key, "moment": moment, "trial": name}
-                    raise CampaignDataError(said("campaign.not_then", first=first, last=last, **told))
+            told = {"event": event, "trial": name, "known": ", ".join(known)}
+            if name not in courses:
+                wrong = "no_course" if name in known else "no_trial"
+                kind = known[name].kind.value if name in known else ""
+                raise CampaignFileError(f"{CAMPAIGN_FILE}: {said(f'campaign.{wrong}', kind=kind, **told)}.")
+            first, last = known[name].time[[0, -1]].tolist()
+            # its end has a name, too, by which expressions know it
+            for key, word, moment in (
+                ("time", event.name, event.time), ("until", f"{event.name}_until", event.until)
+            ):  # fmt: skip
+                if moment is None:
+                    continue
+                if (word, name) in seen:
+                    twice = said("campaign.two_moments", word=word, trial=name)
+                    raise CampaignFileError(f"{CAMPAIGN_FILE}: {twice}.")
+                if not first <= moment <= last:
+                    told |= {"key": key, "moment": moment, "first": first, "last": last}
+                    raise CampaignDataError(said("campaign.not_then", **told))
+                seen.add((word, name))
         yield found
 
 
@@ -189,7 +203,7 @@ def _trial(
         health=health,
         regions=regions,
         health_deviation=health_deviation,
-        release=None if section.release is None else _release(section.release),
+        release=section.release,
         begins=section.begins or Start.SETTLED,
         begin_assumed=section.begins is None,
         inputs=inputs,
@@ -317,12 +331,6 @@ def _health(
                 place = f"{table.name}, line {table.lines[row]}"
                 raise CampaignFileError(f"{place}: {key} is {what}, and {values[row, index]:g} came.")
     return regions, health, deviation
-
-
-def _release(section: schema.ReleaseSection) -> Release:
-    quantity = Quantity.DISPLACEMENT if section.unit in ("m", "mm", "um") else Quantity.SIGNAL
-    given = section.model_dump(exclude={"displacement", "unit"})
-    return Release(conversion_of(quantity, section.unit).to_si(section.displacement), **given)
 
 
 # ---------------------------------------------------------------- channels

@@ -12,9 +12,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from discrepancy.campaign.protocol import Event, Release
 from discrepancy.campaign.sampling import IntArray, nearly_even
-from discrepancy.errors import CampaignDataError
-from discrepancy.sentences import said
 from reporting.words import brief
 
 FloatArray = NDArray[np.float64]
@@ -194,38 +193,6 @@ class Channel:
         return 0.0 if self.noise is None else self.noise.standard_deviation * trial.noise_factor
 
 
-@dataclass(frozen=True)
-class Release:
-    """How a ring-down began.
-
-    Attributes
-    ----------
-    displacement : float
-        Nominal displacement of the release point before the release [m or the signal's unit].
-    deviation : float
-        Prior relative standard deviation of it [1].
-    at_rest : bool
-        True: the first sample is at the release, from the static shape under the holding force, and higher
-        modes start as that shape says, within `deviation`; False: the record starts later, and displacement
-        and velocity of each of `mode_count` modes are free.
-    mode_count : int
-        Modes whose initial state is free, at least 1: the first entry is the amplitude, within `deviation`.
-    time_zero_deviation : float
-        Prior standard deviation of the time between release and first sample [s].
-    """
-
-    displacement: float
-    deviation: float = 0.05
-    at_rest: bool = True
-    mode_count: int = 3
-    time_zero_deviation: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Refuse a release whose amplitude no unknown stands for: it would count as exact, unseen."""
-        if self.mode_count < 1:
-            raise CampaignDataError(said("campaign.mode_count", count=self.mode_count))
-
-
 USUAL_REGIONS = ("z1", "z2")
 """Damage regions that every trial knows: those of the shipped wing."""
 
@@ -353,28 +320,6 @@ class Trial:
     def whitened_at(self) -> float | None:
         """Interval [s] at which noise of a dynamic trial can be whitened; None at too uneven stamps."""
         return self.interval if self.is_dynamic and nearly_even(self.time) else None
-
-
-@dataclass(frozen=True)
-class Event:
-    """Something that happened in trials, known from a protocol.
-
-    Attributes
-    ----------
-    name : str
-        As expressions use it; `name_until` is its end.
-    trials : tuple of str
-        Trials in which it happened.
-    time : float
-        Since each trial's start [s].
-    until : float or None
-        When it was over [s]; None where nothing is said.
-    """
-
-    name: str
-    trials: tuple[str, ...]
-    time: float
-    until: float | None = None
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,13 @@
 """The schema of `campaign.toml`: what it may say, checked strictly; units are still those of the file."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from keyword import iskeyword
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from math import inf, isinf
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
-    BeforeValidator,
+    AfterValidator,
     ConfigDict,
     Field,
     PlainSerializer,
@@ -16,11 +16,11 @@ from pydantic import (
     model_validator,
 )
 
+from discrepancy.campaign.protocol import LIST, Event, Release
 from discrepancy.campaign.records import Hold, Quantity, Start, TrialKind
 from discrepancy.campaign.units import conversion_of
 from discrepancy.errors import CampaignFileError
 from discrepancy.sentences import said
-from fe.runtime.expression import RESERVED
 from fe.runtime.patch import EVERY_CHANNEL
 from reporting.section import Name, NotNegative, Number, Positive, Section, checked
 
@@ -39,9 +39,6 @@ Deviation = Annotated[
     WrapValidator(lambda value, check: inf if value == "free" else check(value)),
     PlainSerializer(lambda value: "free" if isinf(value) else value, when_used="json"),
 ]
-MOST_MODES = 100
-_LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
-"""What a list of the file becomes before it is checked."""
 
 
 class ParameterSection(Section):
@@ -126,22 +123,11 @@ class InputSection(ColumnSection):
         return Hold.SMOOTH if self.quantity.moving and not self.reference else self.hold
 
 
-class ReleaseSection(Section):
-    """`release` of a ring-down."""
-
-    displacement: Number
-    unit: Literal["m", "mm", "um", "V", "mV", "1"] = "m"
-    deviation: Positive = 0.05
-    at_rest: bool = True
-    mode_count: Annotated[int, Field(ge=1, le=MOST_MODES)] = 3
-    time_zero_deviation: NotNegative = 0.0
-
-    @field_validator("displacement")
-    @classmethod
-    def _somewhere(cls, displacement: float) -> float:
-        if displacement == 0.0:
-            raise ValueError("must not be zero: its sign is the side to which the structure is held")
-        return displacement
+def _in_si(release: Release) -> Release:
+    """Return a release in metres or volts."""
+    quantity = Quantity.DISPLACEMENT if release.unit in ("m", "mm", "um") else Quantity.SIGNAL
+    held = conversion_of(quantity, release.unit).to_si(release.displacement)
+    return replace(release, displacement=held, unit="m" if quantity is Quantity.DISPLACEMENT else "V")
 
 
 class HealthSection(Section):
@@ -171,9 +157,9 @@ class TrialSection(Section):
     temperature: Number | None = None
     load_place: Name | tuple[Number, Number] = Field(default="tip_load", union_mode="left_to_right")
     health: HealthSection | None = None
-    release: ReleaseSection | None = None
-    channels: Annotated[tuple[Name, ...], _LIST] | None = None
-    left_out: dict[str, Annotated[tuple[Annotated[int, Field(ge=1)], ...], _LIST]] = Field(
+    release: Annotated[Release, AfterValidator(_in_si)] | None = None
+    channels: Annotated[tuple[Name, ...], LIST] | None = None
+    left_out: dict[str, Annotated[tuple[Annotated[int, Field(ge=1)], ...], LIST]] = Field(
         default_factory=dict
     )
     begins: Start | None = Field(default=None, strict=False)
@@ -205,37 +191,6 @@ class TrialSection(Section):
         return self
 
 
-class EventSection(Section):
-    """`[[event]]`."""
-
-    name: Name
-    time: NotNegative
-    trial: Name | None = None
-    trials: Annotated[tuple[Name, ...], Field(min_length=1), _LIST] | None = None
-    until: Number | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if not self.name.isidentifier():
-            raise ValueError(said("campaign.event_name", event=self))
-        if self.name in RESERVED or iskeyword(self.name):
-            raise ValueError(said("campaign.event_reserved", event=self))
-        if self.trial is not None and self.trials is not None:
-            raise ValueError(said("campaign.event_trials", event=self))
-        if self.until is not None and self.until <= self.time:
-            raise ValueError(said("campaign.event_end", event=self))
-        return self
-
-    def among(self, trials: Sequence[TrialSection]) -> tuple[str, ...]:
-        """Return the trials in which it happened: those named, or all that are samples in time."""
-        if self.trial is not None:
-            return (self.trial,)
-        if self.trials is not None:
-            return self.trials
-        still = (TrialKind.STATIC, TrialKind.FLIGHT)
-        return tuple(item.name for item in trials if item.kind not in still)
-
-
 def _twice(names: Iterable[str]) -> str | None:
     """Return the first name in the alphabet that comes more than once."""
     return min((name for name, count in Counter(names).items() if count > 1), default=None)
@@ -249,12 +204,12 @@ class CampaignSection(Section):
     reference_temperature: Annotated[float, Field(allow_inf_nan=False, ge=-273.15)] | None = None
     parameters: dict[Name, ParameterSection] = Field(default_factory=dict)
     noise: NoiseFileSection | None = None
-    channel: Annotated[tuple[ChannelSection, ...], Field(min_length=1), _LIST]
-    input: Annotated[tuple[InputSection, ...], _LIST] = ()
-    trial: Annotated[tuple[TrialSection, ...], Field(min_length=1), _LIST]
-    event: Annotated[tuple[EventSection, ...], _LIST] = ()
-    remarks: Annotated[tuple[str, ...], _LIST] = ()
-    loggers: dict[Name, Annotated[tuple[Name, ...], _LIST]] = Field(default_factory=dict)
+    channel: Annotated[tuple[ChannelSection, ...], Field(min_length=1), LIST]
+    input: Annotated[tuple[InputSection, ...], LIST] = ()
+    trial: Annotated[tuple[TrialSection, ...], Field(min_length=1), LIST]
+    event: Annotated[tuple[Event, ...], LIST] = ()
+    remarks: Annotated[tuple[str, ...], LIST] = ()
+    loggers: dict[Name, Annotated[tuple[Name, ...], LIST]] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -277,7 +232,6 @@ class CampaignSection(Section):
         if len(scales) > 1:
             raise ValueError("temperatures are given in degC and in K: give all of them in one of the two")
         self._check_loggers()
-        self._check_events()
         known = {item.name for item in self.channel}
         for item in self.trial:
             for name in (*(item.channels or ()), *item.left_out):
@@ -303,22 +257,6 @@ class CampaignSection(Section):
                 raise ValueError(f"{name!r} must be on one of the `loggers`, and it is on {came}")
         if sum(bool(inputs & set(names)) for names in self.loggers.values()) > 1:
             raise ValueError("all inputs must be on one of the `loggers`, and they are on several")
-
-    def _check_events(self) -> None:
-        """Refuse an event in a trial that is not there or not in time, and two of a name in one trial."""
-        kinds, seen = {item.name: item.kind for item in self.trial}, set[tuple[str, str]]()
-        for event in self.event:
-            for trial in event.among(self.trial):
-                told = {"event": event, "trial": trial, "known": ", ".join(kinds)}
-                if trial not in kinds:
-                    raise ValueError(said("campaign.no_trial", **told))
-                if kinds[trial] in (TrialKind.STATIC, TrialKind.FLIGHT):
-                    raise ValueError(said("campaign.no_course", kind=kinds[trial].value, **told))
-                # Its end has a name, too, by which expressions know it.
-                for word in (event.name, f"{event.name}_until")[: 1 if event.until is None else 2]:
-                    if (word, trial) in seen:
-                        raise ValueError(said("campaign.two_moments", word=word, trial=trial))
-                    seen.add((word, trial))
 
 
 def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:

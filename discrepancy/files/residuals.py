@@ -13,15 +13,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from discrepancy.campaign.records import (
-    USUAL_REGIONS,
-    Channel,
-    NoiseRecord,
-    Quantity,
-    Release,
-    Trial,
-    TrialKind,
-)
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import USUAL_REGIONS, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import DiscrepancyError, VerdictFileError
 from discrepancy.location.residuals import FittedTrial, ResidualSet

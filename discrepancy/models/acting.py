@@ -9,7 +9,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline, PPoly
 
-from discrepancy.campaign.records import FloatArray, Hold, Release, Start, Trial
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import FloatArray, Hold, Start, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Place
 from fe.runtime.expression import Expression

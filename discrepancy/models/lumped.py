@@ -1,7 +1,7 @@
 """A lumped linear structure as a model: masses, springs, dampers with named inputs, outputs and ports."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -32,8 +32,6 @@ from fe.runtime.state import Losses
 
 LEAST_STIFFNESS = 0.05
 """A temperature that leaves less than this share of the stiffness is refused."""
-KEPT = 256
-"""Systems that a model keeps."""
 MOST_MODES = 8
 """Modes that move of a structure on springs; the others follow without inertia."""
 
@@ -108,6 +106,8 @@ class LumpedModel(DescribedModel, SystemModel):
 
     follows_windows: ClassVar[bool] = True
 
+    kept = 256
+
     def __init__(self, description: LumpedDescription) -> None:
         self.description, padded = description, description.padded
         super().__init__(description, {item.name: item.quantity for item in description.output})
@@ -125,7 +125,6 @@ class LumpedModel(DescribedModel, SystemModel):
             self.stations = self._places[0].station, self._places[-1].station
         self._inputs = {item.name: item for item in description.input}
         self._outputs = {item.name: item for item in description.output}
-        self._rig_of, self.system = lru_cache(KEPT)(self._rig), lru_cache(KEPT)(self.made)
 
     @classmethod
     def load(cls, path: Path | str) -> "LumpedModel":
@@ -309,6 +308,10 @@ class LumpedModel(DescribedModel, SystemModel):
     def rig(self, state: State) -> Rig:
         """Return the model at values of the parameters, a structure and a temperature."""
         return self._rig_of(state._replace(drives=(), closed=True))
+
+    @cached_property
+    def _rig_of(self) -> Callable[[State], Rig]:
+        return lru_cache(self.kept)(self._rig)
 
     def _rig(self, state: State) -> Rig:
         description, n = self.description, self.description.size

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import cache, lru_cache, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +51,6 @@ paper, its masses, and the damping of the joint posterior, whose spread holds th
 
 
 ROTATING_PORT = "root"
-KEPT_SYSTEMS = 64
-"""Systems that are kept, of a wing 2 MB each."""
 Prior = Mapping[str, tuple[float, float]]
 """Means and standard deviations of calibrated parameters, by the names of `STATE`."""
 Design = WingDesign | None
@@ -100,7 +98,6 @@ class StructureModel(SystemModel):
             **dict.fromkeys(model.accelerations, Quantity.ACCELERATION),
         }
         self._rows = dict(zip(self.quantities, (*outputs, *accelerations), strict=True))
-        self.system = lru_cache(KEPT_SYSTEMS)(self.made)
         mean = State(tuple(self.prior_mean().tolist()))
         along = [self._load(mean, force) for force in self.forces]
         self.port_rows = {
@@ -229,8 +226,11 @@ class WingModel(SystemModel):
         self.name, self.parameters = name, wing_priors(box, **prior)
         self.regions, self.length, self.port_rows = arrays.regions, wing.span, wing.port_rows
         self.stations = 0.0, wing.span
-        self.ports, self._row = tuple(PORTS), cache(wing.output_row)
-        self.system = lru_cache(KEPT_SYSTEMS)(self.made)
+        self.ports = tuple(PORTS)
+
+    @cached_property
+    def _row(self) -> Callable[[str], FloatArray | None]:
+        return cache(self.wing.output_row)
 
     @classmethod
     def of_design(cls, path: Path | str | None = None, progress: Progress | None = None) -> "WingModel":

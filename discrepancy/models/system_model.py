@@ -3,8 +3,9 @@
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cached_property, lru_cache
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -76,14 +77,23 @@ class SystemModel(Model):
         Rows of all ports where laws act.
     reference : str or None
         Place whose stiffness and modal mass are the natural ones; None: that of the first trial.
-    system : callable
-        Gives what moves in a state: `made`, which is kept.
+    kept : int
+        Systems that are kept, of a wing 2 MB each.
     """
 
     port_rows: Mapping[str, FloatArray]
     reference: str | None = None
+    kept = 64
     kinds = frozenset(TrialKind) - {TrialKind.DRIVEN}
-    system: Callable[[State], LinearSystem]
+
+    @cached_property
+    def system(self) -> Callable[[State], LinearSystem]:
+        """What gives what moves in a state: `made`, which is kept."""
+        return lru_cache(self.kept)(self.made)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what is kept for speed: a process cannot hand it to another one."""
+        return {name: value for name, value in vars(self).items() if not hasattr(value, "cache_clear")}
 
     # ------------------------------------------------------------ what each says
 

@@ -44,28 +44,26 @@ from .text import WORDS, added_label, force_sentence, motion_of, scored
 _LARGEST_DISTANCE = 1e4
 
 
+@publication_style()
 def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
     """Draw histograms of probability integral transforms; keys are titles, in order before and after."""
     if not scores:
         return None
-    with publication_style():
-        figure, (row,) = panels(1, 2, 1.9)
-        for spare in row[len(scores) :]:
-            spare.remove()
-        top = max(max(item.pit) for item in scores.values())
-        for number, (axes, (title, item)) in enumerate(zip(row, scores.items(), strict=False)):
-            count = len(item.pit)
-            axes.bar(
-                (np.arange(count) + 0.5) / count, item.pit, 0.94 / count,
-                color=PREDICTION if number == 0 and len(scores) > 1 else PAST, alpha=0.75,
-            )  # fmt: skip
-            axes.axhline(1.0 / count, color=OBSERVED, lw=0.9, ls="--")
-            axes.yaxis.set_major_locator(MaxNLocator(4))
-            axes.set(
-                xlim=(0.0, 1.0), ylim=(0.0, 1.1 * max(top, 0.16)), xlabel="probability integral transform"
-            )
-            axes.set_ylabel("share of samples" if number == 0 else "")
-            axes.set_title(f"{'ab'[number]}  {title}" if len(scores) > 1 else title)
+    figure, (row,) = panels(1, 2, 1.9)
+    for spare in row[len(scores) :]:
+        spare.remove()
+    top = max(max(item.pit) for item in scores.values())
+    for number, (axes, (title, item)) in enumerate(zip(row, scores.items(), strict=False)):
+        count = len(item.pit)
+        axes.bar(
+            (np.arange(count) + 0.5) / count, item.pit, 0.94 / count,
+            color=PREDICTION if number == 0 and len(scores) > 1 else PAST, alpha=0.75,
+        )  # fmt: skip
+        axes.axhline(1.0 / count, color=OBSERVED, lw=0.9, ls="--")
+        axes.yaxis.set_major_locator(MaxNLocator(4))
+        axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.1 * max(top, 0.16)), xlabel="probability integral transform")
+        axes.set_ylabel("share of samples" if number == 0 else "")
+        axes.set_title(f"{'ab'[number]}  {title}" if len(scores) > 1 else title)
     return figure
 
 
@@ -82,6 +80,7 @@ def _map_of_names(
     return figure, axes, image
 
 
+@publication_style()
 def separability_figure(found: Separability) -> Figure | None:
     """Draw how well each effect can be told from each other one; None with fewer than two effects."""
     names = found.identifiers
@@ -94,28 +93,27 @@ def separability_figure(found: Separability) -> Figure | None:
     table = np.clip(distance, 0.3, _LARGEST_DISTANCE)
     np.fill_diagonal(table, np.nan)
     labels = [names[n] for n in order]
-    with publication_style():
-        figure, axes, image = _map_of_names(table, labels, labels, LogNorm(1.0, _LARGEST_DISTANCE))
-        for row, column in zip(*np.nonzero(distance < CONFUSED), strict=True):
-            if row != column:
-                axes.plot(column, row, "x", color=PREDICTION, ms=4.0, mew=1.1)
-        cell = 1.0 / len(names)
-        beside = axes.inset_axes((1.0 + 0.4 * cell, 0.0, 0.4 * cell, 1.0))
-        bar = color_bar(figure, image, "squared distance d²", cax=beside)
-        plain_powers(bar.yaxis, (1.0,))
-        bar.axhline(CONFUSED, color=PREDICTION, lw=1.2)
-        bar.axhline(DETECTED, color="white", lw=1.2)
+    figure, axes, image = _map_of_names(table, labels, labels, LogNorm(1.0, _LARGEST_DISTANCE))
+    for row, column in zip(*np.nonzero(distance < CONFUSED), strict=True):
+        if row != column:
+            axes.plot(column, row, "x", color=PREDICTION, ms=4.0, mew=1.1)
+    cell = 1.0 / len(names)
+    beside = axes.inset_axes((1.0 + 0.4 * cell, 0.0, 0.4 * cell, 1.0))
+    bar = color_bar(figure, image, "squared distance d²", cax=beside)
+    plain_powers(bar.yaxis, (1.0,))
+    bar.axhline(CONFUSED, color=PREDICTION, lw=1.2)
+    bar.axhline(DETECTED, color="white", lw=1.2)
     return figure
 
 
+@publication_style()
 def confusion_figure(found: SelfCalibration) -> Figure:
     """Draw the confusion matrix of the workflow on simulated campaigns of this geometry."""
     rows, columns, counts = found.confusion()
     share = np.where(counts > 0, counts / np.maximum(counts.sum(axis=1, keepdims=True), 1), np.nan)
     texts = np.where(counts > 0, counts.astype(str), "")
-    with publication_style():
-        figure, axes, _ = _map_of_names(share, rows, columns, Normalize(0.0, 1.0), texts)
-        axes.set(xlabel="verdict", ylabel="what was hidden")
+    figure, axes, _ = _map_of_names(share, rows, columns, Normalize(0.0, 1.0), texts)
+    axes.set(xlabel="verdict", ylabel="what was hidden")
     return figure
 
 
@@ -125,6 +123,7 @@ MOST_TURNS = 400
 """Samples of the course in time: the stretch where the force is largest."""
 
 
+@publication_style()
 def missing_force_figure(missing: MissingForce, told: ForceAtPort) -> Figure:
     """Draw a missing force and what is told of it, with its law and what is left where there is one."""
     parts = [("missing force", "force"), ("what is left", "left")][: 2 if missing.law else 1]
@@ -136,28 +135,27 @@ def missing_force_figure(missing: MissingForce, told: ForceAtPort) -> Figure:
     first = int(np.argmax(np.abs(strongest.force))) - MOST_TURNS // 2
     first = max(min(first, len(strongest.time) - MOST_TURNS), 0)
     stretch = slice(first, first + MOST_TURNS)
-    with publication_style():
-        figure, rows = panels(len(parts), 3, 2.4 * len(parts) + 0.5, sharey=True)
-        for number, (row, (title, name)) in enumerate(zip(rows, parts, strict=True)):
-            law = "law" if missing.law and name == "force" else ""
-            for axes, (motion, label) in zip(row[:2], along, strict=True):
-                _draw_over(axes, missing, motion, name, law, every)
-                axes.set_xlabel(label)
-            time, values = strongest.time[stretch], getattr(strongest, name)[stretch]
-            reach = 2.0 * strongest.deviation[stretch]
-            band(row[2], time, values - reach, values + reach, OBSERVED)
-            row[2].plot(time, values, color=OBSERVED, lw=0.9)
-            if law and strongest.law is not None:
-                row[2].plot(time, strongest.law[stretch], "--", color=PREDICTION, lw=0.9)
-            row[2].set_xlabel(f"time in {strongest.trial}, s")
-            row[0].set_ylabel(f"{what}, {told.unit}")
-            for column, axes in enumerate(row):
-                axes.axhline(0.0, color=REFERENCE, lw=0.6, zorder=0)
-                axes.locator_params(axis="x", nbins=4)  # the integral of a state may have six digits
-                axes.tick_params(labelleft=True)
-                panel_label(axes, "abcdef"[3 * number + column], title)
-        drawn = rows[0][0].get_legend_handles_labels()
-        figure.legend(*drawn, loc="outside upper right", ncols=2, markerscale=3.0)
+    figure, rows = panels(len(parts), 3, 2.4 * len(parts) + 0.5, sharey=True)
+    for number, (row, (title, name)) in enumerate(zip(rows, parts, strict=True)):
+        law = "law" if missing.law and name == "force" else ""
+        for axes, (motion, label) in zip(row[:2], along, strict=True):
+            _draw_over(axes, missing, motion, name, law, every)
+            axes.set_xlabel(label)
+        time, values = strongest.time[stretch], getattr(strongest, name)[stretch]
+        reach = 2.0 * strongest.deviation[stretch]
+        band(row[2], time, values - reach, values + reach, OBSERVED)
+        row[2].plot(time, values, color=OBSERVED, lw=0.9)
+        if law and strongest.law is not None:
+            row[2].plot(time, strongest.law[stretch], "--", color=PREDICTION, lw=0.9)
+        row[2].set_xlabel(f"time in {strongest.trial}, s")
+        row[0].set_ylabel(f"{what}, {told.unit}")
+        for column, axes in enumerate(row):
+            axes.axhline(0.0, color=REFERENCE, lw=0.6, zorder=0)
+            axes.locator_params(axis="x", nbins=4)  # the integral of a state may have six digits
+            axes.tick_params(labelleft=True)
+            panel_label(axes, "abcdef"[3 * number + column], title)
+    drawn = rows[0][0].get_legend_handles_labels()
+    figure.legend(*drawn, loc="outside upper right", ncols=2, markerscale=3.0)
     return figure
 
 

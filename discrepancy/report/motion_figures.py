@@ -48,6 +48,7 @@ def worst_record(items: Sequence[FittedTrial]) -> Worst | None:
     return Worst(*max(found)[1:]) if found else None
 
 
+@publication_style()
 def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure:
     """Draw the worst record: measured and predicted values, and the residuals against the noise."""
     item = before.trials[worst.trial]
@@ -55,28 +56,28 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     factor, unit = UNITS[before.channels[worst.channel].quantity].drawn
     time, used = item.trial.time, item.used[:, column]
     shown = models(before, after)
-    with publication_style():
-        count = 1 + len(shown)
-        shape = {"height_ratios": [1.25, *[1.0] * len(shown)], "sharex": True}
-        figure, ((axes,), *below) = panels(count, 1, 1.45 * count + 0.35, **shape)
-        axes.margins(x=0.01)
-        values = factor * item.trial.values[used, column]
-        axes.plot(time[used], values, ".", ms=1.8, color=OBSERVED, label="measured")
-        for one in shown:
-            predicted = factor * one.residuals.trials[worst.trial].prediction[:, column]
-            axes.plot(time, predicted, one.dashes, lw=0.9, color=one.colour, label=one.label)
-        axes.set(ylabel=f"{worst.channel}, {unit}", title=f"a  {worst.channel} in {item.trial.name}")
-        axes.legend(ncol=3, loc="upper right")
-        for number, ((panel,), one) in enumerate(zip(below, shown, strict=True)):
-            each = one.residuals.trials[worst.trial]
-            draw_noise(panel, factor * float(each.noise_deviation[column]), 0.3)
-            panel.plot(time[used], factor * each.residual[used, column], lw=0.6, color=one.colour)
-            panel.set(ylabel=f"residual, {unit}", title=f"{'bc'[number]}  residual, {one.label}")
-        below[0][0].legend(loc="upper right")
-        figure.axes[-1].set_xlabel("time, s")
+    count = 1 + len(shown)
+    shape = {"height_ratios": [1.25, *[1.0] * len(shown)], "sharex": True}
+    figure, ((axes,), *below) = panels(count, 1, 1.45 * count + 0.35, **shape)
+    axes.margins(x=0.01)
+    values = factor * item.trial.values[used, column]
+    axes.plot(time[used], values, ".", ms=1.8, color=OBSERVED, label="measured")
+    for one in shown:
+        predicted = factor * one.residuals.trials[worst.trial].prediction[:, column]
+        axes.plot(time, predicted, one.dashes, lw=0.9, color=one.colour, label=one.label)
+    axes.set(ylabel=f"{worst.channel}, {unit}", title=f"a  {worst.channel} in {item.trial.name}")
+    axes.legend(ncol=3, loc="upper right")
+    for number, ((panel,), one) in enumerate(zip(below, shown, strict=True)):
+        each = one.residuals.trials[worst.trial]
+        draw_noise(panel, factor * float(each.noise_deviation[column]), 0.3)
+        panel.plot(time[used], factor * each.residual[used, column], lw=0.6, color=one.colour)
+        panel.set(ylabel=f"residual, {unit}", title=f"{'bc'[number]}  residual, {one.label}")
+    below[0][0].legend(loc="upper right")
+    figure.axes[-1].set_xlabel("time, s")
     return figure
 
 
+@publication_style()
 def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure | None:
     """Draw spectra of the residuals of the worst channel over all dynamic trials, with that of the noise."""
     drawn = [
@@ -87,27 +88,26 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
     if not drawn:
         return None
     noise = before.channels[worst.channel].noise
-    with publication_style():
-        figure, ((axes,),) = panels(1, 1, 2.7)
-        if noise is not None and noise.samples is not None and noise.interval and len(noise.samples) >= 32:
-            count = min(len(noise.samples), 128)
-            at, power = welch(noise.samples / noise.standard_deviation, 1.0 / noise.interval, nperseg=count)
-            power = power[1:] * 0.5 / noise.interval
-            axes.plot(at[1:], power, color=OBSERVED, lw=0.8, alpha=0.6, label="noise record")
-        axes.axhline(1.0, color=TRUTH, lw=0.7, ls="-.", label="white noise of the stated size")
-        for at, power, item in drawn:
-            axes.plot(at, power, item.dashes, color=item.colour, lw=1.1, label=item.label)
-        for number, frequency in enumerate(mode_frequencies(before)[:4], start=1):
-            axes.axvline(frequency, color=REFERENCE, lw=0.6, ls=":")
-            axes.annotate(
-                f"mode {number}", (frequency, 1.0), (2.0, -2.0), xycoords=("data", "axes fraction"),
-                textcoords="offset points", rotation=90, va="top", fontsize=6.5, color=OBSERVED,
-            )  # fmt: skip
-        axes.set(yscale="log", xlim=(0.0, float(drawn[0][0][-1])), xlabel="frequency, Hz")
-        axes.set(ylabel="power / white noise", title=f"residuals of {worst.channel}, all dynamic trials")
-        low, high = axes.get_ylim()
-        axes.set_ylim(min(low, 0.1), max(high, 10.0))
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=2, borderaxespad=0.0)
+    figure, ((axes,),) = panels(1, 1, 2.7)
+    if noise is not None and noise.samples is not None and noise.interval and len(noise.samples) >= 32:
+        count = min(len(noise.samples), 128)
+        at, power = welch(noise.samples / noise.standard_deviation, 1.0 / noise.interval, nperseg=count)
+        power = power[1:] * 0.5 / noise.interval
+        axes.plot(at[1:], power, color=OBSERVED, lw=0.8, alpha=0.6, label="noise record")
+    axes.axhline(1.0, color=TRUTH, lw=0.7, ls="-.", label="white noise of the stated size")
+    for at, power, item in drawn:
+        axes.plot(at, power, item.dashes, color=item.colour, lw=1.1, label=item.label)
+    for number, frequency in enumerate(mode_frequencies(before)[:4], start=1):
+        axes.axvline(frequency, color=REFERENCE, lw=0.6, ls=":")
+        axes.annotate(
+            f"mode {number}", (frequency, 1.0), (2.0, -2.0), xycoords=("data", "axes fraction"),
+            textcoords="offset points", rotation=90, va="top", fontsize=6.5, color=OBSERVED,
+        )  # fmt: skip
+    axes.set(yscale="log", xlim=(0.0, float(drawn[0][0][-1])), xlabel="frequency, Hz")
+    axes.set(ylabel="power / white noise", title=f"residuals of {worst.channel}, all dynamic trials")
+    low, high = axes.get_ylim()
+    axes.set_ylim(min(low, 0.1), max(high, 10.0))
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=2, borderaxespad=0.0)
     return figure
 
 
@@ -138,6 +138,7 @@ def mode_frequencies(residuals: ResidualSet) -> tuple[float, ...]:
 # ---------------------------------------------------------------- backbones
 
 
+@publication_style()
 def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
     """Draw frequency and damping ratio of the ring-downs over the amplitude, and name the channel.
 
@@ -155,29 +156,28 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
         return None
     factor, unit = UNITS[before.channels[channel].quantity].drawn
     drawn = (("frequency", "frequency, Hz", 1.0), ("damping_ratio", "damping ratio, %", 100.0))
-    with publication_style():
-        figure, cells = panels(len(modes), 2, 2.3 * len(modes) + 0.3)
-        for row, mode in enumerate(modes):
-            points = measured[mode]
-            for place, (axes, (name, label, scale)) in enumerate(zip(cells[row], drawn, strict=True)):
-                for found, shown in curves:
-                    if (curve := found.get(mode)) is not None:
-                        (line,) = axes.plot(factor * curve.amplitude, scale * getattr(curve, name))
-                        line.set(color=shown.colour, ls=shown.dashes, lw=1.1, alpha=0.8, label=shown.label)
-                values, error = scale * getattr(points, name), scale * getattr(points, f"{name}_error")
-                axes.errorbar(
-                    factor * points.amplitude, values, error, fmt="o", ms=2.6, color=OBSERVED, elinewidth=0.6,
-                    lw=0.0, alpha=0.85, label="measured, ± 1 standard error", zorder=3,
-                )  # fmt: skip
-                title, across = f"{'abcd'[2 * row + place]}  mode {mode}", f"amplitude of {channel}, {unit}"
-                axes.set(xscale="log", title=title, xlabel=across, ylabel=label)
-                plain_powers(axes.xaxis, (1.0, 2.0, 5.0))
-                # what was measured and its surroundings, whatever a wrong model does
-                low, high = np.nanquantile(values, (0.02, 0.98))
-                wide = 1.2 * max(float(high - low), 0.02 * abs(float(np.nanmedian(values))))
-                bottom, top = axes.get_ylim()
-                axes.set_ylim(max(bottom, low - wide), min(top, high + wide))
-        cells[0][1].legend(loc="best")
+    figure, cells = panels(len(modes), 2, 2.3 * len(modes) + 0.3)
+    for row, mode in enumerate(modes):
+        points = measured[mode]
+        for place, (axes, (name, label, scale)) in enumerate(zip(cells[row], drawn, strict=True)):
+            for found, shown in curves:
+                if (curve := found.get(mode)) is not None:
+                    (line,) = axes.plot(factor * curve.amplitude, scale * getattr(curve, name))
+                    line.set(color=shown.colour, ls=shown.dashes, lw=1.1, alpha=0.8, label=shown.label)
+            values, error = scale * getattr(points, name), scale * getattr(points, f"{name}_error")
+            axes.errorbar(
+                factor * points.amplitude, values, error, fmt="o", ms=2.6, color=OBSERVED, elinewidth=0.6,
+                lw=0.0, alpha=0.85, label="measured, ± 1 standard error", zorder=3,
+            )  # fmt: skip
+            title, across = f"{'abcd'[2 * row + place]}  mode {mode}", f"amplitude of {channel}, {unit}"
+            axes.set(xscale="log", title=title, xlabel=across, ylabel=label)
+            plain_powers(axes.xaxis, (1.0, 2.0, 5.0))
+            # what was measured and its surroundings, whatever a wrong model does
+            low, high = np.nanquantile(values, (0.02, 0.98))
+            wide = 1.2 * max(float(high - low), 0.02 * abs(float(np.nanmedian(values))))
+            bottom, top = axes.get_ylim()
+            axes.set_ylim(max(bottom, low - wide), min(top, high + wide))
+    cells[0][1].legend(loc="best")
     return figure, channel
 
 

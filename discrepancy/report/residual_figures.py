@@ -66,6 +66,7 @@ def gauge_places(channels: Sequence[Channel], design: WingDesign) -> dict[str, t
     return places
 
 
+@publication_style()
 def planform_figure(before: ResidualSet, after: ResidualSet | None, design: WingDesign) -> Figure | None:
     """Draw the sizes of the residuals on the planform, before and after at one scale; None without places."""
     places = gauge_places(list(before.channels.values()), design)
@@ -75,16 +76,15 @@ def planform_figure(before: ResidualSet, after: ResidualSet | None, design: Wing
         return None
     norm = scale_of(np.array(sizes))
     strain = [before.channels[name].quantity is Quantity.STRAIN for name in places]
-    with publication_style():
-        figure, rows = panels(len(sizes), 1, 1.62 * len(sizes) + 0.35, sharex=True)
-        for (axes,), row, title in zip(rows, sizes, titles(shown), strict=True):
-            _draw_planform(axes, design)
-            for name, is_strain, value in zip(places, strain, row, strict=True):
-                if np.isfinite(value):
-                    _draw_gauge(axes, name, _depth(design, *places[name]), value, norm, is_strain)
-            axes.set(title=title, ylabel="chord, m")
-        rows[-1][0].set_xlabel("distance from the root, m")
-        size_bar(figure, norm, [axes for (axes,) in rows])
+    figure, rows = panels(len(sizes), 1, 1.62 * len(sizes) + 0.35, sharex=True)
+    for (axes,), row, title in zip(rows, sizes, titles(shown), strict=True):
+        _draw_planform(axes, design)
+        for name, is_strain, value in zip(places, strain, row, strict=True):
+            if np.isfinite(value):
+                _draw_gauge(axes, name, _depth(design, *places[name]), value, norm, is_strain)
+        axes.set(title=title, ylabel="chord, m")
+    rows[-1][0].set_xlabel("distance from the root, m")
+    size_bar(figure, norm, [axes for (axes,) in rows])
     return figure
 
 
@@ -119,6 +119,7 @@ def _draw_gauge(
     axes.annotate(name, place, (0.0, -6.5), textcoords="offset points", ha="center", va="top", fontsize=6.5)
 
 
+@publication_style()
 def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
     """Draw the sizes of the residuals by channel and trial, before and after at one scale."""
     shown = models(before, after)
@@ -127,14 +128,13 @@ def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
     norm = scale_of(np.concatenate([table.ravel() for _, _, table in tables]))
     below = min(0.22 + 0.042 * max(len(name) for name in trials), 1.5)
     height = max(0.22 * len(channels), 0.9) + below + 0.35
-    with publication_style():
-        figure, (row,) = panels(1, len(tables), height)
-        few = len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS
-        for number, (axes, (_, _, table), title) in enumerate(zip(row, tables, titles(shown), strict=True)):
-            names = ([""] * len(channels) if number else channels, trials)
-            heat_map(axes, table, names, norm, 40, _cells(table) if few else None)
-            axes.set_title(title)
-        size_bar(figure, norm, row)
+    figure, (row,) = panels(1, len(tables), height)
+    few = len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS
+    for number, (axes, (_, _, table), title) in enumerate(zip(row, tables, titles(shown), strict=True)):
+        names = ([""] * len(channels) if number else channels, trials)
+        heat_map(axes, table, names, norm, 40, _cells(table) if few else None)
+        axes.set_title(title)
+    size_bar(figure, norm, row)
     return figure
 
 
@@ -144,6 +144,7 @@ def _cells(value: float) -> str:
     return "" if np.isnan(value) else f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
+@publication_style()
 def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None:
     """Draw residuals of static trials and flights over the load, by quantity; None without such trials."""
     found = []
@@ -158,19 +159,18 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
     found = found[:4]
     columns = min(len(found), 2)
     rows = (len(found) + columns - 1) // columns
-    with publication_style():
-        figure, cells = panels(rows, columns, 2.25 * rows + 0.3)
-        for spare in cells[-1][len(found) - columns * (rows - 1) :]:
-            spare.remove()
-        for number, (kind, label, quantity, names) in enumerate(found):
-            axes = cells[number // columns][number % columns]
-            factor, unit = UNITS[quantity].drawn
-            noise, *_ = [_draw_loads(axes, item, kind, names, factor) for item in models(before, after)]
-            draw_noise(axes, noise, 0.25)
-            axes.axhline(0.0, color=OBSERVED, lw=0.6)
-            title = f"{'abcd'[number]}  {kind.value}, {quantity.value}"
-            axes.set(xlabel=label, ylabel=f"residual, {unit}", title=title)
-        figure.legend(*cells[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
+    figure, cells = panels(rows, columns, 2.25 * rows + 0.3)
+    for spare in cells[-1][len(found) - columns * (rows - 1) :]:
+        spare.remove()
+    for number, (kind, label, quantity, names) in enumerate(found):
+        axes = cells[number // columns][number % columns]
+        factor, unit = UNITS[quantity].drawn
+        noise, *_ = [_draw_loads(axes, item, kind, names, factor) for item in models(before, after)]
+        draw_noise(axes, noise, 0.25)
+        axes.axhline(0.0, color=OBSERVED, lw=0.6)
+        title = f"{'abcd'[number]}  {kind.value}, {quantity.value}"
+        axes.set(xlabel=label, ylabel=f"residual, {unit}", title=title)
+    figure.legend(*cells[0][0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure
 
 
@@ -199,6 +199,7 @@ def _draw_loads(axes: Axes, shown: Shown, kind: TrialKind, names: Sequence[str],
 # ---------------------------------------------------------------- when
 
 
+@publication_style()
 def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
     """Draw the windows of the records with the largest gaps; None without a window."""
     if not windows:
@@ -209,17 +210,16 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
     trials = [name for name in names if name in largest]
     norm = scale_of([window.size for window in windows])
     both = any(window.with_effect for window in windows)
-    with publication_style():
-        figure, ((axes,),) = panels(1, 1, 0.34 * len(trials) + 0.9)
-        for row, name in enumerate(trials):
-            own = [window for window in windows if window.trial == name]
-            _draw_record(axes, row, own, norm, both=both)
-        axes.set_yticks(range(len(trials)), [_short(name) for name in trials])
-        axes.set_ylim(len(trials) - 0.4, -0.6)
-        axes.tick_params(axis="y", length=0)
-        axes.spines["left"].set_visible(False)
-        axes.set_xlabel("time since the start of the trial, s")
-        size_bar(figure, norm, [axes])
+    figure, ((axes,),) = panels(1, 1, 0.34 * len(trials) + 0.9)
+    for row, name in enumerate(trials):
+        own = [window for window in windows if window.trial == name]
+        _draw_record(axes, row, own, norm, both=both)
+    axes.set_yticks(range(len(trials)), [_short(name) for name in trials])
+    axes.set_ylim(len(trials) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)
+    axes.spines["left"].set_visible(False)
+    axes.set_xlabel("time since the start of the trial, s")
+    size_bar(figure, norm, [axes])
     return figure
 
 

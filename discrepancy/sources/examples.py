@@ -8,8 +8,9 @@ from typing import Any, Literal
 import numpy as np
 
 from discrepancy.campaign.noise import pre_trigger_record
+from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.checks.model_check import prior_mean
 from discrepancy.errors import CampaignFileError, ModelError

@@ -15,8 +15,9 @@ from calibration.dynamics.records import RingDownRecord, read_records
 from calibration.errors import CalibrationError
 from calibration.static.experiments import LoadDisplacementData, read_measurements
 from discrepancy.campaign.noise import pre_trigger_record
+from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.campaign.sampling import FloatArray
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.errors import CampaignDataError, CampaignFileError

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 
 FloatArray = NDArray[np.float64]

@@ -77,7 +77,7 @@ def test_the_workflow_tried_on_its_own_geometry(tmp_path):
     assert all(case.distance >= 25.0 for case in found.cases if case.hidden != NOTHING)
     assert sum(found.confusion()[2].ravel()) == 9
     assert found.share("right", null=True).total == 3
-    again = self_calibrate(campaign, model, FEW, 9, seed=2, workers=1)
+    again = self_calibrate(campaign, model, FEW, 9, seed=2, workers=2)
     assert again == found
     path = write_self_calibration(tmp_path / "self_calibration.json", found, ORIGIN)
     stored = json.loads(path.read_text(encoding="utf-8"))

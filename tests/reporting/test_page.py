@@ -9,7 +9,7 @@ import pytest
 
 from reporting import figures
 from reporting.errors import InvalidFigureError
-from reporting.page import Column, Page, Table, script_source
+from reporting.page import Column, Page, Table, Words, script_source
 
 VOID = {"meta", "br", "link", "img"}
 
@@ -121,3 +121,17 @@ def test_an_empty_page_is_still_a_page() -> None:
     parse(text)
     assert "<nav>" not in text
     assert "<script" not in text
+
+
+def test_words_say_cells_units_columns_that_may_go_and_rows_that_are_always_there() -> None:
+    words = Words("twin_master.report", half=0.5)
+    cells = [
+        {"text": "name", "cell": "{{ row }}"},
+        {"number": "{{ what }}", "unit": "m", "cell": "{{ half }}"},
+    ]
+    words.content = {"tables": {"t": {"columns": [*cells, {"text": "more", "cell": "x", "when": "long"}]}}}
+    columns, rows = words.table("t", ["a"], what="length", long=False)
+    assert (columns, rows) == ([Column("name"), Column("length", "m", numeric=True)], [["a", "0.5"]])
+    assert words.table("t", ["a"], what="length", long=True)[1] == [["a", "0.5", "x"]]
+    words.content["tables"]["t"] = {"columns": ["item", "value"], "rows": [["{{ what }}", "1"], ["none", ""]]}
+    assert words.table("t", [["b", "2"]], what="length")[1] == [["length", "1"], ["b", "2"]]

@@ -260,33 +260,26 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
     """Check that the model holds where the true assets are."""
     from fe.wing.design import wing_structure
 
-    name, regions = "young_modulus_factor", tuple(factor.name for factor in scenario.state)
+    name, regions = "young_modulus_factor", scenario.state_names
     ranges = wing_structure(regions, 0).ranges
     own = scenario.asset.true_parameters.get(name, 1.0)
-    e = np.array([member.parameters.get(name, own) for member in group.members])
-    states = np.zeros((1, len(scenario.state)))
+    found = {name: (np.array([member.parameters.get(name, own) for member in group.members]), "assets")}
     if scenario.truth.kind == "scripted":
-        states = scenario.scripted_history()
-    found = [(name, e, ranges[name], "assets")]
-    found += [
-        (region, states[:, place], ranges[region], f"{scenario.mission.step_name}s")
-        for place, region in enumerate(regions)
-    ]
-    for what, values, (low, high), of in found:
+        steps = f"{scenario.mission.step_name}s"
+        states = scenario.scripted_history().T
+        found |= {region: (values, steps) for region, values in zip(regions, states, strict=True)}
+    for what, (values, of) in found.items():
+        low, high = ranges[what]
         outside = values[(values < low - 1e-12) | (values > high + 1e-12)]
         if len(outside):
-            raise FleetError(
-                said(
-                    "fleet.outside",
-                    what=what,
-                    count=len(outside),
-                    number=len(values),
-                    of=of,
-                    low=low,
-                    high=high,
-                    example=outside[0],
-                )
-            )
+            told = {
+                "what": what,
+                "count": len(outside),
+                "number": len(values),
+                "of": of,
+                "example": outside[0],
+            }
+            raise FleetError(said("fleet.outside", low=low, high=high, **told))
 
 
 def prepared(scenario: Scenario, folder: Path, progress: Progress, *, real: bool = False) -> bytes:

@@ -31,6 +31,9 @@ LARGEST = 1_000_000
 """Twins of a group, or of an ensemble."""
 
 
+Text = Annotated[str, Field(min_length=1)]
+
+
 class Spread(Section):
     """A parameter of the true assets: normally distributed over the group."""
 
@@ -42,13 +45,13 @@ class GroupSection(Section):
     """Assets that share a scenario."""
 
     name: Name
-    scenario: Annotated[str, Field(min_length=1)]
+    scenario: Text
     count: Annotated[int, Field(strict=True, ge=1, le=LARGEST)] | None = None
-    fmus: str | None = None
+    fmus: Text | None = None
     """A pattern of files: one asset for each FMU."""
-    calibrations: str | None = None
+    calibrations: Text | None = None
     """A pattern of files: one asset for each calibration."""
-    observations: str | None = None
+    observations: Text | None = None
     """A pattern of recordings, or `mqtt://HOST/TOPIC/+`: one real asset for each file, or for each topic."""
     fmu: str | None = None
     binding: str | None = None
@@ -259,38 +262,33 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
     given = {key: getattr(section, key) for key in ("fmu", "binding", "calibration", "learnt")}
     files: dict[str, Any] = {key: folder / name for key, name in given.items() if name is not None}
     common = replace(Overrides(seed=seed, in_process=section.in_process, learnt_group=section.name), **files)
-    if section.observations is not None:
-        address = section.observations
-        where = address if is_broker(address) else str(folder / address)
-        watched = _of_group(section, resolve_scenario(loaded, common))
-        paths = () if is_broker(address) else tuple(recordings(where))
-        members = tuple(Member(row, asset_name(path), seed, {}) for row, path in enumerate(paths))
-        return Group(
-            section.name, (watched,), {}, members, observations=where, recordings=paths,
-            file=loaded.file,
-        )  # fmt: skip
-    if section.count is not None:
-        scenarios: list[Scenario] = [resolve_scenario(loaded, common)]
-        names = [f"{section.name}-{number}" for number in range(section.count)]
-        own_files: list[str] = []
-    else:
-        key, pattern = ("fmu", section.fmus) if section.fmus else ("calibration", section.calibrations)
-        found = sorted(folder.glob(str(pattern)))
-        if not found:
-            raise FleetError(f'no file fits `{key}s = "{pattern}"` in {folder}.')
-        scenarios, wrong = [], []
-        for file in found:
-            own: dict[str, Any] = {key: file}
-            try:
-                scenarios.append(resolve_scenario(loaded, replace(common, **own)))
-            except TwinMasterError as error:
-                wrong.append(f"{file.name}: {error}")
-        if wrong:
-            raise FleetError("\n".join(["assets that cannot fly:", *wrong]))
-        names, own_files = [file.stem for file in found], [file.name for file in found]
-    scenarios = [_of_group(section, scenario) for scenario in scenarios]
-    members = tuple(_member(section, seed, row, name) for row, name in enumerate(names))
-    return Group(section.name, tuple(scenarios), section.parameters, members, tuple(own_files))
+    observed = section.observations or ""
+    where = str(folder / observed) if observed and not is_broker(observed) else observed
+    paths = tuple(recordings(where)) if where and not is_broker(where) else ()
+    key, pattern = ("fmu", section.fmus) if section.fmus else ("calibration", section.calibrations)
+    found = sorted(folder.glob(pattern)) if pattern else []
+    if pattern and not found:
+        raise FleetError(f'no file fits `{key}s = "{pattern}"` in {folder}.')
+    scenarios, wrong = [], []
+    own: list[dict[str, Any]] = [{key: file} for file in found] or [{}]
+    for files in own:
+        try:
+            resolved = resolve_scenario(loaded, replace(common, **files))
+        except TwinMasterError as error:
+            if not found:
+                raise
+            wrong.append(f"{files[key].name}: {error}")
+        else:
+            scenarios.append(_of_group(section, resolved))
+    if wrong:
+        raise FleetError("\n".join(["assets that cannot fly:", *wrong]))
+    names = [file.stem for file in found] or [f"{section.name}-{row}" for row in range(section.count or 0)]
+    members = [_member(section, seed, row, name) for row, name in enumerate(names)]
+    members += [Member(row, asset_name(path), seed, {}) for row, path in enumerate(paths)]
+    return Group(
+        section.name, tuple(scenarios), {} if where else section.parameters, tuple(members),
+        tuple(file.name for file in found), where, paths, loaded.file,
+    )  # fmt: skip
 
 
 def recordings(pattern: str) -> list[Path]:

@@ -164,32 +164,23 @@ class _Unpacked:
             atomic_write_bytes(folder / name, content)
         self.scenario = Scenario.model_validate(kit.scenario).moved(folder)
         self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
-        self._wing = kit.wing
+        self.wing = kit.wing
         self._model: Asset | None = None
 
     def model(self, parameters: Mapping[str, float]) -> Asset:
         """Return the reduced model as an asset with true parameters; one object for all that share them."""
         from twin_master.assets.reduced_model import ReducedModelSource
 
-        assert self._wing is not None
+        assert self.wing is not None
         if parameters:
-            return ReducedModelSource(with_parameters(self.scenario, parameters), self._wing).open()
+            return ReducedModelSource(with_parameters(self.scenario, parameters), self.wing).open()
         if self._model is None:
-            self._model = ReducedModelSource(self.scenario, self._wing).open()
+            self._model = ReducedModelSource(self.scenario, self.wing).open()
         return self._model
 
     def told(self, sentence: str) -> str:
         """Return a sentence without the folder of this process, which nobody else knows."""
         return sentence.replace(f"{self._folder}/", "")
-
-    @property
-    def flies_model(self) -> bool:
-        return self._wing is not None
-
-    def asset_of(self, member: Member) -> tuple[Mapping[str, float], int | None]:
-        """Return what sets an asset apart: its parameters, and its seed where it has seeds of its own."""
-        own = getattr(self.scenario.asset, "seeds", ())
-        return member.parameters, member.seed if own else None
 
     def source(self, parameters: Mapping[str, float], seed: int | None) -> AssetSource:
         """Return what is flown, ready to be opened."""
@@ -242,7 +233,7 @@ def _flown(kit: _Unpacked, members: Sequence[Member]) -> Flights:
     """Fly twins with their assets."""
     truths = [kit.knowledge.truth(member.seed) for member in members]
     alone = kit.scenario.learning is not None or kit.scenario.notice is not None
-    if kit.flies_model:
+    if kit.wing is not None:
         models = [kit.model(member.parameters) for member in members]
         if alone:
             return fly_one_by_one(kit.knowledge, truths, lambda twin, _sound: models[twin])
@@ -261,7 +252,9 @@ class _Hangar(ExitStack):
 
     def __init__(self, kit: _Unpacked, members: Sequence[Member]) -> None:
         super().__init__()
-        self._kit, self._wanted = kit, [kit.asset_of(member) for member in members]
+        seeds = bool(getattr(kit.scenario.asset, "seeds", ()))  # where assets have seeds of their own
+        self._kit = kit
+        self._wanted = [(member.parameters, member.seed if seeds else None) for member in members]
         self._asset: Asset | None = None
         self._start, self._opened = b"", self._wanted[0]
 

@@ -8,9 +8,8 @@ stay what they are. Each has a filter of its own over the states, and its weight
 which is exact. What a gauge has of its own, given the hypothesis, is a `GaugeRegression`.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +18,7 @@ from scipy.special import gammaincinv, gammaln, logsumexp
 from reporting.arrays import Float, Index
 from twin_master.errors import ImpossibleObservation, InvalidModelError
 from twin_master.learning.hypotheses import Hypotheses, shown_by
-from twin_master.learning.posterior import INTERVAL, DrawsPosterior
+from twin_master.learning.posterior import INTERVAL, posterior_of_draws
 from twin_master.learning.regression import GaugeRegression
 from twin_master.network.estimator import Carried, Estimate, Learnt
 from twin_master.network.graphical_model import GraphicalModel
@@ -59,26 +58,6 @@ class LearntPriors:
     offset: ArrayLike = 0.0
     transition_factors: tuple[float, ...] = (1.0,)
     sensor_unit: str = "1"
-
-
-class _Posteriors(Mapping[str, Learnt]):
-    """Posteriors by name, found when they are first asked for: nobody looks at those of every turn."""
-
-    def __init__(self, find: Callable[[], Mapping[str, Learnt]]) -> None:
-        self._find = find
-
-    @cached_property
-    def _found(self) -> Mapping[str, Learnt]:
-        return self._find()
-
-    def __getitem__(self, name: str) -> Learnt:
-        return self._found[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._found)
-
-    def __len__(self) -> int:
-        return len(self._found)
 
 
 class LearningFilter:
@@ -135,10 +114,6 @@ class LearningFilter:
             for prior in (priors.offset, priors.gain)
         )
         self._gauges = GaugeRegression(offset, gain, priors.noise_degrees)
-        self._of_draws = (
-            None if priors.draws is None else DrawsPosterior(priors.draws, sensor_model.draw_weight)
-        )
-        self._of_factors = DrawsPosterior(priors.transition_factors, np.full(factors, 1.0 / factors))
 
     @property
     def prior(self) -> Mapping[str, Learnt]:
@@ -180,7 +155,7 @@ class LearningFilter:
             filtered=filtered.sum(axis=0),
             log_evidence=evidence,
             carried=Carried(control_index, arrays),
-            learnt=_Posteriors(lambda: self._learnt(filtered, statistics, count)),
+            learnt=self._learnt(filtered, statistics, count),
             expected=lambda: self._expected(filtered, statistics, count, control_index),
         )
 
@@ -258,12 +233,13 @@ class LearningFilter:
         weight = filtered.sum(axis=1)  # of each hypothesis
         result: dict[str, Learnt] = {}
         factors = np.asarray(self.priors.transition_factors)
-        if self.priors.parameter is not None and self._of_draws is not None:
-            own = weight.reshape(len(factors), -1).sum(axis=0)
-            result[self.priors.parameter] = self._of_draws.of(own)
+        if self.priors.parameter is not None and self.priors.draws is not None:
+            own, prior = weight.reshape(len(factors), -1).sum(axis=0), self.sensor_model.draw_weight
+            result[self.priors.parameter] = posterior_of_draws(self.priors.draws, prior, own)
         if len(factors) > 1:
             own = weight.reshape(len(factors), -1).sum(axis=1)
-            result["transition_factor"] = self._of_factors.of(own)
+            prior = np.full(len(factors), 1.0 / len(factors))
+            result["transition_factor"] = posterior_of_draws(factors, prior, own)
         if self._gauges.learns:
             result |= self._learnt_of_gauges(weight, statistics, count)
         return result

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from discrepancy.campaign.protocol import Event
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Event
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Setting
@@ -80,7 +80,7 @@ def test_an_effect_acts_from_a_parameter_after_an_event_on(campaign, tmp_path):
 
 
 def test_events_survive_the_files(campaign, tmp_path):
-    assert campaign.events == (Event("pump_on", ("pumping",), 2.5, 8.0),)
+    assert campaign.events == (Event("pump_on", ("pumping",), time=2.5, until=8.0),)
     assert campaign.event_times("pumping") == {"pump_on": 2.5, "pump_on_until": 8.0}
     assert campaign.event_times("quiet") == {}
     assert read_campaign(write_campaign(campaign, tmp_path / "again")).events == campaign.events

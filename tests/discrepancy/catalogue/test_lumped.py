@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.cantilever import campaign
-from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Release
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
 from discrepancy.models.interface import Conditions

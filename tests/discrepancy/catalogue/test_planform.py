@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh
 
-from discrepancy.campaign.records import Campaign, Release, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
 from discrepancy.catalogue.scales import loss_integral

@@ -7,7 +7,8 @@ from math import inf
 import numpy as np
 
 from calibration.result.record import ParameterPrior
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.fits.candidate import Candidate, Point, Term

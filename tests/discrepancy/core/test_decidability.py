@@ -9,7 +9,8 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from benchmarks.cantilever import Cantilever, campaign
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Release, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, TrialKind
 from discrepancy.fits.candidate import Term
 from discrepancy.judgement.next_experiment import (
     Proposal,

@@ -5,16 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from discrepancy.campaign.records import (
-    Campaign,
-    Channel,
-    Event,
-    NoiseRecord,
-    Quantity,
-    Start,
-    Trial,
-    TrialKind,
-)
+from discrepancy.campaign.protocol import Event
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, Trial, TrialKind
 from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.library import effect_by_identifier, in_events, library
 from discrepancy.fits.candidate import Candidate, Term
@@ -45,7 +37,7 @@ def campaign():
         given = {"load_place": "push", "begins": Start.STILL, "held_out": name == "second"}
         trials.append(Trial.plain(name, TrialKind.FORCED, ("x",), time, force=force, **given))
     channels = {"x": Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(NOISE, 500.0))}
-    events = tuple(Event("bolt_loose", (name,), begin) for name, begin in BEGIN.items())
+    events = tuple(Event("bolt_loose", (name,), time=begin) for name, begin in BEGIN.items())
     base = Campaign("a bolt", channels, tuple(trials), None, {}, "0" * 64, events=events)
     for trial in base.trials:
         conditions = Conditions(np.array([1.01, 0.9]), refinement=4)

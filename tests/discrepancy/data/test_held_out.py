@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from discrepancy.campaign.held_out import choose_held_out, level
+from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.records import Campaign, Channel, Quantity, Trial, TrialKind
 from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model, prior_left, unobservable
 from discrepancy.checks.outliers import mark_outliers

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Campaign, Channel, Quantity, Trial, TrialKind
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe

@@ -16,76 +16,15 @@ from openpyxl import Workbook
 from discrepancy.campaign.importing import Understanding
 from discrepancy.campaign.sheet import read_sheet
 from discrepancy.errors import CampaignFileError, DiscrepancyError
-from tests.refusals import refused
+from tests.refusals import Inputs, refused
 
-ODD = {
-    "title rows, units row, footer with statistics": (
-        "Prüfstand 3;;\nDatum: 12.03.2026;;\nAbtastrate;500;Hz\n\nZeit;Weg;Kraft\nms;mm;kN\n"
-        "0,0;1,5;0,25\n2,0;1,25;0,5\n4,0;-0,5;0,75\nMittelwert;0,75;0,5\nMaximum;1,5;0,75\n".encode("latin-1"),
-        ("Zeit", "Weg", "Kraft"), ("ms", "mm", "kN"), ["0.0 1.5 0.25", "2.0 1.25 0.5", "4.0 -0.5 0.75"],
-    ),
-    "units in heads, byte order mark, micro sign": (
-        "t [s],ε1 (µm/m),F / kN\r\n0.0,12.5,1\r\n0.5,13.5,2\r\n".encode("utf-8-sig"),
-        ("t", "ε1", "F"), ("s", "µm/m", "kN"), ["0.0 12.5 1", "0.5 13.5 2"],
-    ),
-    "micro sign in latin-1": (
-        "t [s];ε [µm/m];T [°C]\n0;1,5;20,1\n1;2,5;20,2\n".replace("ε", "e").encode("latin-1"),
-        ("t", "e", "T"), ("s", "µm/m", "°C"), ["0 1.5 20.1", "1 2.5 20.2"],
-    ),
-    "empty trailing columns and cells": (
-        b"w [mm];F [N];;;\n0,1;0,5;;;\n;1,0;;;\n0,2;;;;\n0,3;1,5;;;\n",
-        ("w", "F"), ("mm", "N"), ["0.1 0.5", " 1.0", "0.2 ", "0.3 1.5"],
-    ),
-    "repeated head": (
-        b"t [s]\tw [mm]\n0\t0.5\n1\t0.6\nt [s]\tw [mm]\n2\t0.7\n\n3\t0.8\n",
-        ("t", "w"), ("s", "mm"), ["0 0.5", "1 0.6", "2 0.7", "3 0.8"],
-    ),
-    "quoted numbers with decimal commas between commas": (
-        b'"Kraft, kN","Weg, mm"\n"0,5","1,25"\n"1,0","2,5"\n',
-        ("Kraft", "Weg"), ("kN", "mm"), ["0.5 1.25", "1.0 2.5"],
-    ),
-    "thousands with points": (
-        b"F [N];w [mm]\n1.234,5;0,5\n12.345,0;1.000\n",
-        ("F", "w"), ("N", "mm"), ["1234.5 0.5", "12345.0 1000"],
-    ),
-    "thousands with commas, in quotes": (
-        b'F [lbf],w [in]\n"1,234.5",0.5\n"12,345",1.5\n',
-        ("F", "w"), ("lbf", "in"), ["1234.5 0.5", "12345 1.5"],
-    ),
-    "thousands with apostrophes and hard blanks": (
-        "F [N];w [mm]\n1'234,5;0,5\n12\u202f345,5;1,5\n".encode(),
-        ("F", "w"), ("N", "mm"), ["1234.5 0.5", "12345.5 1.5"],
-    ),
-    "clock times over midnight, with dates": (
-        b"Zeit;w [mm]\n31.12.2025 23:59:59,5;0,5\n01.01.2026 00:00:00,0;0,6\n01.01.2026 00:00:00,5;0,7\n",
-        ("Zeit", "w"), ("s", "mm"), ["0.0 0.5", "0.5 0.6", "1.0 0.7"],
-    ),
-    "clock times, with dates as ISO has them": (
-        b"Time,w [mm]\n2026-12-03T10:00:00.25,0.5\n2026-12-03 10:01:00.50,0.6\n",
-        ("Time", "w"), ("s", "mm"), ["0.00 0.5", "60.25 0.6"],
-    ),
-    "a comment column, a comment line, exponents, a true minus": (
-        "# t [s];w [mm];Bemerkung\n0;1,5E-3;ok\n# Pause\n1;−2,5e+0;gut, sehr\n".encode(),
-        ("t", "w"), ("s", "mm"), ["0 1.5E-3", "1 -2.5e+0"],
-    ),
-    "an index without a name, one name twice": (
-        b",t [s],w [mm],w [mm]\n0,0.0,1.5,2.5\n1,0.5,3.5,4.5\n",
-        ("column 1", "t", "w", "w 2"), ("", "s", "mm", "mm"), ["0 0.0 1.5 2.5", "1 0.5 3.5 4.5"],
-    ),
-    "numbers that are part of a name": (
-        b"t [s],strain[1],strain[2] [um/m],u(1),q [1]\ns,um/m,,mm,\n0,1.5,2.5,3.5,4.5\n1,1.6,2.6,3.6,4.6\n",
-        ("t", "strain[1]", "strain[2]", "u(1)", "q"), ("s", "um/m", "um/m", "mm", "1"),
-        ["0 1.5 2.5 3.5 4.5", "1 1.6 2.6 3.6 4.6"],
-    ),
-    "the last of several brackets": (
-        b"strain[1] [um/m];w (tip) (mm)\n1;2\n3;4\n",
-        ("strain[1]", "w (tip)"), ("um/m", "mm"), ["1 2", "3 4"],
-    ),
-    "separator said, integers, blanks around": (
-        b"sep=;\n F (N) ; w (um) \n 1 ; 2 \n 3 ; 4 \n",
-        ("F", "w"), ("N", "um"), ["1 2", "3 4"],
-    ),
-}  # fmt: skip
+INPUTS = Inputs(__file__)
+
+ODD = INPUTS.table("sheets.toml")
+
+
+def bytes_of(odd):
+    return odd["text"].encode(odd.get("encoding", "utf-8"))
 
 
 def text_of(sheet):
@@ -101,14 +40,13 @@ def sheet_of(folder, content):
 
 @pytest.mark.parametrize("name", ODD)
 def test_odd_files_are_read_as_they_are_meant(tmp_path, name):
-    content, heads, units, rows = ODD[name]
-    sheet = sheet_of(tmp_path, content)
-    assert (sheet.heads, sheet.units) == (heads, units)
-    assert text_of(sheet) == rows
+    sheet = sheet_of(tmp_path, bytes_of(ODD[name]))
+    assert [[*sheet.heads], [*sheet.units]] == [ODD[name]["heads"], ODD[name]["units"]]
+    assert text_of(sheet) == ODD[name]["rows"]
 
 
 def test_what_is_passed_over_is_told(tmp_path):
-    sheet = sheet_of(tmp_path, ODD["title rows, units row, footer with statistics"][0])
+    sheet = sheet_of(tmp_path, bytes_of(ODD["title rows, units row, footer with statistics"]))
     assert sheet.remark == "lines 7 to 9, semicolons between cells; what stands from 10 on is left out"
     sheet = sheet_of(tmp_path, b"t [s];w [mm];Notiz\n0;0,5;ok\n1;0,6;\n")
     assert sheet.remark.endswith("; the column 'Notiz' holds no numbers and is left out")
@@ -118,29 +56,10 @@ def test_what_is_passed_over_is_told(tmp_path):
     assert sheet.remark.endswith("; what stands from 4 on is left out")
 
 
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        (b"t;w\n0;0.5\n1;0,5\n",
-         "decimals with a point ('0.5' in line 2) and with a comma ('0,5' in line 3)"),
-        (b"t;w\n0;0,5\n1;OVL\n2;0,7\n",
-         "line 3: numbers must stand under 't' and the other names, and '1 and"),
-        (b"t;w;e\n0;0,5;1\n1;0,6;2\n2;0,7;OVL\n3;0,8;OVL\n",
-         "line 4: numbers must stand under 't' and the other names, and '2, 0,7 and OVL' came"),
-        (b"t,w\n0,0.5\n1,0.6\n2,OVL\n", "line 4: numbers must stand under 't'"),
-        (b"t,w\n0,1,2,3\n0,2,2,4\n", "line 2: 4 cells came, and the row above names 2 columns"),
-        (b"0;1\n1;2\n", "holds no table"),
-        (b"", "holds no table"),
-        (b"some words\nand more\n", "holds no table"),
-        (b"t;w\n03/12/2026 10:00:00;1\n04/12/2026 10:00:00;2\n", "'03/12/2026 10:00:00' is no time, or has"),
-        (b"t;w\n31.2.2026 10:00:00;1\n1.3.2026 10:00:00;2\n", "line 2: '31.2.2026 10:00:00' is no time"),
-        (b"t;w\n10:00:00;1\n5;2\n", "line 3: '5' is no time, or has a date that can be read"),
-        (b"t;w\n\x00;1\n", "zero byte"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("content", "sentence"), INPUTS.refused("sheets"))
 def test_what_cannot_be_read_is_one_sentence(tmp_path, content, sentence):
     with pytest.raises(CampaignFileError) as caught:
-        sheet_of(tmp_path, content)
+        sheet_of(tmp_path, content.encode())
     assert sentence in str(caught.value)
     assert "odd.csv" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -225,8 +144,8 @@ def test_300_damaged_files_are_read_or_refused_in_one_sentence(tmp_path):
         b"=", b"#", b":", b"31.2.26 1:2:3",
     ]  # fmt: skip
     started, outcomes = time.monotonic(), set()
-    for content, *_ in [*ODD.values()] * 22:
-        damaged = bytearray(content)
+    for odd in [*ODD.values()] * 22:
+        damaged = bytearray(bytes_of(odd))
         for _ in range(rng.randint(1, 6)):
             at, until = sorted(rng.randrange(len(damaged) + 1) for _ in range(2))
             damaged[at : min(until, at + 9)] = rng.choice(pieces)

@@ -10,7 +10,8 @@ from scipy.optimize import least_squares
 
 from calibration.dynamics.records import read_records
 from discrepancy.campaign.noise_tests import holm
-from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import FitError
 from discrepancy.location.dependence import modal_motion
 from discrepancy.location.locate import locate, outlier_remarks

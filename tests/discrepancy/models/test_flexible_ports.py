@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from discrepancy.campaign.records import Release
+from discrepancy.campaign.protocol import Release
 from discrepancy.models.acting import Acting, Course, Load, Shown
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.motion import Motion, motion_of

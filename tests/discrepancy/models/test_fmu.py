@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from discrepancy.campaign.records import Campaign, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.errors import ModelError
 from discrepancy.model_choice import choose_model

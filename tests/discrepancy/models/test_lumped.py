@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import eigh
 
-from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.models.acting import Acting, Course, Load
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.lumped import LumpedModel

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.structures import StructureModel, WingModel

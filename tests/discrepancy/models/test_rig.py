@@ -9,7 +9,8 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from benchmarks.tank import tank_setting
-from discrepancy.campaign.records import Channel, Hold, Quantity, RecordedInput, Release, Start, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Channel, Hold, Quantity, RecordedInput, Start, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError

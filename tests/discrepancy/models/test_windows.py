@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from discrepancy.campaign.records import Channel, Quantity, Release, Start, Trial, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Channel, Quantity, Start, Trial, TrialKind
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe

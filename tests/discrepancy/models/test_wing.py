@@ -9,7 +9,8 @@ import pytest
 from scipy.linalg import eigh
 
 from calibration.result.file import save_calibration
-from discrepancy.campaign.records import Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Quantity, Trial, TrialKind
 from discrepancy.models.interface import ACROSS, Conditions
 from discrepancy.models.structures import WingModel
 from fe.reduction.built_once import cache_folder

@@ -16,7 +16,8 @@ from fmpy import read_model_description
 from hypothesis import given
 from hypothesis import strategies as st
 
-from discrepancy.campaign.records import Campaign, Channel, Quantity, Release, Trial, TrialKind
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import Campaign, Channel, Quantity, Trial, TrialKind
 from discrepancy.document import Origin
 from discrepancy.files.verdict import StoredPatch, fmu_outputs, patch_effects, read_patch, write_patch
 from discrepancy.models.high_pass import filtered_record

@@ -320,17 +320,13 @@ class TestOnTheWing:
         assert np.sign(wrong.bias[1].value) == np.sign(expected[1])
         assert wrong.credible.value < right.credible.value
 
-    def test_a_belief_of_some_regions_and_one_of_frequencies_are_the_wing_itself(self, wing, tmp_path):
+    def test_a_belief_of_some_regions_and_of_each_role_is_the_wing_itself(self, wing, tmp_path):
         """A region that is not named is healthy, for the twin, the FMU that flies and the field."""
-        frequency = tmp_path / "frequency.toml"
-        bound = edited(
-            binding_files()["uav_wing"].read_text(), ("observation.strain", "observation.frequency")
-        )
-        outputs = ('strain[{1..24}]"\nunit = "1"', 'frequency[{1..3}]"\nunit = "Hz"')
-        frequency.write_text(edited(bound, outputs))
-        for role, changes in (
-            ("strain", {}),
-            ("frequency", {"count": 3, "unit": "Hz", "standard_deviation": 0.1}),
+        strains = '[observation.strain]\nvariables = "strain[{1..24}]"\nunit = "1"'
+        for role, variables, changes in (
+            ("strain", "", {}),
+            ("displacement", '["tip_displacement"]', {"count": 1, "unit": "m", "standard_deviation": 0.1}),
+            ("frequency", '"frequency[{1..3}]"', {"count": 3, "unit": "Hz", "standard_deviation": 0.1}),
         ):
             table = table_of("level_turns") | {"reference": []}
             table["state"], table["calibration"]["draws"] = table["state"][:1], 3
@@ -340,7 +336,9 @@ class TestOnTheWing:
                 table["rewards"] |= {"health_limit": 100.0, "error_scale": 1.0}
                 del table["rewards"]["health_limit_microstrain"], table["rewards"]["error_scale_microstrain"]
                 table["truth"]["noise"] = {"standard_deviation": 0.1}
-                table["asset"] |= {"binding": str(frequency)}
+                own = f'[observation.{role}]\nvariables = {variables}\nunit = "{changes["unit"]}"'
+                bound = edited(binding_files()["uav_wing"].read_text(), (strains, own))
+                table["asset"] |= {"binding": str(written(tmp_path, bound, name=f"{role}.toml"))}
             table["asset"]["isolated"] = False
             scenario = resolve_scenario(loaded_from(table, "level_turns"), Overrides())
             source, model = asset_source(scenario), build_graphical_model(scenario)
@@ -353,9 +351,9 @@ class TestOnTheWing:
             flown.close()
             for e, row in zip((*draws.values, 1.0073), (*found[:, state, 1], shown), strict=True):
                 losses = {"young_modulus_factor": e, "stiffness_loss": (0.4, 0.0)}
-                full = wing.static_response(load_factor=3.0, **losses).strain
-                full = full if role == "strain" else wing.modes(**losses).frequency[:3]
-                np.testing.assert_allclose(row, full, rtol=1e-9)
+                static, modes = wing.static_response(load_factor=3.0, **losses), wing.modes(**losses)
+                full = {"strain": static.strain, "displacement": static.displacement}
+                np.testing.assert_allclose(row, full.get(role, modes.frequency[:3]), rtol=1e-9)
             assert source.write_field(tmp_path / "wing.vtu", health, control)
         table["belief"]["patch"] = str(written(tmp_path, PATCH, name="patch.json"))
         patched = resolve_scenario(loaded_from(table, "level_turns"), Overrides())

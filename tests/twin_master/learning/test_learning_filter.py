@@ -12,7 +12,7 @@ from twin_master.errors import InvalidModelError
 from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.hypotheses import quantiles_of
 from twin_master.learning.learning_filter import LearningFilter, LearntPriors
-from twin_master.learning.posterior import DrawsPosterior
+from twin_master.learning.posterior import posterior_of_draws
 from twin_master.network.estimator import Carried, Estimate, ExactFilter, Learnt
 from twin_master.network.graphical_model import GraphicalModel, worsening_table
 from twin_master.network.rewards import RewardModel, RewardSettings
@@ -186,7 +186,7 @@ def test_the_interval_of_a_parameter_does_not_depend_on_where_its_draws_lie():
     def posterior(values: Float) -> Learnt:
         prior = np.exp(-0.5 * values**2) / np.exp(-0.5 * values**2).sum()
         weight = prior * np.exp(-0.5 * ((values - 0.61) / 0.08) ** 2)
-        return DrawsPosterior(values, prior).of(weight / weight.sum())
+        return posterior_of_draws(values, prior, weight / weight.sum())
 
     exact, rough = posterior(fine), posterior(coarse)
     assert rough.mean == pytest.approx(exact.mean, abs=0.005)
@@ -197,10 +197,10 @@ def test_the_interval_of_a_parameter_does_not_depend_on_where_its_draws_lie():
 
 
 def test_draws_that_are_the_same_or_few_give_their_own_posterior():
-    found = DrawsPosterior([2.0, 1.0, 2.0], [0.25, 0.5, 0.25]).of([0.4, 0.2, 0.4])
+    found = posterior_of_draws([2.0, 1.0, 2.0], [0.25, 0.5, 0.25], [0.4, 0.2, 0.4])
     assert (found.mean, found.lower, found.upper) == pytest.approx((1.8, 1.0, 2.0))
-    single = DrawsPosterior([2.0], [1.0], "Pa").of([1.0])
-    assert (single.mean, single.standard_deviation, single.unit) == (2.0, 0.0, "Pa")
+    single = posterior_of_draws([2.0], [1.0], [1.0])
+    assert (single.mean, single.standard_deviation) == (2.0, 0.0)
 
 
 def test_a_belief_that_underflows_comes_back():

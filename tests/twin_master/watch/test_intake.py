@@ -102,6 +102,26 @@ def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
     assert same(watched(knowledge, [*parts, *halves])[0], expected)
 
 
+def test_what_was_refused_behind_the_last_turn_is_refused_once_when_it_is_read_again(knowledge, tmp_path):
+    path, rejected = tmp_path / "m.csv", tmp_path / "rejected.jsonl"
+    path.write_text("turn,strain_1\nno,1\n0,1e-4\nno,2\n1,1e-4\nno,3\n")
+    twin, intake = (
+        knowledge.twin(lag=20),
+        intake_of(knowledge, [], rejected, feeds.CsvFeed(path, knowledge.scenario)),
+    )
+    states = [json.dumps(intake.state()) for _ in operate(twin, intake)]
+    whole = rejected.read_text()
+    for cut in ("", '{"message": 7, "rea'):  # a kill may leave half a line
+        rejected.write_text(whole + cut)
+        intake_of(knowledge, [], rejected).restore(json.loads(states[0]))  # a live one keeps all
+        assert rejected.read_text() == whole
+        rejected.write_text(whole + cut)
+        again = intake_of(knowledge, [], rejected, feeds.CsvFeed(path, knowledge.scenario))
+        again.restore(json.loads(states[0]))
+        assert [*operate(knowledge.twin(lag=20), again)]
+        assert rejected.read_text() == whole
+
+
 INPUTS = Inputs(__file__)
 
 
@@ -208,6 +228,8 @@ def test_units_and_names(knowledge):
         found = reader.read({name: value}).observed
         assert found[2] == pytest.approx(8.12e-4, rel=1e-15)
         assert np.isnan(found).sum() == 23
+    together = reader.read({"strain": [812.0] * 24, "unit": "microstrain"})
+    np.testing.assert_allclose(together.observed, 8.12e-4, rtol=1e-15)
     scenario = load_scenario("pump_wear").scenario
     pump, unit = MessageReader(scenario), scenario.observation.sensor_units[0]
     assert pump.read({f"{next(iter(pump._index))} [k{unit}]": 2.0}).observed[0] == 2000.0

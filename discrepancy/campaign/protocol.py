@@ -1,0 +1,92 @@
+"""How trials began and what happened in them, as files and models have it: one record each."""
+
+from dataclasses import dataclass, field
+from keyword import iskeyword
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, ConfigDict, Field
+
+from discrepancy.sentences import said
+from fe.runtime.expression import RESERVED
+from reporting.section import Name, NotNegative, Number, Positive
+
+MOST_MODES = 100
+IN_FILES = ConfigDict(extra="forbid", strict=False)
+"""How a table of a file becomes a record: unknown keys are refused; fields say how strict they are."""
+LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
+"""What a list of the file becomes before it is checked."""
+
+
+@dataclass(frozen=True)
+class Release:
+    """How a ring-down began.
+
+    Attributes
+    ----------
+    displacement : float
+        Nominal displacement of the release point before the release [`unit`], not zero.
+    deviation : float
+        Prior relative standard deviation of it [1].
+    at_rest : bool
+        True: the first sample is at the release, from the static shape under the holding force, and higher
+        modes start as that shape says, within `deviation`; False: the record starts later, and displacement
+        and velocity of each of `mode_count` modes are free.
+    mode_count : int
+        Modes whose initial state is free, at least 1: the first entry is the amplitude, within `deviation`.
+    time_zero_deviation : float
+        Prior standard deviation of the time between release and first sample [s].
+    unit : str
+        m or V, or 1 of another signal; of a file any that is known, until it is read.
+    """
+
+    displacement: Number
+    deviation: Positive = 0.05
+    at_rest: Annotated[bool, Field(strict=True)] = True
+    mode_count: Annotated[int, Field(strict=True, ge=1, le=MOST_MODES)] = 3
+    time_zero_deviation: NotNegative = 0.0
+    unit: Literal["m", "mm", "um", "V", "mV", "1"] = field(default="m", compare=False)
+
+    __pydantic_config__ = IN_FILES
+
+    def __post_init__(self) -> None:
+        if self.displacement == 0.0:
+            raise ValueError("must not be zero: its sign is the side to which the structure is held")
+        if self.mode_count < 1:  # its amplitude would count as exact, unseen
+            raise ValueError(said("campaign.mode_count", count=self.mode_count))
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened in trials, known from a protocol.
+
+    Attributes
+    ----------
+    name : str
+        As expressions use it; `name_until` is its end.
+    trials : tuple of str
+        Trials in which it happened.
+    time : float
+        Since each trial's start [s].
+    until : float or None
+        When it was over [s]; None where nothing is said.
+    trial : str or None
+        Of a file, in the place of `trials`; without both it happened in all that are samples in time.
+    """
+
+    name: Name
+    trials: Annotated[tuple[Name, ...], Field(min_length=1), LIST] = ()
+    time: NotNegative = field(kw_only=True)
+    until: Number | None = field(default=None, kw_only=True)
+    trial: Name | None = field(default=None, kw_only=True)
+
+    __pydantic_config__ = IN_FILES
+
+    def __post_init__(self) -> None:
+        for wrong, sentence in (
+            (not self.name.isidentifier(), "event_name"),
+            (self.name in RESERVED or iskeyword(self.name), "event_reserved"),
+            (self.trial is not None and self.trials != (), "event_trials"),
+            (self.until is not None and self.until <= self.time, "event_end"),
+        ):
+            if wrong:
+                raise ValueError(said(f"campaign.{sentence}", event=self))
