@@ -183,7 +183,7 @@ class Point:
     effect: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class State:
     """Where a candidate stands: a fit, or on the way to one.
 

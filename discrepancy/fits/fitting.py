@@ -32,7 +32,7 @@ CREEPING, NEAR_END = 0.2, 30.0
 the one before it promised: close to the end, promises should fall fast."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CandidateFit(State):
     """A fitted candidate.
 

@@ -6,7 +6,7 @@ those that were not.
 """
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,6 @@ from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate
 from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, Share
 from discrepancy.search.honest_evidence import noise_levels, refitted
 from discrepancy.search.hypotheses import acts_within, are_related
@@ -53,6 +52,10 @@ class Court:
         Lower end of a share that a name needs.
     has_held_out : bool
         Whether there are trials that were not fitted.
+    residuals : callable
+        Fitted and held-out trials of a hypothesis beside their predictions, made once.
+    share : callable
+        What `share_of` returns, made once.
     """
 
     least_end = SEARCH.least_share
@@ -60,9 +63,9 @@ class Court:
     def __init__(self, problem: Problem, found: Search) -> None:
         self.problem, self.found = problem, found
         self.has_held_out = bool(problem.campaign.held_out)
-        self._shares: dict[tuple[int, bool], tuple[Any, Share]] = {}
+        self.residuals = cache(partial(residual_set, problem, sensitivities=False))
+        self.share = cache(self.share_of)
         self._followed: dict[Key, Any] = {}
-        self._sets: dict[int, tuple[CandidateFit, ResidualSet]] = {}
         self._free: dict[Key, CandidateFit] = {}
 
     # ---------------------------------------------------------------- how they are compared
@@ -84,12 +87,6 @@ class Court:
     def ranked(self) -> Sequence[Any]:
         """Hypotheses, the most probable first."""
         return sorted(self.found.all().values(), key=lambda item: -self.found.score(item))
-
-    def residuals(self, item: Any) -> ResidualSet:
-        """Return fitted and held-out trials beside their predictions."""
-        if id(item) not in self._sets:
-            self._sets[id(item)] = item, residual_set(self.problem, item, sensitivities=False)
-        return self._sets[id(item)][1]
 
     @cached_property
     def _noise(self) -> Mapping[str, float]:
@@ -171,13 +168,6 @@ class Court:
         return said("verdict.left_of_readings" if share.left > 0.0 else "verdict.nothing_left", share=share)
 
     # ---------------------------------------------------------------- who may be named
-
-    def share(self, item: Any, *, held_out: bool) -> Share:
-        """Return the share that a hypothesis is of what is missing."""
-        key = (id(item), held_out)
-        if key not in self._shares:
-            self._shares[key] = item, self.share_of(item, held_out=held_out)
-        return self._shares[key][1]
 
     def told(self, item: Any) -> Share:
         """Return the share that counts: in trials not fitted, if there are any that can test it."""

@@ -39,7 +39,7 @@ from .conclusion import (
     small_terms,
 )
 from .consistency_gate import consistency_gate
-from .court import Court, names, part, percent
+from .court import Court, families, names, part, percent
 from .court_of_force import ByForce
 from .proof import held_out_gate
 
@@ -172,7 +172,7 @@ def _in_part(court: Court, best: Hypothetic, probability: float) -> Outcome:
     sentence = said(
         "verdict.in_part", what=capital(what), certain=probability_text(probability), part=part(share),
         where=_where(share), inside=said("verdict.hardly_any_force") if inside else "",
-        left=court.left(best, share), shape=_shape(court, best),
+        left=court.left(best, share), shape=_shape(court, best) + _not_proved(court, best),
     )  # fmt: skip
     more = {"effects": effects, "family": family, "gates": (court.gate(best),)}
     return _outcome(court, VerdictKind.NAMED_IN_PART, sentence, probability, best, [best], **more)
@@ -260,6 +260,19 @@ def _shape(court: Court, best: Hypothetic) -> str:
         if deviation < SEARCH.told_by_data
     ]
     return said("verdict.with_a_shape", shape=", ".join(shown)) if shown else ""
+
+
+def _not_proved(court: Court, best: Hypothetic) -> str:
+    """Return the sentence on the next law that would stand beside a name, close but not probable enough."""
+    own, least = families(best), court.score(best) - SEARCH.contenders
+    longer = (item for item in court.ranked if families(item) > own)
+    more = (item for item in longer if all(map(court.acts, item.candidate.terms)))
+    close = next((item for item in more if court.score(item) > least), None)
+    if close is None or court.told(close).value < court.told(best).value + SEARCH.sliver:
+        return ""
+    effects = named_effects(court.problem, close)
+    added = effects_text(effect for effect in effects if (effect.family, effect.place) not in own)
+    return said("verdict.not_proved", what=capital(added))
 
 
 def explained_share(share: Share) -> ExplainedShare:

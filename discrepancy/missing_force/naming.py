@@ -22,7 +22,7 @@ from .columns import Columns
 from .filtered import Process, Solution
 from .hypotheses import both_signs, log_prior, scaled, sized, stepped, variants
 from .trial import seen_trial
-from .view import Column, Motion, Processes, View, combined
+from .view import SHARES, Column, Motion, Processes, View, combined
 
 NOTHING, NO_VALUES = Candidate(), np.zeros(0)
 WIDE = 3.0
@@ -40,8 +40,6 @@ WIDTHS = (10, 4, 4)
 """Effects that are followed after the screen: alone, beside one other, beside two."""
 BEAM = 3
 """Sets to which one more effect is added."""
-LITTLE = 0.03
-"""Share of a force from which what is left of it beside a law is looked for, too."""
 BEGIN_TIMES = (1.0, 10.0)
 """Correlation times over that of the port's motion, from which the most probable one is looked for."""
 ROUNDS = 8
@@ -173,7 +171,7 @@ class ForceSearch:
                 view = self._along(bare, bare.smoothed(self.at[name].processes)[2]) if turn else bare
                 begins = [scaled(self.about((port,)), 1.0, time) for time in BEGIN_TIMES]
                 begins += [self.at[name].processes] if turn else []
-                self.at[name] = seen(view, self.about((port,)), begins)
+                self.at[name] = seen(view, self.about((port,)), begins, SHARES[:1])
             if not turn and about is None:
                 self.point = self._point(self.best())
         self.whole = self._together()
@@ -190,8 +188,8 @@ class ForceSearch:
         for item in ranked[1:]:
             begin |= scaled(item.processes, BESIDE, 1.0)
         view = best.view
-        for _ in range(2):
-            found = seen(view, self.about(begin), [begin])
+        for shares in (SHARES[:1], ()):
+            found = seen(view, self.about(begin), [begin], shares)
             view = self._along(view, found.motions)
             begin = dict(found.processes)
         return found
@@ -359,8 +357,8 @@ class ForceSearch:
             if view is None:
                 break
             if turn == 0 or settled or turn == ROUNDS - 1:
-                begins = [processes] if turn else [processes, scaled(processes, LITTLE, 1.0)]
-                found = seen(view, self.about(processes), begins, candidate, effect)
+                some = () if turn else SHARES
+                found = seen(view, self.about(processes), [processes], some, candidate, effect)
                 processes = dict(found.processes)
             else:
                 evidence = view.evidence(self.about(processes), processes)
@@ -409,9 +407,10 @@ def seen(
     view: View,
     about: Processes,
     begins: Sequence[Processes],
+    shares: Sequence[float] = SHARES,
     candidate: Candidate = NOTHING,
     effect: FloatArray = NO_VALUES,
 ) -> Explained:
     """Return a hypothesis beside the most probable missing forces, about some and begun at others."""
-    processes, evidence = view.most_probable(about, begins)
+    processes, evidence = view.most_probable(about, begins, shares)
     return Explained(candidate, effect, processes, evidence, view, *view.smoothed(processes))

@@ -18,11 +18,12 @@ Processes = Mapping[int, Process]
 
 SIZE_DOUBT, TIME_DOUBT = 3.0, 1.2
 """Prior deviations of the logarithms of a process's size and correlation time."""
-DOUBTS = np.array([SIZE_DOUBT, TIME_DOUBT])
-UNSOUND = -1e12
-"""Evidence of forces under which variances are lost to rounding [nat]."""
-AT_TOP = {"eps": 2e-3, "ftol": 1e-6, "gtol": 0.05, "maxiter": 12}
-"""Of the descent: difference of logarithms by which slopes are found, and where it ends."""
+SHARES = (1.0, 0.03)
+"""Sizes from which the most probable process is looked for: what is left beside a law is a part of it."""
+MOST_PASSES = 30
+NEAR, LONGEST, AT_TOP, MOST_STEPS = 0.02, 0.7, 1e-4, 8
+"""Of Newton's method: difference of logarithms by which slopes are found, the longest step that is taken,
+that after which the top is reached, and how many are taken."""
 FARTHEST = 5.0
 """Prior deviations from which on a process is not looked at."""
 
@@ -214,7 +215,7 @@ class View:
         return self.products(processes).solve(range(len(self.precisions)), self.precisions)
 
     def most_probable(
-        self, about: Processes, begins: Sequence[Processes]
+        self, about: Processes, begins: Sequence[Processes], shares: Sequence[float] = SHARES
     ) -> tuple[dict[int, Process], float]:
         """Return the processes of the largest evidence times their prior, and its logarithm [nat].
 
@@ -223,26 +224,57 @@ class View:
         about : mapping of int to Process
             Medians of the prior.
         begins : sequence of mapping of int to Process
-            From each of which they are looked for.
+            From each of which they are looked for, port after port, and from some shares of their sizes; with
+            no share from what is near alone.
         """
-        first = begins[0]
-        median = np.log([(about[port].size, about[port].time) for port in first])
-        low, high = median - FARTHEST * DOUBTS, median + FARTHEST * DOUBTS
-        low[:, 1], high[:, 1] = np.clip((low[:, 1], high[:, 1]), *np.log(self.times))
+        climbs = []
+        for begin in begins:
+            found, greatest = dict(begin), -np.inf
+            for _ in range(min(len(begin), 2)):
+                for port in begin:
+                    first = np.log((found[port].size, found[port].time))
+                    for share in shares:
+                        best, value = self._climbed(
+                            about, found, port, first + np.array([np.log(share), 0.0])
+                        )
+                        if value > greatest:
+                            found, greatest = best, value
+            climbs.append((greatest, found))
+        return self._settled(about, max(climbs, key=lambda item: item[0])[1])
 
-        def at(logs: FloatArray) -> dict[int, Process]:
-            items = zip(first.items(), np.exp(logs.reshape(median.shape)).tolist(), strict=True)
+    @np.errstate(invalid="ignore")
+    def _settled(self, about: Processes, begin: Processes) -> tuple[dict[int, Process], float]:
+        """Return the processes at the top near some, and the logarithm there [nat], by Newton's method.
+
+        Where a climb ends a rounding decides; the top does not depend on it.
+        """
+        first = np.log([(one.size, one.time) for one in begin.values()])
+        unit, logs, far = NEAR * np.eye(first.size), np.zeros(first.size), np.inf
+
+        def at(move: FloatArray) -> dict[int, Process]:
+            items = zip(begin.items(), np.exp(first + move.reshape(first.shape)).tolist(), strict=True)
             return {port: replace(one, size=size, time=time) for (port, one), (size, time) in items}
 
-        def lack(logs: FloatArray) -> float:
-            return -self.evidence(about, at(logs))
-
-        pairs = ([(begin[port].size, begin[port].time) for port in first] for begin in begins)
-        bounds = list(zip(low.ravel(), high.ravel(), strict=True))
-        how = {"method": "L-BFGS-B", "bounds": bounds, "options": AT_TOP}
-        tops = [minimize(lack, np.clip(np.log(pair), low, high).ravel(), **how) for pair in pairs]
-        best = min(tops, key=lambda top: float(top.fun))
-        return at(best.x), -float(best.fun)
+        for _ in range(MOST_STEPS):
+            ahead, back = (
+                np.array([self.evidence(about, at(logs + step)) for step in steps]) for steps in (unit, -unit)
+            )
+            if far > NEAR:
+                top = self.evidence(about, at(logs))
+                bend = np.diag(ahead + back - 2.0 * top)
+                for i, k in zip(*np.triu_indices(first.size, 1), strict=True):
+                    both = self.evidence(about, at(logs + unit[i] + unit[k]))
+                    bend[i, k] = bend[k, i] = both - ahead[i] - ahead[k] + top
+            if not np.isfinite((*bend.flat, *ahead, *back)).all():
+                break
+            values, axes = np.linalg.eigh(bend)  # uphill where it is hollow, too
+            step = axes @ (axes.T @ (0.5 * NEAR * (ahead - back)) / np.maximum(np.abs(values), 1e-300))
+            far = np.abs(step).max()
+            logs = logs + step / max(1.0, far / LONGEST)
+            if far < AT_TOP:
+                break
+        ends = ((item, self.evidence(about, item)) for item in (dict(begin), at(logs)))
+        return max(ends, key=lambda item: item[1])
 
     @cached_property
     def times(self) -> tuple[float, float]:
@@ -253,15 +285,40 @@ class View:
     def evidence(self, about: Processes, processes: Processes) -> float:
         """Return the evidence of processes times their prior, as a logarithm [nat]."""
         away = [
-            (np.log(one.size / about[port].size), np.log(one.time / about[port].time)) / DOUBTS
+            (
+                np.log(one.size / about[port].size) / SIZE_DOUBT,
+                np.log(one.time / about[port].time) / TIME_DOUBT,
+            )
             for port, one in processes.items()
         ]
+        shortest, longest = self.times
+        outside = any(not shortest <= one.time <= longest for one in processes.values())
+        if outside or np.abs(away).max() > FARTHEST:
+            return -np.inf
         filters = self.filtered(processes)
         if not all(one.is_sound for one in filters):
-            return UNSOUND
+            return -np.inf
         products = regression(filters, self.residuals, self.columns)
         value = products.solve(range(len(self.precisions)), self.precisions).evidence
         return float(value - 0.5 * np.sum(np.square(away)))
+
+    def _climbed(
+        self, about: Processes, processes: Processes, port: int, first: FloatArray
+    ) -> tuple[dict[int, Process], float]:
+        """Return processes with that of a port at its most probable, from logarithms of size and time."""
+
+        def at(logs: FloatArray) -> dict[int, Process]:
+            size, time = np.exp(logs)
+            return {**processes, port: replace(processes[port], size=float(size), time=float(time))}
+
+        low, high = np.log(self.times)
+        first = np.array([first[0], np.clip(first[1], low, high - 0.7)])
+        simplex = first + np.array([[0.0, 0.0], [0.9, 0.0], [0.0, 0.7]])
+        options = {"xatol": 0.2, "fatol": 1.0, "maxfev": MOST_PASSES, "initial_simplex": simplex}
+        found = minimize(
+            lambda logs: -self.evidence(about, at(logs)), first, method="Nelder-Mead", options=options
+        )
+        return at(found.x), -float(found.fun)
 
     def smoothed(
         self, processes: Processes, given: Solution | None = None

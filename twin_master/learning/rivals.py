@@ -98,17 +98,20 @@ def weigh_gauges(
     log_likelihood are of the model. belief (G K, N), squares (G, K) and sums are brought up to date;
     returned is the log evidence (G, K).
     """
-    belief[belief < NEGLIGIBLE_RIVAL] = 0.0
-    rival, place = np.nonzero(belief)
+    held = belief >= NEGLIGIBLE_RIVAL
+    belief[~held] = 0.0
+    rival, place = np.nonzero(held)  # of truth values: ten times as fast as of numbers
     gauge, k = np.divmod(rival, len(gains))
-    size, x = shown.size[place, gauge], shown.residual[place, gauge] - gains[k] * shown.size[place, gauge]
+    at = gauge * len(log_likelihood) + place
+    size, x, ratio = (own.T.ravel()[at] for own in (shown.size, shown.residual, np.log(known)))
+    x -= gains[k] * size
     left, (cc, cx) = shown.degrees + squares[gauge, k], sums[gauge, k].T
     c, unknown = reach[k] * size, 1.0 / (1.0 + cc)
     wide = 1.0 + c**2 * unknown
     squared = (x - c * np.clip(unknown * cx, -1.0, 1.0)) ** 2 / wide
     constant = 0.5 * np.log((shown.degrees + squares_of_model[gauge]) / left) * shown.there[gauge]
     log_value = log_likelihood[place] + constant
-    log_value += shown.power[gauge] * np.log(known[place, gauge] / (1.0 + squared / left))
+    log_value += shown.power[gauge] * (ratio - np.log1p(squared / left))
     best = np.full(len(belief), -_LARGEST)
     np.maximum.at(best, rival, log_value)
     weight = belief[rival, place] * np.exp(log_value - best[rival]) / np.sqrt(wide)

@@ -199,27 +199,14 @@ class GridSampler:
         if not np.any(change > tolerance * np.maximum(np.abs(before), np.abs(again))):
             return
         worst = int(np.argmax(change))
-        shown = f"{self._sensor(worst)} = {before[worst]:.9g}"
-        if steps:
-            raise InvalidObservationLibraryError(
-                said(
-                    "library.unsettled",
-                    fmu=self._grid.fmu,
-                    steps=steps,
-                    place=self._name(index),
-                    shown=shown,
-                    later=again[worst],
-                )
-            )
+        sensor = self._asset.binding.observation[self._grid.role].variables[worst]
         raise InvalidObservationLibraryError(
             said(
-                "library.remembers",
+                "library.unsettled" if steps else "library.remembers",
                 fmu=self._grid.fmu,
+                steps=steps,
                 place=self._name(index),
-                shown=shown,
+                shown=f"{sensor} = {before[worst]:.9g}",
                 later=again[worst],
             )
         )
-
-    def _sensor(self, sensor: int) -> str:
-        return self._asset.binding.observation[self._grid.role].variables[sensor]

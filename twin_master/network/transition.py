@@ -5,9 +5,9 @@ one table, whose loops are the shortest; what is not, as blocks of neighbouring 
 its own axis.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from math import prod
 
 import numpy as np
@@ -123,8 +123,7 @@ class TransitionModel:
             },
             "take fewer levels or state factors, or apply the transition instead",
         )
-        joint = [_kronecker([block[control] for block in self.blocks]) for control in range(controls)]
-        table = np.stack(joint)
+        table = _joint(self.blocks)
         table.setflags(write=False)
         return table
 
@@ -141,8 +140,7 @@ class TransitionModel:
     def row(self, control: int, state: int) -> Float:
         """Return p(D_t | D_{t-1} = state, control): (S,)."""
         levels = np.unravel_index(state, [block.shape[1] for block in self.blocks])
-        rows = [block[control, level] for block, level in zip(self.blocks, levels, strict=True)]
-        return _kronecker(rows)
+        return _kronecker(block[control, level] for block, level in zip(self.blocks, levels, strict=True))
 
     def forward(self, control: int, belief: Float) -> Float:
         """Return beliefs (..., S) one step later, in the linear domain."""
@@ -164,11 +162,8 @@ class TransitionModel:
         return vector.reshape(shape)
 
 
-def _kronecker(arrays: Sequence[Float]) -> Float:
-    product = arrays[0]
-    for array in arrays[1:]:
-        product = np.asarray(np.kron(product, array), dtype=np.float64)
-    return product
+def _kronecker(arrays: Iterable[Float]) -> Float:
+    return reduce(lambda first, second: np.asarray(np.kron(first, second)), arrays)
 
 
 def _grouped(factors: Sequence[Float]) -> Iterator[Float]:
@@ -194,5 +189,4 @@ def _grouped(factors: Sequence[Float]) -> Iterator[Float]:
 
 
 def _joint(factors: Sequence[Float]) -> Float:
-    controls = range(len(factors[0]))
-    return np.stack([_kronecker([factor[control] for factor in factors]) for control in controls])
+    return np.stack([_kronecker(tables) for tables in zip(*factors, strict=True)])

@@ -301,18 +301,6 @@ def test_one_linear_mode_does_not_explain_the_real_ring_downs():
 # -------------------------------- the hand-over record, and the split of a motion into its modes
 
 
-def test_sensitivity_holds_the_leverages_of_least_squares():
-    generator = np.random.default_rng(3)
-    jacobian = generator.standard_normal((30, 2, 4))
-    noise = np.array([0.5, 2.0])
-    table = (jacobian / noise[:, np.newaxis]).reshape(60, 4)
-    covariance = np.linalg.inv(table.T @ table)
-    hat = table @ covariance @ table.T
-    found = sensitivity(jacobian, covariance, noise).reshape(60, 4)
-    np.testing.assert_allclose(found @ found.T, hat, atol=1e-12)
-    assert np.sum(found**2) == pytest.approx(4.0)
-
-
 def test_moments_of_a_sum_of_squares_are_those_of_the_projection():
     generator = np.random.default_rng(5)
     S = np.linalg.qr(generator.standard_normal((12, 3)))[0] * np.array([1.0, 0.9, 0.4])
@@ -336,16 +324,6 @@ def test_restored_residuals_are_white_with_unit_variance(held_out):
     # Standard deviations of the entries are sqrt(2 / 1200) on and sqrt(1 / 1200) off the diagonal.
     assert np.max(np.diag(plain)) < 5.0 * np.sqrt(2.0 / 1200)
     assert np.max(plain - np.diag(np.diag(plain))) < 6.0 * np.sqrt(1.0 / 1200)
-
-
-def test_without_restoring_the_early_samples_are_too_quiet():
-    bench = Bench(count=40, noise_freedom=np.inf, static=False)
-    generator = np.random.default_rng(12)
-    squares = np.mean([bench.fit(generator).trials[0].standardised[:8] ** 2 for _ in range(300)], axis=0)
-    expected = bench.fit(generator).trials[0].expected_variance[:8]
-    assert expected.min() < 0.9
-    np.testing.assert_allclose(squares, expected, atol=0.35)
-    assert np.mean(squares - expected) == pytest.approx(0.0, abs=0.06)
 
 
 def test_what_no_fit_leaves_is_refused():
