@@ -188,7 +188,9 @@ class Search(Hypotheses):
             self.shorter()
         self.settle()
         if self._open and 0 < len(self.best().candidate.terms) < self.longest:
-            self._extended(self.best())  # what stood in for a smaller set hid what is beside it
+            # what stood in for a smaller set hid what is beside it, and from there fewer may fit as well
+            if self._extended(self.best()):
+                self.shorter()
         self.settle()
         self.keep(elsewhere(self.problem, self.best()), exact=True)  # from other places of the structure
 
