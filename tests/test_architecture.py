@@ -36,7 +36,7 @@ BESIDE = {"benchmarks", "evidence", "tests"}
 # The rooms of each package from the ground up; a file at the root of its package is a room of its own.
 ROOMS = {
     "fe": (
-        "designs", "sentences", "runtime", "elements", "full", "structure", "wing", "reduction",
+        "designs", "sentences", "runtime", "high_pass", "elements", "full", "structure", "wing", "reduction",
         "compilation", "verification",
     ),
     "fmu_asset": (

@@ -7,8 +7,8 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
-from discrepancy.models.high_pass import filtered_record
 from discrepancy.models.interface import ACROSS, Conditions, Model, Response
+from fe.high_pass import filtered_record
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive, SensorRotation
 from fe.runtime.sensors import SensorRecord, apply_sensors, check_channels, clock_of

@@ -94,7 +94,7 @@ def apply_sensors(
         Strain across each gauge's direction and engineering shear strain; needed for rotations.
     filtered : callable
         How columns (N, C) of a dynamic record and their rates pass a high-pass:
-        `discrepancy.models.high_pass.filtered_record`, or `FilterMemory.filtered` of one row of a longer one,
+        `fe.high_pass.filtered_record`, or `FilterMemory.filtered` of one row of a longer one,
         which has no rates.
 
     Raises

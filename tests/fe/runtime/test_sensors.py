@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.special import hyp1f1
 
-from discrepancy.models.high_pass import filtered_record, high_pass
+from fe.high_pass import filtered_record, high_pass
 from fe.runtime import patch, sensors
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import Clock, HighPass, ModelPatch, RunOffset, SensorDrift, SensorGain, SensorRotation

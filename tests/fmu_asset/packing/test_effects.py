@@ -20,10 +20,10 @@ from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, Quantity, Trial, TrialKind
 from discrepancy.document import Origin
 from discrepancy.files.verdict import StoredPatch, fmu_outputs, patch_effects, read_patch, write_patch
-from discrepancy.models.high_pass import filtered_record
 from discrepancy.models.interface import ACROSS, Conditions
 from discrepancy.models.structures import WingModel
 from discrepancy.verdict import NamedEffect, VerdictKind
+from fe.high_pass import filtered_record
 from fe.runtime.patch import STRUCTURE, ModelPatch, SensorGain, SensorRotation
 from fe.runtime.sensors import SensorRecord, apply_sensors
 from fe.runtime.state import DigitalState

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.signal import fftconvolve
 from scipy.special import hyp1f1, rgamma
 
-from discrepancy.campaign.records import FloatArray
+from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import HighPass
 from fe.runtime.sensors import SensorRecord
