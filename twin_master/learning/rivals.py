@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fe.compilation import compiled
 from reporting.arrays import Float, Single
 
 NEGLIGIBLE = 1e-30
 """Places of the model below this probability are left out of its evidence."""
 NEGLIGIBLE_RIVAL = 1e-7
 """The same of a rival: what is left out makes its evidence smaller, and an alarm later."""
-_LARGEST = 1e300
 
 
 @dataclass(frozen=True)
@@ -98,33 +98,66 @@ def weigh_gauges(
     log_likelihood are of the model. belief (G K, N), squares (G, K) and sums are brought up to date;
     returned is the log evidence (G, K).
     """
-    held = belief >= NEGLIGIBLE_RIVAL
-    belief[~held] = 0.0
-    rival, place = np.nonzero(held)  # of truth values: ten times as fast as of numbers
-    gauge, k = np.divmod(rival, len(gains))
-    at = gauge * len(log_likelihood) + place
-    size, x, ratio = (own.T.ravel()[at] for own in (shown.size, shown.residual, np.log(known)))
-    x -= gains[k] * size
-    left, (cc, cx) = shown.degrees + squares[gauge, k], sums[gauge, k].T
-    c, unknown = reach[k] * size, 1.0 / (1.0 + cc)
-    wide = 1.0 + c**2 * unknown
-    squared = (x - c * np.clip(unknown * cx, -1.0, 1.0)) ** 2 / wide
-    constant = 0.5 * np.log((shown.degrees + squares_of_model[gauge]) / left) * shown.there[gauge]
-    log_value = log_likelihood[place] + constant
-    log_value += shown.power[gauge] * (ratio - np.log1p(squared / left))
-    best = np.full(len(belief), -_LARGEST)
-    np.maximum.at(best, rival, log_value)
-    weight = belief[rival, place] * np.exp(log_value - best[rival]) / np.sqrt(wide)
+    result = np.empty_like(squares)
+    _weigh_gauges(
+        shown.there, shown.residual, shown.size, shown.power, shown.degrees, gains, reach, squares_of_model,
+        known, log_likelihood, belief, squares, sums, result,
+    )  # fmt: skip
+    return result
 
-    def total(values: Float | float) -> Float:
-        return np.bincount(rival, weight * values, len(belief)).astype(np.float64)
 
-    mass = total(1.0)
-    weight /= np.maximum(mass, 1.0 / _LARGEST)[rival]
-    belief[rival, place] = weight
-    squares += total(squared).reshape(squares.shape)
-    sums += np.stack([total(c**2), total(c * x)], axis=-1).reshape(sums.shape)
-    return np.asarray(best + np.log(mass)).reshape(squares.shape)
+@compiled
+def _weigh_gauges(
+    there: NDArray[np.bool_],
+    residual: Float,
+    size: Float,
+    power: Float,
+    degrees: float,
+    gains: Float,
+    reach: Float,
+    squares_of_model: Float,
+    known: Float,
+    log_likelihood: Float,
+    belief: Single,
+    squares: Float,
+    sums: Float,
+    result: Float,
+) -> None:
+    """Fill result (G, K), see `weigh_gauges`."""
+    weight = np.empty(len(log_likelihood))
+    for rival in range(len(belief)):
+        g, k = divmod(rival, len(gains))
+        left, unknown = degrees + squares[g, k], 1.0 / (1.0 + sums[g, k, 0])
+        fitted = min(max(unknown * sums[g, k, 1], -1.0), 1.0)
+        constant = 0.5 * np.log((degrees + squares_of_model[g]) / left)
+        own, best, mass, added, cc, cx = belief[rival], -np.inf, 0.0, 0.0, 0.0, 0.0
+        for n in range(len(own)):
+            if own[n] < NEGLIGIBLE_RIVAL:
+                own[n] = 0.0
+                continue
+            weight[n] = log_likelihood[n]
+            if there[g]:
+                c = reach[k] * size[n, g]
+                x, wide = residual[n, g] - gains[k] * size[n, g] - c * fitted, 1.0 + c * c * unknown
+                weight[n] += constant + power[g] * np.log(known[n, g] / (1.0 + x * x / (left * wide)))
+            best = max(best, weight[n])
+        for n in range(len(own)):
+            if own[n] > 0.0:
+                c = reach[k] * size[n, g]
+                x, wide = residual[n, g] - gains[k] * size[n, g], 1.0 + c * c * unknown
+                weight[n] = own[n] * np.exp(weight[n] - best) / (np.sqrt(wide) if there[g] else 1.0)
+                mass += weight[n]
+                cc += weight[n] * c * c
+                cx += weight[n] * c * x
+                added += weight[n] * (x - c * fitted) ** 2 / wide
+        result[g, k] = best + np.log(mass) if mass > 0.0 else -np.inf
+        for n in range(len(own)):
+            if own[n] > 0.0:
+                own[n] = weight[n] / mass
+        if mass > 0.0:
+            squares[g, k] += added / mass
+            sums[g, k, 0] += cc / mass
+            sums[g, k, 1] += cx / mass
 
 
 def weigh_none(
