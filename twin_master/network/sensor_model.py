@@ -15,7 +15,7 @@ from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError
 from twin_master.network.distributions import expect_controls, expect_shape
 from twin_master.network.quantity import QuantityModel
-from twin_master.network.sensor_kernels import LOG_ROOT_TWO_PI, log_densities, separated
+from twin_master.network.sensor_kernels import log_densities, separated
 from twin_master.sentences import said
 
 _WORST_SHOWN = 3
@@ -134,7 +134,6 @@ class GaussianSensorModel(QuantityModel):
             self.interval.transpose(1, 0, 2, 3) * by_control[..., None]
         )
         self.averages_inside = average == "inside"
-        self._kept: dict[tuple[int, bytes], tuple[Float, Float, Float]] = {}
         with np.errstate(divide="ignore"):
             self._log_weight: Float = np.log(self.draw_weight)
         self._mean = np.ascontiguousarray(self.mean.transpose(1, 0, 2))
@@ -229,41 +228,15 @@ class GaussianSensorModel(QuantityModel):
         expect_shape("observations", observations.shape, control.size, self.sensor_count)
         expect_controls(control, self.control_count)
         inside = self.averages_inside and draws == 1
-        log_weight = self._log_weight if draws == 1 else np.zeros(draws)
-        there = ~np.isnan(observations)
-        result, found = np.zeros((2, len(observations), self.state_count, draws))
+        result = np.zeros((len(observations), self.state_count, draws))
         for sensors in np.eye(self.sensor_count, dtype=bool) if inside else [np.array([True])]:
-            alike: dict[tuple[int, bytes], list[int]] = {}
-            for row, (place, seen) in enumerate(zip(control.tolist(), sensors & there, strict=True)):
-                alike.setdefault((place, seen.tobytes()), []).append(row)
-            for (place, seen), rows in alike.items():
-                inverse, asked, added = self._shared(place, seen)
-                fixed = self._mean[place], inverse, asked, added + log_weight, self._function
-                log_densities(observations, np.array(rows), *fixed, found)
+            found = np.empty_like(result)
+            log_densities(
+                np.where(sensors, observations, np.nan), control, self._mean, self._part, self._function,
+                self._inverse_deviation, self._log_scale, self._scaled_interval, self._log_weight, found,
+            )  # fmt: skip
             result += found
         return result
-
-    def _shared(self, control: int, reporting: bytes) -> tuple[Float, Float, Float]:
-        """Return what all observations by the same sensors share, see `log_densities`; it is kept.
-
-        The covariance is the unit matrix plus interval times its transpose, inverted by Woodbury's identity.
-        """
-        if (found := self._kept.get((control, reporting))) is not None:
-            return found
-        seen = np.frombuffer(reporting, dtype=bool)
-        interval, part = (own[control] * seen[:, None] for own in (self._scaled_interval, self._part))
-        factor = np.linalg.cholesky(np.eye(interval.shape[-1]) + interval.swapaxes(1, 2) @ interval)
-        outward = np.linalg.inv(factor) @ interval.swapaxes(1, 2)  # (S, F, G)
-        along = part - outward.swapaxes(1, 2) @ (outward @ part)
-        scale = np.sum(self._log_scale[control] - LOG_ROOT_TWO_PI, axis=1, where=seen)
-        scale -= np.log(np.einsum("sff->sf", factor)).sum(axis=1)
-        square = np.sum((part.swapaxes(1, 2) @ along @ self._function) * self._function, axis=1)
-        asked = np.concatenate((outward.swapaxes(1, 2), along), axis=2)
-        found = self._inverse_deviation[control] * seen, asked, scale[:, None] - 0.5 * square
-        if len(self._kept) > 2 * self.control_count:
-            self._kept.clear()
-        self._kept[control, reporting] = found
-        return found
 
     def nearest(
         self, observation: Float, control_index: int, value: Float, precision: ArrayLike = 1.0
