@@ -20,15 +20,30 @@ from discrepancy.fits.other_optima import elsewhere
 from discrepancy.fits.screening import Screen
 from discrepancy.judgement.separability import _distance
 from discrepancy.models.interface import Conditions
+from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.sensing import observe
 from discrepancy.search.honest_evidence import left_by, refitted, widened
+from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
-from fe.runtime.patch import ModelPatch, PowerStiffness
+from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
 from tests.discrepancy.rigs import measured
 from tests.refusals import Inputs
 
 from . import kit
+
+
+@pytest.mark.long
+def test_friction_that_ends_motions_is_named_alone():
+    """Alone it has many optima: the right one is reached beside a second effect, which then has to go."""
+    model = LumpedModel.load("single_mass_rig")
+    plan = plan_for(model, ("displacement", "leaf_strain"), "mass")
+    friction = PowerDamping("slide", 0.316, 0.0, 0.0, 1.0, 1.0)
+    found = example_campaign(model, "laboratory", 4, plan, ModelPatch((friction,)))
+    effects = kit.chosen("coulomb_friction", "quadratic_damping", "structural_damping")
+    verdict = investigate(found, model, effects, thorough=False).verdict
+    (named,) = verdict.effects
+    assert named.patch.primitives[0].coefficient == pytest.approx(0.316, rel=2e-3)
 
 
 @pytest.mark.parametrize("place", [0.8, 1.2, 1.8])
