@@ -5,7 +5,6 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -435,76 +434,25 @@ LENGTHS, PAIRS, RECORD = (
 )  # fmt: skip
 
 
-def exchanged(old: str, new: str) -> Callable[[str], str]:
-    return lambda text: edited(text, (old, new))
-
-
-def in_kgf(text: str) -> str:
-    rows = [line.split(",") for line in text.splitlines()[1:]]
-    return "load,displacement\n" + "\n".join(f"{float(load) / 9.80665},{w}" for load, w in rows)
-
-
-def recorded(signal: Callable[[Any, Any], Any]) -> Callable[[str], str]:
-    """Return what writes another signal of time and signal into a record."""
-
-    def change(text: str) -> str:
-        time, old = np.loadtxt(text.splitlines())[:, :2].T
-        return "\n".join(f"{t:.9e} {s:.9e} 0" for t, s in zip(time, signal(time, old), strict=True))
-
-    return change
-
-
-def mode(time: Any, amplitude: float, frequency: float) -> Any:
-    return amplitude * np.cos(2.0 * np.pi * frequency * time)
-
-
-SPOILT: dict[str, tuple[str, Callable[[str], str], str]] = {
-    "renamed column": (PAIRS, exchanged("load,", "force,"), "no column 'load', which a load test needs"),
-    "no column": (
-        LENGTHS,
-        exchanged("manufactured", "built"),
-        "no column 'manufactured', which the measured",
-    ),
-    "load in kgf": (PAIRS, in_kgf, "looks like kgf: give it in N"),
-    "lengths in m": (LENGTHS, exchanged("1828.8,1828", "1.8288,1.828"), "looks like m: give it in mm"),
-    "lost value": (
-        PAIRS,
-        lambda text: text.replace(text.splitlines()[3], "nan,7.3"),
-        "line 4: column 'load' holds nan, and a finite number is needed",
-    ),
-    "empty pairs": (PAIRS, lambda _text: "", "is empty"),
-    "empty record": (RECORD, lambda _text: "", "is empty"),
-    "no decay": (RECORD, recorded(lambda t, _s: mode(t, 0.01, 5.65) + mode(t, 0.003, 29.9)), "decay"),
-    "clipped": (RECORD, recorded(lambda _t, s: np.clip(s, -0.3 * s.max(), 0.3 * s.max())), "clipped"),
-    "one mode": (
-        RECORD,
-        recorded(lambda t, _s: np.exp(-0.9 * t) * mode(t, 0.01, 5.65)),
-        "two spectral peaks are needed",
-    ),
-    "record with a gap": (
-        RECORD,
-        recorded(lambda t, s: np.where(np.arange(t.size) == 200, np.nan, s)),
-        "line 201: column 'spanwise' holds nan, and a finite number is needed",
-    ),
-    "masses that cannot be": (
-        "step3/weighed_mass.csv",
-        lambda _text: "mass,standard_deviation\n950,1\n",
-        "cannot weigh 0.95 kg",
-    ),
-}
+def one_mode(text: str) -> str:
+    """Write a record of one mode over the times of another record."""
+    time = np.loadtxt(text.splitlines())[:, 0]
+    signal = 0.01 * np.exp(-0.9 * time) * np.cos(2.0 * np.pi * 5.65 * time)
+    return "\n".join(f"{t:.9e} {s:.9e} 0" for t, s in zip(time, signal, strict=True))
 
 
 @pytest.mark.parametrize(
-    "kind",
-    [  # masses are looked for after all else was read; test_procedure.py has their refusal, too
-        pytest.param(kind, marks=pytest.mark.long if kind == "masses that cannot be" else ())
-        for kind in SPOILT
+    ("name", "change", "sentence"),
+    [  # one of each step; tests/calibration has the others
+        (LENGTHS, lambda text: edited(text, ("1828.8,1828", "1.8288,1.828")), "looks like m: give it in mm"),
+        (PAIRS, lambda text: edited(text, ("load,", "force,")), "no column 'load', which a load test needs"),
+        (RECORD, one_mode, "two spectral peaks are needed"),
     ],
+    ids=["lengths", "pairs", "record"],
 )
-def test_a_wrong_file_is_one_sentence_and_leaves_nothing(kind, wings, tmp_path):
+def test_a_wrong_file_is_one_sentence_and_leaves_nothing(wings, tmp_path, name, change, sentence):
     lab, out = tmp_path / "lab", tmp_path / "out"
     shutil.copytree(wings["soft"].lab, lab)
-    name, change, sentence = SPOILT[kind]
     (lab / name).write_text(change((lab / name).read_text(encoding="utf-8")), encoding="utf-8")
     assert sentence in refused("calibrate", "--data", lab, "--out", out)
     assert not out.exists()
