@@ -46,8 +46,9 @@ class SearchSettings:
     """Starts of the fit of each effect close to the truth."""
     far_starts: int = 2
     """The same far from it, of the best on a grid."""
-    far_levels: tuple[int, ...] = (1, 5, 5, 5, 3)
-    """Levels of each parameter on it, by their number from none on."""
+    far_levels: tuple[int, ...] = (1, 25, 5, 5, 3)
+    """Levels of each parameter on it, by their number from none on: friction that ends motions has an optimum
+    for every size, and the right one is that narrow."""
     few_places: int = 3
     """Effects with more places than this are those of single channels, which are linear in their size."""
     worth_fitting: float = 2.0

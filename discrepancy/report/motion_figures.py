@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -27,6 +27,8 @@ LARGEST_ERROR = 0.25
 """Largest error of a damping ratio, relative to the median ratio, of a point that is drawn."""
 MOST_MODES = 3
 """Modes that are fitted together in a window."""
+ABOVE: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.0}
+"""Place of a legend that lies over no curve."""
 
 
 class Worst(NamedTuple):
@@ -66,13 +68,13 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
         predicted = factor * one.residuals.trials[worst.trial].prediction[:, column]
         axes.plot(time, predicted, one.dashes, lw=0.9, color=one.colour, label=one.label)
     axes.set(ylabel=f"{worst.channel}, {unit}", title=f"a  {worst.channel} in {item.trial.name}")
-    axes.legend(ncol=3, loc="upper right")
+    axes.legend(**ABOVE, ncol=3)
     for number, ((panel,), one) in enumerate(zip(below, shown, strict=True)):
         each = one.residuals.trials[worst.trial]
         draw_noise(panel, factor * float(each.noise_deviation[column]), 0.3)
         panel.plot(time[used], factor * each.residual[used, column], lw=0.6, color=one.colour)
         panel.set(ylabel=f"residual, {unit}", title=f"{'bc'[number]}  residual, {one.label}")
-    below[0][0].legend(loc="upper right")
+    below[0][0].legend(**ABOVE)
     figure.axes[-1].set_xlabel("time, s")
     return figure
 
@@ -107,7 +109,7 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
     axes.set(ylabel="power / white noise", title=f"residuals of {worst.channel}, all dynamic trials")
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, 0.1), max(high, 10.0))
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=2, borderaxespad=0.0)
+    axes.legend(**ABOVE, ncol=2)
     return figure
 
 

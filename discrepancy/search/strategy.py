@@ -187,10 +187,8 @@ class Search(Hypotheses):
         if self._open:
             self.shorter()
         self.settle()
-        fewer = self._open and 0 < len(self.best().candidate.terms) < self.longest
-        # what stood in for a smaller set hid what is beside it, and from there fewer may fit as well
-        if fewer and self._extended(self.best()):
-            self.shorter()
+        if self._open and 0 < len(self.best().candidate.terms) < self.longest:
+            self._extended(self.best())  # what stood in for a smaller set hid what is beside it
         self.settle()
         self.keep(elsewhere(self.problem, self.best()), exact=True)  # from other places of the structure
 
