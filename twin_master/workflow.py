@@ -259,7 +259,9 @@ def _noted(folder: Path) -> Iterator[None]:
         raise
     except Exception as error:
         error.add_note(
-            said(f"mission.{'flown' if (folder / JOURNAL_NAME).exists() else 'begun'}", folder=folder)
+            said("mission.flown", folder=folder)
+            if (folder / JOURNAL_NAME).exists()
+            else said("mission.begun")
         )
         raise
 
