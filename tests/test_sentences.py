@@ -19,10 +19,11 @@ def test_every_sentence_is_said_with_its_values(package):
     for path in (ROOT / package).rglob("*.py"):
         for call in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "said":
-                name, given = ast.literal_eval(call.args[0]), {item.arg for item in call.keywords}
-                wanted = {
-                    key.split(".")[0].split("[")[0] for _, key, _, _ in Formatter().parse(known[name]) if key
-                }
-                assert wanted == given or (None in given and given - {None} <= wanted), (path.name, name)
-                said.add(name)
+                first, given = call.args[0], {item.arg for item in call.keywords}
+                either = (first.body, first.orelse) if isinstance(first, ast.IfExp) else (first,)
+                names = [ast.literal_eval(item) for item in either]
+                fields = (key for name in names for _, key, _, _ in Formatter().parse(known[name]) if key)
+                wanted = {key.split(".")[0].split("[")[0] for key in fields}
+                assert wanted == given or (None in given and given - {None} <= wanted), (path.name, names)
+                said.update(names)
     assert said == known.keys()
