@@ -8,9 +8,12 @@ from typing import Any
 
 from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
 
-_PART = r"""(?:[\w-]++|"(?:[^"\\\n]++|\\.)*+"|'[^'\n]*+')"""
-_DEEP_KEY = re.compile(rf"(?<![\w\\.-])(?:{_PART}[ \t]*+\.[ \t]*+){{{DEEPEST_NESTING}}}")
-"""A dotted key of too many parts; it begins at no other place of a word, which is gone over once."""
+_PART = r"""(?:[\w-]++|"(?:[^"\\\n]++|\\.)*+"?+|'[^'\n]*+'?+)"""
+_TEXT = (
+    r'''#[^\n]*+|"""(?:[^"\\]++|\\[\s\S]|"(?!""))*+(?:"""|\Z)|''' + r"""'''(?:[^']++|'(?!''))*+(?:'''|\Z)"""
+)
+_KEYS = re.compile(rf"{_TEXT}|({_PART}(?:[ \t]*+\.[ \t]*+{_PART})*+)")
+"""Comments and texts of several lines, then words and dotted keys; each is gone over once, however long."""
 
 LONGEST_ARRAY = 90
 """Characters of an array that stands in one line."""
@@ -45,8 +48,11 @@ def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> dic
 
 
 def _parsed(text: str, subject: str, error: type[Exception]) -> dict[str, Any]:
-    if _DEEP_KEY.search(text):  # the time that `tomllib` takes for it grows with the square of its parts
-        raise error(too_deep(subject))
+    # The time that `tomllib` takes for a dotted key grows with the square of its parts.
+    if any(line.count(".") >= DEEPEST_NESTING for line in text.split("\n")):
+        keys = (found[1] or "" for found in _KEYS.finditer(text))
+        if any(key.count(".") >= DEEPEST_NESTING < len(re.findall(_PART, key)) for key in keys):
+            raise error(too_deep(subject))
     try:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as cause:

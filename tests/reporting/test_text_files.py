@@ -73,6 +73,9 @@ def test_the_deepest_document_that_is_allowed_is_read() -> None:
     assert parse_toml(text, "the draft", WrongFileError)["x"]
     with refused(WrongFileError, r"^the draft is nested deeper"):
         parse_toml(text.replace("[", "[[").replace("]", "]]"), "the draft", WrongFileError)
+    words = "one.two." * 20
+    told = parse_toml(f'# {words}\ntext = "{words}"\nlines = """\n{words}"""', "the draft", WrongFileError)
+    assert told == {"text": words, "lines": words}  # these are no keys
 
 
 # ---------------------------------------------------------------- tables

@@ -17,6 +17,7 @@ from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.store.mission_result import SCHEMA
 from twin_master.store.summary import find_fallback
 
@@ -180,9 +181,11 @@ def open_group(folder: Path, group: str) -> "xr.Dataset":
 
     try:
         found: xr.Dataset = xr.open_zarr(folder / STORE_NAME, group=group, chunks=None, consolidated=False)
-        return found
     except (OSError, KeyError, ValueError) as error:
         raise FleetError(f"{folder} holds no group {group} of a fleet ({error}).") from error
+    if missing := SCHEMA["fleet"].keys() - found.keys():
+        raise FleetError(said("fleet.other_layout", folder=folder, missing=", ".join(sorted(missing))))
+    return found
 
 
 def create_store(folder: Path, fleet: Fleet) -> None:

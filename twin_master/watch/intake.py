@@ -214,6 +214,12 @@ class Intake:
                 self._sort(twin, message)
             except Refused as refusal:
                 self._refuse(str(refusal))
+            if not self._pending and self.look is not None:  # silence among messages that are not taken
+                self._waiting = False
+                self.look()
+                self._waiting = True
+                if self.asked:
+                    return None
         turn, reading, given = self._pending.popleft()
         self.observation_turn = turn
         self._known = self._unreadable

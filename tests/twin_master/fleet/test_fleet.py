@@ -1,6 +1,7 @@
 """Fleets: plan, shards, store, what goes on after a kill, and what is refused."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -219,6 +220,9 @@ def test_the_command_line(library_file, tmp_path):
     said(*words, "3:5", "--out", tmp_path / "b")
     compared = json.loads(said("compare", tmp_path / "a", tmp_path / "b", "--json"))
     assert [group["twins"] for group in compared.values()] == [3, 2]
+    (notices,) = (tmp_path / "b" / "fleet.zarr").glob("*/notices")
+    shutil.rmtree(notices)
+    assert "lacks notices: fly the fleet again" in refused("compare", tmp_path / "a", tmp_path / "b")
     for wrong in (("--seeds", "0:3", "--seed", 1), ("--workers", 2)):
         refused("run", "growing_damage", *wrong, code=2)
 

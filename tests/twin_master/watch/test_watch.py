@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -38,7 +39,7 @@ from twin_master.mission.turns import History
 from twin_master.network.estimator import ExactFilter
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run as stored_run
-from twin_master.watch.feeds import CsvFeed, FolderFeed, JsonLinesFeed, file_feed
+from twin_master.watch.feeds import CsvFeed, FolderFeed, JsonLinesFeed, MappingFeed, file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.intake import Feed
 from twin_master.watch.message import Message
@@ -519,3 +520,15 @@ def test_a_slip_of_the_pen_makes_no_folder(scenario, recorded, whole, tmp_path):
         again = ("watch", scenario.path, "--out", copy, "--replace", "--observations", source)
         assert "choose another --out" in command(*again).stderr
     check_same(copy, whole, JOURNAL_NAME)
+
+
+def test_silence_is_told_among_messages_that_are_all_refused(base, tmp_path):
+    watch, told = soon_quiet(begun(base, tmp_path / "watch")), list[dict[str, Any]]()
+
+    def flood():
+        end = time.monotonic() + 60.0
+        while not told and time.monotonic() < end:
+            yield {"turn": 0, "no_sensor": 1.0}
+
+    watch.run(MappingFeed(flood(), watch.scenario), told.append)
+    assert [notice["kind"] for notice in told[0]["notices"]] == ["quiet"]
