@@ -4,7 +4,7 @@ Coloured noise is whitened by an autoregression fitted to the record, so that sa
 are not counted as evidence. Lines of the mains are taken out first: they are an effect, not noise.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil, inf
@@ -309,24 +309,3 @@ def _repeats(first: Trial, second: Trial) -> bool:
         np.max(np.abs(one - other)) <= SAME_INPUT * np.max(np.abs(one))
         for one, other in zip(acting(first), acting(second), strict=True)
     )
-
-
-def with_noise(
-    channel: Channel,
-    recorded: Mapping[str, NoiseRecord],
-    stated: NoiseRecord | None,
-    trials: Sequence[Trial],
-) -> tuple[NoiseRecord | None, str]:
-    """Return a channel's noise record and a remark (empty if there is nothing to say).
-
-    Samples at rest come first, then what is stated, then repeats: repeats hold whatever differs from trial to
-    trial (a zero that drifts, a seating), which may be the effect that is looked for.
-    """
-    if channel.name in recorded:
-        return recorded[channel.name], ""
-    if stated is not None:
-        return stated, ""
-    found = repeat_record(channel, trials)
-    if found is not None:
-        return found, said("remarks.repeats", channel=channel, found=found)
-    return None, ""  # said by the checks
