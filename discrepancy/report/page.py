@@ -17,7 +17,7 @@ from discrepancy.self_calibration import outcomes
 from discrepancy.verdict import Proof, Scores, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page, ReportFigure
-from reporting.words import listing
+from reporting.words import listing, plus_minus
 
 SHOWN_HYPOTHESES = 8
 NINETY = 1.6449
@@ -76,8 +76,7 @@ def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
 
 
 def _beside(value: float, deviation: float) -> str:
-    show = words.rounded(value, NINETY * deviation)
-    return f"{show(value)} ± {show(NINETY * deviation)}" if deviation > 0.0 else f"{value:.6g}, exact"
+    return plus_minus(value, NINETY * deviation) if deviation > 0.0 else f"{value:.6g}, exact"
 
 
 _SCORES: dict[str, Callable[[Scores], str]] = {
