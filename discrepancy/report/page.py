@@ -158,15 +158,11 @@ def add_origin(page: Page, origin: Origin) -> None:
     page.add_section("Where it comes from")
     provenance = origin.provenance
     rows = [
-        ("campaign", f"{origin.campaign}, SHA-256 {origin.data_hash}"),
-        ("model", f"{origin.model}, SHA-256 {origin.model_hash}"),
-        ("command", origin.short_command),
-        ("seed", str(provenance.seed)),
         *((f"input {name}", f"SHA-256 {value}") for name, value in provenance.input_hashes.items()),
         ("software", ", ".join(f"{name} {version}" for name, version in provenance.versions.items())),
         ("sources", ", ".join(f"{name} {value[:12]}" for name, value in provenance.source_hashes.items())),
     ]
-    WORDS.add_table(page, "origin", rows)
+    WORDS.add_table(page, "origin", rows, origin=origin)
 
 
 def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dict[str, ReportFigure]) -> str:
