@@ -131,9 +131,7 @@ class FmuModel(DescribedModel):
         if trial.is_dynamic:
             return Response(*self._moving(trial, conditions, patch, columns, orders))
         if any(quantity.order > 0 for _, quantity in outputs):
-            raise ModelError(
-                f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
-            )
+            raise ModelError(said("models.speed_at_rest", trial=trial))
         return Response(self._at_rest(trial, conditions, patch)[:, columns])
 
     def _read(self, outputs: Outputs) -> tuple[list[int], list[int]]:
@@ -158,11 +156,8 @@ class FmuModel(DescribedModel):
         offsets, given = conditions.offset or (0.0,) * len(trial.inputs), dict[str, FloatArray]()
         for item, offset in zip(trial.inputs, offsets, strict=True):
             if item.name not in self._inputs:
-                raise ModelError(
-                    f"The trial {trial.name!r} holds the input {item.name!r}, which the FMU model "
-                    f"{self.name!r} does not have; it has {', '.join(self._inputs) or 'none'}: name it in "
-                    "[[input]]."
-                )
+                known = ", ".join(self._inputs) or "none"
+                raise ModelError(said("models.no_input", trial=trial, item=item, model=self, known=known))
             variable = self._inputs[item.name]
             given[variable] = self.fmu.input_factors[variable] * (item.values + offset)
         if trial.kind is TrialKind.FLIGHT:
@@ -240,9 +235,7 @@ class FmuModel(DescribedModel):
         """Return the inputs that a force at a place of a patch pushes, each with its lever."""
         inputs, load = self.description.inputs, self._load(patch)
         if load.along_chord and inputs.torque is None:
-            raise ModelError(
-                f"The FMU model {self.name!r} names no torque in [inputs], so no load moves along the chord."
-            )
+            raise ModelError(said("models.no_torque", model=self))
         moments = ((inputs.bending_moment, load.along_span), (inputs.torque, load.along_chord))
         place = place_among([*self._forces], trial.load_place, self.what, f"the trial {trial.name!r}")
         levers = {self.fmu.variable(name): lever for name, lever in moments if name is not None and lever}

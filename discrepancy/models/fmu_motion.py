@@ -196,12 +196,8 @@ class FmuMotion(FmuPace):
                 self._refinements[key] = (parts, strength)
                 return parts
             parts *= 2
-        raise ModelError(
-            f"The internal force at {', '.join(dict.fromkeys(laws.ports))} does not converge in the "
-            f"co-simulation with the FMU model {self.description.name!r}: halving steps of "
-            f"{2.0 * step / parts:.2g} s still changes the motion by {change:.1g} of its size; the force is "
-            f"too stiff for the port."
-        )
+        at, step = ", ".join(dict.fromkeys(laws.ports)), 2.0 * step / parts
+        raise ModelError(said("models.too_stiff", at=at, model=self, step=step, change=change))
 
     # ------------------------------------------------------------ rest
 
@@ -281,10 +277,9 @@ class FmuMotion(FmuPace):
             change, linear = np.abs(again - linear).max(axis=1), again
             if np.all(change <= STATIC_TOLERANCE * np.maximum(np.abs(again).max(axis=1), 1e-300)):
                 return values
+        names, level = ", ".join(dict.fromkeys(laws.ports)), int(np.argmax(change)) + 1
         raise ModelError(
-            f"The law at {', '.join(dict.fromkeys(laws.ports))} and the FMU model "
-            f"{self.description.name!r} did not agree at load level {int(np.argmax(change)) + 1} of "
-            f"{trial!r} within {STATIC_ITERATIONS} iterations; the force is too strong for the FMU."
+            said("models.too_strong", at=names, model=self, level=level, trial=trial, most=STATIC_ITERATIONS)
         )
 
 

@@ -245,9 +245,7 @@ class FmuPace(FmuRuns):
         moving = moving - moving[-len(moving) // 4 :].mean(axis=0)
         lines, power = periodogram(moving, 1.0 / case.step, "hann", 4 * len(moving), False, axis=0)
         if not np.any(power):
-            raise ModelError(
-                f"The FMU model {self.description.name!r} does not move; state angular_frequency in [scales]."
-            )
+            raise ModelError(said("models.silent", model=self))
         return 2.0 * np.pi * float(max(lines[1], lines[np.argmax(power.max(axis=1))]))
 
     def usual(self, trial: Trial) -> tuple[float, float]:

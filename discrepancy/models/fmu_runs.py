@@ -14,6 +14,7 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.interface import Memory
+from discrepancy.sentences import said
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector, expand, load_binding
 from fmu_asset.door.session import FmiAsset
@@ -175,10 +176,8 @@ class FmuRuns:
         for item in given.output:
             names, variables = expand(item.name), expand(item.variable)
             if len(names) != len(variables):
-                raise ModelError(
-                    f"The FMU model {given.name!r}: the output {item.name!r} stands for "
-                    f"{counted(len(names), 'name')}, but its variable for {len(variables)}; give as many."
-                )
+                came = counted(len(names), "name"), len(variables)
+                raise ModelError(said("models.as_many", model=given, item=item, came=came))
             self.quantities |= dict.fromkeys(names, item.quantity)
             pairs = zip(names, variables, strict=True)
             shown += [(name, variable, self._unit(item.quantity, variable)) for name, variable in pairs]
@@ -243,12 +242,8 @@ class FmuRuns:
                 return np.asarray(0.5 * (high + low))
             if waited >= rest.limit:
                 worst = int(np.argmax((high - low) / np.where(largest > 0.0, largest, 1.0)))
-                raise ModelError(
-                    f"The FMU {self._path} did not come to rest within {rest.limit:g} s: the output "
-                    f"{self._binding.observation_variables[worst]!r} still moves by "
-                    f"{high[worst] - low[worst]:.2g}; raise `limit` or `tolerance` in "
-                    "[static], or give the FMU's parameters for a state at rest there."
-                )
+                output, moves = self._binding.observation_variables[worst], high[worst] - low[worst]
+                raise ModelError(said("models.unrest", fmu=self._path, rest=rest, output=output, moves=moves))
 
     def begun(self, run: Run) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
         """Return an instance at the begin of a motion, its outputs there, and the inputs (steps,) to come.

@@ -278,23 +278,16 @@ class Model(ABC):
 
     def check(self, trial: Trial) -> None:
         """Refuse a trial that it cannot follow."""
-        name = f"The trial {trial.name!r}"
-        if trial.kind is TrialKind.FLIGHT and trial.kind not in self.kinds:
-            raise ModelError(f"{name} is a flight, but {self.what} has no input load_factor: give it one.")
-        if trial.kind not in self.kinds and trial.kind is TrialKind.RINGDOWN:
-            raise ModelError(said("models.free_ringdown", name=name, model=self))
+        for kind, why in ((TrialKind.FLIGHT, "models.flight"), (TrialKind.RINGDOWN, "models.free_ringdown")):
+            if trial.kind is kind and kind not in self.kinds:
+                raise ModelError(said(why, trial=trial, model=self))
         driven = trial.kind is TrialKind.DRIVEN
         if TrialKind.DRIVEN not in self.kinds and (driven or trial.begins is not Start.SETTLED):
-            raise ModelError(
-                f"{name} {'is driven' if driven else f'begins {trial.begins.value}'}, which {self.what} "
-                "cannot follow: describe the rig as a lumped model, or record it forced from rest."
-            )
+            how = "is driven" if driven else f"begins {trial.begins.value}"
+            raise ModelError(said("models.driven", trial=trial, how=how, model=self))
         if trial.kind is TrialKind.STATIC and trial.inputs and not self.holds_inputs:
-            raise ModelError(
-                f"{name} is static under the inputs {', '.join(map(repr, trial.input_names))}, which "
-                f"{self.what} does not have at rest: describe the asset as an FMU model with [[input]], or "
-                'record the trial as "driven".'
-            )
+            names = ", ".join(map(repr, trial.input_names))
+            raise ModelError(said("models.static_inputs", trial=trial, names=names, model=self))
 
     def check_outputs(self, outputs: Outputs) -> None:
         """Refuse outputs that it does not have, or that no channel can measure so."""
@@ -304,10 +297,7 @@ class Model(ABC):
                 known = ", ".join(self.shown_outputs)
                 raise ModelError(f"{capital(self.what)} has no output {output!r}; it has {known}.")
             if not quantity.shows(own):
-                raise ModelError(
-                    f"The output {output!r} of {self.what} is a {own.value}, but a channel measures "
-                    f"{quantity.value}."
-                )
+                raise ModelError(said("models.measured", output=output, model=self, own=own, by=quantity))
 
     def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
         """Return the losses of its regions in each row from those (N, K) that a trial names.
@@ -319,10 +309,8 @@ class Model(ABC):
             if name in self.regions:
                 losses[:, self.regions.index(name)] = column
             elif np.any(column):
-                raise ModelError(
-                    f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but {self.what} "
-                    f"has {', '.join(self.regions) or 'none'}."
-                )
+                known = ", ".join(self.regions) or "none"
+                raise ModelError(said("models.no_region", trial=trial, name=name, model=self, known=known))
         return [tuple(row) for row in losses.tolist()]
 
     @property

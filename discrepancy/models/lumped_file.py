@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.errors import ModelError
 from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
+from discrepancy.sentences import said
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.laws.interface import PortForce
@@ -161,9 +162,7 @@ class LawSection(Section):
     def _is_a_law(self) -> Self:
         known = [law.kind for law in LAWS]
         if self.kind not in known:
-            raise ValueError(
-                f"the law {self.name!r} has the kind {self.kind!r}, but known are {', '.join(known)}"
-            )
+            raise ValueError(said("models.law", law=self, known=", ".join(known)))
         try:
             self.scaled(1.0).check()
         except InvalidPatchError as cause:
@@ -389,16 +388,11 @@ class LumpedDescription(ModelDescription):
             push, capacity = np.array(item.acts), np.sum([*self.given("capacity").values()], axis=0)
             of_states = not any(row[:n]) and not any(push[:n])
             if not of_states or row[n:] @ np.linalg.solve(capacity, push[n:]) <= 0.0:
-                raise ValueError(
-                    f"`acts` of the port {item.name!r} is for states, and must take from what its vector sees"
-                )
+                raise ValueError(said("models.acts", port=item))
         if isinstance(item, ControllerSection):
             order = item.quantity.order + any(row[n:])
             if item.quantity.order == 2 or (item.derivative and order > 0):
-                raise ValueError(
-                    f"the controller {item.name!r} cannot follow an acceleration, nor the derivative of a "
-                    "speed or of a state: leave `derivative` out"
-                )
+                raise ValueError(said("models.controller_speed", controller=item))
 
     def _check_names(self) -> None:
         """Refuse names that are there twice, and those that name nothing."""

@@ -25,6 +25,7 @@ from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.motion import Motion, motion_of
 from discrepancy.models.port_scales import Ports
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
+from discrepancy.sentences import said
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
@@ -154,10 +155,7 @@ class SystemModel(Model):
         acting = Acting(trial.time, conditions.stamps(trial.time), begins=trial.begins)
         if trial.kind is TrialKind.RINGDOWN:
             if len(patch.of(PortLoad)):
-                raise ModelError(
-                    f"The trial {trial.name!r} is a ring-down, which no force with a course in time can act "
-                    'on; say kind = "driven" and begins = "unknown".'
-                )
+                raise ModelError(said("models.forced_ringdown", trial=trial))
             release = self.force_row(trial.load_place, state), release_of(trial)
             return replace(acting, release=release, initial=conditions.initial)
         loads, drives = self.pushes(case)
@@ -213,10 +211,7 @@ class SystemModel(Model):
             n = system.displacements
             for (_, quantity), item in zip(outputs, shown, strict=True):
                 if np.any(item.rows[2:, n:]) or (quantity.order > 0 and np.any(item.rows[1:, :n])):
-                    raise ModelError(
-                        f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
-                        "acceleration."
-                    )
+                    raise ModelError(said("models.speed_at_rest", trial=trial))
             seen = np.array([np.concatenate((item.rows[0, :n], item.rows[1, n:])) for item in shown])
             try:
                 values[rows], memory = system.static(units, laws, given, memory, before, seen=seen)
