@@ -1,8 +1,12 @@
-"""How much memory this process may still take."""
+"""Results that are kept in memory, and how much memory this process may still take."""
 
 import contextlib
 import math
+from collections.abc import Callable, Hashable
 from pathlib import Path
+from typing import Any, TypeVar
+
+_Value = TypeVar("_Value")
 
 
 def memory_left() -> float:
@@ -19,3 +23,40 @@ def memory_left() -> float:
         files = float(parts.split("\ninactive_file ")[1].split()[0])  # kept of files until memory is wanted
         left = min(left, float(limit) - float(used) + files)
     return left
+
+
+class Memory:
+    """Results by key, the least recently used forgotten where there are more than `size`.
+
+    `weight` says how much of the size a result takes; one each if it is left out. `end` is called with each
+    that is forgotten.
+    """
+
+    def __init__(
+        self, size: int = 256, weight: Callable[[Any], int] = lambda _: 1,
+        end: Callable[[Any], None] = lambda _: None,
+    ) -> None:  # fmt: skip
+        self._room, self._weight, self._end = size, weight, end
+        self._values: dict[Hashable, Any] = {}
+
+    def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
+        """Return what `make` returned for `key`, calling it if need be."""
+        if key in self._values:
+            found: _Value = self._values.pop(key)
+            self._values[key] = found
+            return found
+        value = self._values[key] = make()
+        self._room -= self._weight(value)
+        while self._room < 0 and len(self._values) > 1:
+            self._forget()
+        return value
+
+    def clear(self) -> None:
+        """Forget all results."""
+        while self._values:
+            self._forget()
+
+    def _forget(self) -> None:
+        value = self._values.pop(next(iter(self._values)))
+        self._room += self._weight(value)
+        self._end(value)

@@ -11,14 +11,14 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course, LoadChange, divided, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion, Sampled
-from discrepancy.models.fmu_pace import Case
-from discrepancy.models.fmu_runs import State
+from discrepancy.models.fmu_system import Case
 from discrepancy.models.interface import NO_PATCH, Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.model_file import DescribedModel
 from discrepancy.models.scales import PortScale, Scales, campaign_sizes
 from discrepancy.sentences import said
 from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
+from fmu_asset.door.runs import State
 
 
 class FmuModel(DescribedModel):
@@ -47,14 +47,15 @@ class FmuModel(DescribedModel):
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
         self.description: FmuModelDescription = description
         self.fmu = fmu = FmuMotion(description, Path(folder))
-        super().__init__(description, fmu.quantities)
+        self.names = names = fmu.names
+        super().__init__(description, names.quantities)
         self.length, self.regions = description.scales.length, tuple(description.inputs.regions)
         self.stations = None if self.length is None else (0.0, self.length)
         flies = description.inputs.load_factor is not None
         self.kinds = frozenset(TrialKind) - {TrialKind.DRIVEN, *(() if flies else (TrialKind.FLIGHT,))}
-        self._keys = [fmu.parameter(item.variable) for item in description.parameter]
-        self._forces = {place: fmu.variable(name) for place, name in description.inputs.force.items()}
-        self._inputs = {item.name: fmu.variable(item.variable) for item in description.input}
+        self._keys = [names.parameter(item.variable) for item in description.parameter]
+        self._forces = {place: names.variable(name) for place, name in description.inputs.force.items()}
+        self._inputs = {item.name: names.variable(item.variable) for item in description.input}
         self.load_places = tuple(self._forces)
         limits = (fmu.asset.input_range("load", name)[1] for name in self._forces.values())
         self.largest_force = 0.5 * min(limits, default=np.inf)
@@ -137,7 +138,7 @@ class FmuModel(DescribedModel):
     def _read(self, outputs: Outputs) -> tuple[list[int], list[int]]:
         """Return the columns of outputs, and how often each is derived."""
         orders = [quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs]
-        return [self.fmu.columns[output] for output, _ in outputs], orders
+        return [self.names.columns[output] for output, _ in outputs], orders
 
     def _moving(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch, columns: list[int], orders: list[int],
@@ -159,9 +160,9 @@ class FmuModel(DescribedModel):
                 known = ", ".join(self._inputs) or "none"
                 raise ModelError(said("models.no_input", trial=trial, item=item, model=self, known=known))
             variable = self._inputs[item.name]
-            given[variable] = self.fmu.input_factors[variable] * (item.values + offset)
+            given[variable] = self.names.input_factors[variable] * (item.values + offset)
         if trial.kind is TrialKind.FLIGHT:
-            given = {self.fmu.variable(str(self.description.inputs.load_factor)): trial.load_factor}
+            given = {self.names.variable(str(self.description.inputs.load_factor)): trial.load_factor}
         elif not given or np.any(trial.force):
             acting = self._load(patch).changed(trial.force, trial.force)
             given |= {name: acting * lever for name, lever in self._levers(trial, patch).items()}
@@ -185,12 +186,8 @@ class FmuModel(DescribedModel):
             for conditions in [Conditions(values, health=trial.health[:1])]
         )
         columns, numbers = np.array(fmu.x, dtype=np.int64), np.arange(len(fmu.x))
-        if (
-            base is None
-            or found is None
-            or len(base.push) != len(found.push)
-            or found.jumps(columns, numbers)
-        ):
+        same = base and found and len(base.push) == len(found.push)
+        if not (base and found and same) or found.jumps(columns, numbers):
             raise ModelError(said("models.unseen_ports", model=self))
         found = found.in_state_of(base)
         (position, _), (speed, _) = (found.rows(fmu.x, order) for order in (0, 1))
@@ -238,22 +235,22 @@ class FmuModel(DescribedModel):
             raise ModelError(said("models.no_torque", model=self))
         moments = ((inputs.bending_moment, load.along_span), (inputs.torque, load.along_chord))
         place = place_among([*self._forces], trial.load_place, self.what, f"the trial {trial.name!r}")
-        levers = {self.fmu.variable(name): lever for name, lever in moments if name is not None and lever}
+        levers = {self.names.variable(name): lever for name, lever in moments if name is not None and lever}
         return {self._forces[place]: 1.0} | levers
 
     def _state(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH, row: int = 0
     ) -> State:
         """Return parameters and constant inputs of a row of a trial, with what the FMU carries of a patch."""
-        fmu, wanted, effects = self.fmu, self.description.inputs, self.description.effects
+        names, wanted, effects = self.names, self.description.inputs, self.description.effects
         losses = self.losses(trial, conditions.health)
         health = zip(wanted.regions.values(), losses[min(row, len(losses) - 1)], strict=True)
-        inputs = {fmu.variable(name): value for name, value in health}
+        inputs = {names.variable(name): value for name, value in health}
         if wanted.temperature is not None:
             warm = float(trial.temperature[0 if trial.is_dynamic else row])
-            inputs[fmu.variable(wanted.temperature)] = (wanted.temperature_reference or 0.0) + warm
+            inputs[names.variable(wanted.temperature)] = (wanted.temperature_reference or 0.0) + warm
         table = self.description.motion if trial.is_dynamic else self.description.static
-        parameters = {fmu.parameter(name): value for name, value in table.parameters.items()}
+        parameters = {names.parameter(name): value for name, value in table.parameters.items()}
         parameters |= dict(zip(self._keys, conditions.parameters.tolist(), strict=True))
         for item in (item for item in patch if item.kind in effects):
             effect = f"effect.{effects[item.kind]}"

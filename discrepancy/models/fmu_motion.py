@@ -16,8 +16,7 @@ from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Load
 from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.fmu_pace import LINEAR, RECORD, Case, FmuPace
-from discrepancy.models.fmu_runs import Run, State
+from discrepancy.models.fmu_system import LINEAR, RECORD, Case, FmuPace
 from discrepancy.sentences import said
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import PLACE
@@ -26,6 +25,7 @@ from fe.runtime.motion import Laws, static_solution
 from fe.runtime.motion_arrays import ModalMotion
 from fe.runtime.motion_arrays import State as Moving
 from fe.runtime.stepwise import ALIKE, Boundaries, steps_under
+from fmu_asset.door.runs import Run, State
 
 CONVERGED = 1e-4
 """Largest rms change of a motion with laws when steps are halved, as a share of the largest motion."""
@@ -206,8 +206,9 @@ class FmuMotion(FmuPace):
 
         Where the FMU has to come to rest and is linear, what loads add is that of its system.
         """
-        if not self.description.static.settle:
-            return self.resting(states, loads)
+        how = self.description.static
+        if not how.settle:
+            return self.resting(states, loads, how.step, settle=False)
         names = tuple(sorted(name for name, values in loads.items() if np.any(values)))
         rows = np.array([loads[name] for name in names]).reshape(-1, len(states)).T
         order = np.argsort(-np.abs(rows).sum(axis=1), kind="stable")  # the largest load says whether it is
@@ -216,12 +217,13 @@ class FmuMotion(FmuPace):
 
     def _rested(self, state: State, amounts: FloatArray, names: tuple[str, ...]) -> FloatArray:
         """Return the outputs (C,) when a motion has come to rest under amounts (E,) on some inputs."""
+        step = self.description.static.step
 
         def asked(amounts: FloatArray) -> FloatArray:
             loads, key = dict(zip(names, amounts[:, None], strict=True)), (state, names, amounts.tobytes())
-            return self.remembered(key, lambda: self.resting([state], loads)[0])
+            return self.remembered(key, lambda: self.resting([state], loads, step, settle=True)[0])
 
-        case = Case(state, self.description.static.step, RECORD, names, at_rest=True)
+        case = Case(state, step, RECORD, names, at_rest=True)
         if self._adds.get(names) is False or (system := self.system(case)) is None:
             return asked(amounts)
         zero, moved = asked(0.0 * amounts), system.gain @ amounts

@@ -1,11 +1,11 @@
 """What the workflow asks of a model: structural response under a patch, before any sensor touches it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from discrepancy.sentences import said
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.state import Losses
+from reporting.memory import Memory
 from reporting.words import brief, capital, counted
 
 Place = str | tuple[float, float]
@@ -24,44 +25,6 @@ MOVES, TURNS, EITHER = ("N", "m"), ("N m", "rad"), ("N or N m", "m or rad")
 """Units of a force and of a motion at a port."""
 KEPT = 400
 """Responses that a model keeps; the oldest goes first."""
-_Value = TypeVar("_Value")
-
-
-class Memory:
-    """Results by key, the least recently used forgotten where there are more than `size`.
-
-    `weight` says how much of the size a result takes; one each if it is left out. `end` is called with each
-    that is forgotten.
-    """
-
-    def __init__(
-        self, size: int = 256, weight: Callable[[Any], int] = lambda _: 1,
-        end: Callable[[Any], None] = lambda _: None,
-    ) -> None:  # fmt: skip
-        self._room, self._weight, self._end = size, weight, end
-        self._values: dict[Hashable, Any] = {}
-
-    def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
-        """Return what `make` returned for `key`, calling it if need be."""
-        if key in self._values:
-            found: _Value = self._values.pop(key)
-            self._values[key] = found
-            return found
-        value = self._values[key] = make()
-        self._room -= self._weight(value)
-        while self._room < 0 and len(self._values) > 1:
-            self._forget()
-        return value
-
-    def clear(self) -> None:
-        """Forget all results."""
-        while self._values:
-            self._forget()
-
-    def _forget(self) -> None:
-        value = self._values.pop(next(iter(self._values)))
-        self._room += self._weight(value)
-        self._end(value)
 
 
 @dataclass(frozen=True)
