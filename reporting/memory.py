@@ -25,19 +25,26 @@ def memory_left() -> float:
     return left
 
 
+def _alike(_: object) -> int:
+    return 1
+
+
 class Memory:
     """Results by key, the least recently used forgotten where there are more than `size`.
 
     `weight` says how much of the size a result takes; one each if it is left out. `end` is called with each
-    that is forgotten.
+    that is forgotten. Another process is handed none of them.
     """
 
     def __init__(
-        self, size: int = 256, weight: Callable[[Any], int] = lambda _: 1,
-        end: Callable[[Any], None] = lambda _: None,
-    ) -> None:  # fmt: skip
-        self._room, self._weight, self._end = size, weight, end
+        self, size: int = 256, weight: Callable[[Any], int] = _alike, end: Callable[[Any], object] = _alike
+    ) -> None:
+        self._size, self._weight, self._end = size, weight, end
         self._values: dict[Hashable, Any] = {}
+        self._taken = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_values": {}, "_taken": 0}
 
     def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
         """Return what `make` returned for `key`, calling it if need be."""
@@ -46,8 +53,8 @@ class Memory:
             self._values[key] = found
             return found
         value = self._values[key] = make()
-        self._room -= self._weight(value)
-        while self._room < 0 and len(self._values) > 1:
+        self._taken += self._weight(value)
+        while self._taken > self._size and len(self._values) > 1:
             self._forget()
         return value
 
@@ -58,5 +65,5 @@ class Memory:
 
     def _forget(self) -> None:
         value = self._values.pop(next(iter(self._values)))
-        self._room += self._weight(value)
+        self._taken -= self._weight(value)
         self._end(value)

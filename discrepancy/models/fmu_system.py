@@ -3,6 +3,7 @@
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from math import ceil
 from pathlib import Path
 from types import MappingProxyType
@@ -108,7 +109,7 @@ class FmuSystem:
     outputs: FloatArray
     direct: FloatArray
     starts: FloatArray
-    _kept: Memory = field(default_factory=lambda: Memory(KEPT), init=False, repr=False)
+    _kept: Memory = field(default_factory=partial(Memory, KEPT), init=False, repr=False)
 
     def in_state_of(self, base: "FmuSystem") -> "FmuSystem":
         """Return the same system in the state of another of its order.
@@ -253,9 +254,10 @@ class FmuPace(FmuRuns):
         with self.refusals():
             self.names = names = FmuVariables(description, folder)
             super().__init__(names.path, names.binding, description.isolated, rest.limit, rest.tolerance)
+            door = self.asset
             for item in description.parameter:  # beyond its range it refuses, and a posterior is cut there
                 for end in (item.low, item.high):
-                    self.asset.check_parameters({names.parameter(item.variable): end})
+                    door.check_parameters({names.parameter(item.variable): end})
         self.ports = [port.name for port in description.port]
         self.forces = [names.variable(port.force) for port in description.port]
         self.x = [names.columns[f"port.{port}.displacement"] for port in self.ports]

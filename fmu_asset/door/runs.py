@@ -2,9 +2,11 @@
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -64,15 +66,6 @@ class FmuRuns:
     tolerance : float
         At rest, no output moves by more than this share of its largest value.
 
-    Attributes
-    ----------
-    asset : FmiAsset
-        The door to the FMU, for what it declares.
-
-    Raises
-    ------
-    FmuError
-        If the FMU is missing, or the binding does not fit it.
     """
 
     refusals: Callable[[], AbstractContextManager[None]] = nullcontext
@@ -80,9 +73,18 @@ class FmuRuns:
 
     def __init__(self, path: Path, binding: Binding, isolated: bool, limit: float, tolerance: float) -> None:
         self._of, self._limit, self._tolerance = (path, binding, isolated), limit, tolerance
-        self.asset = FmiAsset(path, binding, isolated=isolated)
         self._assets = Memory(MOST_INSTANCES, end=FmiAsset.close)
-        self._kept = Memory(KEPT_BYTES, lambda found: found.nbytes)
+        self._kept = Memory(KEPT_BYTES, attrgetter("nbytes"))
+
+    @cached_property
+    def asset(self) -> FmiAsset:
+        """The door to the FMU, for what it declares."""
+        path, binding, isolated = self._of
+        return FmiAsset(path, binding, isolated=isolated)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the door, which another process opens itself."""
+        return {name: value for name, value in vars(self).items() if name != "asset"}
 
     def remembered(self, key: Hashable, make: Callable[[], FloatArray]) -> FloatArray:
         """Return what `make` returned for `key`; the oldest results are forgotten."""
