@@ -14,7 +14,7 @@ from discrepancy.models.fmu_motion import FmuMotion, Sampled
 from discrepancy.models.fmu_system import Case
 from discrepancy.models.interface import NO_PATCH, Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.scales import PortScale, Scales, campaign_sizes
+from discrepancy.models.scales import PortScale, Scales
 from discrepancy.sentences import said
 from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
@@ -114,7 +114,7 @@ class FmuModel(DescribedModel):
             tip_stiffness=given.tip_stiffness or tip,
             modal_mass=given.modal_mass or modal / frequency**2,
             angular_frequency=frequency,
-            **campaign_sizes(campaign),
+            **campaign.sizes,
             ports={
                 port: PortScale(float(most) or 1.0, own, frequency, rest)
                 for port, most, (own, rest) in zip(self.ports, largest, pairs, strict=True)

@@ -16,7 +16,7 @@ from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Load
 from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.fmu_system import LINEAR, RECORD, Case, FmuPace
+from discrepancy.models.fmu_system import LINEAR, RECORD, Case, FmuPace, state_motion
 from discrepancy.sentences import said
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import PLACE
@@ -73,11 +73,9 @@ class FmuMotion(FmuPace):
         if not even:  # as many lengths of steps as stamps would take long
             stamps = case.step * np.arange(ceil(end / case.step - 1e-6) + 1.0)
         loads = [] if case.course is None else [Load(case.lever, case.course)]
-        states, forces = system.motion(
-            Acting(trial.time, stamps, loads), self._start(system, case, amounts), laws, seen, numbers,
-            still[seen], refinement,
-        )  # fmt: skip
-        rows, at_once = system.rows(columns, orders)
+        acting, start = Acting(trial.time, stamps, loads), self._start(system, case, amounts)
+        found = state_motion(system, acting, start, laws, seen, numbers, still[seen], refinement)
+        (states, forces), (rows, at_once) = found, system.rows(columns, orders)
         values = states @ rows.T + forces @ at_once.T + np.where(derived, 0.0, still[columns])
         if case.starts:  # the force that holds it until then may be seen at once
             held = [self._answer(case, name, released=True)[0] * amount for name, amount in amounts.items()]

@@ -2,15 +2,13 @@
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache
 from math import ceil
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import root_scalar
 from scipy.signal import periodogram
 
@@ -21,21 +19,18 @@ from discrepancy.models.fmu_file import FmuModelDescription, ReleaseOf
 from discrepancy.models.fmu_variables import FmuVariables
 from discrepancy.sentences import said
 from fe.compilation import compiled_kernel
-from fe.reduction.realisation import not_zero, realised
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.stepwise import Begin, advance, steps_under, substeps
 from fmu_asset.door.runs import FmuRuns, Run, State
+from fmu_asset.door.state_space import StateSpace, realised
 from fmu_asset.errors import FmuError
 from reporting.memory import Memory
 
 NONE: Any = np.zeros(0, dtype=np.int64)
-ComplexArray = NDArray[np.complex128]
-KEPT, KEPT_SYSTEMS = 16, 64
-"""Sets of ports that a system keeps, and systems that are kept."""
-JUMP = 1e-2
-"""Share of a port's speed that may come at once with a force: a solver of coarse steps shows a little."""
+KEPT = 64
+"""Systems that are kept."""
 ROUNDING = 1e-9
 """Share of the displacement at rest below which what a force moves at once is rounding."""
 LINEAR = 1e-6
@@ -92,144 +87,66 @@ class Case(NamedTuple):
         return np.array([self.levers.get(name, 0.0) for name in self.inputs])
 
 
-@dataclass(frozen=True, eq=False)
-class FmuSystem:
-    """What E forces f and R releases do to C outputs of a linear FMU, beside what it shows without.
+def state_motion(
+    system: StateSpace, acting: Acting, start: FloatArray, laws: Laws = NO_LAWS, columns: IntArray = NONE,
+    numbers: IntArray = NONE, still: FloatArray = NONE, refinement: int = 1,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Return states (N, n) and forces (N, E) of a system at the times of what acts, with laws at ports.
 
-    s' = G s + B f, y = C s + D f, f being that just before where it jumps.
+    Position and speed of a law's port are coordinates beside the state, from which they follow: so laws act
+    on this system as on any other.
 
-    Attributes
+    Parameters
     ----------
-    generator, push, outputs, direct, starts : ndarray
-        G (n, n) [1/s], B (n, E), C (C, n), D (C, E), and the states (n, R) after unit releases.
+    system : StateSpace
+        What moves.
+    acting : Acting
+        Forces, in rows (E,).
+    start : (n,) ndarray
+        State at the first time.
+    laws : Laws
+        J internal forces.
+    columns, numbers : (J,) ndarray of int
+        Column of the displacement, and number of the force, of each law's port.
+    still : (J,) ndarray
+        Position of each law's port without forces.
+    refinement : int
+        Steps with laws are this many times smaller.
     """
+    acts, modal, law = _with_ports(system, laws.ports, tuple(columns.tolist()), tuple(numbers.tolist()))
+    smooth = any(course.hold is Hold.SMOOTH for _, course, _ in acting.loads)
+    boundaries = substeps(modal, laws, acting.sampled, refinement, SMOOTH_PARTS if smooth else 1)
+    begin, end = straight(lambda time: acting.load_at(time, acts.T), boundaries.time)
+    feed, seen = acting.load_at(boundaries.time, system.direct[columns].T), system.outputs[columns[law]]
+    first = Begin(
+        np.concatenate((seen @ start + still[law], 0.0 * start)),
+        np.concatenate((seen @ system.generator @ start, start)),
+    )
+    found = advance(modal, laws, steps_under(modal, boundaries, begin, end, feed), first, compiled_kernel())
+    forces = acting.load_at(acting.sampled, np.eye(system.push.shape[1]))
+    np.subtract.at(forces.T, numbers, found.port_forces.T)
+    return found.v[:, len(law) :], forces
 
-    generator: FloatArray
-    push: FloatArray
-    outputs: FloatArray
-    direct: FloatArray
-    starts: FloatArray
-    _kept: Memory = field(default_factory=partial(Memory, KEPT), init=False, repr=False)
 
-    def in_state_of(self, base: "FmuSystem") -> "FmuSystem":
-        """Return the same system in the state of another of its order.
-
-        Outputs and their rates say what that state is: those of a structure do not change with its
-        parameters, wherever its modes go.
-        """
-        mine, others = (np.vstack((item.outputs, item.outputs @ item.generator)) for item in (self, base))
-        size = not_zero(np.linalg.norm(others, axis=1, keepdims=True))
-        way = np.linalg.lstsq(mine / size, others / size, rcond=None)[0]
-        back = np.linalg.inv(way)
-        return FmuSystem(
-            back @ self.generator @ way, back @ self.push, self.outputs @ way, self.direct, back @ self.starts
-        )
-
-    def rows(self, columns: Sequence[int], orders: Sequence[int] | int = 0) -> tuple[FloatArray, FloatArray]:
-        """Return what outputs, each derived so many times, show of the state (K, n), of forces (K, E)."""
-        row, at_once = self.outputs[columns], self.direct[columns]
-        for times in (0, 1):
-            further = np.broadcast_to(orders, len(columns))[:, None] > times
-            at_once = np.where(further, row @ self.push, at_once)
-            row = np.where(further, row @ self.generator, row)
-        return row, at_once
-
-    def at_rest(self, forces: FloatArray) -> FloatArray:
-        """Return the state (n, ...) at rest under forces (E, ...)."""
-        return np.asarray(np.linalg.solve(self.generator, -self.push @ forces))
-
-    @property
-    def gain(self) -> FloatArray:
-        """Outputs (C, E) at rest under unit forces."""
-        return np.asarray(self.direct + self.outputs @ self.at_rest(np.eye(self.push.shape[1])))
-
-    def _residues(self, column: int, number: int) -> tuple[ComplexArray, ComplexArray]:
-        """Return the rates (n,) [1/s] of the modes, and the residues of an output's answer to a force."""
-        rates, shapes = self._kept.get("modes", lambda: np.linalg.eig(self.generator))
-        into = np.linalg.solve(shapes, self.push[:, number].astype(complex))
-        return rates, (self.outputs[column] @ shapes) * into
-
-    def most_flexible(self, column: int, number: int) -> tuple[float, float] | None:
-        """Return the mode that gives an output the most at rest under a force; None if none vibrates.
-
-        Its angular frequency [rad/s], and its flexibility between the two [m/N].
-        """
-        rates, residues = self._residues(column, number)
-        frequency, vibrating = np.abs(rates), rates.imag > 1e-9 * np.abs(rates)
-        flexible = np.where(vibrating, np.abs(2.0 * rates.imag * residues) / frequency**2, 0.0)
-        best = int(np.argmax(flexible))
-        return (float(frequency[best]), float(flexible[best])) if vibrating.any() else None
-
-    def stiffness(self, column: int, number: int) -> tuple[float, float]:
-        """Return the stiffness of the most flexible mode between output and force, and that at rest [N/m]."""
-        at_rest, mode = 1.0 / float(self.gain[column, number]), self.most_flexible(column, number)
-        return (at_rest if mode is None or mode[1] * at_rest < 1e-6 else 1.0 / mode[1]), at_rest
-
-    def jumps(self, columns: IntArray, numbers: IntArray) -> bool:
-        """Whether the speed of an output jumps with its force, so that laws there find no mass."""
-        found = (self._residues(*pair)[1] for pair in zip(columns, numbers, strict=True))
-        return any(abs(item.sum()) > JUMP * np.abs(item).sum() for item in found)
-
-    # ------------------------------------------------------------ motion
-
-    def motion(
-        self, acting: Acting, start: FloatArray, laws: Laws = NO_LAWS, columns: IntArray = NONE,
-        numbers: IntArray = NONE, still: FloatArray = NONE, refinement: int = 1,
-    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-        """Return states (N, n) and forces (N, E) at the times of what acts, with laws at ports.
-
-        Position and speed of a law's port are coordinates beside the state, from which they follow: so laws
-        act on this system as on any other.
-
-        Parameters
-        ----------
-        acting : Acting
-            Forces, in rows (E,).
-        start : (n,) ndarray
-            State at the first time.
-        laws : Laws
-            J internal forces.
-        columns, numbers : (J,) ndarray of int
-            Column of the displacement, and number of the force, of each law's port.
-        still : (J,) ndarray
-            Position of each law's port without forces.
-        refinement : int
-            Steps with laws are this many times smaller.
-        """
-        key = (laws.ports, columns.tobytes(), numbers.tobytes())
-        acts, modal, law = self._kept.get(key, lambda: self._with_ports(laws.ports, columns, numbers))
-        smooth = any(course.hold is Hold.SMOOTH for _, course, _ in acting.loads)
-        boundaries = substeps(modal, laws, acting.sampled, refinement, SMOOTH_PARTS if smooth else 1)
-        begin, end = straight(lambda time: acting.load_at(time, acts.T), boundaries.time)
-        feed = acting.load_at(boundaries.time, self.direct[columns].T)
-        seen = self.outputs[columns[law]]
-        first = Begin(
-            np.concatenate((seen @ start + still[law], 0.0 * start)),
-            np.concatenate((seen @ self.generator @ start, start)),
-        )
-        steps = steps_under(modal, boundaries, begin, end, feed)
-        found = advance(modal, laws, steps, first, compiled_kernel())
-        forces = acting.load_at(acting.sampled, np.eye(self.push.shape[1]))
-        np.subtract.at(forces.T, numbers, found.port_forces.T)
-        return found.v[:, len(law) :], forces
-
-    def _with_ports(
-        self, names: tuple[str, ...], columns: IntArray, numbers: IntArray
-    ) -> tuple[FloatArray, ModalSystem, IntArray]:
-        """Return along what forces act (N, E), the system of ports and state, and a law of each port."""
-        places, law = np.unique(names, return_index=True)
-        count, order = len(law), len(self.generator)
-        seen = self.outputs[columns[law]] @ self.generator
-        acts = np.vstack((seen @ self.push, self.push))
-        damping = np.zeros((count + order, count + order))
-        damping[:, count:] = -np.vstack((seen @ self.generator, self.generator))
-        at_once, gain = (item[columns[law], numbers[law]] for item in (self.direct, self.gain))
-        modal = ModalSystem(
-            np.zeros(count + order), damping, dict(zip(places, np.eye(count, count + order), strict=True)),
-            np.where(at_once > ROUNDING * gain, at_once, 0.0),
-            actions=dict(zip(places, acts.T[numbers[law]], strict=True)),
-        )  # fmt: skip
-        return acts, modal, law
+@lru_cache(maxsize=KEPT)
+def _with_ports(
+    system: StateSpace, names: tuple[str, ...], columns: tuple[int, ...], numbers: tuple[int, ...]
+) -> tuple[FloatArray, ModalSystem, IntArray]:
+    """Return along what forces act (N, E), the system of ports and state, and a law of each port."""
+    places, law = np.unique(names, return_index=True)
+    count, order = len(law), len(system.generator)
+    column, number = (np.array(given, dtype=np.int64)[law] for given in (columns, numbers))
+    seen = system.outputs[column] @ system.generator
+    acts = np.vstack((seen @ system.push, system.push))
+    damping = np.zeros((count + order, count + order))
+    damping[:, count:] = -np.vstack((seen @ system.generator, system.generator))
+    at_once, gain = (item[column, number] for item in (system.direct, system.gain))
+    modal = ModalSystem(
+        np.zeros(count + order), damping, dict(zip(places, np.eye(count, count + order), strict=True)),
+        np.where(at_once > ROUNDING * gain, at_once, 0.0),
+        actions=dict(zip(places, acts.T[number], strict=True)),
+    )  # fmt: skip
+    return acts, modal, law
 
 
 class FmuPace(FmuRuns):
@@ -254,20 +171,21 @@ class FmuPace(FmuRuns):
         with self.refusals():
             self.names = names = FmuVariables(description, folder)
             super().__init__(names.path, names.binding, description.isolated, rest.limit, rest.tolerance)
-            door = self.asset
-            for item in description.parameter:  # beyond its range it refuses, and a posterior is cut there
-                for end in (item.low, item.high):
-                    door.check_parameters({names.parameter(item.variable): end})
+            # beyond its range it refuses, and a posterior is cut there
+            told = [{item.variable: end} for item in description.parameter for end in (item.low, item.high)]
+            told += [{f"effect.{name}.active": 1.0} for name in description.effects.values()]
+            for given in (*told, rest.parameters, description.motion.parameters):
+                self.asset.check_parameters({names.parameter(name): value for name, value in given.items()})
         self.ports = [port.name for port in description.port]
         self.forces = [names.variable(port.force) for port in description.port]
         self.x = [names.columns[f"port.{port}.displacement"] for port in self.ports]
         self.v = [names.columns.get(f"port.{port}.velocity", -1) for port in self.ports]
         way = description.release or ReleaseOf.model_construct()
-        told = (way.displacement, way.velocity)
-        self.release = [names.parameter(name) for name in told if name is not None]
+        ways = (way.displacement, way.velocity)
+        self.release = [names.parameter(name) for name in ways if name is not None]
         self.release += [names.variable(way.hold)] if way.hold is not None else []
         self._linear, self._sizes = dict[Hashable, bool](), dict[str, float]()
-        self._systems, self._paces = Memory(KEPT_SYSTEMS), Memory()
+        self._systems, self._paces = Memory(KEPT), Memory()
 
     @contextmanager
     def refusals(self) -> Iterator[None]:
@@ -287,7 +205,7 @@ class FmuPace(FmuRuns):
 
     # ------------------------------------------------------------ its system
 
-    def system(self, case: Case) -> FmuSystem | None:
+    def system(self, case: Case) -> StateSpace | None:
         """Return an FMU as a system; None if it is not linear.
 
         It is where one system shows its answers to single forces and releases, and predicts what all do.
@@ -297,11 +215,10 @@ class FmuPace(FmuRuns):
         if not asked or self._linear.get(kind) is False:
             return None
 
-        def identified() -> FmuSystem | None:
+        def identified() -> StateSpace | None:
             answers = [self._answer(case, name) for name in case.inputs]
             answers += [self._answer(case, name, released=True) for name in case.starts]
-            found = realised(np.stack(answers, axis=2)[1:], len(case.inputs), case.step)
-            return None if found is None else FmuSystem(*found)
+            return realised(np.stack(answers, axis=2)[1:], len(case.inputs), case.step)
 
         found = self._systems.get((kind, *case[:3]), identified)
         if found is not None and kind not in self._linear:
@@ -326,7 +243,7 @@ class FmuPace(FmuRuns):
     def _still(self, case: Case) -> FloatArray:
         return self.remembered(case[:2], lambda: self.begun(Run(case.state, case.step, 0))[1])
 
-    def _predicts(self, system: FmuSystem, case: Case, tolerance: float) -> bool:
+    def _predicts(self, system: StateSpace, case: Case, tolerance: float) -> bool:
         """Whether a system shows what the FMU does under all that moves it, random forces where laws act."""
         amounts, random = self._amounts(case, linear=True), np.random.default_rng(0)
         run = self._run(case, amounts)
@@ -335,7 +252,7 @@ class FmuPace(FmuRuns):
         moved, time = self._moved(case, run._replace(courses=courses)), case.step * np.arange(run.steps + 1.0)
         held = (Course(time, np.append(values, 0.0), Hold.ZERO_ORDER) for values in courses.values())
         acting = Acting(time, time, list(map(Load, np.eye(len(courses)), held)))
-        states, forces = system.motion(acting, self._start(system, case, amounts))
+        states, forces = state_motion(system, acting, self._start(system, case, amounts))
         error = np.max(np.abs(moved - states @ system.outputs.T - forces @ system.direct.T)[1:], axis=0)
         return bool(np.all(error <= tolerance * np.max(np.abs(moved), axis=0) + 1e-300))
 
@@ -378,7 +295,7 @@ class FmuPace(FmuRuns):
             courses={name: 0.5 * lever * (begins + ends) for name, lever in case.levers.items()}
         )
 
-    def _start(self, system: FmuSystem, case: Case, amounts: Mapping[str, float]) -> FloatArray:
+    def _start(self, system: StateSpace, case: Case, amounts: Mapping[str, float]) -> FloatArray:
         """Return the state (n,) of a system at the begin."""
         start: FloatArray = system.starts @ np.array([*amounts.values()])
         first = 0.0 if case.course is None else float(case.course.values[0])
@@ -401,7 +318,7 @@ class FmuPace(FmuRuns):
             system = self.system(case)
             if system is None or fixed or parts > MOST_PARTS:
                 break
-            turn = np.max(np.abs(np.linalg.eigvals(system.generator).imag)) * case.step
+            turn = np.max(np.abs(system.modes[0].imag)) * case.step
             half = case._replace(step=0.5 * case.step)
             if turn <= SAFE_TURN and self._predicts(system, half, SAME_PACE):
                 break

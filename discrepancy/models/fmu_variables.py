@@ -96,20 +96,14 @@ class FmuVariables:
 
     def _parameters(self, known: Mapping[str, Parameter]) -> dict[str, Parameter]:
         """Return the parameters that are not known so: a value or range in another unit is none of theirs."""
-        given, way = self._given, self._given.release
-        units: dict[str | None, str | None] = {
-            **dict.fromkeys((*given.static.parameters, *given.motion.parameters)),  # in their own
-            **{f"effect.{identifier}.active": None for identifier in given.effects.values()},
-            **{item.variable: item.unit for item in given.parameter},
-            **({way.displacement: "m", way.velocity: "m/s"} if way is not None else {}),
-        }
+        way, given = self._given.release, self._given.parameter
+        units = dict[str | None, str]((item.variable, item.unit) for item in given)
+        units |= {way.displacement: "m", way.velocity: "m/s"} if way is not None else {}
         named = ((self.parameter(name), unit) for name, unit in units.items() if name is not None)
         return {
-            key: Parameter(
-                variable=known[key].variable if key in known else key, unit=unit or self._own_unit(key)
-            )
+            key: Parameter(variable=known[key].variable if key in known else key, unit=unit)
             for key, unit in named
-            if key not in known or unit not in (None, known[key].unit)
+            if key not in known or unit != known[key].unit
         }
 
     def _observed(self) -> Vector:

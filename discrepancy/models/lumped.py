@@ -300,12 +300,9 @@ class LumpedModel(DescribedModel, SystemModel):
                 factors[term] = factors.get(term, 1.0) * value
         return factors
 
-    def rig(self, state: State) -> Rig:
-        """Return the model at values of the parameters, a structure and a temperature."""
-        return self._rig_of(state._replace(drives=(), closed=True))
-
     @cached_property
-    def _rig_of(self) -> Callable[[State], Rig]:
+    def rig(self) -> Callable[[State], Rig]:
+        """What gives the model at values of the parameters, a structure and a temperature, kept."""
         return lru_cache(self.kept)(self._rig)
 
     def _rig(self, state: State) -> Rig:

@@ -16,7 +16,7 @@ from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course, straight
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.port_scales import FORCES
+from discrepancy.models.system_model import FORCES
 from fe.runtime.patch import ModulusTemperature, Overflow, PowerDamping, PowerStiffness
 from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
 from tests.discrepancy.asking import trial as asked
