@@ -99,7 +99,7 @@ def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(open_asset
 
 
 def ways() -> Iterator[Any]:
-    """Yield each kind in this process and in a worker; what flies still and in motion, one of them in each."""
+    """Yield each kind here and in a worker; of what flies still and in motion one in each."""
     for name, kind in KINDS.items():
         moving = name.endswith(" in motion")
         twice = moving or f"{name} in motion" in KINDS
