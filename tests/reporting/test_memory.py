@@ -6,7 +6,8 @@ from reporting.memory import Memory
 
 
 def test_the_least_recently_used_are_forgotten_where_there_is_no_room() -> None:
-    ended, kept = list[str](), Memory(6, weight=len, end=ended.append)
+    ended = list[str]()
+    kept = Memory(6, weight=len, end=ended.append)
     for text in ("one", "two", "one", "four"):  # seven letters do not fit
         assert kept.get(text, lambda text=text: text) == text
     assert ended == ["two", "one"]
