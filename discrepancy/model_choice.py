@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
+from calibration.joint.wing_table import SHIPPED_PRIOR
 from discrepancy.document import Origin
 from discrepancy.errors import ModelError, VerdictFileError
 from discrepancy.files.verdict import StoredPatch, read_patch
@@ -11,7 +12,7 @@ from discrepancy.models.fmu import FmuModel
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
-from discrepancy.models.structures import SHIPPED_PRIOR, StructureModel, WingModel
+from discrepancy.models.structures import StructureModel, WingModel
 from discrepancy.sources import from_run
 from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError

@@ -45,6 +45,15 @@ _PRIORS = {
     "damping_alpha": ("1/s", 0.0, 3.0, _OURS, "mass-proportional Rayleigh damping, alpha"),
     "damping_beta": ("s", 0.0, 1.5e-3, _OURS, "stiffness-proportional Rayleigh damping, beta"),
 }
+SHIPPED_PRIOR = {
+    "young_modulus_factor": (1.0073, 0.0103),
+    "servo_mass": (0.1685, 0.0041),
+    "pitot_mass": (0.1350, 0.0083),
+    "damping_alpha": (1.03, 0.37),
+    "damping_beta": (7.56e-4, 1.84e-4),
+}
+"""Mean and standard deviation of the calibrated state of the shipped wing (docs/calibration.md): e of the
+paper, its masses, and the damping of the joint posterior, whose spread holds the measurement too."""
 _DAMPING_RANGES = {"damping_alpha": (0.0, 20.0), "damping_beta": (0.0, 1e-2)}
 
 

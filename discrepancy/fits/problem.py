@@ -17,9 +17,10 @@ from discrepancy.campaign.records import Campaign, FloatArray, Trial
 from discrepancy.campaign.sampling import IntArray
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
-from discrepancy.models.interface import Memory, Model
+from discrepancy.models.interface import Model
 from discrepancy.models.sensing import observe
 from fe.runtime.patch import ModelPatch
+from reporting.memory import Memory
 
 from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Candidate, Linearisation, Point, moved
 from .trial_data import GlobalUnknowns, TrialData, global_unknowns, stand_in
