@@ -32,8 +32,8 @@ DAYS = 14
 """What nobody read for so long is removed."""
 
 # The product has numba keep loops in folders named by the content of their sources; the path of a clone would
-# part them again. Before numba is imported, and for the processes that tests start. Those know nothing of what
-# stands here: where there is one clone only, all keep the path and find each other's loops.
+# part them again. Before numba is imported, and for the processes that tests start. Those know nothing of
+# this: where there is one clone only, all keep the path and find each other's loops.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(FOLDER / "compiled"))
 if not os.environ.get("CI"):
     from numba.core.caching import UserProvidedCacheLocator
