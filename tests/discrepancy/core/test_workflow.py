@@ -27,6 +27,7 @@ LABORATORY = kit.chain_bench(amplitudes=(0.004, 0.003, 0.002), samples=200, held
 
 EFFECTS = kit.chosen("quadratic_damping", "gauge_gain", "load_cell", "stiffness_drift", "coulomb_friction")
 
+
 def judged(campaign, effects=EFFECTS, **how):
     return investigate(campaign, LABORATORY.model, effects, **how)
 
