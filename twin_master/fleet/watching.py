@@ -2,7 +2,6 @@
 
 import json
 import re
-import resource
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack
@@ -178,6 +177,8 @@ class FleetWatch:
                 self._sources.append(_Files(self, group, follow))
         self.closing.enter_context(_held(fleet, folder))
         self._told_before = read_standing(folder)["assets"]
+        import resource
+
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (limits[1], limits[1]))  # three files for each asset
 
