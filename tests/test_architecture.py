@@ -40,7 +40,7 @@ ROOMS = {
         "compilation", "verification",
     ),
     "fmu_asset": (
-        "errors", "folders", "slaves", "description", "instances", "worker", "archive", "compiled", "door",
+        "errors", "sentences", "folders", "slaves", "description", "instances", "worker", "archive", "compiled", "door",
         "packing", "companions", "structures", "coupling", "check", "ssp",
     ),
     "calibration": (
