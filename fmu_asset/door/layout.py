@@ -220,7 +220,8 @@ class Slot(NamedTuple):
         per_step = history and array.shape != cell
         if per_step and array.shape[1:] not in (cell, (count,)):
             wanted = "a number, or one" if count == 1 else f"{count} values, or as many"
-            raise FmuInputError(said("inputs.history_shape", self=self, wanted=wanted, array=array))
+            shape = str(array.shape)
+            raise FmuInputError(said("inputs.history_shape", self=self, wanted=wanted, shape=shape))
         if not history and array.size != count:
             wrong = f"takes {count} values, but {array.size} came"
             wrong = f"must be a number, but is {given!r}" if count == 1 else wrong

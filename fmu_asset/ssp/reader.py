@@ -184,8 +184,8 @@ class _Tree:
         # The kinds of the connectors say which way a value goes; "start" and "end" do not (SSP 1.0, 5.3).
         source, target = ends if gives[0] else reversed(ends)
         if target in self._edges:
-            given = self._edges[target].source, source
-            raise self._error(said("coupling.two_sources", target=target, given=given))
+            to, *given = (repr(str(end)) for end in (target, self._edges[target].source, source))
+            raise self._error(said("coupling.two_sources", target=to, given=given))
         scale = self._transformation(element, f"the connection from {source} to {target}")
         convert, delayed = (
             not _flag(element, "suppressUnitConversion"),
