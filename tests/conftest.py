@@ -95,13 +95,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if named:
             group[item.path] = named.args[0]
     slow = {group[item.path] for item in items if item.get_closest_marker("slow")}
-    waiting = {item.path for item in items if set(COMPILED) & set(item.path.parts)}
+    waiting = {group[item.path] for item in items if set(COMPILED) & set(item.path.parts)}
     items.sort(
         key=lambda item: (
             group[item.path] != LARGEST,
             group[item.path] != COMPILING,
             group[item.path] not in slow,
-            item.path in waiting,
+            group[item.path] in waiting,
         )
     )
     for item in items:
