@@ -40,8 +40,8 @@ ROOMS = {
         "compilation", "verification",
     ),
     "fmu_asset": (
-        "errors", "sentences", "folders", "slaves", "description", "instances", "worker", "archive", "compiled", "door",
-        "packing", "companions", "structures", "coupling", "check", "ssp",
+        "errors", "sentences", "folders", "slaves", "description", "instances", "worker", "archive",
+        "compiled", "door", "packing", "companions", "structures", "coupling", "check", "ssp",
     ),
     "calibration": (
         "errors", "lab_folder", "static", "result", "geometry", "dynamics", "joint",
