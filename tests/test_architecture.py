@@ -44,7 +44,7 @@ ROOMS = {
         "compiled", "door", "packing", "companions", "structures", "coupling", "check", "ssp",
     ),
     "calibration": (
-        "errors", "lab_folder", "static", "result", "geometry", "dynamics", "joint",
+        "errors", "sentences", "lab_folder", "static", "result", "geometry", "dynamics", "joint",
         "virtual_wing", "paper", "wing",
     ),
     "twin_master": (
