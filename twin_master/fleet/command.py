@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from twin_master.fleet.flight import FleetOutcome
     from twin_master.fleet.plan import Fleet
     from twin_master.fleet.reading import Estimated
-    from twin_master.fleet.standing import WatchedAsset
-    from twin_master.fleet.watching import FleetWatch
+    from twin_master.fleet.watching import FleetWatch, WatchedAsset
 
 
 ROWS = 20
@@ -122,9 +121,9 @@ class _Console:
 
 def _heading(watched: "FleetWatch") -> str:
     assets = watched.assets.values()
-    turns = sum(asset.keep.twin.turns for asset in assets)
+    turns = sum(asset.watch.twin.turns for asset in assets)
     alarms = sum(asset.alarm_count for asset in assets)
-    refused = sum(asset.keep.intake.counts.rejected for asset in assets)
+    refused = sum(asset.watch.intake.counts.rejected for asset in assets)
     told = [counted(len(assets), "asset"), counted(turns, "turn"), counted(alarms, "alarm")]
     told += [f"{counted(refused, 'message')} refused"] * (refused > 0)
     told += [f"{len(watched.failures)} not watched"] * bool(watched.failures)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from reporting.files import atomic_write_bytes, atomic_write_text
+from reporting.files import atomic_write_bytes, atomic_write_text, written
 from reporting.folders import lock_folder
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
@@ -23,7 +23,7 @@ from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine, Piece, flown
 from twin_master.fleet.plan import Fleet, Group, load_fleet
 from twin_master.fleet.shard import Kit, ShardResult, read_recording, with_parameters
-from twin_master.fleet.store import FAILED, STORE_NAME, check_installed, create_store, sizes_of, written
+from twin_master.fleet.store import FAILED, STORE_NAME, check_installed, create_store, sizes_of
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT

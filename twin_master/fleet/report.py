@@ -25,9 +25,9 @@ from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND as FLOWN_KIND
 from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
 from twin_master.fleet.reading import WITHIN, figure_rows, group_figures, last_turns, leaving, noticed
-from twin_master.fleet.standing import read_standing
 from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, has_flown, open_group
 from twin_master.fleet.watching import KIND as WATCHED_KIND
+from twin_master.fleet.watching import read_standing
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.journal import records as records_of
 from twin_master.report.view import printed_factors

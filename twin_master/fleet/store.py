@@ -1,7 +1,6 @@
 """The store of a fleet: what is kept of each twin, chunk by chunk, and which shards are there."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib import util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
-from reporting.files import write_error
+from reporting.files import written
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Fleet, Group, Member
 from twin_master.mission.preparation import Knowledge
@@ -157,15 +156,6 @@ def check_installed(*packages: str) -> None:
     missing = [name for name in packages if util.find_spec(name) is None]
     if missing:
         raise FleetError(f"a fleet needs {' and '.join(missing)}: pip install 'uav-twin[fleet]'.")
-
-
-@contextmanager
-def written(path: Path) -> Iterator[None]:
-    """Turn what the system refuses into one sentence."""
-    try:
-        yield
-    except OSError as error:
-        raise write_error(error, path) from error
 
 
 def open_group(folder: Path, group: str) -> "xr.Dataset":
