@@ -1,8 +1,20 @@
 """Sentences in a TOML file beside a module, filled in where they are said."""
 
 import tomllib
+from collections.abc import Collection
 from pathlib import Path
+from string import Formatter
 from typing import Any
+
+
+class _Written(Formatter):
+    """Braces as in `str.format`; several things are written one after the other, and "none" where none is."""
+
+    def convert_field(self, value: Any, conversion: str | None) -> Any:
+        if not isinstance(value, Collection) or isinstance(value, str | bytes) or hasattr(value, "_fields"):
+            return super().convert_field(value, conversion)
+        each = (super(_Written, self).convert_field(item, conversion) for item in value)
+        return ", ".join(map(str, each)) or "none"
 
 
 class Sentences:
@@ -24,7 +36,10 @@ class Sentences:
         self.tables: dict[str, Any] = tomllib.loads(text)
 
     def said(self, sentence: str, /, **values: object) -> str:
-        """Return a sentence by table and name, such as "mesh.empty", with its values."""
+        """Return a sentence by table and name, such as "mesh.empty", with its values.
+
+        Several values in one are written one after the other.
+        """
         table, _, key = sentence.partition(".")
         text: str = self.tables[table][key]
-        return text.format(**values)
+        return _Written().vformat(text, (), values)

@@ -11,7 +11,7 @@ from reporting.sentences import Sentences
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.parametrize("package", ["fe", "twin_master"])
+@pytest.mark.parametrize("package", ["calibration", "fe", "fmu_asset", "twin_master"])
 def test_every_sentence_is_said_with_its_values(package):
     tables = Sentences(str(ROOT / package / "sentences.py")).tables
     known = {f"{table}.{key}": text for table, own in tables.items() for key, text in own.items()}

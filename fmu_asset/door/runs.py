@@ -12,6 +12,7 @@ import numpy as np
 
 from fe.runtime.arrays import FloatArray
 from fmu_asset.errors import FmuOutputError
+from fmu_asset.sentences import said
 from reporting.memory import Memory
 
 from .binding import Binding
@@ -126,12 +127,8 @@ class FmuRuns:
                 return np.asarray(0.5 * (high + low))
             if waited >= self._limit:
                 worst = int(np.argmax((high - low) / np.where(largest > 0.0, largest, 1.0)))
-                raise FmuOutputError(
-                    f"{self._of[0]} did not come to rest within {self._limit:g} s: the output "
-                    f"{asset.binding.observation_variables[worst]!r} still moves by "
-                    f"{high[worst] - low[worst]:.2g}; raise `limit` or `tolerance` in "
-                    "[static], or give the FMU's parameters for a state at rest there."
-                )
+                output, moves = asset.binding.observation_variables[worst], high[worst] - low[worst]
+                raise FmuOutputError(said("running.unrest", limit=self._limit, output=output, moves=moves))
 
     def begun(self, run: Run) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
         """Return an instance at the begin of a motion, its outputs there, and the inputs (steps,) to come.
