@@ -95,9 +95,8 @@ class StrainLibrary:
         for factor, value in zip(self.states.factors, stiffness_loss, strict=True):
             known = factor.levels
             if not known[0] <= value <= known[-1]:
-                raise InvalidStrainLibraryError(
-                    said("assets.covers", factor=factor, known=known, value=value)
-                )
+                ends = known[0], known[-1]
+                raise InvalidStrainLibraryError(said("assets.covers", factor=factor, ends=ends, value=value))
             weights = [np.interp(value, known, level) for level in np.eye(len(known))]
             strain = np.tensordot(weights, strain, axes=1)
         return strain
