@@ -9,7 +9,6 @@ summed. Numbers are copied one by one: numba takes two seconds to compile the co
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.compilation import callable_when_compiled, compiled
 from reporting.arrays import Float, Index, Unsigned
@@ -233,14 +232,3 @@ def sweep(
             change = max(change, abs(improved - value[state]))
             value[state] = improved
         iterations += 1
-
-
-@compiled
-def move_rows(lists: Lists, control: int, rows: NDArray[np.floating]) -> None:
-    """Bring beliefs (N, S) as they are one transition further; those of zeros stay."""
-    after, work = np.empty_like(rows[0]), np.empty_like(rows[0])
-    for row in range(len(rows)):
-        if np.any(rows[row]):
-            _apply(lists, control, rows[row], after, work)
-            for state in range(len(after)):
-                rows[row, state] = after[state]
