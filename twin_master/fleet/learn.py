@@ -106,10 +106,14 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
     }
     result: dict[str, Any] = {"source": source, "groups": groups}
     if together is not None:
-        titles = "mean", "standard_deviation", "log10_concentration", "log10_concentration_standard_deviation"
-        pairs = zip(names, together.mean, together.concentration, strict=True)
         result["shared"] = {
-            name: dict(zip(titles, (*mean, *size), strict=True)) for name, mean, size in pairs
+            name: {
+                "mean": mean.mean,
+                "standard_deviation": mean.standard_deviation,
+                "log10_concentration": size.mean,
+                "log10_concentration_standard_deviation": size.standard_deviation,
+            }
+            for name, mean, size in zip(names, together.mean, together.concentration, strict=True)
         }
     return result
 
