@@ -98,11 +98,8 @@ class Watch:
     ) -> None:  # fmt: skip
         self.folder, self.scenario, self._progress = folder, scenario, progress
         tidy(folder)
-        if like is None:
-            self._source = believed_source(scenario)
-            self._inputs = dict(self._source.prepare(folder, progress))
-        else:
-            self._source, self._inputs = like._source, like._inputs
+        self._source = believed_source(scenario) if like is None else like._source
+        self._inputs = dict(self._source.prepare(folder, progress)) if like is None else like._inputs
         self._config = with_inputs(folder, config, self._inputs)
         self.models: list[BelievedModel] = [self._prepared() if like is None else like.models[0]]
         self._path = folder / JOURNAL_NAME
