@@ -12,8 +12,9 @@ from tornado.web import Application
 
 from reporting.errors import ReportingError
 from twin_master.errors import TwinMasterError
+from twin_master.fleet.flight import fleet_record
 from twin_master.fleet.lessons import LESSONS_NAME
-from twin_master.fleet.report import fleet_page, fleet_record
+from twin_master.fleet.report import fleet_page
 from twin_master.fleet.watching import STATE_NAME
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.viewer.server import OWN_NAMES, handlers_of, serve_application, text_of

@@ -4,7 +4,7 @@ import json
 import re
 import time
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from reporting.files import atomic_write_text, written
 from reporting.json_file import read_json
 from reporting.progress import SilentProgress
 from twin_master.errors import FleetError
-from twin_master.fleet.flight import hold_folder, see_folder
+from twin_master.fleet.flight import WATCHED_KIND, held_fleet
 from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
 from twin_master.fleet.reading import attention
 from twin_master.mission.side_by_side import IN_FLIGHT
@@ -27,7 +27,6 @@ from twin_master.watch.intake import Feed
 from twin_master.watch.mqtt import Session, Topic
 from twin_master.watch.opening import begun_watch, resumed_watch
 
-KIND = "uav-twin fleet watch"
 TURNS_AT_ONCE = 64
 """Turns of one asset before the next one is looked at."""
 SEARCH_SECONDS, STATE_SECONDS = 2.0, 2.0
@@ -175,7 +174,10 @@ class FleetWatch:
                 self._sources.append(_Topics(self, group, authority))
             else:
                 self._sources.append(_Files(self, group, follow))
-        self.closing.enter_context(_held(fleet, folder))
+        named = [(group.name, group.scenarios[0].portable().to_dict()) for group in fleet.groups]
+        groups = [{"name": name, "scenarios": [scenario]} for name, scenario in named]
+        record = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "groups": groups}
+        self.closing.enter_context(held_fleet(folder, WATCHED_KIND, record))
         self._told_before = read_standing(folder)["assets"]
         import resource
 
@@ -312,17 +314,6 @@ class FleetWatch:
         assets = {name: asset.record() for name, asset in sorted(self.assets.items())}
         record = {"assets": {**self._told_before, **assets}, "failures": self.failures}
         atomic_write_text(self.folder / STATE_NAME, json.dumps(record) + "\n")
-
-
-def _held(fleet: Fleet, folder: Path) -> AbstractContextManager[None]:
-    """Make the folder of a fleet, or see that it holds the same; return what holds it."""
-    groups = [
-        {"name": group.name, "scenarios": [group.scenarios[0].portable().to_dict()]} for group in fleet.groups
-    ]
-    heading = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "groups": groups}
-    config = {"kind": KIND, "format": 1, "fleet": heading}
-    see_folder(folder, config, fleet.seed)
-    return hold_folder(folder, config, fleet.seed)
 
 
 class _Files:
