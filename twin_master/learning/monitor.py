@@ -93,15 +93,8 @@ class WatchfulEstimator:
         sensors, states = sensor_model.sensor_count, inner.model.states.size
         self._shape = (sensors, len(_GAINS), len(places), states)
         if np.prod(self._shape, dtype=float) > _LARGEST:
-            raise InvalidModelError(
-                said(
-                    "learning.faults",
-                    states=states,
-                    draws=len(places),
-                    faults=sensors * len(_GAINS),
-                    most=_LARGEST,
-                )
-            )
+            parts = states, len(places), sensors * len(_GAINS), _LARGEST
+            raise InvalidModelError(said("learning.faults", parts=parts))
         # A model that takes the place of another, as one that was taught, begins without suspicion.
         digest = sha256(b"2" + np.ascontiguousarray(table).tobytes()).digest()
         self._key = np.frombuffer(digest[:8], dtype=np.uint64)
