@@ -53,7 +53,7 @@ def watch(
     from twin_master.watch.intake import listening
 
     fleet = load_fleet(file, seed)
-    folder = out if out is not None else Path("runs") / fleet.name
+    folder = out if out is not None else Path("runs") / fleet.head.name
     console = _Console()
     watched = FleetWatch(
         fleet, folder, console.tell, console.say, follow=follow, turns=turns, authority=ca_file
@@ -223,7 +223,7 @@ def fly_and_show(
     """Fly a fleet and print what became of it."""
     from twin_master.fleet.flight import fly_fleet
 
-    folder = out if out is not None else Path("runs") / fleet.name
+    folder = out if out is not None else Path("runs") / fleet.head.name
     try:
         outcome = fly_fleet(fleet, folder, engine, replace_old=replace, progress=terminal.progress())
     except KeyboardInterrupt:
@@ -234,7 +234,7 @@ def fly_and_show(
         _report(outcome.folder)
     figures = _figures([outcome.folder])
     if json:
-        told = {"folder": str(outcome.folder), "twins": outcome.twins, "failed": outcome.failed}
+        told = {"folder": str(outcome.folder), "twins": outcome.twins, "failed": len(outcome.failures)}
         terminal.print_json(told | {"failures": outcome.failures, "ended": outcome.ended, "groups": figures})
     else:
         _show(outcome, figures)
@@ -282,7 +282,7 @@ def _show(outcome: "FleetOutcome", figures: Figures) -> None:
     kept = f", {counted(outcome.shards_kept, 'shard')} there before" if outcome.shards_kept else ""
     rate = f"{counted(outcome.twins, 'twin')} in {outcome.seconds:.3g} s{kept}"
     short = f", {len(outcome.ended)} ended early" if outcome.ended else ""
-    console.print(f"{rate}; {outcome.failed} failed in flight{short}.", soft_wrap=True)
+    console.print(f"{rate}; {len(outcome.failures)} failed in flight{short}.", soft_wrap=True)
     told = [*outcome.failures.items(), *outcome.ended.items()]
     for name, sentence in told[:SHOWN]:
         console.print(f"  {name}: {sentence}", soft_wrap=True, style="yellow")

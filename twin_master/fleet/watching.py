@@ -176,7 +176,7 @@ class FleetWatch:
                 self._sources.append(_Files(self, group, follow))
         named = [(group.name, group.scenarios[0].portable().to_dict()) for group in fleet.groups]
         groups = [{"name": name, "scenarios": [scenario]} for name, scenario in named]
-        record = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "groups": groups}
+        record = fleet.head.model_dump(exclude={"shard"}) | {"groups": groups}
         self.closing.enter_context(held_fleet(folder, WATCHED_KIND, record))
         self._told_before = read_standing(folder)["assets"]
         import resource
