@@ -26,7 +26,6 @@ from twin_master.learning.switching import GAUGES, MENDED, NONE
 from twin_master.learning.words import Words
 from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion
 from twin_master.network.inference import smooth
-from twin_master.network.kernels import move_rows
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.tables import MOST_DRAWS, Noticing
 from twin_master.sentences import said
@@ -208,7 +207,8 @@ class WatchfulEstimator:
         own = self._unpacked(before.arrays)
         for name in ("model", "gauge", "none", "mended"):
             rows = own[name].reshape(-1, self._shape[-1])
-            move_rows(self.model.transition.forward_lists, before.control_index, rows)
+            held = rows.any(axis=1)
+            rows[held] = self.model.transition.forward(before.control_index, rows[held])
         turn = float(own["turns"][0])
         inflow = np.log(self._to_begin(turn - 1.0) - self._to_begin(turn))
         gauges = own["gauge"].reshape(-1, *self._shape[2:])

@@ -120,8 +120,8 @@ def test_groups_share_what_a_dense_sum_says():
     a, b = m * kappa, (1.0 - m) * kappa
     weight = np.prod([betabinom.pmf(n, n + k, a, b) for n, k in counts], axis=0)
     weight /= weight.sum()
-    assert found.mean[0][0] == pytest.approx(float((weight * m).sum()), rel=1e-3)
-    assert found.concentration[0][0] == pytest.approx(float((weight * np.log10(kappa)).sum()), rel=1e-3)
+    assert found.mean[0].mean == pytest.approx(float((weight * m).sum()), rel=1e-3)
+    assert found.concentration[0].mean == pytest.approx(float((weight * np.log10(kappa)).sum()), rel=1e-3)
     for (n, k), (marginal,) in zip(counts, found.groups, strict=True):
         exact = float((weight * (a + n) / (kappa + n + k)).sum())
         assert marginal.mean == pytest.approx(exact, rel=2e-3)
