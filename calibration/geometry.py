@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.result.record import ParameterPrior, Reading
+from calibration.sentences import said
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import GaussianPrior
 from fe.runtime.errors import InvalidDesignError
@@ -59,14 +60,10 @@ class MeasuredLength:
         for what in ("designed", "measured"):
             value = getattr(self, what)
             if not (math.isfinite(value) and value > 0.0):
-                raise ExperimentDataError(
-                    f"{what} of {self.name} is {value:g} m, but a positive finite length is needed."
-                )
+                raise ExperimentDataError(said("geometry.length", what=what, self=self, value=value))
         if abs(self.measured / self.designed - 1.0) > _LARGEST_DEVIATION:
-            raise ExperimentDataError(
-                f"{self.name} measures {self.measured * 1e3:g} mm where {self.designed * 1e3:g} mm were "
-                "designed, more than 10 % apart: check the units (both in mm) and the wing."
-            )
+            lengths = self.measured * 1e3, self.designed * 1e3
+            raise ExperimentDataError(said("geometry.apart", self=self, lengths=lengths))
 
     @property
     def prior(self) -> ParameterPrior:
@@ -141,16 +138,13 @@ def read_lengths(path: Path) -> Lengths:
     table.refuse_repeated(names, "parameter", "keep one of them")
     lost = [published for published in PUBLISHED_NAMES if published not in names]
     if lost:
-        raise ExperimentFileError(
-            f"{table.name} lacks the row {' and '.join(lost)}; {', '.join(PUBLISHED_NAMES)} are needed."
-        )
+        lacks = " and ".join(lost)
+        raise ExperimentFileError(said("geometry.no_row", table=table, lacks=lacks, known=PUBLISHED_NAMES))
     lengths = {column: table.positive_numbers(column, _USER) for column in ("designed", "manufactured")}
     for column, values in lengths.items():
         for row in np.flatnonzero(values < 10.0):
-            raise ExperimentDataError(
-                f"{table.name}, line {table.lines[row]}: {column} is {values[row]:g} mm, which looks like m: "
-                "give it in mm."
-            )
+            where = f"{table.name}, line {table.lines[row]}: {column}"
+            raise ExperimentDataError(said("geometry.metres", where=where, value=values[row]))
     rows = {name: names.index(published) for published, name in PUBLISHED_NAMES.items()}
     return Lengths(
         *(MeasuredLength(name, *(1e-3 * of[row] for of in lengths.values())) for name, row in rows.items())
@@ -184,15 +178,12 @@ def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
     for name, value in planform.items():
         drawn = getattr(design.planform, name)
         if abs(value / drawn - 1.0) > _LARGEST_DEVIATION:
-            raise ExperimentDataError(
-                f"{name} measures {value * 1e3:.1f} mm, but the design {design.name} has "
-                f"{drawn * 1e3:.1f} mm, more than 10 % apart: give the design of this wing with --design."
-            )
+            both = value * 1e3, drawn * 1e3
+            raise ExperimentDataError(said("geometry.another", name=name, lengths=both, design=design))
     try:
         return design.changed(planform=planform)
     except InvalidDesignError as error:
         reason = str(error).removeprefix("the changed design: ")
         shown = " x ".join(f"{value * 1e3:.1f}" for value in planform.values())
-        raise InvalidDesignError(
-            f"the design {design.name} does not fit the measured planform ({shown} mm): {reason}"
-        ) from None
+        why = said("geometry.unfit", design=design, shown=shown, reason=reason)
+        raise InvalidDesignError(why) from None

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.sentences import said
 from reporting.table_file import TableErrors, TextTable, read_table
 
 from .errors import ExperimentDataError, ExperimentFileError
@@ -31,16 +32,13 @@ def keep_vectors(record: Any, *names: str) -> None:
         object.__setattr__(record, name, column)
         beside = getattr(record, names[0]).shape
         if column.ndim != 1 or column.shape != beside:
-            raise ExperimentDataError(
-                f"{record.source}: {' and '.join(names)} must be vectors of one length, but {name} has the "
-                f"shape {column.shape} beside {beside}."
-            )
+            all_of_them, shapes = " and ".join(names), (str(column.shape), str(beside))
+            of = {"record": record, "names": all_of_them, "name": name}
+            raise ExperimentDataError(said("readings.shapes", **of, shapes=shapes))
         wrong = np.flatnonzero(~np.isfinite(column))
         if wrong.size:
-            raise ExperimentDataError(
-                f"{record.source}: {name} of reading {wrong[0] + 1} is {column[wrong[0]]:g}; a lost value "
-                "must be left out of a load test, and a ring-down cannot be evaluated with one."
-            )
+            found = wrong[0] + 1, column[wrong[0]]
+            raise ExperimentDataError(said("readings.lost", record=record, name=name, found=found))
 
 
 def places_of(folder: Path, name: Path) -> Iterator[Path]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from calibration.dynamics.records import RingDownRecord
 from calibration.joint.wing_table import weighed
 from calibration.result.record import Reading
+from calibration.sentences import said
 from calibration.static.experiments import (
     HALF_WIDTH_95,
     LoadDisplacementData,
@@ -65,9 +66,7 @@ def check_recorded(gauges: int) -> None:
         If it has fewer than `RECORDED_GAUGE`.
     """
     if gauges < RECORDED_GAUGE:
-        raise ExperimentDataError(
-            f"the wing has {gauges} gauges, but a release is recorded at gauge {RECORDED_GAUGE}."
-        )
+        raise ExperimentDataError(said("virtual.gauges", gauges=gauges, recorded=RECORDED_GAUGE))
 
 
 def sampling_times(duration: float, sampling_rate: float) -> FloatArray:
@@ -79,10 +78,8 @@ def sampling_times(duration: float, sampling_rate: float) -> FloatArray:
         If duration or rate is not positive and finite, or no two samples fit.
     """
     if not (0.0 < duration < math.inf and 0.0 < sampling_rate < math.inf and duration * sampling_rate >= 1.0):
-        raise ExperimentDataError(
-            "a record needs a positive duration and sampling rate, but "
-            f"{duration:g} s at {sampling_rate:g} Hz were asked for."
-        )
+        asked = duration, sampling_rate
+        raise ExperimentDataError(said("virtual.duration", asked=asked))
     return np.arange(int(duration * sampling_rate + 1e-9) + 1) / sampling_rate
 
 
@@ -115,10 +112,8 @@ class VirtualWing:
     def __post_init__(self) -> None:
         check_recorded(self.model.gauge_count)
         if not all(math.isfinite(error) and error > -1.0 for error in self.frequency_error):
-            raise ExperimentDataError(
-                "a relative frequency error must be finite and above -1, but "
-                f"{' and '.join(f'{error:g}' for error in self.frequency_error)} were given."
-            )
+            given = " and ".join(f"{error:g}" for error in self.frequency_error)
+            raise ExperimentDataError(said("virtual.frequency_error", given=given))
         self.model.modes(self.truth.values, self.truth.stiffness_loss)  # refuses a truth outside the model
 
     def tip_displacement(self, load: float) -> float:
@@ -213,15 +208,10 @@ def measure_ring_down(
         If there is no trial, noise or step is negative or not finite, or the records would be too short.
     """
     if trials < 1 or not (math.isfinite(noise) and noise >= 0.0):
-        raise ExperimentDataError(
-            "ring-down tests need at least one trial and noise that is finite and not negative, but "
-            f"{trials} trials with {noise:g} V were asked for."
-        )
+        raise ExperimentDataError(said("virtual.trials", trials=trials, noise=noise))
     if MOST_SAMPLES < trials * duration * sampling_rate < math.inf:
-        raise ExperimentDataError(
-            f"{trials} records of {duration:g} s at {sampling_rate:g} Hz are more than {MOST_SAMPLES:,} "
-            "samples: take fewer, shorter or slower ones."
-        )
+        asked = trials, duration, sampling_rate, MOST_SAMPLES
+        raise ExperimentDataError(said("virtual.samples", asked=asked))
     if quantisation is not None and not (math.isfinite(quantisation) and quantisation > 0.0):
         raise ExperimentDataError(f"the recorder's step must be positive, but {quantisation:g} V was given.")
     generator = np.random.default_rng(child_seed(seed, _PURPOSES["ring_down"]))

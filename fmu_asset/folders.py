@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from fmu_asset.sentences import said
+
 from .errors import FmuFileError
 
 _tidied: set[Path] = set()
@@ -39,10 +41,7 @@ def plain_folder() -> Path:
             folder = Path(parent, "own").absolute()
             folder.mkdir(0o700)
             return folder
-    raise FmuFileError(
-        f"FMUs need a writable folder for temporary files with a plain ASCII path, but none of "
-        f"{', '.join(candidates)} is one; set TMPDIR."
-    )
+    raise FmuFileError(said("running.no_folder", candidates=candidates))
 
 
 @contextmanager

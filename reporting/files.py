@@ -39,6 +39,15 @@ def write_error(error: OSError, path: Path) -> FileNotWrittenError:
     return FileNotWrittenError(f"{path} could not be written: {error.strerror or error}.")
 
 
+@contextmanager
+def written(path: Path) -> Iterator[None]:
+    """Turn what the operating system refuses while writing `path` into one clear sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise write_error(error, path) from error
+
+
 def _destination(path: Path) -> Path:
     """Return the file behind `path` (links followed); refuse a folder and a device."""
     target = Path(os.path.realpath(path))

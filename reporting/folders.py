@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from reporting.errors import FileNotWrittenError
-from reporting.files import write_error
+from reporting.files import write_error, written
 
 _OLD, _REPLACED = "old", "replaced"
 
@@ -65,7 +65,7 @@ def whole_folder(folder: Path, take: Callable[[Path], int] = _taken) -> Iterator
     FileNotWrittenError
         The disk is full, the place is not writable, or another process holds the folder.
     """
-    try:
+    with written(folder):
         fresh = fresh_folder(folder)
         try:
             yield fresh
@@ -79,8 +79,6 @@ def whole_folder(folder: Path, take: Callable[[Path], int] = _taken) -> Iterator
                 os.close(held)
         finally:
             shutil.rmtree(fresh, ignore_errors=True)
-    except OSError as error:
-        raise write_error(error, folder) from error
 
 
 def replace_folder(fresh: Path, folder: Path) -> None:

@@ -38,6 +38,12 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
+def require(met: object, otherwise: str) -> None:
+    """Refuse a table with a sentence, in validators; raises `ValueError`."""
+    if not met:
+        raise ValueError(otherwise)
+
+
 _Description = TypeVar("_Description", bound=BaseModel)
 
 

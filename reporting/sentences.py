@@ -1,8 +1,28 @@
 """Sentences in a TOML file beside a module, filled in where they are said."""
 
 import tomllib
+from collections.abc import Mapping, Set
 from pathlib import Path
+from string import Formatter
 from typing import Any
+
+MOST_LISTED = 30
+"""Of several things, those that are written out."""
+
+
+class _Written(Formatter):
+    """Braces as in `str.format`; several things are written one after the other, "none" if there is none.
+
+    As Python writes them with `!s`: a place in an array, a shape.
+    """
+
+    def convert_field(self, value: Any, conversion: str | None) -> Any:
+        several = isinstance(value, tuple | list | Set | Mapping) and not hasattr(value, "_fields")
+        if not several or conversion == "s":
+            return super().convert_field(value, conversion)
+        texts = [str(super(_Written, self).convert_field(item, conversion)) for item in value]
+        more = f" and {len(texts) - MOST_LISTED} more" if len(texts) > MOST_LISTED else ""
+        return (", ".join(texts[:MOST_LISTED]) or "none") + more
 
 
 class Sentences:
@@ -24,7 +44,10 @@ class Sentences:
         self.tables: dict[str, Any] = tomllib.loads(text)
 
     def said(self, sentence: str, /, **values: object) -> str:
-        """Return a sentence by table and name, such as "mesh.empty", with its values."""
+        """Return a sentence by table and name, such as "mesh.empty", with its values.
+
+        Several values in one are written one after the other.
+        """
         table, _, key = sentence.partition(".")
         text: str = self.tables[table][key]
-        return text.format(**values)
+        return _Written().vformat(text, (), values)

@@ -32,11 +32,13 @@ DAYS = 14
 """What nobody read for so long is removed."""
 
 # The product has numba keep loops in folders named by the content of their sources; the path of a clone would
-# part them again. Before numba is imported, and for the processes that tests start.
+# part them again. Before numba is imported, and for the processes that tests start. Those know nothing of
+# this: where there is one clone only, all keep the path and find each other's loops.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(FOLDER / "compiled"))
-from numba.core.caching import UserProvidedCacheLocator  # noqa: E402
+if not os.environ.get("CI"):
+    from numba.core.caching import UserProvidedCacheLocator
 
-UserProvidedCacheLocator.get_suitable_cache_subpath = classmethod(lambda cls, py_file: "")
+    UserProvidedCacheLocator.get_suitable_cache_subpath = classmethod(lambda cls, py_file: "")
 
 _Made = TypeVar("_Made")
 

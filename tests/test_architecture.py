@@ -40,11 +40,11 @@ ROOMS = {
         "compilation", "verification",
     ),
     "fmu_asset": (
-        "errors", "folders", "slaves", "description", "instances", "worker", "archive", "compiled", "door",
-        "packing", "companions", "structures", "coupling", "check", "ssp",
+        "errors", "sentences", "folders", "slaves", "description", "instances", "worker", "archive",
+        "compiled", "door", "packing", "companions", "structures", "coupling", "check", "ssp",
     ),
     "calibration": (
-        "errors", "lab_folder", "static", "result", "geometry", "dynamics", "joint",
+        "errors", "sentences", "lab_folder", "static", "result", "geometry", "dynamics", "joint",
         "virtual_wing", "paper", "wing",
     ),
     "twin_master": (

@@ -41,6 +41,7 @@ def plan(
     from twin_master.report.plan import plan_figure
 
     knowledge, _ = _knowledge(scenario, seed, calibration)
+    blind = _without(knowledge, [value_of]) if value_of is not None else None
     problem, plan, promised = _planned(knowledge)
     if out is not None:
         write_policy(out, plan.policy, knowledge.model)
@@ -53,9 +54,9 @@ def plan(
         "half_width": promised.half_width,
         "beyond_limit": risk_of(knowledge.scenario, problem, knowledge.rewards, plan.policy),
     }
-    rows = [promised, *([] if value_of else compared(knowledge.scenario, problem))]
-    if value_of is not None:
-        without = _planned(_without(knowledge, [value_of]))[2]
+    rows = [promised, *([] if blind else compared(knowledge.scenario, problem))]
+    if blind is not None:
+        without = _planned(blind)[2]
         worth = promised.beyond(without)
         rows.append(replace(without, name=f"planned without {value_of}"))
         record["value"] = {"of": value_of, "mean": worth.mean, "half_width": worth.half_width}
@@ -107,15 +108,8 @@ def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
     titles, inspecting = _titles(scenario), [action.name for action in scenario.action if action.inspects]
     for name in names:
         if name not in (*titles, *inspecting):
-            raise MissionInputError(
-                said(
-                    "plan_command.value_of",
-                    inspecting=", ".join(inspecting) or "there is none",
-                    first=titles[0],
-                    last=titles[-1],
-                    name=name,
-                )
-            )
+            known, gauges = inspecting or ["there is none"], f"{titles[0]} to {titles[-1]}"
+            raise MissionInputError(said("plan_command.value_of", inspecting=known, gauges=gauges, name=name))
     given, count = scenario.observation.standard_deviation, scenario.observation.count
     each = given if isinstance(given, tuple) else (given,) * count
     each = tuple(_BLIND if title in names else own for title, own in zip(titles, each, strict=True))

@@ -78,7 +78,7 @@ def watch(
             last=last, report=not no_report, otherwise="-", begun=opened, progress=terminal.progress(),
         )  # fmt: skip
         _write("", flush=True)
-        counts = watches[0].keep.intake.counts
+        counts = watches[0].intake.counts
         refused = f", {counts.rejected} messages refused (see rejected.jsonl)" if counts.rejected else ""
         typer.echo(f"Watch: {folder}, {counts.received} messages{refused}.", err=True)
         if not no_report and (folder / REPORT_NAME).is_file():

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
 from calibration.errors import ExperimentDataError
+from calibration.sentences import said
 
 from .damped_cosine import ComplexArray, DampedCosines, FloatArray, Solution, modal_slopes
 
@@ -105,10 +106,8 @@ def identify_modes(
     lags = int(np.clip(np.ceil(2.0 * sampling_rate / limits.min()), fewest, _MOST_LAGS))
     needed = (BLOCKS if kind == "ambient" else 4) * 2 * lags
     if len(record) < needed:
-        raise ExperimentDataError(
-            f"the record has {len(record)} samples; {needed} are needed to tell modes and their covariance: "
-            "record longer, or take a smaller sampling rate."
-        )
+        few = len(record), needed
+        raise ExperimentDataError(said("record.short", few=few))
     way = partial(_ambient, modes=len(limits)) if kind == "ambient" else _decay
     found, covariances = way(record, sampling_rate, lags)
     strongest = [found.strongest(low, high) for low, high in limits]
@@ -126,29 +125,20 @@ def _checked(acceleration: ArrayLike, rate: float, bands: ArrayLike) -> tuple[Fl
     record = record[:, None] if record.ndim == 1 else record
     limits = np.array(bands, dtype=np.float64)
     if record.ndim != 2 or not np.all(np.isfinite(record)):
-        raise ExperimentDataError(
-            "a record of accelerations must be finite numbers, one row for each sample; lost values must be "
-            "cut out or filled before."
-        )
+        raise ExperimentDataError(said("record.finite"))
     if limits.ndim != 2 or limits.shape[1] != 2 or not np.all(np.diff(limits, prepend=0.0) > 0.0):
         raise ExperimentDataError("each band is its least and its largest frequency [Hz], above zero.")
     if limits.max() > 0.5 * rate:
-        raise ExperimentDataError(
-            f"a band ends at {limits.max():g} Hz, and a record at {rate:g} Hz shows nothing above "
-            f"{0.5 * rate:g} Hz."
-        )
+        rates = limits.max(), rate, 0.5 * rate
+        raise ExperimentDataError(said("record.band_end", rates=rates))
     if 2 * len(limits) > LARGEST_ORDER:
-        raise ExperimentDataError(
-            f"{LARGEST_ORDER // 2} modes are identified at most, and {len(limits)} are asked for."
-        )
+        raise ExperimentDataError(said("record.many_modes", most=LARGEST_ORDER // 2, asked=len(limits)))
     rising = limits[np.argsort(limits[:, 0])]
     if np.any(rising[1:, 0] < rising[:-1, 1]):
         raise ExperimentDataError("bands overlap, and one mode could be found in two: part them.")
     dead = np.flatnonzero(np.ptp(record, axis=0) == 0.0)
     if dead.size:
-        raise ExperimentDataError(
-            f"accelerometer {dead[0] + 1} of the record shows one value throughout: leave it out, or mend it."
-        )
+        raise ExperimentDataError(said("record.dead", number=dead[0] + 1))
     return record - record.mean(axis=0), limits
 
 
@@ -276,10 +266,8 @@ def _ambient(record: FloatArray, rate: float, lags: int, modes: int) -> _Found:
         together = int(np.ceil(memory * rate / length))
         count = BLOCKS // together
         if count < _FEWEST_BLOCKS:
-            raise ExperimentDataError(
-                f"a mode dies away in {memory:.3g} s, and the record of {size / rate:.3g} s holds that less "
-                f"than {_FEWEST_BLOCKS} times, too few for a covariance: record longer."
-            )
+            times = memory, size / rate, _FEWEST_BLOCKS
+            raise ExperimentDataError(said("record.memory", times=times))
         long = each[: count * together].reshape(count, together, *whole.shape).mean(axis=1)
         moved = [subspace.moved(_STEP * (one - whole), order, poles) for one in long]
         changes = [

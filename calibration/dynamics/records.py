@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.lab_folder import LAB_ERRORS, keep_vectors, places_of
+from calibration.sentences import said
 from reporting.table_file import TextTable, parse_table
 from reporting.text_file import read_text
 from reporting.words import counted
@@ -66,18 +67,14 @@ class RingDownRecord:
         names = ("time", "signal", "lowest", "highest")
         keep_vectors(self, *(name for name in names if getattr(self, name) is not None))
         if self.count < MINIMUM_COUNT:
-            raise ExperimentDataError(
-                f"{self.source}: the record has {self.count} samples; at least {MINIMUM_COUNT} are needed."
-            )
+            raise ExperimentDataError(said("record.samples", self=self, least=MINIMUM_COUNT))
         step = np.diff(self.time)
         usual = float(self.time[-1] - self.time[0]) / (self.count - 1)
         astray = np.abs(self.time - np.linspace(self.time[0], self.time[-1], self.count)).max()
         if not (step.min() >= 0.0 and usual > 0.0 and astray <= max(0.05 * usual, _ROUNDING)):
             place = int(np.argmax(np.abs(step - np.median(step))))
-            raise ExperimentDataError(
-                f"{self.source}: time must run upwards in even steps, but after sample {place + 1} it moves "
-                f"by {step[place]:.6g} s where {np.median(step):.6g} s is usual."
-            )
+            steps = step[place], np.median(step)
+            raise ExperimentDataError(said("record.uneven", self=self, number=place + 1, steps=steps))
         _refuse_clipped(self)
 
     @property
@@ -111,10 +108,7 @@ def read_records(path: Path) -> tuple[RingDownRecord, ...]:
     """
     files = find_records(path)
     if not files:
-        raise ExperimentFileError(
-            f"{path} holds no ring-down record; {FILE_PATTERNS[0]} or {FILE_PATTERNS[-1]} is needed, there "
-            f"or in its folder {STEP_FOLDER}."
-        )
+        raise ExperimentFileError(said("record.none", path=path, files=FILE_PATTERNS, folder=STEP_FOLDER))
     return tuple(_read_record(file) for file in files)
 
 
@@ -152,10 +146,8 @@ def _read_record(file: Path) -> RingDownRecord:
         header = [_named(cell.strip().strip('"'), file) for cell in cells]
         text = text if first.startswith("#") else text.replace(first, f"#{first}", 1)
     elif not 2 <= (count := len(first.split(separator))) <= len(_RAW_COLUMNS):
-        raise ExperimentFileError(
-            f"{file} has {counted(count, 'column')}; time [s], spanwise and, if there is one, chordwise "
-            "signal [V] are needed, without header."
-        )
+        came = counted(count, "column")
+        raise ExperimentFileError(said("record.columns", file=file, came=came))
     table = parse_table(text, str(file), LAB_ERRORS, header=header, separator=separator)
     time, signal = (_column(table, spellings) for spellings in _NAMES[:2])
     if "spanwise" in header:
@@ -178,9 +170,7 @@ def _column(table: TextTable, spellings: tuple[str, ...]) -> NDArray[np.float64]
     for name in spellings:
         if name in table.columns:
             return table.numbers(name, "a ring-down")
-    raise ExperimentFileError(
-        f"{table.name} lacks the column {' or '.join(spellings)}; its columns are {', '.join(table.columns)}."
-    )
+    raise ExperimentFileError(said("record.no_column", table=table, wanted=" or ".join(spellings)))
 
 
 def _refuse_clipped(record: RingDownRecord) -> None:
@@ -193,7 +183,4 @@ def _refuse_clipped(record: RingDownRecord) -> None:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(np.int8)))
         run = int(np.max(edges[1::2] - edges[::2]))
         if run >= 3 and run / record.sampling_rate >= _CLIPPED_DURATION:
-            raise ExperimentDataError(
-                f"{record.source}: {run} samples in a row have the {name} value {extreme:g}, as if the "
-                "recorder had clipped the signal; repeat the test with a wider range."
-            )
+            raise ExperimentDataError(said("record.clipped", record=record, run=run, name=name, end=extreme))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.signal import decimate, detrend, find_peaks
 
 from calibration.errors import ExperimentDataError
+from calibration.sentences import said
 
 from .damped_cosine import DampedCosines, RingDownMode
 from .records import MINIMUM_COUNT, RingDownRecord
@@ -89,10 +90,8 @@ def prepare(record: RingDownRecord, start: float | None = FIRST_PEAK) -> RingDow
     lowest, highest = record.lowest, record.highest
     factor = int(record.sampling_rate / WORKING_RATE + 0.5)
     if factor > 1 and record.count // factor < MINIMUM_COUNT:
-        raise ExperimentDataError(
-            f"{record.source}: {record.count} samples at {record.sampling_rate:.4g} Hz last "
-            f"{record.time[-1] - record.time[0]:.3g} s, too short for a ring-down; is the time in s?"
-        )
+        length = record.time[-1] - record.time[0]
+        raise ExperimentDataError(said("ringdown.short", record=record, length=length))
     while factor > 1:
         stage = max(divisor for divisor in range(1, 11) if factor % divisor == 0)
         if stage == 1:
@@ -103,10 +102,8 @@ def prepare(record: RingDownRecord, start: float | None = FIRST_PEAK) -> RingDow
         factor //= stage
     after = time > start if start is not None else np.ones(time.shape, dtype=bool)
     if np.count_nonzero(after) < 0.25 * time.size:
-        raise ExperimentDataError(
-            f"{record.source}: cropped at {start:g} s, {np.count_nonzero(after)} of {time.size} samples "
-            "remain; give the instant of release."
-        )
+        left = np.count_nonzero(after), time.size
+        raise ExperimentDataError(said("ringdown.cropped", record=record, start=start, left=left))
     lowest, highest = (None if column is None else column[after] for column in (lowest, highest))
     return replace(record, time=time[after], signal=signal[after], lowest=lowest, highest=highest)
 
@@ -132,20 +129,16 @@ def spectral_peaks(record: RingDownRecord) -> tuple[float, float]:
         in the record itself or in its beginning.
     """
     if 0.5 * record.sampling_rate < 4.0 * SEARCH_BAND[0]:
-        raise ExperimentDataError(
-            f"{record.source}: a sampling rate of {record.sampling_rate:.3g} Hz shows nothing above "
-            f"{0.5 * record.sampling_rate:.3g} Hz; is the time in s?"
-        )
+        highest = 0.5 * record.sampling_rate
+        raise ExperimentDataError(said("ringdown.slow", record=record, highest=highest))
     found = _peaks(record, 0.0)
     if len(found) < 2:
         found = _peaks(record, _SEARCH_DECAY)
     if len(found) < 2:
         seen = "none" if not found else f"one, at {found[0]:.3g} Hz"
         top = min(SEARCH_BAND[1], 0.5 * record.sampling_rate)
-        raise ExperimentDataError(
-            f"{record.source}: two spectral peaks are needed between {SEARCH_BAND[0]:.3g} and "
-            f"{top:.3g} Hz, but there is {seen}; check the record, its sampling and the release."
-        )
+        band = SEARCH_BAND[0], top
+        raise ExperimentDataError(said("ringdown.peaks", record=record, band=band, seen=seen))
     first, second = sorted(found[:2])
     return first, second
 
@@ -215,10 +208,8 @@ def refuse_growing(modes: Iterable[RingDownMode], source: str) -> None:
     """Raise ExperimentDataError for what is no decaying oscillation."""
     for number, mode in enumerate(modes, start=1):
         if not 0.0 < -mode.pole.real < mode.pole.imag:
-            raise ExperimentDataError(
-                f"{source}: mode {number} at {mode.damped_frequency:.3g} Hz is not a decaying oscillation "
-                f"(fitted rate {-mode.pole.real:.3g} 1/s); a ring-down record is needed."
-            )
+            where, fitted = (source, number), (mode.damped_frequency, -mode.pole.real)
+            raise ExperimentDataError(said("ringdown.no_decay", where=where, fitted=fitted))
 
 
 def _refuse_steady(record: RingDownRecord) -> None:
@@ -226,7 +217,4 @@ def _refuse_steady(record: RingDownRecord) -> None:
     third = record.count // 3
     first, last = (math.sqrt(float(np.mean(part**2))) for part in (signal[:third], signal[-third:]))
     if last > _STEADY_SHARE * first:
-        raise ExperimentDataError(
-            f"{record.source}: the signal does not decay (its last third has {last / first:.2g} times the "
-            "rms of its first); a record of free vibration from the release on is needed."
-        )
+        raise ExperimentDataError(said("ringdown.steady", record=record, share=last / first))

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from calibration.errors import ExperimentDataError
+from calibration.sentences import said
 
 from .damped_cosine import DampedCosines, FloatArray, RingDownMode
 from .records import RingDownRecord
@@ -126,9 +127,7 @@ def refine_by_extremes(trials: RingDownTrials) -> RingDownTrials:
 def _refine(fit: RingDownFit) -> RingDownFit:
     record = fit.record
     if record.lowest is None or record.highest is None:
-        raise ExperimentDataError(
-            f"{record.source}: the record has no lowest and highest values; only one read off a plot does."
-        )
+        raise ExperimentDataError(said("ringdown.envelope", record=record))
     lowest, highest = record.lowest, record.highest
     time = record.time - record.time[0]
     within = time[:, np.newaxis] + np.linspace(-0.5, 0.5, _POINTS) * record.averaging_width

@@ -16,6 +16,7 @@ from scipy.special import gammaln
 
 from calibration.errors import PosteriorError
 from calibration.result.record import ParameterPrior
+from calibration.sentences import said
 from calibration.static.posterior import Seed, check_count, child_seed
 
 FloatArray = NDArray[np.float64]
@@ -117,10 +118,7 @@ def infer(
     largest = float(log_weight.max())
     effective = _effective(weight) if math.isfinite(largest) else 0.0
     if effective < LEAST_EFFECTIVE_SAMPLE_SIZE:
-        raise PosteriorError(
-            f"only {effective:.0f} of {proposals} draws describe the posterior: the readings contradict each "
-            "other within the model's range; check them, or allow the model a larger error."
-        )
+        raise PosteriorError(said("joint.effective", effective=effective, proposals=proposals))
     values = density.values(points)
     mean = weight @ values
     chosen = np.searchsorted(np.cumsum(weight), (np.arange(count) + generator.random()) / count)

@@ -16,6 +16,7 @@ from calibration.dynamics.trials import (
 )
 from calibration.errors import ExperimentDataError
 from calibration.result.record import Reading
+from calibration.sentences import said
 
 MODAL = ("frequency_1", "frequency_2", "damping_ratio_1", "damping_ratio_2")
 """What a ring-down tells of a wing."""
@@ -40,20 +41,12 @@ def check_readings(readings: Sequence[Reading]) -> tuple[Reading, ...]:
     """
     for item in readings:
         if not all(math.isfinite(value) and value > 0.0 for value in (item.value, item.deviation)):
-            raise ExperimentDataError(
-                f"{item.experiment}: {item.name} and its standard deviation must be positive and finite, but "
-                f"{item.value:g} and {item.deviation:g} came."
-            )
+            raise ExperimentDataError(said("joint.positive", item=item))
         if item.name.startswith("damping_ratio") and not item.value < 1.0:
-            raise ExperimentDataError(
-                f"{item.experiment}: a damping ratio of {item.value:.4g} lets nothing swing; give "
-                "fractions of critical damping, 0.05 for 5 %."
-            )
+            raise ExperimentDataError(said("joint.ratio", item=item))
     first, second = ([item.value for item in readings if item.name == f"frequency_{mode}"] for mode in (1, 2))
     if first and second and not first[0] < second[0]:
-        raise ExperimentDataError(
-            f"the first flapwise frequency, {first[0]:.4g} Hz, must lie below the second, {second[0]:.4g} Hz."
-        )
+        raise ExperimentDataError(said("joint.order", first=first[0], second=second[0]))
     return tuple(readings)
 
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from calibration.errors import ExperimentDataError, OutsideValidityError
 from calibration.result.record import ParameterPrior, Reading
+from calibration.sentences import said
 from calibration.static.errors_in_variables import exact_posterior, residual_variance
 from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import GaussianPrior
@@ -74,10 +75,8 @@ def joint_posterior(
     """
     check_readings(readings)
     if not all(math.isfinite(value) and 0.0 <= value < 1.0 for value in model_error):
-        raise ExperimentDataError(
-            "the model error of a frequency is a relative standard deviation from 0 to below 1 (not "
-            f"percent), but {' and '.join(f'{value:g}' for value in model_error)} were given."
-        )
+        given = " and ".join(f"{value:g}" for value in model_error)
+        raise ExperimentDataError(said("joint.model_error", given=given))
     priors = wing_priors(wing.validity) if priors is None else priors
     errors = {"frequency_1": model_error[0], "frequency_2": model_error[1]}
     columns = {figure.name: at for at, figure in enumerate(QUANTITIES[1:], start=1)}
@@ -101,11 +100,7 @@ def joint_posterior(
     for limit in limits:
         share = float(np.mean(np.abs(found.samples[:, 0] - limit) < _LIMIT_MARGIN * (limits[1] - limits[0])))
         if share > _LARGEST_SHARE_AT_LIMIT:
-            raise OutsideValidityError(
-                f"{share:.0%} of the joint posterior of e is pressed against {limit:g}, where the model "
-                "ends: load test and frequencies contradict each other; check them, or allow the model a "
-                "larger error of its frequencies."
-            )
+            raise OutsideValidityError(said("joint.limit", share=share, limit=limit))
     return found
 
 
@@ -117,10 +112,7 @@ def _refuse_negative(readings: Mapping[str, Reading]) -> None:
     coefficients = inverse @ [item.value for item in ratios]
     spread = np.sqrt(inverse**2 @ [item.deviation**2 for item in ratios])
     if np.any(coefficients + _HARDLY * spread < 0.0):
-        raise ExperimentDataError(
-            f"damping ratios {ratios[0].value:g} and {ratios[1].value:g} need a negative Rayleigh "
-            "coefficient, but neither may be negative; check the ring-down records."
-        )
+        raise ExperimentDataError(said("joint.negative", ratios=ratios))
 
 
 def servo_range(validity: Mapping[str, tuple[float, float]], total_mass: float) -> tuple[float, float]:
@@ -136,8 +128,5 @@ def servo_range(validity: Mapping[str, tuple[float, float]], total_mass: float) 
     upper = min(servo[1], 0.5 * (total_mass - pitot[0]))
     if not (math.isfinite(total_mass) and lower < upper):
         least, greatest = 2.0 * servo[0] + pitot[0], 2.0 * servo[1] + pitot[1]
-        raise ExperimentDataError(
-            f"two servos and the pitot tube cannot weigh {total_mass:g} kg: the model takes totals between "
-            f"{least:g} and {greatest:g} kg."
-        )
+        raise ExperimentDataError(said("joint.total", total=total_mass, ends=(least, greatest)))
     return lower, upper

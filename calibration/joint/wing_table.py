@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibration.errors import OutsideValidityError, PosteriorError
 from calibration.result.record import CalibratedFigure, ParameterPrior, Reading
+from calibration.sentences import said
 from calibration.static.posterior import PRIOR_DEVIATION
 from calibration.static.stiffness_curve import StiffnessCurve, stiffness_curve_of
 from fe.runtime.modal_system import rayleigh_damping_ratio
@@ -45,6 +46,15 @@ _PRIORS = {
     "damping_alpha": ("1/s", 0.0, 3.0, _OURS, "mass-proportional Rayleigh damping, alpha"),
     "damping_beta": ("s", 0.0, 1.5e-3, _OURS, "stiffness-proportional Rayleigh damping, beta"),
 }
+SHIPPED_PRIOR = {
+    "young_modulus_factor": (1.0073, 0.0103),
+    "servo_mass": (0.1685, 0.0041),
+    "pitot_mass": (0.1350, 0.0083),
+    "damping_alpha": (1.03, 0.37),
+    "damping_beta": (7.56e-4, 1.84e-4),
+}
+"""Mean and standard deviation of the calibrated state of the shipped wing (docs/calibration.md): e of the
+paper, its masses, and the damping of the joint posterior, whose spread holds the measurement too."""
 _DAMPING_RANGES = {"damping_alpha": (0.0, 20.0), "damping_beta": (0.0, 1e-2)}
 
 
@@ -133,11 +143,8 @@ class WingTable:
             row, place = np.argwhere(~inside)[0]
             prior = wing_priors(self.validity)[place]
             unit = f" {prior.figure.shown_unit}".rstrip()
-            raise OutsideValidityError(
-                f"the {prior.title} is {points[row, place]:.4g}{unit}, but the model holds for "
-                f"{prior.low:g} to {prior.high:g}{unit}; check the measurements, or build a model with a "
-                "wider range."
-            )
+            value = points[row, place]
+            raise OutsideValidityError(said("joint.outside", prior=prior, value=value, unit=unit))
         scaled = (2.0 * points - self.limits.sum(axis=1)) / np.diff(self.limits, axis=1)[:, 0]
         return _values(scaled, self.coefficient)
 
@@ -202,7 +209,4 @@ def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTabl
         error = float(np.abs(_values(checks, coefficient) / expected - 1.0).max())
         if error <= tolerance:
             return WingTable(limits, coefficient, curve, error)
-    raise PosteriorError(
-        f"the flapwise frequencies of the model are not smooth over its range: a polynomial errs by "
-        f"{error:.2g} where {tolerance:.2g} are allowed; build a model with a narrower range of masses."
-    )
+    raise PosteriorError(said("joint.rough", error=error, tolerance=tolerance))

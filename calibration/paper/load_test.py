@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from calibration.errors import OutsideValidityError, PosteriorError
+from calibration.sentences import said
 from calibration.static.errors_in_variables import FitQuality, Measure, assess_fit, exact_posterior
 from calibration.static.experiments import LoadDisplacementData, published_measurements
 from calibration.static.posterior import GaussianPrior, ScalarPosterior, Seed, check_count, child_seed
@@ -143,9 +144,7 @@ def particle_filter(
     """
     prior = prior or GaussianPrior()
     if particle_count < _FEWEST_PARTICLES:
-        raise PosteriorError(
-            f"at least {_FEWEST_PARTICLES} particles are needed, but {particle_count} were given."
-        )
+        raise PosteriorError(said("particles.few", least=_FEWEST_PARTICLES, given=particle_count))
     check_count(particle_count, PosteriorError)
     generator = np.random.default_rng(child_seed(seed, _PURPOSE_PARTICLES))
     of_pairs = np.random.default_rng(child_seed(seed, _PURPOSE_PAIRS))
@@ -164,19 +163,14 @@ def particle_filter(
             log_weight += np.log(np.interp(particles, *known, left=0.0, right=0.0))
         largest = float(log_weight.max())
         if largest == -math.inf:
-            raise PosteriorError(
-                f"no particle explains pair {pair + 1} ({load:g} N, {displacement * 1e3:g} mm) of "
-                f"{data.source} and those before it; check the prior N({prior.mean:g}, "
-                f"{prior.standard_deviation:.3g}^2), the units and the curve."
-            )
+            given = pair + 1, load, displacement * 1e3
+            raise PosteriorError(said("particles.unexplained", given=given, data=data, prior=prior))
         weight = np.exp(log_weight - largest)
         weight /= weight.sum()
         effective[pair] = 1.0 / float(np.sum(weight**2))
     if effective[-1] < _FEWEST_EFFECTIVE_PARTICLES:
-        raise PosteriorError(
-            f"only {effective[-1]:.1f} of {particle_count} particles effectively remain after "
-            f"{data.count} pairs; take more particles, or the exact posterior."
-        )
+        left = effective[-1], particle_count
+        raise PosteriorError(said("particles.effective", left=left, data=data))
     mean, standard_deviation = _moments(weight, particles)
     # The spread of the weighted particles, in the rule's place of the median deviation.
     bandwidth = standard_deviation * reference_bandwidth_factor(float(effective[-1]))

@@ -19,6 +19,7 @@ from calibration.joint.measurement import MODAL
 from calibration.joint.posterior import servo_range
 from calibration.lab_folder import lab_table
 from calibration.result.record import Reading
+from calibration.sentences import said
 from fe.runtime.modal_system import rayleigh_coefficients
 
 RESULTS_FILE = "massoptimizationresults.csv"
@@ -86,11 +87,8 @@ def fit_masses(
             minimize_scalar(error, bounds=(lower, upper), method="bounded", options={"xatol": 1e-9}).x
         )
         if min(servo - lower, upper - servo) < 1e-6:
-            raise ExperimentDataError(
-                f"at e = {factor:g} the masses nearest to {wanted[0]:.4g} and {wanted[1]:.4g} Hz lie at the "
-                f"limit of the model, {servo:.4g} kg for a servo under a total of {total_mass:g} kg; check "
-                "the measured frequencies and the total."
-            )
+            found = servo, total_mass
+            raise ExperimentDataError(said("paper.masses", factor=factor, wanted=wanted, masses=found))
         masses = factor, servo, total_mass - 2.0 * servo
         pairs.append(frequencies(np.array([masses]))[0])
         ratios = measured[MODAL[2]], measured[MODAL[3]]
@@ -110,11 +108,8 @@ def damping_coefficients(
     """
     alpha, beta = rayleigh_coefficients(frequency, damping_ratio)
     if alpha < 0.0 or beta < 0.0:
-        raise ExperimentDataError(
-            f"damping ratios {damping_ratio[0]:g} at {frequency[0]:.4g} Hz and {damping_ratio[1]:g} at "
-            f"{frequency[1]:.4g} Hz need Rayleigh coefficients of {alpha:.3g} 1/s and {beta:.3g} s, but "
-            "neither may be negative; check the ring-down records."
-        )
+        modes = *damping_ratio, *frequency
+        raise ExperimentDataError(said("paper.negative", modes=modes, alpha=alpha, beta=beta))
     return alpha, beta
 
 

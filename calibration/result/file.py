@@ -20,6 +20,7 @@ from pydantic import TypeAdapter
 
 from calibration.errors import CalibrationError, CalibrationRecordError
 from calibration.result.record import FROM_CAMPAIGN, FROM_LABORATORY, Calibration
+from calibration.sentences import said
 from reporting.errors import DamagedFileError, FileNotWrittenError
 from reporting.files import atomic_write_bytes
 from reporting.netcdf import read_groups
@@ -100,10 +101,8 @@ def load_calibration(path: Path | str) -> Calibration:
     groups, root = _read(path)
     came = root.get("schema")
     if came != SCHEMA:
-        raise CalibrationRecordError(
-            f"{path} is {'of the schema ' + repr(str(came)) if came else 'no calibration file'}, but "
-            f"{SCHEMA!r} is needed; calibrate again with this version."
-        )
+        came = f"of the schema {str(came)!r}" if came else "no calibration file"
+        raise CalibrationRecordError(said("file.version", path=path, came=came, schema=SCHEMA))
     try:
         if root[_HASH] != _content_hash(groups, root):
             raise CalibrationRecordError("its content does not match its hash")
@@ -132,15 +131,11 @@ def check_folder(folder: Path, asset: str, *, wing: bool) -> None:
     except CalibrationRecordError:
         return  # there is none, or what cannot be read is of no use to anyone
     if found.asset != asset:
-        raise FileNotWrittenError(
-            f"{kept} is the calibration of {found.asset}, not of {asset}: choose another --out, one for each "
-            "asset."
-        )
+        raise FileNotWrittenError(said("file.asset", kept=kept, found=found, asset=asset))
     if (found.design is not None) != wing:
         kept_one, wanted = (FROM_CAMPAIGN, FROM_LABORATORY) if wing else (FROM_LABORATORY, FROM_CAMPAIGN)
         raise FileNotWrittenError(
-            f"{kept} is the calibration of {asset} {kept_one}, and one {wanted} was asked for: choose "
-            "another --out, one for each kind of calibration."
+            said("file.another_kind", kept=kept, asset=asset, kept_one=kept_one, wanted=wanted)
         )
 
 
@@ -159,16 +154,12 @@ def _calibration(groups: Groups, root: Root) -> Calibration:
 
 def _read(path: Path) -> tuple[Groups, Root]:
     if not path.is_file():
-        raise CalibrationRecordError(
-            f"{path} is {'no file' if path.exists() else 'not there'}; give the {FILE_NAME} that "
-            "`uav-twin calibrate --out DIR` leaves."
-        )
+        what = "no file" if path.exists() else "not there"
+        raise CalibrationRecordError(said("file.absent", path=path, what=what, name=FILE_NAME))
     try:
         tree = _tree(path, hashlib.sha256(path.read_bytes()).digest())
     except DamagedFileError as error:
-        raise CalibrationRecordError(
-            f"{path} is damaged or no calibration file: it cannot be read as NetCDF; calibrate again."
-        ) from error
+        raise CalibrationRecordError(said("file.damaged", path=path)) from error
     groups = {name: tree[name].to_dataset() for name in tree.children}
     return groups, {str(name): value for name, value in tree.attrs.items()}
 

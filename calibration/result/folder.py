@@ -14,7 +14,7 @@ from calibration.result.text import (
     correlation_lines,
 )
 from reporting.figures import save_figure
-from reporting.files import atomic_write_bytes, atomic_write_text, write_error
+from reporting.files import atomic_write_bytes, atomic_write_text, written
 from reporting.page import Page, ReportFigure
 from reporting.progress import Progress
 from reporting.words import plus_minus
@@ -39,7 +39,7 @@ def calibration_folder(result: Calibration, folder: Path) -> Iterator[Path]:
         If a file cannot be written; the folder is then as it was.
     """
     content = result_bytes(result)
-    try:
+    with written(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as scratch:
             fresh = Path(scratch)
@@ -55,8 +55,6 @@ def calibration_folder(result: Calibration, folder: Path) -> Iterator[Path]:
             for file in (*files, Path(FILE_NAME)):
                 (folder / file).parent.mkdir(parents=True, exist_ok=True)
                 (fresh / file).replace(folder / file)
-    except OSError as error:
-        raise write_error(error, folder) from error
 
 
 def write_calibration_folder(

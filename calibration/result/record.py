@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from calibration.errors import CalibrationRecordError, PosteriorError
+from calibration.sentences import said
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import Seed, check_count, child_seed, stratified
 from fe.runtime.state import DigitalState
@@ -103,10 +104,7 @@ class ParameterPrior:
         """
         low, high = self.ends
         if not high - low > 1e-6:
-            raise PosteriorError(
-                f"the prior of {self.name}, {self.mean:g} ± {self.deviation:g}, lies outside {self.low:g} to "
-                f"{self.high:g}, where the model holds; choose another prior or a wider model."
-            )
+            raise PosteriorError(said("posterior.prior_outside", self=self))
         return math.log(high - low)
 
 
@@ -223,18 +221,14 @@ class Calibration:
     def __post_init__(self) -> None:
         check_name(self.asset)
         if self.procedure not in get_args(Procedure):
-            raise CalibrationRecordError(
-                f"the procedure of a calibration is one of {', '.join(get_args(Procedure))}, and "
-                f"{self.procedure!r} came."
-            )
+            raise CalibrationRecordError(said("posterior.procedure", known=get_args(Procedure), self=self))
         for which in ("samples", "prior_samples"):
             values = np.array(getattr(self, which), dtype=np.float64, order="C")
             values.setflags(write=False)
             columns = len(self.figures)
             if values.ndim != 2 or not len(values) or values.shape[1] != columns:
-                raise CalibrationRecordError(
-                    f"{which} must have the shape (N, {columns}), and {values.shape} came."
-                )
+                came = str(values.shape)
+                raise CalibrationRecordError(said("posterior.shape", which=which, columns=columns, came=came))
             if not np.all(np.isfinite(values)):
                 raise CalibrationRecordError(f"{which} hold a value that is not finite.")
             object.__setattr__(self, which, values)
@@ -256,9 +250,7 @@ class Calibration:
         """
         names = [figure.name for figure in self.figures]
         if name not in names:
-            raise CalibrationRecordError(
-                f"the calibration of {self.asset} has no samples of `{name}`; it has {', '.join(names)}."
-            )
+            raise CalibrationRecordError(said("posterior.no_samples", self=self, name=name, known=names))
         return (self.prior_samples if prior else self.samples)[:, names.index(name)]
 
     def mean(self, name: str) -> float:
@@ -374,9 +366,8 @@ class Calibration:
             If this is the calibration of a model's parameters from a campaign, which has none.
         """
         if self.design is None:
-            raise CalibrationRecordError(
-                f"the calibration of {self.asset} is {FROM_CAMPAIGN}, and one {FROM_LABORATORY} is needed."
-            )
+            kinds = FROM_CAMPAIGN, FROM_LABORATORY
+            raise CalibrationRecordError(said("posterior.laboratory", self=self, kinds=kinds))
         return self.design
 
     def mean_state(self) -> DigitalState:
@@ -430,7 +421,5 @@ def check_name(asset: str) -> str:
         If it is empty, too long or holds control characters.
     """
     if not (0 < len(asset) <= LONGEST_NAME and asset.isprintable() and asset.strip()):
-        raise CalibrationRecordError(
-            f"the name of the asset must be 1 to {LONGEST_NAME} printable characters, and {asset!r} came."
-        )
+        raise CalibrationRecordError(said("posterior.name", most=LONGEST_NAME, asset=asset))
     return asset

@@ -35,6 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import erf
 
 from calibration.errors import OutsideValidityError, PosteriorError
+from calibration.sentences import said
 
 from .experiments import LoadDisplacementData
 from .posterior import GaussianPrior, ScalarPosterior
@@ -190,11 +191,8 @@ def exact_posterior(
         lower, upper = narrower
     outside = 1.0 - float(np.diff(posterior.cumulative([curve.lower, curve.upper]))[0])
     if outside > _LARGEST_PROBABILITY_OUTSIDE:
-        raise OutsideValidityError(
-            f"the posterior e = {posterior.mean:.4g} +- {posterior.standard_deviation:.2g} lies to "
-            f"{outside:.2%} outside [{curve.lower:g}, {curve.upper:g}], where {curve.name} may be trusted; "
-            "build the model for a wider range of e, or check units and prior."
-        )
+        shown = said("load_test.outside", posterior=posterior, outside=outside, curve=curve)
+        raise OutsideValidityError(shown)
     return posterior
 
 

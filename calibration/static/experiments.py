@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from calibration.errors import ExperimentDataError
 from calibration.lab_folder import keep_vectors, lab_table
+from calibration.sentences import said
 from reporting.provenance import hash_record
 
 STANDARD_GRAVITY = 9.81
@@ -81,16 +82,11 @@ class LoadDisplacementData:
         for name in ("load", "displacement"):
             column = getattr(self, name)
             for wrong in np.flatnonzero(column <= 0.0):
-                raise ExperimentDataError(
-                    f"{self.source}: {name} of reading {wrong + 1} is {column[wrong]:g}, but every {name} "
-                    "must be positive; leave out zero readings."
-                )
+                found = wrong + 1, column[wrong]
+                raise ExperimentDataError(said("load_test.positive", self=self, name=name, found=found))
         deviations = (self.load_standard_deviation, self.displacement_standard_deviation)
         if not all(math.isfinite(value) and value >= 0.0 for value in deviations) or not any(deviations):
-            raise ExperimentDataError(
-                f"{self.source}: the standard deviations of load and displacement must be finite, "
-                f"not negative and not both zero, but they are {deviations[0]:g} N and {deviations[1]:g} m."
-            )
+            raise ExperimentDataError(said("load_test.deviations", self=self, given=deviations))
 
     @property
     def count(self) -> int:
@@ -168,7 +164,5 @@ def _refuse_other_units(file: str, load: NDArray[np.float64], displacement_mm: N
     factor, remedy = min(_UNIT_SLIPS, key=lambda slip: abs(math.log(ratio / slip[0])))
     if abs(math.log(ratio / factor)) > math.log(1.25):
         remedy = "check the columns, their units (N and mm) and the wing"
-    raise ExperimentDataError(
-        f"{file}: load over displacement is {stiffness:.3g} N/mm, {ratio:.3g} times the {expected:.3g} N/mm "
-        f"expected before calibration; {remedy}."
-    )
+    found = stiffness, ratio, expected
+    raise ExperimentDataError(said("load_test.stiffness", file=file, found=found, remedy=remedy))

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
 from calibration.errors import PosteriorError
+from calibration.sentences import said
 
 Seed = int | np.random.SeedSequence
 """A seed: a whole number, or a SeedSequence spawned for the purpose."""
@@ -59,10 +60,7 @@ class GaussianPrior:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.mean) and 0.0 < self.standard_deviation < math.inf):
-            raise PosteriorError(
-                "a Gaussian prior needs a finite mean and a positive standard deviation, but "
-                f"{self.mean:g} and {self.standard_deviation:g} were given."
-            )
+            raise PosteriorError(said("load_test.prior", self=self))
 
     def log_density(self, value: ArrayLike) -> NDArray[np.float64]:
         """Return the logarithm of the density, elementwise."""
@@ -108,10 +106,8 @@ class ScalarPosterior:
         good = grid.ndim == 1 and grid.size > 2 and grid.shape == density.shape
         good = good and bool(np.all(np.isfinite(grid)) and np.all(np.diff(grid) > 0.0))
         if not (good and np.all(np.isfinite(density)) and density.min() >= 0.0 and density.max() > 0.0):
-            raise PosteriorError(
-                "a posterior needs a grid of three finite values or more that ascend, and a density that "
-                f"is finite, not negative, and positive somewhere; {grid.shape} and {density.shape} came."
-            )
+            came = f"{grid.shape} and {density.shape}"
+            raise PosteriorError(said("load_test.density", came=came))
         density /= density.max()  # guards the integral against overflow
         density /= np.trapezoid(density, grid)
         cumulative = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(grid))])

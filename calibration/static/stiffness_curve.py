@@ -8,6 +8,7 @@ from numpy.polynomial import Chebyshev
 from numpy.typing import ArrayLike, NDArray
 
 from calibration.errors import PosteriorError
+from calibration.sentences import said
 
 TABLE_TOLERANCE = 1e-7
 """Largest relative error of a curve between the nodes at which a model was asked."""
@@ -42,11 +43,8 @@ class StiffnessCurve:
         rise = np.diff(stiffnesses)
         if not (np.all(np.isfinite(stiffnesses)) and stiffnesses[0] > 0.0 and np.all(rise > 0.0)):
             worst = int(np.argmin(rise))
-            raise PosteriorError(
-                f"the tip stiffness must be positive and rise with e, but {self.name} goes from "
-                f"{stiffnesses[worst]:g} to {stiffnesses[worst + 1]:g} N/m between e = {factors[worst]:g} "
-                f"and {factors[worst + 1]:g}."
-            )
+            between = stiffnesses[worst : worst + 2], factors[worst : worst + 2]
+            raise PosteriorError(said("load_test.rising", self=self, between=between))
 
     @property
     def lower(self) -> float:
@@ -119,8 +117,6 @@ def stiffness_curve_of(
     between = np.linspace(*limits, 2 * _DEGREE)
     error = float(np.max(np.abs(polynomial(between) / stiffness(between) - 1.0)))
     if error > TABLE_TOLERANCE:
-        raise PosteriorError(
-            f"the tip stiffness of {name} over e in [{limits[0]:g}, {limits[1]:g}] is too rough for a "
-            f"polynomial: the relative error is {error:.1g} at degree {_DEGREE}."
-        )
+        fit = error, _DEGREE
+        raise PosteriorError(said("load_test.rough", name=name, limits=limits, fit=fit))
     return StiffnessCurve(polynomial, name)

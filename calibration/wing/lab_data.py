@@ -18,6 +18,7 @@ from calibration.joint.wing_table import weighed
 from calibration.lab_folder import lab_place, lab_table
 from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results
 from calibration.result.record import Reading
+from calibration.sentences import said
 from calibration.static.experiments import (
     MEASUREMENTS_FILE,
     LoadDisplacementData,
@@ -102,17 +103,13 @@ def read_weighed_mass(file: Path) -> Reading:
     """
     table = lab_table(file, WEIGHED_MASS_FILE)
     if len(table) != 1:
-        raise ExperimentFileError(
-            f"{file} needs a header `mass,standard_deviation` and one row in grams, and {len(table)} came."
-        )
+        raise ExperimentFileError(said("readings.mass", file=file, came=len(table)))
     mass, deviation = (float(table.positive_numbers(name, "a weighing")[0]) for name in _WEIGHED_COLUMNS)
     for wrong, unit in ((mass < 10.0, "kg"), (mass > 1e5, "mg")):
         if wrong:
             raise ExperimentDataError(f"{file}: mass is {mass:g} g, which looks like {unit}: give it in g.")
     if deviation >= mass:
-        raise ExperimentDataError(
-            f"{file}: the standard deviation, {deviation:g} g, must be less than the mass, {mass:g} g."
-        )
+        raise ExperimentDataError(said("readings.mass_deviation", file=file, given=(deviation, mass)))
     return weighed(1e-3 * mass, 1e-3 * deviation)
 
 
@@ -196,21 +193,14 @@ def read_lab_folder(
     """
     path = Path(path)
     if not path.is_dir():
-        raise ExperimentFileError(
-            f"{path} is {'no folder' if path.exists() else 'not there'}; give the folder that holds "
-            "step1, step2 and step3."
-        )
+        what = "no folder" if path.exists() else "not there"
+        raise ExperimentFileError(said("readings.no_folder", path=path, what=what))
     steps = {step for step in (1, 2, 3) if lab_place(path, Path(f"step{step}")) is not None}
     records = find_records(path)
     if not steps and not records:
-        raise ExperimentFileError(
-            f"{path} holds none of the folders step1, step2 and step3; give the authors' calibration folder "
-            "or one laid out like it."
-        )
+        raise ExperimentFileError(said("readings.no_steps", path=path))
     if targets == "measured" and not records:
-        raise ExperimentFileError(
-            f"{path} holds no ring-down record, and --measured asks for them; give --published instead."
-        )
+        raise ExperimentFileError(said("readings.measured", path=path))
     lab = published_data()
     hashes, origins = lab.input_hashes, {origin.step: origin for origin in lab.origins}
     found: dict[str, Any] = {}

@@ -415,3 +415,20 @@ class Campaign:
     def held_out(self) -> tuple[Trial, ...]:
         """Trials kept for proof."""
         return tuple(trial for trial in self.trials if trial.held_out)
+
+    @property
+    def sizes(self) -> dict[str, float]:
+        """Largest force [N] and load factor, longest dynamic record and time from first to last sample [s].
+
+        Times that nothing tells are one.
+        """
+        trials = self.trials
+        moments = [trial.start + trial.time if trial.is_dynamic else trial.time for trial in trials]
+        span = float(max(map(np.max, moments)) - min(map(np.min, moments))) if moments else 0.0
+        lengths = (float(trial.time[-1] - trial.time[0]) for trial in trials if trial.is_dynamic)
+        return {
+            "force": max((float(np.max(np.abs(trial.force))) for trial in trials), default=0.0),
+            "load_factor": max((float(np.max(np.abs(trial.load_factor))) for trial in trials), default=0.0),
+            "duration": max(lengths, default=1.0),
+            "campaign_time": span or 1.0,
+        }

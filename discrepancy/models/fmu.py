@@ -11,14 +11,14 @@ from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course, LoadChange, divided, place_among, release_of
 from discrepancy.models.fmu_file import FmuModelDescription
 from discrepancy.models.fmu_motion import FmuMotion, Sampled
-from discrepancy.models.fmu_pace import Case
-from discrepancy.models.fmu_runs import State
+from discrepancy.models.fmu_system import Case
 from discrepancy.models.interface import NO_PATCH, Conditions, Outputs, PortedSystem, Response
 from discrepancy.models.model_file import DescribedModel
-from discrepancy.models.scales import PortScale, Scales, campaign_sizes
+from discrepancy.models.scales import PortScale, Scales
 from discrepancy.sentences import said
 from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
+from fmu_asset.door.runs import State
 
 
 class FmuModel(DescribedModel):
@@ -47,14 +47,15 @@ class FmuModel(DescribedModel):
     def __init__(self, description: FmuModelDescription, folder: Path | str = ".") -> None:
         self.description: FmuModelDescription = description
         self.fmu = fmu = FmuMotion(description, Path(folder))
-        super().__init__(description, fmu.quantities)
+        self.names = names = fmu.names
+        super().__init__(description, names.quantities)
         self.length, self.regions = description.scales.length, tuple(description.inputs.regions)
         self.stations = None if self.length is None else (0.0, self.length)
         flies = description.inputs.load_factor is not None
         self.kinds = frozenset(TrialKind) - {TrialKind.DRIVEN, *(() if flies else (TrialKind.FLIGHT,))}
-        self._keys = [fmu.parameter(item.variable) for item in description.parameter]
-        self._forces = {place: fmu.variable(name) for place, name in description.inputs.force.items()}
-        self._inputs = {item.name: fmu.variable(item.variable) for item in description.input}
+        self._keys = [names.parameter(item.variable) for item in description.parameter]
+        self._forces = {place: names.variable(name) for place, name in description.inputs.force.items()}
+        self._inputs = {item.name: names.variable(item.variable) for item in description.input}
         self.load_places = tuple(self._forces)
         limits = (fmu.asset.input_range("load", name)[1] for name in self._forces.values())
         self.largest_force = 0.5 * min(limits, default=np.inf)
@@ -113,7 +114,7 @@ class FmuModel(DescribedModel):
             tip_stiffness=given.tip_stiffness or tip,
             modal_mass=given.modal_mass or modal / frequency**2,
             angular_frequency=frequency,
-            **campaign_sizes(campaign),
+            **campaign.sizes,
             ports={
                 port: PortScale(float(most) or 1.0, own, frequency, rest)
                 for port, most, (own, rest) in zip(self.ports, largest, pairs, strict=True)
@@ -131,15 +132,13 @@ class FmuModel(DescribedModel):
         if trial.is_dynamic:
             return Response(*self._moving(trial, conditions, patch, columns, orders))
         if any(quantity.order > 0 for _, quantity in outputs):
-            raise ModelError(
-                f"The trial {trial.name!r} is at rest, but a channel measures velocity or acceleration."
-            )
+            raise ModelError(said("models.speed_at_rest", trial=trial))
         return Response(self._at_rest(trial, conditions, patch)[:, columns])
 
     def _read(self, outputs: Outputs) -> tuple[list[int], list[int]]:
         """Return the columns of outputs, and how often each is derived."""
         orders = [quantity.derivatives_of(self.quantities[output]) for output, quantity in outputs]
-        return [self.fmu.columns[output] for output, _ in outputs], orders
+        return [self.names.columns[output] for output, _ in outputs], orders
 
     def _moving(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch, columns: list[int], orders: list[int],
@@ -158,15 +157,12 @@ class FmuModel(DescribedModel):
         offsets, given = conditions.offset or (0.0,) * len(trial.inputs), dict[str, FloatArray]()
         for item, offset in zip(trial.inputs, offsets, strict=True):
             if item.name not in self._inputs:
-                raise ModelError(
-                    f"The trial {trial.name!r} holds the input {item.name!r}, which the FMU model "
-                    f"{self.name!r} does not have; it has {', '.join(self._inputs) or 'none'}: name it in "
-                    "[[input]]."
-                )
+                known = self._inputs
+                raise ModelError(said("models.no_input", trial=trial, item=item, model=self, known=known))
             variable = self._inputs[item.name]
-            given[variable] = self.fmu.input_factors[variable] * (item.values + offset)
+            given[variable] = self.names.input_factors[variable] * (item.values + offset)
         if trial.kind is TrialKind.FLIGHT:
-            given = {self.fmu.variable(str(self.description.inputs.load_factor)): trial.load_factor}
+            given = {self.names.variable(str(self.description.inputs.load_factor)): trial.load_factor}
         elif not given or np.any(trial.force):
             acting = self._load(patch).changed(trial.force, trial.force)
             given |= {name: acting * lever for name, lever in self._levers(trial, patch).items()}
@@ -190,12 +186,8 @@ class FmuModel(DescribedModel):
             for conditions in [Conditions(values, health=trial.health[:1])]
         )
         columns, numbers = np.array(fmu.x, dtype=np.int64), np.arange(len(fmu.x))
-        if (
-            base is None
-            or found is None
-            or len(base.push) != len(found.push)
-            or found.jumps(columns, numbers)
-        ):
+        same = base and found and len(base.push) == len(found.push)
+        if not (base and found and same) or found.jumps(columns, numbers):
             raise ModelError(said("models.unseen_ports", model=self))
         found = found.in_state_of(base)
         (position, _), (speed, _) = (found.rows(fmu.x, order) for order in (0, 1))
@@ -240,27 +232,25 @@ class FmuModel(DescribedModel):
         """Return the inputs that a force at a place of a patch pushes, each with its lever."""
         inputs, load = self.description.inputs, self._load(patch)
         if load.along_chord and inputs.torque is None:
-            raise ModelError(
-                f"The FMU model {self.name!r} names no torque in [inputs], so no load moves along the chord."
-            )
+            raise ModelError(said("models.no_torque", model=self))
         moments = ((inputs.bending_moment, load.along_span), (inputs.torque, load.along_chord))
         place = place_among([*self._forces], trial.load_place, self.what, f"the trial {trial.name!r}")
-        levers = {self.fmu.variable(name): lever for name, lever in moments if name is not None and lever}
+        levers = {self.names.variable(name): lever for name, lever in moments if name is not None and lever}
         return {self._forces[place]: 1.0} | levers
 
     def _state(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH, row: int = 0
     ) -> State:
         """Return parameters and constant inputs of a row of a trial, with what the FMU carries of a patch."""
-        fmu, wanted, effects = self.fmu, self.description.inputs, self.description.effects
+        names, wanted, effects = self.names, self.description.inputs, self.description.effects
         losses = self.losses(trial, conditions.health)
         health = zip(wanted.regions.values(), losses[min(row, len(losses) - 1)], strict=True)
-        inputs = {fmu.variable(name): value for name, value in health}
+        inputs = {names.variable(name): value for name, value in health}
         if wanted.temperature is not None:
             warm = float(trial.temperature[0 if trial.is_dynamic else row])
-            inputs[fmu.variable(wanted.temperature)] = (wanted.temperature_reference or 0.0) + warm
+            inputs[names.variable(wanted.temperature)] = (wanted.temperature_reference or 0.0) + warm
         table = self.description.motion if trial.is_dynamic else self.description.static
-        parameters = {fmu.parameter(name): value for name, value in table.parameters.items()}
+        parameters = {names.parameter(name): value for name, value in table.parameters.items()}
         parameters |= dict(zip(self._keys, conditions.parameters.tolist(), strict=True))
         for item in (item for item in patch if item.kind in effects):
             effect = f"effect.{effects[item.kind]}"

@@ -8,6 +8,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from discrepancy.campaign.records import Quantity
 from discrepancy.models.acting import DEFAULT_PLACE
 from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
+from discrepancy.sentences import said
 from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
 from reporting.section import Name, Number, Positive
 from scenarios import binding_files
@@ -209,11 +210,8 @@ class FmuModelDescription(ModelDescription):
             self.check_unique(kind, [item.name for item in getattr(self, kind)])
         for kind in self.effects:
             if kind not in CARRIED:
-                raise ValueError(
-                    f"effects.{kind} is not a primitive that an FMU can carry itself"
-                    + (" (internal forces act at ports)" if kind in PRIMITIVES else "")
-                    + f"; known are {', '.join(CARRIED)}"
-                )
+                why = " (internal forces act at ports)" if kind in PRIMITIVES else ""
+                raise ValueError(said("models.effect", kind=kind, why=why, known=", ".join(CARRIED)))
         if self.inputs.temperature_reference is not None and self.inputs.temperature is None:
             raise ValueError("temperature_reference needs the input temperature")
         return self

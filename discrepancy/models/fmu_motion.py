@@ -16,8 +16,7 @@ from discrepancy.campaign.records import FloatArray, Trial
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Load
 from discrepancy.models.fmu_file import FmuModelDescription
-from discrepancy.models.fmu_pace import LINEAR, RECORD, Case, FmuPace
-from discrepancy.models.fmu_runs import Run, State
+from discrepancy.models.fmu_system import LINEAR, RECORD, Case, FmuPace, state_motion
 from discrepancy.sentences import said
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import PLACE
@@ -26,6 +25,7 @@ from fe.runtime.motion import Laws, static_solution
 from fe.runtime.motion_arrays import ModalMotion
 from fe.runtime.motion_arrays import State as Moving
 from fe.runtime.stepwise import ALIKE, Boundaries, steps_under
+from fmu_asset.door.runs import Run, State
 
 CONVERGED = 1e-4
 """Largest rms change of a motion with laws when steps are halved, as a share of the largest motion."""
@@ -73,11 +73,9 @@ class FmuMotion(FmuPace):
         if not even:  # as many lengths of steps as stamps would take long
             stamps = case.step * np.arange(ceil(end / case.step - 1e-6) + 1.0)
         loads = [] if case.course is None else [Load(case.lever, case.course)]
-        states, forces = system.motion(
-            Acting(trial.time, stamps, loads), self._start(system, case, amounts), laws, seen, numbers,
-            still[seen], refinement,
-        )  # fmt: skip
-        rows, at_once = system.rows(columns, orders)
+        acting, start = Acting(trial.time, stamps, loads), self._start(system, case, amounts)
+        found = state_motion(system, acting, start, laws, seen, numbers, still[seen], refinement)
+        (states, forces), (rows, at_once) = found, system.rows(columns, orders)
         values = states @ rows.T + forces @ at_once.T + np.where(derived, 0.0, still[columns])
         if case.starts:  # the force that holds it until then may be seen at once
             held = [self._answer(case, name, released=True)[0] * amount for name, amount in amounts.items()]
@@ -196,12 +194,8 @@ class FmuMotion(FmuPace):
                 self._refinements[key] = (parts, strength)
                 return parts
             parts *= 2
-        raise ModelError(
-            f"The internal force at {', '.join(dict.fromkeys(laws.ports))} does not converge in the "
-            f"co-simulation with the FMU model {self.description.name!r}: halving steps of "
-            f"{2.0 * step / parts:.2g} s still changes the motion by {change:.1g} of its size; the force is "
-            f"too stiff for the port."
-        )
+        at, step = ", ".join(dict.fromkeys(laws.ports)), 2.0 * step / parts
+        raise ModelError(said("models.too_stiff", at=at, model=self, step=step, change=change))
 
     # ------------------------------------------------------------ rest
 
@@ -210,8 +204,9 @@ class FmuMotion(FmuPace):
 
         Where the FMU has to come to rest and is linear, what loads add is that of its system.
         """
-        if not self.description.static.settle:
-            return self.resting(states, loads)
+        how = self.description.static
+        if not how.settle:
+            return self.resting(states, loads, how.step, settle=False)
         names = tuple(sorted(name for name, values in loads.items() if np.any(values)))
         rows = np.array([loads[name] for name in names]).reshape(-1, len(states)).T
         order = np.argsort(-np.abs(rows).sum(axis=1), kind="stable")  # the largest load says whether it is
@@ -220,12 +215,13 @@ class FmuMotion(FmuPace):
 
     def _rested(self, state: State, amounts: FloatArray, names: tuple[str, ...]) -> FloatArray:
         """Return the outputs (C,) when a motion has come to rest under amounts (E,) on some inputs."""
+        step = self.description.static.step
 
         def asked(amounts: FloatArray) -> FloatArray:
             loads, key = dict(zip(names, amounts[:, None], strict=True)), (state, names, amounts.tobytes())
-            return self.remembered(key, lambda: self.resting([state], loads)[0])
+            return self.remembered(key, lambda: self.resting([state], loads, step, settle=True)[0])
 
-        case = Case(state, self.description.static.step, RECORD, names, at_rest=True)
+        case = Case(state, step, RECORD, names, at_rest=True)
         if self._adds.get(names) is False or (system := self.system(case)) is None:
             return asked(amounts)
         zero, moved = asked(0.0 * amounts), system.gain @ amounts
@@ -281,10 +277,9 @@ class FmuMotion(FmuPace):
             change, linear = np.abs(again - linear).max(axis=1), again
             if np.all(change <= STATIC_TOLERANCE * np.maximum(np.abs(again).max(axis=1), 1e-300)):
                 return values
+        names, level = ", ".join(dict.fromkeys(laws.ports)), int(np.argmax(change)) + 1
         raise ModelError(
-            f"The law at {', '.join(dict.fromkeys(laws.ports))} and the FMU model "
-            f"{self.description.name!r} did not agree at load level {int(np.argmax(change)) + 1} of "
-            f"{trial!r} within {STATIC_ITERATIONS} iterations; the force is too strong for the FMU."
+            said("models.too_strong", at=names, model=self, level=level, trial=trial, most=STATIC_ITERATIONS)
         )
 
 

@@ -1,263 +1,349 @@
-"""A linear FMU as a linear system, made from its answers to single forces and releases."""
+"""An FMU with ports: its system where it is linear, what moves it, and at which pace it is stepped."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
-from warnings import catch_warnings, simplefilter
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from math import ceil
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.linalg import logm
+from scipy.optimize import root_scalar
+from scipy.signal import periodogram
 
-from discrepancy.campaign.records import FloatArray, Hold
-from discrepancy.models.acting import SMOOTH_PARTS, Acting, straight
-from discrepancy.models.interface import Memory
+from discrepancy.campaign.records import FloatArray, Hold, Trial
+from discrepancy.errors import ModelError
+from discrepancy.models.acting import SMOOTH_PARTS, Acting, Course, Load, straight
+from discrepancy.models.fmu_file import FmuModelDescription, ReleaseOf
+from discrepancy.models.fmu_variables import FmuVariables
+from discrepancy.sentences import said
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws
 from fe.runtime.stepwise import Begin, advance, steps_under, substeps
+from fmu_asset.door.runs import FmuRuns, Run, State
+from fmu_asset.door.state_space import StateSpace, realised
+from fmu_asset.errors import FmuError
+from reporting.memory import Memory
 
 NONE: Any = np.zeros(0, dtype=np.int64)
-ComplexArray = NDArray[np.complex128]
-KEPT = 16
-"""Lengths of steps, and sets of ports, that a system keeps."""
-MOST_STATES = 40
-"""Largest order of a linear system that is made from records."""
-HANKEL_ROWS, MIXTURES = 64, 3
-"""Rows, and mixtures of all outputs in each, in which a system shows its states."""
-HANKEL_COLUMNS = 160
-INDEPENDENT = 1e5
-"""Condition up to which eigenvectors give the logarithm of a matrix, 20 times faster than `logm`."""
-THRESHOLDS = 10.0 ** np.arange(-12, -6)
-"""Shares of the largest singular value below which one is rounding, one after the other."""
-FIT = 1e-7
-"""Largest error of a linear system against the record that it is made of, as a share of the record."""
-JUMP = 1e-2
-"""Share of a port's speed that may come at once with a force: a solver of coarse steps shows a little."""
+KEPT = 64
+"""Systems that are kept."""
 ROUNDING = 1e-9
 """Share of the displacement at rest below which what a force moves at once is rounding."""
+LINEAR = 1e-6
+"""Largest deviation from superposition, as a share of the motion, of an FMU that is taken as linear."""
+PHASE = 0.1
+"""Longest communication step without laws: radians of the first mode."""
+LEAST_RECORD, RECORD = 64, 600
+"""Least and most steps of the answer to a force or a release that are recorded."""
+SAFE_TURN = 0.8 * np.pi
+"""Turn of a mode in a step up to which it does not become half a circle as parameters change [rad]."""
+MOST_PARTS = 16
+"""Parts of an interval at which the system is looked for."""
+SAME_PACE = 1e-2
+"""A mode that turns by more than half a circle in a step looks like a slower one there: half the step tells
+by more than this share of the motion."""
 
 
-@dataclass(frozen=True, eq=False)
-class FmuSystem:
-    """What E forces f and R releases do to C outputs of a linear FMU, beside what it shows without.
-
-    s' = G s + B f, y = C s + D f, f being that just before where it jumps.
+class Case(NamedTuple):
+    """What moves an FMU.
 
     Attributes
     ----------
-    generator, push, outputs, direct, starts : ndarray
-        G (n, n) [1/s], B (n, E), C (C, n), D (C, E), and the states (n, R) after unit releases.
+    state : State
+        Of the FMU.
+    step : float
+        At which it is asked [s].
+    record : int
+        Steps after which it is known what each of the following does alone.
+    inputs : tuple of str
+        By which something may push it: a recorded force, or laws.
+    levers : mapping of str to float
+        How much of the recorded force inputs have.
+    course : Course, optional
+        Of that force.
+    starts : mapping of str to float
+        Parameters that release it, with displacement [m] and velocity [m/s] of the release point; or the
+        input that holds it until then, with the displacement.
+    at_rest : bool
+        Whether it is to come to rest.
     """
 
-    generator: FloatArray
-    push: FloatArray
-    outputs: FloatArray
-    direct: FloatArray
-    starts: FloatArray
-    _kept: Memory = field(default_factory=lambda: Memory(KEPT), init=False, repr=False)
-
-    def in_state_of(self, base: "FmuSystem") -> "FmuSystem":
-        """Return the same system in the state of another of its order.
-
-        Outputs and their rates say what that state is: those of a structure do not change with its
-        parameters, wherever its modes go.
-        """
-        mine, others = (np.vstack((item.outputs, item.outputs @ item.generator)) for item in (self, base))
-        size = _not_zero(np.linalg.norm(others, axis=1, keepdims=True))
-        way = np.linalg.lstsq(mine / size, others / size, rcond=None)[0]
-        back = np.linalg.inv(way)
-        return FmuSystem(
-            back @ self.generator @ way, back @ self.push, self.outputs @ way, self.direct, back @ self.starts
-        )
-
-    def rows(self, columns: Sequence[int], orders: Sequence[int] | int = 0) -> tuple[FloatArray, FloatArray]:
-        """Return what outputs, each derived so many times, show of the state (K, n), of forces (K, E)."""
-        row, at_once = self.outputs[columns], self.direct[columns]
-        for times in (0, 1):
-            further = np.broadcast_to(orders, len(columns))[:, None] > times
-            at_once = np.where(further, row @ self.push, at_once)
-            row = np.where(further, row @ self.generator, row)
-        return row, at_once
-
-    def at_rest(self, forces: FloatArray) -> FloatArray:
-        """Return the state (n, ...) at rest under forces (E, ...)."""
-        return np.asarray(np.linalg.solve(self.generator, -self.push @ forces))
+    state: State
+    step: float
+    record: int
+    inputs: tuple[str, ...] = ()
+    levers: Mapping[str, float] = MappingProxyType({})
+    course: Course | None = None
+    starts: Mapping[str, float] = MappingProxyType({})
+    at_rest: bool = False
 
     @property
-    def gain(self) -> FloatArray:
-        """Outputs (C, E) at rest under unit forces."""
-        return np.asarray(self.direct + self.outputs @ self.at_rest(np.eye(self.push.shape[1])))
-
-    def _residues(self, column: int, number: int) -> tuple[ComplexArray, ComplexArray]:
-        """Return the rates (n,) [1/s] of the modes, and the residues of an output's answer to a force."""
-        rates, shapes = self._kept.get("modes", lambda: np.linalg.eig(self.generator))
-        into = np.linalg.solve(shapes, self.push[:, number].astype(complex))
-        return rates, (self.outputs[column] @ shapes) * into
-
-    def most_flexible(self, column: int, number: int) -> tuple[float, float] | None:
-        """Return the mode that gives an output the most at rest under a force; None if none vibrates.
-
-        Its angular frequency [rad/s], and its flexibility between the two [m/N].
-        """
-        rates, residues = self._residues(column, number)
-        frequency, vibrating = np.abs(rates), rates.imag > 1e-9 * np.abs(rates)
-        flexible = np.where(vibrating, np.abs(2.0 * rates.imag * residues) / frequency**2, 0.0)
-        best = int(np.argmax(flexible))
-        return (float(frequency[best]), float(flexible[best])) if vibrating.any() else None
-
-    def stiffness(self, column: int, number: int) -> tuple[float, float]:
-        """Return the stiffness of the most flexible mode between output and force, and that at rest [N/m]."""
-        at_rest, mode = 1.0 / float(self.gain[column, number]), self.most_flexible(column, number)
-        return (at_rest if mode is None or mode[1] * at_rest < 1e-6 else 1.0 / mode[1]), at_rest
-
-    def jumps(self, columns: IntArray, numbers: IntArray) -> bool:
-        """Whether the speed of an output jumps with its force, so that laws there find no mass."""
-        found = (self._residues(*pair)[1] for pair in zip(columns, numbers, strict=True))
-        return any(abs(item.sum()) > JUMP * np.abs(item).sum() for item in found)
-
-    # ------------------------------------------------------------ motion
-
-    def motion(
-        self, acting: Acting, start: FloatArray, laws: Laws = NO_LAWS, columns: IntArray = NONE,
-        numbers: IntArray = NONE, still: FloatArray = NONE, refinement: int = 1,
-    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-        """Return states (N, n) and forces (N, E) at the times of what acts, with laws at ports.
-
-        Position and speed of a law's port are coordinates beside the state, from which they follow: so laws
-        act on this system as on any other.
-
-        Parameters
-        ----------
-        acting : Acting
-            Forces, in rows (E,).
-        start : (n,) ndarray
-            State at the first time.
-        laws : Laws
-            J internal forces.
-        columns, numbers : (J,) ndarray of int
-            Column of the displacement, and number of the force, of each law's port.
-        still : (J,) ndarray
-            Position of each law's port without forces.
-        refinement : int
-            Steps with laws are this many times smaller.
-        """
-        key = (laws.ports, columns.tobytes(), numbers.tobytes())
-        acts, modal, law = self._kept.get(key, lambda: self._with_ports(laws.ports, columns, numbers))
-        smooth = any(course.hold is Hold.SMOOTH for _, course, _ in acting.loads)
-        boundaries = substeps(modal, laws, acting.sampled, refinement, SMOOTH_PARTS if smooth else 1)
-        begin, end = straight(lambda time: acting.load_at(time, acts.T), boundaries.time)
-        feed = acting.load_at(boundaries.time, self.direct[columns].T)
-        seen = self.outputs[columns[law]]
-        first = Begin(
-            np.concatenate((seen @ start + still[law], 0.0 * start)),
-            np.concatenate((seen @ self.generator @ start, start)),
-        )
-        steps = steps_under(modal, boundaries, begin, end, feed)
-        found = advance(modal, laws, steps, first, compiled_kernel())
-        forces = acting.load_at(acting.sampled, np.eye(self.push.shape[1]))
-        np.subtract.at(forces.T, numbers, found.port_forces.T)
-        return found.v[:, len(law) :], forces
-
-    def _with_ports(
-        self, names: tuple[str, ...], columns: IntArray, numbers: IntArray
-    ) -> tuple[FloatArray, ModalSystem, IntArray]:
-        """Return along what forces act (N, E), the system of ports and state, and a law of each port."""
-        places, law = np.unique(names, return_index=True)
-        count, order = len(law), len(self.generator)
-        seen = self.outputs[columns[law]] @ self.generator
-        acts = np.vstack((seen @ self.push, self.push))
-        damping = np.zeros((count + order, count + order))
-        damping[:, count:] = -np.vstack((seen @ self.generator, self.generator))
-        at_once, gain = (item[columns[law], numbers[law]] for item in (self.direct, self.gain))
-        modal = ModalSystem(
-            np.zeros(count + order), damping, dict(zip(places, np.eye(count, count + order), strict=True)),
-            np.where(at_once > ROUNDING * gain, at_once, 0.0),
-            actions=dict(zip(places, acts.T[numbers[law]], strict=True)),
-        )  # fmt: skip
-        return acts, modal, law
+    def lever(self) -> FloatArray:
+        """How much of the recorded force each of the inputs (E,) has."""
+        return np.array([self.levers.get(name, 0.0) for name in self.inputs])
 
 
-def _not_zero(sizes: FloatArray) -> FloatArray:
-    return np.where(sizes == 0.0, 1.0, sizes)
+def state_motion(
+    system: StateSpace, acting: Acting, start: FloatArray, laws: Laws = NO_LAWS, columns: IntArray = NONE,
+    numbers: IntArray = NONE, still: FloatArray = NONE, refinement: int = 1,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Return states (N, n) and forces (N, E) of a system at the times of what acts, with laws at ports.
 
-
-def _largest(matrix: FloatArray, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the singular vectors and values of a matrix, the largest ones only where there are more.
-
-    From its image of random vectors (Halko, Martinsson and Tropp 2011). The caller uses values far above the
-    rounding of the first alone, so that what is left out changes nothing but rounding.
-    """
-    if min(matrix.shape) <= count:
-        return np.linalg.svd(matrix, full_matrices=False)
-    random = np.random.default_rng(0).standard_normal((matrix.shape[1], count))
-    image = np.linalg.qr(matrix @ random)[0]
-    left, values, right = np.linalg.svd(image.T @ matrix, full_matrices=False)
-    return image @ left, values, right
-
-
-def _logarithm(transition: FloatArray) -> FloatArray:
-    values, shapes = np.linalg.eig(transition)
-    if np.linalg.cond(shapes) < INDEPENDENT:
-        return np.asarray(np.real((shapes * np.log(values.astype(complex))) @ np.linalg.inv(shapes)))
-    with catch_warnings():  # of rounding in what decays within a step
-        simplefilter("ignore", RuntimeWarning)
-        return np.asarray(np.real(logm(transition)))
-
-
-def fmu_system(records: FloatArray, forces: int, step: float) -> FmuSystem | None:
-    """Return the linear system of answers to unit forces, held over the first step only, and to releases.
-
-    The realisation of Ho and Kalman (1966) as by Juang and Pappa (1985), from mixtures of the outputs.
+    Position and speed of a law's port are coordinates beside the state, from which they follow: so laws act
+    on this system as on any other.
 
     Parameters
     ----------
-    records : (K, C, E + R) ndarray
-        Outputs at the ends of the steps for each force, then for each release.
-    forces : int
-        E.
-    step : float
-        [s].
-
-    Returns
-    -------
-    FmuSystem or None
-        None if no system of at most `MOST_STATES` states shows the records within `FIT`.
+    system : StateSpace
+        What moves.
+    acting : Acting
+        Forces, in rows (E,).
+    start : (n,) ndarray
+        State at the first time.
+    laws : Laws
+        J internal forces.
+    columns, numbers : (J,) ndarray of int
+        Column of the displacement, and number of the force, of each law's port.
+    still : (J,) ndarray
+        Position of each law's port without forces.
+    refinement : int
+        Steps with laws are this many times smaller.
     """
-    count, columns, inputs = records.shape
-    size = _not_zero(np.max(np.abs(records[1:]), axis=(0, 2)))
-    amount = _not_zero(np.max(np.abs(records[1:]) / size[:, None], axis=(0, 1)))
-    records = records / (size[:, None] * amount)
-    seen = np.random.default_rng(1).standard_normal((MIXTURES, columns)) @ records
-    height = min(HANKEL_ROWS, (count - 2) // 2)
-    width = min(HANKEL_COLUMNS, count - 2 - height)
-    both = seen[1 + np.arange(height + 1)[:, None] + np.arange(width)].transpose(0, 2, 1, 3)
-    both = both.reshape((height + 1) * MIXTURES, width * inputs)
-    hankel, shifted = both[:-MIXTURES], both[MIXTURES:]
-    for most in (MOST_STATES // 4, MOST_STATES):
-        left, values, right = _largest(hankel, most + 16)
-        if values[-1] <= 1e-13 * values[0]:
-            break
-    goal = records[1:].transpose(0, 2, 1).reshape(-1, columns)
-    for order in dict.fromkeys(int(np.sum(values > least * values[0])) for least in THRESHOLDS):
-        root = np.sqrt(values[:order])
-        transition = (left[:, :order] / root).T @ shifted @ (right[:order].T / root)
-        rates = np.linalg.eigvals(transition)
-        if not 0 < order <= MOST_STATES or np.max(np.abs(rates)) > 1.0 + 1e-9:
-            continue
-        drive = np.linalg.lstsq(transition, (root[:, None] * right[:order])[:, :inputs])[0]
-        states, power = drive[None], transition
-        while len(states) < count:
-            states, power = np.concatenate((states, power @ states)), power @ power
-        flat = states[1:count].transpose(0, 2, 1).reshape(-1, order)
-        unit = np.max(np.abs(flat), axis=0)
-        rows = np.linalg.lstsq(flat / unit, goal, rcond=1e-14)[0].T / unit
-        error = np.max(np.abs(goal - flat @ rows.T), axis=0)
-        if np.all(error <= FIT * np.max(np.abs(goal), axis=0) + 1e-300):
-            held, starts = np.split(drive * amount, [forces], axis=1)
-            whole = np.block([[transition, held], [np.zeros((forces, order)), np.eye(forces)]])
-            generator, push = np.split(_logarithm(whole)[:order] / step, [order], axis=1)
-            rows, first = rows * size[:, None], records[0, :, :forces] * size[:, None] * amount[:forces]
-            return FmuSystem(generator, push, rows, first - rows @ held, np.linalg.solve(transition, starts))
-    return None
+    acts, modal, law = _with_ports(system, laws.ports, tuple(columns.tolist()), tuple(numbers.tolist()))
+    smooth = any(course.hold is Hold.SMOOTH for _, course, _ in acting.loads)
+    boundaries = substeps(modal, laws, acting.sampled, refinement, SMOOTH_PARTS if smooth else 1)
+    begin, end = straight(lambda time: acting.load_at(time, acts.T), boundaries.time)
+    feed, seen = acting.load_at(boundaries.time, system.direct[columns].T), system.outputs[columns[law]]
+    first = Begin(
+        np.concatenate((seen @ start + still[law], 0.0 * start)),
+        np.concatenate((seen @ system.generator @ start, start)),
+    )
+    found = advance(modal, laws, steps_under(modal, boundaries, begin, end, feed), first, compiled_kernel())
+    forces = acting.load_at(acting.sampled, np.eye(system.push.shape[1]))
+    np.subtract.at(forces.T, numbers, found.port_forces.T)
+    return found.v[:, len(law) :], forces
+
+
+@lru_cache(maxsize=KEPT)
+def _with_ports(
+    system: StateSpace, names: tuple[str, ...], columns: tuple[int, ...], numbers: tuple[int, ...]
+) -> tuple[FloatArray, ModalSystem, IntArray]:
+    """Return along what forces act (N, E), the system of ports and state, and a law of each port."""
+    places, law = np.unique(names, return_index=True)
+    count, order = len(law), len(system.generator)
+    column, number = (np.array(given, dtype=np.int64)[law] for given in (columns, numbers))
+    seen = system.outputs[column] @ system.generator
+    acts = np.vstack((seen @ system.push, system.push))
+    damping = np.zeros((count + order, count + order))
+    damping[:, count:] = -np.vstack((seen @ system.generator, system.generator))
+    at_once, gain = (item[column, number] for item in (system.direct, system.gain))
+    modal = ModalSystem(
+        np.zeros(count + order), damping, dict(zip(places, np.eye(count, count + order), strict=True)),
+        np.where(at_once > ROUNDING * gain, at_once, 0.0),
+        actions=dict(zip(places, acts.T[number], strict=True)),
+    )  # fmt: skip
+    return acts, modal, law
+
+
+class FmuPace(FmuRuns):
+    """An FMU with ports: its system where it is linear, and its pace.
+
+    Attributes
+    ----------
+    nominal : State
+        Of motions, at the means of the parameters; set by the model.
+    ports, forces : list of str
+        Names, and inputs of their forces.
+    x, v : list of int
+        Columns of the ports' displacements and velocities; -1: there is no velocity.
+    release : list of str
+        What lets it go, and what gives it a velocity.
+    """
+
+    nominal = State()
+
+    def __init__(self, description: FmuModelDescription, folder: Path) -> None:
+        self.description, rest = description, description.static
+        with self.refusals():
+            self.names = names = FmuVariables(description, folder)
+            super().__init__(names.path, names.binding, description.isolated, rest.limit, rest.tolerance)
+            # beyond its range it refuses, and a posterior is cut there
+            told = [{item.variable: end} for item in description.parameter for end in (item.low, item.high)]
+            told += [{f"effect.{name}.active": 1.0} for name in description.effects.values()]
+            for given in (*told, rest.parameters, description.motion.parameters):
+                self.asset.check_parameters({names.parameter(name): value for name, value in given.items()})
+        self.ports = [port.name for port in description.port]
+        self.forces = [names.variable(port.force) for port in description.port]
+        self.x = [names.columns[f"port.{port}.displacement"] for port in self.ports]
+        self.v = [names.columns.get(f"port.{port}.velocity", -1) for port in self.ports]
+        way = description.release or ReleaseOf.model_construct()
+        ways = (way.displacement, way.velocity)
+        self.release = [names.parameter(name) for name in ways if name is not None]
+        self.release += [names.variable(way.hold)] if way.hold is not None else []
+        self._linear, self._sizes = dict[Hashable, bool](), dict[str, float]()
+        self._systems, self._paces = Memory(KEPT), Memory()
+
+    @contextmanager
+    def refusals(self) -> Iterator[None]:
+        """Say of which model it is what the FMU refuses."""
+        try:
+            yield
+        except FmuError as cause:
+            raise ModelError(f"The FMU model {self.description.name!r}: {cause}") from cause
+
+    def case(
+        self, trial: Trial, state: State, ports: Sequence[str], levers: Mapping[str, float] | None = None
+    ) -> Case:
+        """Return the case of a trial with laws at ports, or a force at inputs."""
+        forces, levers = (self.forces[self.ports.index(name)] for name in ports), levers or {}
+        inputs = tuple(dict.fromkeys([*levers, *forces]))
+        return Case(state, self.usual(trial)[1], record_of(trial), inputs, levers)
+
+    # ------------------------------------------------------------ its system
+
+    def system(self, case: Case) -> StateSpace | None:
+        """Return an FMU as a system; None if it is not linear.
+
+        It is where one system shows its answers to single forces and releases, and predicts what all do.
+        """
+        kind = case.inputs, *case.starts, case.at_rest
+        asked = self.description.superposition and (case.inputs or case.starts)
+        if not asked or self._linear.get(kind) is False:
+            return None
+
+        def identified() -> StateSpace | None:
+            answers = [self._answer(case, name) for name in case.inputs]
+            answers += [self._answer(case, name, released=True) for name in case.starts]
+            return realised(np.stack(answers, axis=2)[1:], len(case.inputs), case.step)
+
+        found = self._systems.get((kind, *case[:3]), identified)
+        if found is not None and kind not in self._linear:
+            self._linear[kind] = self._predicts(found, case, LINEAR)
+        return found if self._linear.get(kind) else None
+
+    def _answer(self, case: Case, name: str, *, released: bool = False) -> FloatArray:
+        """Return the outputs (record + 1, C) after a unit force over the first step, or a release by one."""
+        if released:
+            usual = self.size(name) if name in self.names.binding.load else case.starts[name] or 1.0
+            size = self._sizes.setdefault(name, usual)
+            run = self._run(case._replace(course=None), {name: size})
+        else:
+            size = self.size(name)
+            run = Run(*case[:3], courses={name: size * np.eye(1, case.record).ravel()})
+        return self.remembered((*case[:3], name, released), lambda: self._moved(case, run) / size)
+
+    def _moved(self, case: Case, run: Run) -> FloatArray:
+        """Return the outputs (steps + 1, C) of a motion, less those at the start without anything."""
+        return self.followed(run) - self._still(case)
+
+    def _still(self, case: Case) -> FloatArray:
+        return self.remembered(case[:2], lambda: self.begun(Run(case.state, case.step, 0))[1])
+
+    def _predicts(self, system: StateSpace, case: Case, tolerance: float) -> bool:
+        """Whether a system shows what the FMU does under all that moves it, random forces where laws act."""
+        amounts, random = self._amounts(case, linear=True), np.random.default_rng(0)
+        run = self._run(case, amounts)
+        courses = {name: self.size(name) * random.uniform(-1.0, 1.0, run.steps) for name in case.inputs}
+        courses |= run.courses
+        moved, time = self._moved(case, run._replace(courses=courses)), case.step * np.arange(run.steps + 1.0)
+        held = (Course(time, np.append(values, 0.0), Hold.ZERO_ORDER) for values in courses.values())
+        acting = Acting(time, time, list(map(Load, np.eye(len(courses)), held)))
+        states, forces = state_motion(system, acting, self._start(system, case, amounts))
+        error = np.max(np.abs(moved - states @ system.outputs.T - forces @ system.direct.T)[1:], axis=0)
+        return bool(np.all(error <= tolerance * np.max(np.abs(moved), axis=0) + 1e-300))
+
+    def _amounts(self, case: Case, *, linear: bool) -> dict[str, float]:
+        """Return the parameters, or the force, that put the release point where it is let go.
+
+        Raises
+        ------
+        ModelError
+            If there are none.
+        """
+        found, column, way = dict(case.starts), self.names.columns.get("release"), self.description.release
+        name, displacement = next(iter(found.items()), ("", 0.0))
+        if way is None or column is None or displacement == 0.0:
+            return found
+        if linear:
+            return found | {name: displacement / float(self._answer(case, name, released=True)[0, column])}
+
+        def left(amount: float) -> float:
+            run = self._run(case._replace(course=None, record=0), {name: amount})
+            shown = self.remembered((*case[:2], name, amount, "begin"), lambda: self.begun(run)[1])
+            return float((shown - self._still(case))[column]) - displacement
+
+        first = self.size(name) if name in self.names.binding.load else displacement
+        amount = float(root_scalar(left, x0=0.0, x1=first, rtol=1e-10, maxiter=20).root)
+        if not abs(left(amount)) <= 1e-6 * abs(displacement):
+            raise ModelError(said("models.not_released", way=way, model=self, displacement=displacement))
+        return found | {name: amount}
+
+    def _run(self, case: Case, amounts: Mapping[str, float]) -> Run:
+        """Return the run by which the FMU follows what moves it, released by amounts."""
+        begin = {name: amount for name, amount in amounts.items() if name in self.names.binding.load}
+        state = case.state.having({name: item for name, item in amounts.items() if name not in begin})
+        run = Run(state, case.step, case.record, begin)
+        if case.course is None:
+            return run
+        begins, ends = straight(case.course.at, case.step * np.arange(case.record + 1.0))
+        begin |= {name: lever * float(case.course.values[0]) for name, lever in case.levers.items()}
+        return run._replace(
+            courses={name: 0.5 * lever * (begins + ends) for name, lever in case.levers.items()}
+        )
+
+    def _start(self, system: StateSpace, case: Case, amounts: Mapping[str, float]) -> FloatArray:
+        """Return the state (n,) of a system at the begin."""
+        start: FloatArray = system.starts @ np.array([*amounts.values()])
+        first = 0.0 if case.course is None else float(case.course.values[0])
+        return start + system.at_rest(first * case.lever) if first else start
+
+    # ------------------------------------------------------------ pace
+
+    def pace(self, trial: Trial, state: State) -> tuple[float, float]:
+        """Return the angular frequency [rad/s] of its first mode, and the communication step [s] of a trial.
+
+        The mode is that which is most flexible at the first port; without port, the loudest. The step is a
+        whole part of the sampling interval.
+        """
+        fixed, interval, parts = self.description.motion.step, trial.interval, 1
+        starts = {self.release[0]: 1e-3} if self.release and not self.ports else {}
+        inputs = tuple(dict.fromkeys(self.forces)) or (() if starts else tuple(self.names.binding.load)[:1])
+        case = Case(state, interval, record_of(trial), inputs, starts=starts)
+        while True:
+            case = case._replace(step=fixed or interval / parts)
+            system = self.system(case)
+            if system is None or fixed or parts > MOST_PARTS:
+                break
+            turn = np.max(np.abs(system.modes[0].imag)) * case.step
+            half = case._replace(step=0.5 * case.step)
+            if turn <= SAFE_TURN and self._predicts(system, half, SAME_PACE):
+                break
+            parts *= 2
+        mode = None if system is None or not self.ports else system.most_flexible(self.x[0], 0)
+        frequency = self.description.scales.angular_frequency or (
+            self._loudest(case) if mode is None else mode[0]
+        )
+        return frequency, fixed or interval / max(parts, ceil(frequency * interval / PHASE))
+
+    def _loudest(self, case: Case) -> float:
+        """Return the angular frequency of the largest line in the spectrum of a record [rad/s]."""
+        name, *_ = case.starts or case.inputs
+        moving = self._answer(case, name, released=bool(case.starts))
+        moving = moving - moving[-len(moving) // 4 :].mean(axis=0)
+        lines, power = periodogram(moving, 1.0 / case.step, "hann", 4 * len(moving), False, axis=0)
+        if not np.any(power):
+            raise ModelError(said("models.silent", model=self))
+        return 2.0 * np.pi * float(max(lines[1], lines[np.argmax(power.max(axis=1))]))
+
+    def usual(self, trial: Trial) -> tuple[float, float]:
+        """Return what `pace` does in the nominal state: steps do not change while parameters are fitted."""
+        return self._paces.get(trial.interval, lambda: self.pace(trial, self.nominal))
+
+
+def record_of(trial: Trial) -> int:
+    """Return the steps that are recorded for a trial."""
+    return min(max(len(trial.time), LEAST_RECORD), RECORD)

@@ -1,11 +1,11 @@
 """What the workflow asks of a model: structural response under a patch, before any sensor touches it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from discrepancy.sentences import said
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, ModelPatch, PortForce, Primitive
 from fe.runtime.state import Losses
+from reporting.memory import Memory
 from reporting.words import brief, capital, counted
 
 Place = str | tuple[float, float]
@@ -24,44 +25,6 @@ MOVES, TURNS, EITHER = ("N", "m"), ("N m", "rad"), ("N or N m", "m or rad")
 """Units of a force and of a motion at a port."""
 KEPT = 400
 """Responses that a model keeps; the oldest goes first."""
-_Value = TypeVar("_Value")
-
-
-class Memory:
-    """Results by key, the least recently used forgotten where there are more than `size`.
-
-    `weight` says how much of the size a result takes; one each if it is left out. `end` is called with each
-    that is forgotten.
-    """
-
-    def __init__(
-        self, size: int = 256, weight: Callable[[Any], int] = lambda _: 1,
-        end: Callable[[Any], None] = lambda _: None,
-    ) -> None:  # fmt: skip
-        self._room, self._weight, self._end = size, weight, end
-        self._values: dict[Hashable, Any] = {}
-
-    def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
-        """Return what `make` returned for `key`, calling it if need be."""
-        if key in self._values:
-            found: _Value = self._values.pop(key)
-            self._values[key] = found
-            return found
-        value = self._values[key] = make()
-        self._room -= self._weight(value)
-        while self._room < 0 and len(self._values) > 1:
-            self._forget()
-        return value
-
-    def clear(self) -> None:
-        """Forget all results."""
-        while self._values:
-            self._forget()
-
-    def _forget(self) -> None:
-        value = self._values.pop(next(iter(self._values)))
-        self._room += self._weight(value)
-        self._end(value)
 
 
 @dataclass(frozen=True)
@@ -278,23 +241,16 @@ class Model(ABC):
 
     def check(self, trial: Trial) -> None:
         """Refuse a trial that it cannot follow."""
-        name = f"The trial {trial.name!r}"
-        if trial.kind is TrialKind.FLIGHT and trial.kind not in self.kinds:
-            raise ModelError(f"{name} is a flight, but {self.what} has no input load_factor: give it one.")
-        if trial.kind not in self.kinds and trial.kind is TrialKind.RINGDOWN:
-            raise ModelError(said("models.free_ringdown", name=name, model=self))
+        for kind, why in ((TrialKind.FLIGHT, "models.flight"), (TrialKind.RINGDOWN, "models.free_ringdown")):
+            if trial.kind is kind and kind not in self.kinds:
+                raise ModelError(said(why, trial=trial, model=self))
         driven = trial.kind is TrialKind.DRIVEN
         if TrialKind.DRIVEN not in self.kinds and (driven or trial.begins is not Start.SETTLED):
-            raise ModelError(
-                f"{name} {'is driven' if driven else f'begins {trial.begins.value}'}, which {self.what} "
-                "cannot follow: describe the rig as a lumped model, or record it forced from rest."
-            )
+            how = "is driven" if driven else f"begins {trial.begins.value}"
+            raise ModelError(said("models.driven", trial=trial, how=how, model=self))
         if trial.kind is TrialKind.STATIC and trial.inputs and not self.holds_inputs:
-            raise ModelError(
-                f"{name} is static under the inputs {', '.join(map(repr, trial.input_names))}, which "
-                f"{self.what} does not have at rest: describe the asset as an FMU model with [[input]], or "
-                'record the trial as "driven".'
-            )
+            names = ", ".join(map(repr, trial.input_names))
+            raise ModelError(said("models.static_inputs", trial=trial, names=names, model=self))
 
     def check_outputs(self, outputs: Outputs) -> None:
         """Refuse outputs that it does not have, or that no channel can measure so."""
@@ -304,10 +260,7 @@ class Model(ABC):
                 known = ", ".join(self.shown_outputs)
                 raise ModelError(f"{capital(self.what)} has no output {output!r}; it has {known}.")
             if not quantity.shows(own):
-                raise ModelError(
-                    f"The output {output!r} of {self.what} is a {own.value}, but a channel measures "
-                    f"{quantity.value}."
-                )
+                raise ModelError(said("models.measured", output=output, model=self, own=own, by=quantity))
 
     def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
         """Return the losses of its regions in each row from those (N, K) that a trial names.
@@ -319,10 +272,7 @@ class Model(ABC):
             if name in self.regions:
                 losses[:, self.regions.index(name)] = column
             elif np.any(column):
-                raise ModelError(
-                    f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but {self.what} "
-                    f"has {', '.join(self.regions) or 'none'}."
-                )
+                raise ModelError(said("models.no_region", trial=trial, name=name, model=self))
         return [tuple(row) for row in losses.tolist()]
 
     @property

@@ -18,6 +18,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Acting, Shown, by_order
 from discrepancy.models.interface import PortedSystem
+from discrepancy.sentences import said
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import NO_LAWS, Laws, static_solution
@@ -119,9 +120,7 @@ class LinearSystem:
         if most is None:
             square = np.where(np.abs(square) <= ROUNDING * np.max(np.abs(square), initial=0.0), 0.0, square)
         elif square[0] <= 0.0:
-            raise ModelError(
-                f"The stiffness must be positive definite, but an eigenvalue is {square[0]:g} 1/s^2."
-            )
+            raise ModelError(said("models.indefinite", least=square[0]))
         moving = len(square)
         found = np.zeros((len(self.mass), moving + self.states))
         found[:n, :moving] = free @ shapes
@@ -235,11 +234,7 @@ class LinearSystem:
         found = np.linalg.lstsq(restoring, force.T, rcond=LEAST_PIVOT)[0]
         left = np.max(np.abs(restoring @ found - force.T), initial=0.0)
         if left > 1e-6 * np.max(np.abs(force), initial=1e-300):
-            size = float(np.max(np.abs(restoring), initial=0.0))
-            raise ModelError(
-                "the rig has no rest under what acts at the first sample (nothing holds it): say "
-                f'`begins` = "still" or "unknown" (its largest restoring coefficient is {size:.3g})'
-            )
+            raise ModelError(said("models.unheld", most=np.max(np.abs(restoring), initial=0.0)))
         return np.asarray(found.T @ self.shapes.T)
 
     def static(

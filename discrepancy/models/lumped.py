@@ -194,9 +194,7 @@ class LumpedModel(DescribedModel, SystemModel):
             loads.append(Load(self._moved_row(rig, section, change), Course(time, values, item.hold)))
         for load in (item for item in patch if isinstance(item, PortLoad)):
             if load.port not in self.acts:
-                raise ModelError(
-                    said("models.no_port", load=load, model=self, known=", ".join(self.acts) or "none")
-                )
+                raise ModelError(said("models.no_port", load=load, model=self))
             spans = tuple(window.span for window in load.windows)
             loads.append(Load(self.acts[load.port], FormulaCourse(course_of(load.force, load.kind), spans)))
         return loads, drives
@@ -214,15 +212,11 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the input that a trial records; raises `ModelError` if it is not the model's."""
         section = self._inputs.get(item.name)
         if section is None:
-            raise ModelError(
-                f"The trial {trial.name!r} records the input {item.name!r}, which {self.what} does "
-                f"not have; it has {', '.join(self._inputs) or 'none'}."
-            )
+            known = self._inputs
+            raise ModelError(said("models.unknown_input", trial=trial, item=item, model=self, known=known))
         moving = section.quantity.moving
         if item.quantity is not section.quantity and item.quantity not in moving:
-            raise ModelError(
-                said("models.input_quantity", item=item, model=self, section=section, trial=trial)
-            )
+            raise ModelError(said("models.input_quantity", item=item, model=self, own=section, trial=trial))
         if moving and item.hold not in (None, Hold.SMOOTH):
             raise ModelError(said("models.prescribed", item=item, trial=trial, model=self))
         return section
@@ -305,12 +299,9 @@ class LumpedModel(DescribedModel, SystemModel):
                 factors[term] = factors.get(term, 1.0) * value
         return factors
 
-    def rig(self, state: State) -> Rig:
-        """Return the model at values of the parameters, a structure and a temperature."""
-        return self._rig_of(state._replace(drives=(), closed=True))
-
     @cached_property
-    def _rig_of(self) -> Callable[[State], Rig]:
+    def rig(self) -> Callable[[State], Rig]:
+        """What gives the model at values of the parameters, a structure and a temperature, kept."""
         return lru_cache(self.kept)(self._rig)
 
     def _rig(self, state: State) -> Rig:

@@ -12,11 +12,12 @@ from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.errors import ModelError
 from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
+from discrepancy.sentences import said
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
-from reporting.section import Name, NotNegative, Number, Positive
+from reporting.section import Name, NotNegative, Number, Positive, require
 from reporting.words import counted
 
 SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"
@@ -74,8 +75,8 @@ class Damping(Section):
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
         rayleigh = self.alpha is not None or self.beta is not None
-        if sum((self.ratios is not None, self.matrix is not None, rayleigh)) != 1:
-            raise ValueError("give exactly one of ratios, matrix, or alpha and beta")
+        ways = self.ratios is not None, self.matrix is not None, rayleigh
+        require(sum(ways) == 1, "give exactly one of ratios, matrix, or alpha and beta")
         return self
 
 
@@ -123,10 +124,10 @@ class OutputSection(NamedSection):
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
-        if sum(item is not None for item in (self.vector, self.reaction, self.controller)) != 1:
-            raise ValueError(f"the output {self.name!r} needs one of a vector, a reaction and a controller")
-        if self.reaction is not None and self.quantity not in (Quantity.FORCE, Quantity.TORQUE):
-            raise ValueError(f'output {self.name!r} is a reaction: give it quantity = "force" or "torque"')
+        ways = sum(item is not None for item in (self.vector, self.reaction, self.controller))
+        require(ways == 1, f"the output {self.name!r} needs one of a vector, a reaction and a controller")
+        forces = self.reaction is None or self.quantity in (Quantity.FORCE, Quantity.TORQUE)
+        require(forces, f'output {self.name!r} is a reaction: give it quantity = "force" or "torque"')
         return self
 
 
@@ -160,10 +161,7 @@ class LawSection(Section):
     @model_validator(mode="after")
     def _is_a_law(self) -> Self:
         known = [law.kind for law in LAWS]
-        if self.kind not in known:
-            raise ValueError(
-                f"the law {self.name!r} has the kind {self.kind!r}, but known are {', '.join(known)}"
-            )
+        require(self.kind in known, said("models.law", law=self, known=", ".join(known)))
         try:
             self.scaled(1.0).check()
         except InvalidPatchError as cause:
@@ -197,8 +195,8 @@ class ControllerSection(NamedSection):
 
     @model_validator(mode="after")
     def _does_something(self) -> Self:
-        if not (self.proportional or self.derivative or self.integral):
-            raise ValueError(f"controller {self.name!r} has no gain: give one of {', '.join(GAINS)}")
+        gains = self.proportional or self.derivative or self.integral
+        require(gains, f"controller {self.name!r} has no gain: give one of {', '.join(GAINS)}")
         return self
 
 
@@ -324,28 +322,25 @@ class LumpedDescription(ModelDescription):
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         n, m, ratios = self.size, self.states, self.damping.ratios if self.damping is not None else None
-        if not (n or m):
-            raise ValueError("mass is missing (or capacity, of states of first order)")
+        require(n or m, "mass is missing (or capacity, of states of first order)")
         for kind, wanted, more in (
             ("stiffness", n and not self.free, ", or say `free = true`"),
             ("conductance", m, ""),
         ):
-            if wanted and not self.given(kind):
-                raise ValueError(f"{kind} is missing: give it, or [[{kind}_part]]{more}")
-        if n and not self.free and self.damping is None:
-            raise ValueError("'damping' is missing")
-        if self.is_plain and not self.input:
-            raise ValueError("[[input]] is missing: at least one force must be able to act")
+            there = not wanted or self.given(kind)
+            require(there, f"{kind} is missing: give it, or [[{kind}_part]]{more}")
+        require(self.damping or self.free or not n, "'damping' is missing")
+        acted = self.input or not self.is_plain
+        require(acted, "[[input]] is missing: at least one force must be able to act")
         self._check_names()
         self._check_matrices()
         for kind in ("input", "output", "port", "place", "load", "controller"):
             for item in getattr(self, kind):
                 self._check_vectors(kind, item)
-        if self.root is not None and (len(self.root.lever) != n or not any(self.root.lever)):
-            raise ValueError(f"lever of root needs {counted(n, 'entry', 'entries')}, not all zero")
-        if ratios is not None and len(ratios) != n:
-            came = counted(len(ratios), "value")
-            raise ValueError(f"damping.ratios needs one value for each mode, {n} in all, but {came} came")
+        turns = self.root is None or (len(self.root.lever) == n and any(self.root.lever))
+        require(turns, f"lever of root needs {counted(n, 'entry', 'entries')}, not all zero")
+        came, each = counted(len(ratios or ()), "value"), "damping.ratios needs one value for each mode"
+        require(ratios is None or len(ratios) == n, f"{each}, {n} in all, but {came} came")
         return self
 
     def _check_matrices(self) -> None:
@@ -356,49 +351,40 @@ class LumpedDescription(ModelDescription):
             whole = {"damping": "damping.matrix"}.get(kind, kind if kind in KINDS else f"coupling.{kind}")
             for name, matrix in given.items():
                 place = whole if name == kind else f"{kind}_part {name!r}"
-                if [len(row) for row in matrix] != [columns] * rows:
-                    how = f" (or {counted(rows, 'diagonal value')})" if kind in KINDS else " by rows"
-                    raise ValueError(f"{place} must be a {rows} x {columns} matrix{how}")
+                how = f" (or {counted(rows, 'diagonal value')})" if kind in KINDS else " by rows"
+                fits = [len(row) for row in matrix] == [columns] * rows
+                require(fits, f"{place} must be a {rows} x {columns} matrix{how}")
                 full = np.array(matrix)
                 least = -1e-9 * np.abs(full).max()
-                if kind in KINDS[:4] and np.min(-np.abs(full - full.T)) < least:
-                    raise ValueError(f"{place} must be symmetric")
-                if kind == "damping" and np.linalg.eigvalsh(full)[0] < least:
-                    raise ValueError(f"{place} must not feed energy: it has a negative eigenvalue")
+                alike = kind not in KINDS[:4] or np.min(-np.abs(full - full.T)) >= least
+                require(alike, f"{place} must be symmetric")
+                loses = kind != "damping" or np.linalg.eigvalsh(full)[0] >= least
+                require(loses, f"{place} must not feed energy: it has a negative eigenvalue")
             if given and kind in ("mass", "stiffness", "capacity"):
                 values = np.linalg.eigvalsh(np.sum([*given.values()], axis=0))
-                floats = kind == "stiffness" and self.free and values[0] >= -1e-9 * values[-1]
-                if values[0] <= 0.0 and not floats:
-                    loose = LOOSE if kind == "stiffness" else ""
-                    raise ValueError(f"{kind} (with its parts) must be positive definite{loose}")
+                loose, floats = (LOOSE, self.free) if kind == "stiffness" else ("", False)
+                holds = values[0] > 0.0 or (floats and values[0] >= -1e-9 * values[-1])
+                require(holds, f"{kind} (with its parts) must be positive definite{loose}")
 
     def _check_vectors(self, kind: str, item: NamedVector | OutputSection | ControllerSection) -> None:
         """Refuse vectors of another length and zero ones, and what sees both displacements and states."""
         n, m = self.size, self.states
         for key in ("vector", "acts", "station_derivative"):
-            vector = getattr(item, key, None)
-            if vector is not None and len(vector) != n + m:
-                came, has = counted(len(vector), "entry", "entries"), counted(n + m, "unknown")
-                raise ValueError(f"{key} of {kind} {item.name!r} has {came}, but the model has {has}")
-            if vector is not None and not any(vector) and key != "station_derivative":
-                raise ValueError(f"{key} of {kind} {item.name!r} is zero")
+            row, where = getattr(item, key, None), f"{key} of {kind} {item.name!r}"
+            came, has = counted(len(row or ()), "entry", "entries"), counted(n + m, "unknown")
+            require(row is None or len(row) == n + m, f"{where} has {came}, but the model has {has}")
+            require(row is None or any(row) or key == "station_derivative", f"{where} is zero")
         row = np.array(item.vector or ())
-        if kind in ("port", "controller") and any(row[:n]) and any(row[n:]):
-            raise ValueError(f"the {kind} {item.name!r} sees displacements or states, not both")
+        one = kind not in ("port", "controller") or not (any(row[:n]) and any(row[n:]))
+        require(one, f"the {kind} {item.name!r} sees displacements or states, not both")
         if isinstance(item, PortSection) and item.acts is not None:
             push, capacity = np.array(item.acts), np.sum([*self.given("capacity").values()], axis=0)
             of_states = not any(row[:n]) and not any(push[:n])
-            if not of_states or row[n:] @ np.linalg.solve(capacity, push[n:]) <= 0.0:
-                raise ValueError(
-                    f"`acts` of the port {item.name!r} is for states, and must take from what its vector sees"
-                )
+            takes = of_states and row[n:] @ np.linalg.solve(capacity, push[n:]) > 0.0
+            require(takes, said("models.acts", port=item))
         if isinstance(item, ControllerSection):
-            order = item.quantity.order + any(row[n:])
-            if item.quantity.order == 2 or (item.derivative and order > 0):
-                raise ValueError(
-                    f"the controller {item.name!r} cannot follow an acceleration, nor the derivative of a "
-                    "speed or of a state: leave `derivative` out"
-                )
+            speed = item.quantity.order + any(row[n:]) > 0 and item.derivative
+            require(item.quantity.order < 2 and not speed, said("models.controller_speed", controller=item))
 
     def _check_names(self) -> None:
         """Refuse names that are there twice, and those that name nothing."""
@@ -426,8 +412,8 @@ class LumpedDescription(ModelDescription):
             ("output", "controller", "is what a controller gives,", names["controller"]),
             ("parameter", "terms", "scales", [*terms, *acting, *gains]),
         ):
+            has = ", ".join(known) or "none"
             for item in getattr(self, kind):
                 for name in _listed(getattr(item, key)):
-                    if name is not None and name not in known:
-                        has = ", ".join(known) or "none"
-                        raise ValueError(f"{kind} {item.name!r} {does} {name!r}, but there are {has}")
+                    wrong = f"{kind} {item.name!r} {does} {name!r}, but there are {has}"
+                    require(name is None or name in known, wrong)

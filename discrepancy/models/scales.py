@@ -3,10 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
-from discrepancy.campaign.records import Campaign
-
 
 @dataclass(frozen=True)
 class PortScale:
@@ -89,17 +85,3 @@ class Scales:
     duration: float
     campaign_time: float
     ports: Mapping[str, PortScale]
-
-
-def campaign_sizes(campaign: Campaign) -> dict[str, float]:
-    """Return what `Scales` has of the campaign alone: force, load factor, duration and campaign time."""
-    trials = campaign.trials
-    moments = [trial.start + trial.time if trial.is_dynamic else trial.time for trial in trials]
-    span = float(max(map(np.max, moments)) - min(map(np.min, moments))) if moments else 0.0
-    lengths = (float(trial.time[-1] - trial.time[0]) for trial in trials if trial.is_dynamic)
-    return {
-        "force": max((float(np.max(np.abs(trial.force))) for trial in trials), default=0.0),
-        "load_factor": max((float(np.max(np.abs(trial.load_factor))) for trial in trials), default=0.0),
-        "duration": max(lengths, default=1.0),
-        "campaign_time": span or 1.0,
-    }

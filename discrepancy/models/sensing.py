@@ -8,6 +8,7 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Quantity, Trial, TrialKind
 from discrepancy.errors import CatalogueError, ModelError
 from discrepancy.models.interface import ACROSS, Conditions, Model, Response
+from discrepancy.sentences import said
 from fe.high_pass import filtered_record
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, LoggerClock, ModelPatch, Primitive, SensorRotation
@@ -56,10 +57,7 @@ def observe(
     turned *= len(patch.of(SensorRotation)) > 0
     outputs += tuple((outputs[column][0] + part, Quantity.STRAIN) for part in ACROSS for column in turned)
     if not all(model.output_quantity(output) for output, _ in outputs[len(channels) :]):
-        raise ModelError(
-            f"{model.name} gives no transverse and shear strain, so a turned gauge cannot be computed: leave "
-            "gauge misalignment out for this model."
-        )
+        raise ModelError(said("models.turned_gauge", model=model))
     values = np.zeros((len(trial.time), len(outputs)))
     slopes, by_output = np.zeros_like(values), np.append(by_channel, np.tile(by_channel[turned], 2))
     for rate in np.unique(by_channel).tolist():

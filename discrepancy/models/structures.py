@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from calibration.errors import CalibrationError
-from calibration.joint.wing_table import wing_priors
+from calibration.joint.wing_table import SHIPPED_PRIOR, wing_priors
 from calibration.result.file import load_calibration
 from calibration.result.record import STATE, ParameterPrior
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
@@ -39,17 +39,6 @@ DEVIATION = 0.25
 """Standard deviation of a parameter whose calibration is not known, as a share of its range."""
 SAME = 1e-9
 """Difference of two rows, relative to the largest entry, that is rounding."""
-SHIPPED_PRIOR = {
-    "young_modulus_factor": (1.0073, 0.0103),
-    "servo_mass": (0.1685, 0.0041),
-    "pitot_mass": (0.1350, 0.0083),
-    "damping_alpha": (1.03, 0.37),
-    "damping_beta": (7.56e-4, 1.84e-4),
-}
-"""Mean and standard deviation of the calibrated state of the shipped wing (docs/calibration.md): e of the
-paper, its masses, and the damping of the joint posterior, whose spread holds the measurement too."""
-
-
 ROTATING_PORT = "root"
 Prior = Mapping[str, tuple[float, float]]
 """Means and standard deviations of calibrated parameters, by the names of `STATE`."""

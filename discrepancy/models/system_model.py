@@ -1,7 +1,7 @@
 """A model by its matrices, a wing, a structure or a lumped rig: under patches, at rest and in motion."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from itertools import groupby
@@ -23,13 +23,19 @@ from discrepancy.models.interface import (
 )
 from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.motion import Motion, motion_of
-from discrepancy.models.port_scales import Ports
-from discrepancy.models.scales import PortScale, Scales, campaign_sizes
+from discrepancy.models.scales import PortScale, Scales
+from discrepancy.sentences import said
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import INTERNAL_FORCES, LOADS, STRUCTURE, ModelPatch, PortLoad
 from fe.runtime.state import Losses
+
+FORCES = 5.0
+"""Force scale of a port that no stiffness holds over the rms of the forces there: friction of 1 to 25 % of
+what acts is in the middle of its prior, and drag of as much at the largest speed."""
+BOTH_WAYS = 1e-3
+"""Share of the largest speed of a port that both directions must reach, for a motion that turns."""
 
 
 class State(NamedTuple):
@@ -154,10 +160,7 @@ class SystemModel(Model):
         acting = Acting(trial.time, conditions.stamps(trial.time), begins=trial.begins)
         if trial.kind is TrialKind.RINGDOWN:
             if len(patch.of(PortLoad)):
-                raise ModelError(
-                    f"The trial {trial.name!r} is a ring-down, which no force with a course in time can act "
-                    'on; say kind = "driven" and begins = "unknown".'
-                )
+                raise ModelError(said("models.forced_ringdown", trial=trial))
             release = self.force_row(trial.load_place, state), release_of(trial)
             return replace(acting, release=release, initial=conditions.initial)
         loads, drives = self.pushes(case)
@@ -213,10 +216,7 @@ class SystemModel(Model):
             n = system.displacements
             for (_, quantity), item in zip(outputs, shown, strict=True):
                 if np.any(item.rows[2:, n:]) or (quantity.order > 0 and np.any(item.rows[1:, :n])):
-                    raise ModelError(
-                        f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
-                        "acceleration."
-                    )
+                    raise ModelError(said("models.speed_at_rest", trial=trial))
             seen = np.array([np.concatenate((item.rows[0, :n], item.rows[1, n:])) for item in shown])
             try:
                 values[rows], memory = system.static(units, laws, given, memory, before, seen=seen)
@@ -300,7 +300,7 @@ class SystemModel(Model):
             driven_only = False
             if held:
                 ports.rest(self._held(self.case(trial, Conditions(parameters))), fitted=fitted)
-        (peak, speed, weight), sizes = largest.tolist(), campaign_sizes(campaign)
+        (peak, speed, weight), sizes = largest.tolist(), campaign.sizes
         shape, stiff = np.zeros(0), np.zeros(len(names))
         if held:
             known = [*(trial.load_place for trial in trials), *(self.load_places or ())]
@@ -353,3 +353,80 @@ def _measured(campaign: Campaign, trial: Trial) -> float:
         campaign.channels[name].quantity in (Quantity.FORCE, Quantity.TORQUE) for name in trial.channels
     ]
     return float(np.max(np.abs(trial.values), where=trial.used & np.array(forces, bool), initial=0.0))
+
+
+class Ports:
+    """What acts and moves at ports in a campaign, one trial after the other.
+
+    Where no stiffness of the structure holds a port (that of a controller is none), its force scale is
+    `FORCES` times the rms of inertia, damping, own laws and loads there, its displacement and speed the
+    largest: effects are measured by what acts and moves. At a port of a state likewise, of flows. Where
+    drives alone move a port, no frequency of the structure says how fast: its force scale is the largest
+    measured force.
+
+    Parameters
+    ----------
+    bare : LinearSystem
+        The system at the prior mean, without controllers.
+    rows : (P, N) ndarray
+        Of the ports.
+    """
+
+    def __init__(self, bare: LinearSystem, rows: FloatArray) -> None:
+        self.bare, self.rows, count = bare, rows, len(rows)
+        self.sizes, self.squares, self.count = np.zeros((3, count)), np.zeros(count), 0
+        self.turned, self.follows = np.zeros(count, bool), np.ones(count, bool)
+
+    def rest(self, displacements: FloatArray, *, fitted: bool) -> None:
+        """Add displacements (L, N) at rest, or after a release."""
+        x = np.max(np.abs(displacements @ self.rows.T), axis=0)
+        self.sizes = np.maximum(self.sizes, (x * fitted, x, 0.0 * x))
+
+    def follow(self, motion: Motion, measured: float, *, fitted: bool) -> FloatArray:
+        """Add a motion and the largest force measured in it [N]; return the loads (N, n) in it."""
+        system, shapes = motion.system, motion.system.shapes
+        position, speed = motion.at(self.rows)
+        x, v = (np.max(np.abs(item), axis=0, initial=0.0) for item in (position, speed))
+        self.sizes = np.maximum(self.sizes, (x * fitted, x, v))
+        least = BOTH_WAYS * np.max(np.abs(speed), axis=0)
+        self.turned |= (np.min(speed, axis=0) < -least) & (np.max(speed, axis=0) > least)
+        pushed = (
+            motion.acceleration[:, : shapes.shape[1]] @ (system.mass @ shapes).T,
+            motion.velocity[:, : shapes.shape[1]] @ (self.bare.damping @ shapes).T,
+            motion.acting.load_at(motion.time, np.eye(len(system.mass))),
+        )
+        # modal force along the port, over what a unit force there gives
+        lent = np.sum((self.rows @ shapes) ** 2, axis=1)
+        along = shapes @ (shapes.T @ self.rows.T) / np.where(lent > 0.0, lent, 1.0)
+        largest = np.max([np.mean((item @ along) ** 2, axis=0) for item in pushed], axis=0)
+        self.squares += len(motion.time) * np.where(lent > 0.0, largest, (measured / FORCES) ** 2)
+        self.count += len(motion.time)
+        self.follows &= lent == 0.0
+        return pushed[-1]
+
+    def scales(self, still: Sequence[float], *, driven_only: bool) -> Iterator[PortScale]:
+        """Yield the scale of each port.
+
+        `still` are their stiffnesses at rest, zero where the modes tell it. Where all trials are followed in
+        time from known inputs (`driven_only`), what was not seen to turn does not.
+        """
+        bare, forces = self.bare, FORCES * np.sqrt(self.squares / max(self.count, 1))
+        frequency = bare.angular_frequency[: bare.moving]
+        for number, (row, stiff, force) in enumerate(zip(self.rows, still, forces.tolist(), strict=True)):
+            usual, most, pace = self.sizes[:, number].tolist()
+            weight = (row @ bare.shapes)[: bare.moving] ** 2
+            holds = weight > 1e-6 * float(weight.sum())
+            size, free = usual or most or 1.0, not np.any(frequency[holds] > 0.0)
+            if np.any(holds) and np.all(frequency[holds] > 0.0):
+                stiff = stiff or 1.0 / float(np.sum(weight[holds] / frequency[holds] ** 2))
+                w, of_mode = float(frequency[holds][0]), float(weight[holds][0])
+                if driven_only and self.follows[number] and force > 0.0 < pace:
+                    yield PortScale(size, force / size, pace / size, stiff, most or size, driven=True)
+                else:
+                    yield PortScale(size, w**2 / of_mode, w, stiff, most or 1.0)
+                continue
+            yield PortScale(
+                size, (force or 1.0) / size, (pace or 1.0) / size, None, most or size, free=free,
+                turns=bool(self.turned[number]) or not (free and driven_only and np.any(holds)),
+                of_state=not np.any(row[: bare.displacements]),
+            )  # fmt: skip

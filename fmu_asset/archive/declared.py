@@ -13,6 +13,7 @@ import numpy as np
 
 from fmu_asset.errors import FmuInputError, FmuUnsupportedError, visible
 from fmu_asset.instances.plan import FmuIdentity, Interface
+from fmu_asset.sentences import said
 
 NUMERIC_KINDS = frozenset(
     {"Real", "Integer", "Enumeration", "Boolean", "Float32", "Float64"}
@@ -332,9 +333,8 @@ def read_declared(
 
 def _checked(name: str, shape: Sequence[int]) -> tuple[int, ...]:
     if any(length < 0 for length in shape) or math.prod(shape) > _LARGEST_ARRAY:
-        raise FmuInputError(
-            f"{name!r} is an array of {' x '.join(map(str, shape))} elements; {_LARGEST_ARRAY} are the most."
-        )
+        came = " x ".join(map(str, shape))
+        raise FmuInputError(said("archive.array_too_large", name=name, shape=came, most=_LARGEST_ARRAY))
     return tuple(shape)
 
 
@@ -345,15 +345,9 @@ def _offered(declared: Any, file: Path, wanted: Interface | None) -> dict[Interf
     }  # fmt: skip
     there = {name: given for name, given in there.items() if given is not None}
     if not there:
-        raise FmuUnsupportedError(
-            f"{file} offers neither co-simulation nor model exchange (scheduled execution is not supported); "
-            "export it for co-simulation."
-        )
+        raise FmuUnsupportedError(said("archive.no_interface", file=file))
     if wanted is not None and wanted not in there:
-        raise FmuUnsupportedError(
-            f"{file} offers {next(iter(there))} only, but the binding asks for {wanted}; change `interface` "
-            "there, or export the FMU anew."
-        )
+        raise FmuUnsupportedError(said("archive.other_interface", file=file, there=there, wanted=wanted))
     return there
 
 

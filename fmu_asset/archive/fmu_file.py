@@ -18,6 +18,7 @@ from fmpy import platform_tuple, read_model_description, sharedLibraryExtension
 from fmu_asset.errors import FmuFileError, FmuUnsupportedError
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances.plan import Interface
+from fmu_asset.sentences import said
 from reporting.words import one_line
 
 from .declared import FmuDescription, read_declared
@@ -87,10 +88,7 @@ def inspect_fmu(
     root = _model_description(file)
     version = root.get("fmiVersion") or ""
     if version not in ("1.0", "2.0") and not version.startswith("3."):
-        raise FmuUnsupportedError(
-            f"{file} is an FMU of FMI {version or '(not said)'}; FMI 1.0, 2.0 or 3.0 is needed: export it "
-            "as such."
-        )
+        raise FmuUnsupportedError(said("archive.fmi_version", file=file, version=version or "(not said)"))
     try:
         declared = read_model_description(str(file), validate=False)
         platforms = tuple(
@@ -103,10 +101,7 @@ def inspect_fmu(
     except Exception as error:
         raise FmuFileError(f"The model description of {file} cannot be read ({one_line(error)}).") from error
     if not _IDENTIFIER.fullmatch(description.model_identifier):
-        raise FmuFileError(
-            f"The model identifier of {file}, {description.model_identifier!r}, is no name of a C function; "
-            "the FMU is damaged or unsafe."
-        )
+        raise FmuFileError(said("archive.identifier", file=file, description=description))
     here = platform_tuple if description.major_version == 3 else fmi_platform
     binary = f"binaries/{here}/{description.model_identifier}{sharedLibraryExtension}"
     if binary in names:
@@ -154,10 +149,7 @@ def extract_fmu(description: FmuDescription) -> Path:
 
 def _size_and_hash(file: Path) -> tuple[int, str]:
     if not file.exists():
-        raise FmuFileError(
-            f"There is no FMU {file}; check the path, or make it: `uav-twin fmu build` packs a wing or a "
-            "script, `uav-twin structure fmu` a structure."
-        )
+        raise FmuFileError(said("archive.absent", file=file))
     if not file.is_file():
         raise FmuFileError(f"{file} is a folder, not an FMU file.")
     try:
@@ -182,25 +174,18 @@ def check_archive(file: Path, size: int, what: str = "FMU", again: str = "build"
                 _check_entry(file, entry)
             names = [entry.filename for entry in entries if not entry.is_dir()]
             if len(entries) > _MOST_ENTRIES:
-                raise FmuFileError(
-                    f"{file} holds {len(entries)} entries, more than {_MOST_ENTRIES}; no tool exports that, "
-                    "and it was refused."
-                )
+                raise FmuFileError(said("archive.entries", file=file, count=len(entries), most=_MOST_ENTRIES))
             extracted = sum(entry.file_size for entry in entries)
             if extracted > min(LARGEST_EXTRACTED_BYTES, max(_SMALL_ENOUGH, _LARGEST_RATIO * size)):
-                raise FmuFileError(
-                    f"{file} has {size / 1024**2:.3g} MiB and would extract to {extracted / 1024**2:.0f} "
-                    "MiB, which looks like an archive made to fill the disk; it was refused."
-                )
+                mebibytes = size / 1024**2, extracted / 1024**2
+                raise FmuFileError(said("archive.too_large", file=file, mebibytes=mebibytes))
             broken = archive.testzip()
             if broken is not None:
                 raise FmuFileError(f"{file} is damaged: the checksum of {broken} is wrong; fetch it again.")
             _refuse_unequal_twins(file, archive)
             return {*names}
     except (*_UNREADABLE, EOFError, NotImplementedError, RuntimeError) as error:
-        raise FmuFileError(
-            f"{file} is not a sound {what} archive ({error}); fetch or {again} it again."
-        ) from error
+        raise FmuFileError(said("archive.unsound", file=file, what=what, error=error, again=again)) from error
 
 
 def _refuse_unequal_twins(file: Path, archive: zipfile.ZipFile) -> None:
@@ -212,10 +197,7 @@ def _refuse_unequal_twins(file: Path, archive: zipfile.ZipFile) -> None:
             continue
         equal = (twin.CRC, twin.file_size) == (entry.CRC, entry.file_size)
         if not equal or archive.read(twin) != archive.read(entry):
-            raise FmuFileError(
-                f"{file} holds the entry {entry.filename!r} twice with different content; nobody can say "
-                "which is meant, and it was refused."
-            )
+            raise FmuFileError(said("archive.twice", file=file, entry=entry))
 
 
 def _check_entry(file: Path, entry: zipfile.ZipInfo) -> None:
@@ -223,24 +205,16 @@ def _check_entry(file: Path, entry: zipfile.ZipInfo) -> None:
     parts = PurePosixPath(name).parts
     outside = not name or name.startswith("/") or ".." in parts or not {*name}.isdisjoint("\\:\0")
     if outside or stat.S_ISLNK(entry.external_attr >> 16):
-        raise FmuFileError(
-            f"{file} holds the entry {name!r}, which would be extracted outside its folder; it was refused."
-        )
+        raise FmuFileError(said("archive.outside", file=file, name=name))
     if len(parts) > _DEEPEST:
-        raise FmuFileError(
-            f"{file} holds an entry {len(parts)} folders deep; no tool exports that (at most {_DEEPEST} are "
-            "taken), and it was refused."
-        )
+        raise FmuFileError(said("archive.deep", file=file, deep=len(parts), most=_DEEPEST))
 
 
 class _WithoutDocumentType(TreeBuilder):
     """Elements of a file in any encoding, up to a document type, before its entities are defined."""
 
     def doctype(self, name: str, public: str | None, system: str | None) -> None:
-        raise FmuFileError(
-            "defines a document type or entities, which FMI does not provide for and which can be made to "
-            "fill the memory; it was refused"
-        )
+        raise FmuFileError(said("archive.document_type"))
 
 
 def _model_description(file: Path) -> Element:

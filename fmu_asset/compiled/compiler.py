@@ -12,6 +12,7 @@ from typing import Literal
 from fmpy import platform as fmi_platform
 
 from fmu_asset.errors import FmuBuildError
+from fmu_asset.sentences import said
 
 COMPILERS = ("cc", "gcc", "clang")
 """Tried in this order where the environment variable CC names none."""
@@ -61,20 +62,14 @@ def find_compiler(platform: Platform = PLATFORM) -> list[str]:
     if platform != PLATFORM:
         if program := shutil.which(CROSS_COMPILER):
             return [program]
-        raise FmuBuildError(
-            f"A binary for 64-bit Windows needs {CROSS_COMPILER}, which was not found; install it (such as "
-            "the package gcc-mingw-w64-x86-64), or build without --windows."
-        )
+        raise FmuBuildError(said("compiled.no_cross_compiler", CROSS_COMPILER=CROSS_COMPILER))
     given = shlex.split(os.environ.get("CC", ""))
     for command in [given] if given else [[name] for name in COMPILERS]:
         program = shutil.which(command[0])
         if program is not None:
             return [program, *command[1:]]
     looked_for = f"CC={os.environ['CC']}" if given else ", ".join(COMPILERS)
-    raise FmuBuildError(
-        f"A compiled FMU needs a C compiler, but none was found (looked for: {looked_for}); install one "
-        "(such as the package gcc) or set CC, or build with --kind source and compile the FMU elsewhere."
-    )
+    raise FmuBuildError(said("compiled.no_compiler", looked_for=looked_for))
 
 
 def compile_library(sources: Mapping[str, bytes], *, platform: Platform = PLATFORM) -> bytes:
@@ -98,10 +93,7 @@ def compile_library(sources: Mapping[str, bytes], *, platform: Platform = PLATFO
         If there is no compiler, this is not 64-bit Linux, or the compiler fails.
     """
     if fmi_platform != PLATFORM:
-        raise FmuBuildError(
-            f"Compiled FMUs are built on {PLATFORM} only, but this is {fmi_platform}; build with --kind "
-            "source and compile the FMU with `fmpy compile`."
-        )
+        raise FmuBuildError(said("compiled.platform", PLATFORM=PLATFORM, fmi_platform=fmi_platform))
     compiler = find_compiler(platform)
     with tempfile.TemporaryDirectory(prefix="uav-twin-cc-") as folder:
         for name, content in sources.items():

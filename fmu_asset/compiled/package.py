@@ -24,6 +24,7 @@ from fmu_asset.description import (
 )
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.instances.plan import Interface
+from fmu_asset.sentences import said
 from fmu_asset.slaves.table import Roles
 from fmu_asset.slaves.variables import ENUMERATIONS, TRANSIENT, FmuVariable
 
@@ -262,9 +263,7 @@ def fmi_headers(fmi: FmiVersion = 2) -> dict[str, bytes]:
     folder = Path(str(distribution("fmpy").locate_file("fmpy"))) / "c-code"
     found = {path.name: path.read_bytes() for path in folder.glob(f"fmi{fmi}*.h")}
     if not found:
-        raise FmuBuildError(
-            f"The headers of FMI {fmi} are missing from the installation of fmpy; install it again."
-        )
+        raise FmuBuildError(said("compiled.no_headers", fmi=fmi))
     return found
 
 

@@ -7,10 +7,11 @@ from fmu_asset.door.binding import Binding
 from fmu_asset.door.exchange import Exchange, Values
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import AlgebraicLoopError, BindingError, CouplingError
+from fmu_asset.sentences import said
 
 from .instance import CoupledFmus, naming
 from .schedule import Schedule, loop_sentence
-from .structure import SystemStructure, listed
+from .structure import SystemStructure
 from .system import parts_of, system_description, wiring_hash
 from .wiring import Wiring
 
@@ -75,18 +76,12 @@ class CoupledAsset(FmiAsset):
         parameters: Values | None = None,
     ) -> None:
         if algorithm not in ALGORITHMS:
-            raise CouplingError(f"The algorithm must be one of {listed(ALGORITHMS)}, and {algorithm!r} came.")
+            raise CouplingError(said("coupling.algorithm", known=ALGORITHMS, algorithm=algorithm))
         if iterations < 1 or not (tolerance > 0.0 and math.isfinite(tolerance)):
-            raise CouplingError(
-                f"Iterations must be at least 1 and the tolerance positive; {iterations!r} and "
-                f"{tolerance!r} came."
-            )
+            raise CouplingError(said("coupling.iterations", iterations=iterations, tolerance=tolerance))
         self._wiring = wiring = structure if isinstance(structure, Wiring) else Wiring(structure)
         if binding.binding.decimation != 1:
-            raise BindingError(
-                f"The binding {binding.name} of several FMUs has a decimation, which only a binding of one "
-                "FMU can have; leave it out."
-            )
+            raise BindingError(said("coupling.decimation", binding=binding))
         jacobi, plan = algorithm == "jacobi", wiring.schedule
         if plan.loops and iterations == 1 and not jacobi:  # Jacobi delays every connection
             raise AlgebraicLoopError(loop_sentence(plan.loops))
@@ -107,10 +102,7 @@ class CoupledAsset(FmiAsset):
                 )
         for name in (name for group in plan.circles if iterations > 1 for name in group):
             if assets[name].state_method != "serialised":
-                raise CouplingError(
-                    f"The component {name!r} cannot save and restore its state, which iterations need; "
-                    "allow one iteration only, or delay a connection."
-                )
+                raise CouplingError(said("coupling.no_state", name=name))
         housing = CoupledFmus(
             exchange, plan, parts, assets, jacobi=jacobi, iterations=iterations, tolerance=tolerance
         )

@@ -18,9 +18,10 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import IDENTITY
 from fmu_asset.errors import FmuEndedError, FmuError, FmuStateError, IterationError
 from fmu_asset.instances.plan import Instance, Settings
+from fmu_asset.sentences import said
 
 from .schedule import Schedule
-from .structure import Endpoint, listed
+from .structure import Endpoint
 from .system import Part, SystemDescription
 from .wiring import ConnectedVariable
 
@@ -115,7 +116,7 @@ class CoupledFmus(Housing):
         *, jacobi: bool, iterations: int, tolerance: float,
     ) -> None:  # fmt: skip
         self._exchange, self._schedule, self._parts = exchange, order, parts
-        self._jacobi, self._iterations, self._tolerance = jacobi, iterations, tolerance
+        self._jacobi, self.iterations, self._tolerance = jacobi, iterations, tolerance
         self._system = cast("SystemDescription", exchange.description)
         ends = self._system.ends
         self.reset_trial = ResetTrial(comparable=False)
@@ -198,16 +199,13 @@ class CoupledFmus(Housing):
     def step(self) -> None:
         """Make the step that the request block describes."""
         if self._broken:
-            raise FmuStateError(
-                "A step or a restoration failed, and the FMUs no longer stand at the same time; reset the "
-                "asset or restore a state."
-            )
+            raise FmuStateError(said("coupling.apart"))
         self._take()
         self._earlier, self._before = self._before, self._now.copy()
         self._stepped.clear()
         self._broken = True
         for group in self._schedule.groups:
-            if self._iterations > 1 and group in self._schedule.circles:
+            if self.iterations > 1 and group in self._schedule.circles:
                 self._iterate(group)
             else:
                 self._pass(group, self._before if self._jacobi else self._now)
@@ -299,7 +297,7 @@ class CoupledFmus(Housing):
         states = {name: self.assets[name].save_state() for name in group}
         exchanged = {port.end for name in group for port in self._parts[name].fed.values()}
         watched = [i for i, end in enumerate(self._ends) if end in exchanged and end.component in group]
-        for iteration in range(self._iterations):
+        for iteration in range(self.iterations):
             last = self._now.copy()
             if iteration:
                 for name, state in states.items():
@@ -310,9 +308,5 @@ class CoupledFmus(Housing):
             if iteration and (change <= self._tolerance * np.maximum(1.0, np.abs(last[watched]))).all():
                 return
         worst = int(np.argmax(change))
-        raise IterationError(
-            f"The components {listed(group)} did not settle in {self._iterations} iterations of the "
-            f"step from t = {self.request[0]:g} s ({self._ends[watched[worst]]} still changes by "
-            f"{change[worst]:.3g}); allow more iterations or a larger tolerance, make the step smaller, or "
-            "delay one of their connections."
-        )
+        left = self._ends[watched[worst]], change[worst]
+        raise IterationError(said("coupling.unsettled", self=self, group=group, left=left))

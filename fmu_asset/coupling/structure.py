@@ -10,6 +10,7 @@ from fmu_asset.door.binding import expand
 from fmu_asset.door.units import IDENTITY, Conversion
 from fmu_asset.errors import CouplingError
 from fmu_asset.instances.plan import Interface
+from fmu_asset.sentences import said
 
 CONNECTOR_KINDS = ("input", "output", "parameter")
 """What a connector of a system can be."""
@@ -167,10 +168,8 @@ class SystemStructure:
         for component in self.components:
             if component.name == name:
                 return component
-        raise CouplingError(
-            f"The system {self.name} has no component {name!r}; it has "
-            f"{listed(c.name for c in self.components)}."
-        )
+        known = [component.name for component in self.components]
+        raise CouplingError(said("coupling.no_component", self=self, name=name, known=known))
 
     def delayed(self, targets: Iterable[str]) -> "SystemStructure":
         """Return the system with the connections to these ends delayed.
@@ -183,19 +182,9 @@ class SystemStructure:
         wanted = set(targets)
         ends = [str(connection.target) for connection in self.connections]
         if missing := wanted - {*ends}:
-            raise CouplingError(
-                f"No connection of the system {self.name} ends at {listed(sorted(missing))}, so none can be "
-                f"delayed there; connections end at {listed(ends)}."
-            )
+            raise CouplingError(said("coupling.no_delay", self=self, names=sorted(missing), known=ends))
         delayed = [replace(c, delayed=c.delayed or str(c.target) in wanted) for c in self.connections]
         return replace(self, connections=tuple(delayed))
-
-
-def listed(names: object) -> str:
-    """Return names as a list for people; a long one is cut."""
-    texts = [str(name) for name in names]  # type: ignore[attr-defined]
-    more = f" and {len(texts) - 12} more" if len(texts) > 12 else ""
-    return (", ".join(texts[:12]) or "none") + more
 
 
 def parse_endpoint(text: str, components: Sequence[str]) -> Endpoint:
@@ -211,10 +200,7 @@ def parse_endpoint(text: str, components: Sequence[str]) -> Endpoint:
         owner = max(owners, key=len)
         return Endpoint(owner, text[len(owner) + 1 :])
     if "." in text:
-        raise CouplingError(
-            f"The connection end {text!r} begins with no component; the components are "
-            f"{listed(components)}. A connector of the system itself is written without a dot."
-        )
+        raise CouplingError(said("coupling.no_dot", text=text, components=components))
     return Endpoint("", text)
 
 
@@ -242,10 +228,8 @@ def expand_connection(
     except ValueError as error:
         raise CouplingError(f"A connection from {source!r} to {target!r} cannot be read: {error}.") from error
     if len(sources) != len(targets):
-        raise CouplingError(
-            f"The connection from {source!r} to {target!r} joins {len(sources)} ends to {len(targets)}; the "
-            "two patterns must stand for equally many."
-        )
+        counts = len(sources), len(targets)
+        raise CouplingError(said("coupling.patterns", source=source, target=target, counts=counts))
     return tuple(
         Connection(parse_endpoint(a, components), parse_endpoint(b, components), **options)
         for a, b in zip(sources, targets, strict=True)

@@ -12,6 +12,7 @@ from fmu_asset.door.exchange import Exchange
 from fmu_asset.door.units import IDENTITY
 from fmu_asset.errors import BindingError, CouplingError
 from fmu_asset.instances.plan import Settings
+from fmu_asset.sentences import said
 
 from .structure import Component, Endpoint
 from .wiring import ConnectedVariable, Wiring
@@ -172,11 +173,7 @@ def parts_of(wiring: Wiring, exchange: Exchange, *, linear: bool = False) -> dic
     """
     parts = {c.name: _part(wiring, exchange, c, linear=linear) for c in wiring.structure.components}
     if linear and not any(part.linear for part in parts.values()):
-        raise BindingError(
-            f"The binding {exchange.binding.name} asks for linear interpolation of inputs, but no component "
-            f"of the system {wiring.structure.name} has a continuous input and takes its derivatives "
-            "(`canInterpolateInputs`, or model exchange); leave it out."
-        )
+        raise BindingError(said("coupling.interpolation", exchange=exchange, wiring=wiring))
     return parts
 
 
@@ -196,9 +193,7 @@ def _part(wiring: Wiring, exchange: Exchange, component: Component, *, linear: b
     outputs = (v.name for v in variables.values() if v.causality == "output" and v.single)
     ends = ends or tuple(Endpoint(name, output) for output in outputs)[:1]
     if not ends:
-        raise CouplingError(
-            f"The component {name!r} has no output of a single number, so it takes no part; leave it out."
-        )
+        raise CouplingError(said("coupling.no_output", name=name))
     given = [end.variable for end in bound(variable.name for variable in exchange.sent)]
     tuned = [end.variable for end in bound(item.variable for item in binding.parameter.values())]
     moving = frozenset(

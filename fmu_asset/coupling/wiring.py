@@ -8,9 +8,10 @@ from fmu_asset.archive.declared import READABLE, FmuDescription, UnitInfo, Varia
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.units import IDENTITY, Conversion, between
 from fmu_asset.errors import CouplingError
+from fmu_asset.sentences import said
 
 from .schedule import Link, Schedule, schedule
-from .structure import Component, Connection, Endpoint, Setting, SystemStructure, listed
+from .structure import Component, Connection, Endpoint, Setting, SystemStructure
 
 _FITS = {
     "Real": {"Real"},
@@ -76,10 +77,7 @@ class Wiring:
             raise CouplingError(f"The system {structure.name} has no component; name at least one FMU.")
         for name in names:
             if names.count(name) > 1:
-                raise CouplingError(
-                    f"The system {structure.name} has two components named {name!r}; each needs a name of "
-                    "its own."
-                )
+                raise CouplingError(said("coupling.two_names", structure=structure, name=name))
         self.declared: dict[str, FmuDescription] = {
             c.name: read_fmu(c.fmu, c.interface) for c in structure.components
         }
@@ -124,41 +122,27 @@ class Wiring:
         if variable is None:
             near = difflib.get_close_matches(end.variable, [v.name for v in declared.variables], 1, 0.6)
             hint = f"; did you mean {near[0]!r}?" if near else "."
-            raise CouplingError(
-                f"The component {end.component!r} ({declared.path.name}) has no variable "
-                f"{end.variable!r}{hint}"
-            )
+            raise CouplingError(said("coupling.no_variable", end=end, declared=declared, hint=hint))
         return variable
 
     def _connector(self, end: Endpoint, kinds: tuple[str, ...], verb: str) -> VariableInfo:
         """Return a connector of the system, which has one of these kinds and fits any type."""
         kind = self._kinds.get(end.variable)
         if kind is None:
-            raise CouplingError(
-                f"The system {self.structure.name} has no connector {end.variable!r}; it has "
-                f"{listed(self._kinds)}."
-            )
+            raise CouplingError(said("coupling.no_connector", self=self, end=end, known=self._kinds))
         if kind not in kinds:
-            raise CouplingError(
-                f"The connector {end.variable!r} of the system is of the kind {kind} and cannot be {verb} of "
-                "a connection."
-            )
+            raise CouplingError(said("coupling.connector_kind", end=end, kind=kind, verb=verb))
         return VariableInfo(end.variable, 0, kind="", causality=kind, unit=self.units[end.variable])
 
     def _connect(self, connection: Connection, taken: dict[Endpoint, Endpoint]) -> None:
         source, target = connection.source, connection.target
         if target in taken:
-            raise CouplingError(
-                f"{target} has two sources, {taken[target]} and {source}; keep one of the two connections."
-            )
+            raise CouplingError(said("coupling.two_sources", target=target, given=(taken[target], source)))
         taken[target] = source
         if not (math.isfinite(connection.factor) and math.isfinite(connection.offset)):
             raise CouplingError(f"The transformation from {source} to {target} must be finite.")
         if not (source.component or target.component):
-            raise CouplingError(
-                f"The connection from {source} to {target} joins two connectors of the system; one end must "
-                "be a component."
-            )
+            raise CouplingError(said("coupling.two_connectors", source=source, target=target))
         causalities: tuple[str, ...] = ("input",)
         if source.component:
             needed = "an output of a single number is needed"
@@ -186,10 +170,7 @@ class Wiring:
         """Return the variable at an end, which must be a single number of one of these causalities."""
         variable = self.variable(end)
         if variable.causality not in causalities or not variable.single:
-            raise CouplingError(
-                f"{end} cannot be {what}: it is declared as {variable.causality} of the type "
-                f"{variable.kind}, and {needed}."
-            )
+            raise CouplingError(said("coupling.causality", end=end, what=what, found=variable, needed=needed))
         return variable
 
     def _converted(self, connection: Connection, gives: VariableInfo, takes: VariableInfo) -> Conversion:
@@ -197,23 +178,15 @@ class Wiring:
         source, target, own = connection.source, connection.target, connection.scale
         if gives.kind and takes.kind:
             if takes.base_type not in _FITS[gives.base_type]:
-                raise CouplingError(
-                    f"{source} is of the type {gives.kind} and cannot feed {target}, which is of the type "
-                    f"{takes.kind}."
-                )
+                ends = f"{source} is of the type {gives.kind} and cannot feed {target}"
+                raise CouplingError(said("coupling.types", ends=ends, takes=takes))
             if own != IDENTITY and takes.base_type != "Real":
-                raise CouplingError(
-                    f"The connection from {source} to {target} has a linear transformation, but {target} is "
-                    f"of the type {takes.kind}; only real numbers can be scaled."
-                )
+                raise CouplingError(said("coupling.scaled", source=source, target=target, takes=takes))
         if not connection.convert_units:
             return own
         unit = between(gives.unit, self._definitions(source), takes.unit, self._definitions(target))
         if unit is None:
-            raise CouplingError(
-                f"{source} is in {gives.unit!r} and {target} in {takes.unit!r}, and there is no conversion "
-                "between the two; correct the connection, or suppress the conversion of units."
-            )
+            raise CouplingError(said("coupling.units", source=source, gives=gives, to=target, takes=takes))
         return unit.then(own)
 
     def _definitions(self, end: Endpoint) -> tuple[UnitInfo, ...]:
@@ -223,9 +196,7 @@ class Wiring:
 
     def _settings(self, component: Component, leave_out_unknown: bool) -> dict[str, float]:
         if component.substeps < 1:
-            raise CouplingError(
-                f"The component {component.name!r} needs at least one step in a step of the system."
-            )
+            raise CouplingError(said("coupling.substeps", component=component))
         settings = {}
         for name, setting in component.settings.items():
             if leave_out_unknown and self.declared[component.name].variable(name) is None:
@@ -253,19 +224,12 @@ class Wiring:
         if isinstance(value, str):
             if value in variable.items:
                 return float(variable.items[value])
-            items = (
-                f" with the items {listed(variable.items)}" if variable.items else ", and a number is needed"
-            )
-            raise CouplingError(
-                f"{end} cannot be set to {value!r}: it is of the type {variable.kind}{items}."
-            )
+            wanted = variable.items or "a number"
+            raise CouplingError(said("coupling.setting", end=end, value=value, found=variable, wanted=wanted))
         units = (*setting.units, *self.structure.units, *own)
         conversion = between(setting.unit, units, variable.unit, own)
         if conversion is None:
-            raise CouplingError(
-                f"{end} is given in {setting.unit!r}, but it is in {variable.unit!r}, and there is no "
-                "conversion between the two."
-            )
+            raise CouplingError(said("coupling.setting_unit", end=end, setting=setting, variable=variable))
         number = conversion.then(setting.scale).to_fmu(float(value))
         if variable.kind == "Boolean":
             fits = value in (0, 1)

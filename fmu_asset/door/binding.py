@@ -32,6 +32,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import Interface
+from fmu_asset.sentences import said
 from fmu_asset.worker.client import WorkerLimits
 from reporting.section import Section, checked
 from reporting.toml_file import read_toml
@@ -149,10 +150,7 @@ class Vector(Section):
     @model_validator(mode="after")
     def _one_or_each(self) -> Self:
         if len(self.units) != len(self.variables):
-            raise ValueError(
-                f"`unit` must be one text, or one for each of the {len(self.variables)} variables, and "
-                f"{len(self.units)} came"
-            )
+            raise ValueError(said("binding.unit_count", count=len(self.variables), came=len(self.units)))
         return self
 
 
@@ -177,9 +175,8 @@ class Port(Section):
                 raise ValueError(f"{name} must have one unit, and {len(vector.unit)} came")
             allowed = [same_dimension(vector.unit, unit) for unit in PORT_QUANTITIES[name]]
             if allowed == [False, False]:
-                raise ValueError(
-                    f"{name} is in {vector.unit!r}, but must be in {' or '.join(PORT_QUANTITIES[name])}"
-                )
+                wanted = " or ".join(PORT_QUANTITIES[name])
+                raise ValueError(said("binding.port_unit", name=name, vector=vector, wanted=wanted))
         return self
 
     @property
@@ -316,10 +313,7 @@ class Binding(Section):
             if key == name:
                 return slice(begin, begin + len(vector.variables))
             begin += len(vector.variables)
-        raise BindingError(
-            f"The binding {self.name} has no observation {name!r}; it has "
-            f"{', '.join(self.observation) or 'none'}."
-        )
+        raise BindingError(said("binding.no_observation", self=self, name=name))
 
     def with_header(self, **changes: Any) -> "Binding":
         """Return the binding with other values in its table `[binding]`, which are not checked."""
@@ -383,9 +377,7 @@ def parse_binding(content: Mapping[str, Any], *, where: str = "the binding") -> 
         for key, scalar in table.items():
             here = f"{role}.{key}"
             if scalar.variable in taken:
-                raise BindingError(
-                    f"In {where}, the FMU variable {scalar.variable!r} is set by both "
-                    f"{taken[scalar.variable]} and {here}; keep one."
-                )
+                both = f"{taken[scalar.variable]} and {here}"
+                raise BindingError(said("binding.set_twice", where=where, scalar=scalar, both=both))
             taken[scalar.variable] = here
     return parsed

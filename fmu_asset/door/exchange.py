@@ -11,6 +11,7 @@ import numpy.typing as npt
 from fmu_asset.archive.declared import FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError, FmuInputError
 from fmu_asset.instances.plan import SOLVER_TOLERANCE, Plan, Settings
+from fmu_asset.sentences import said
 
 from .binding import INPUT_ROLES, Binding, Input, Vector
 from .layout import BlockLayout, OutputTable, Place, Slot, configured, find, start_values
@@ -80,10 +81,7 @@ class Exchange:
     def __init__(self, description: FmuDescription, binding: Binding) -> None:
         wanted = binding.binding.fmi_version
         if wanted is not None and wanted[0] != description.fmi_version[0]:
-            raise BindingError(
-                f"The binding {binding.name} is for FMI {wanted}, but {description.path} is of FMI "
-                f"{description.fmi_version}; correct `fmi_version`, or leave it out."
-            )
+            raise BindingError(said("binding.fmi_version", binding=binding, wanted=wanted, fmu=description))
         description, configuration = configured(description, binding)
         self.description = description
         self.binding = binding.with_arrays(self._elements)
@@ -121,10 +119,8 @@ class Exchange:
             for quantity, vector in port.quantities.items():
                 label = f"port.{name}.{quantity}"
                 if len(vector.variables) != len(port.force.variables):
-                    raise BindingError(
-                        f"{label} {self._whose} has {len(vector.variables)} values and the force "
-                        f"{len(port.force.variables)}; give as many."
-                    )
+                    what, came = f"{label} {self._whose}", (len(vector.variables), len(port.force.variables))
+                    raise BindingError(said("binding.port_values", what=what, came=came))
                 read = {not self._is_input(variable) for variable in vector.variables}
                 if len(read) > 1:
                     raise BindingError(f"{label} {self._whose} mixes inputs and outputs of the FMU.")
@@ -132,10 +128,8 @@ class Exchange:
                 found.append((f"{name}.{quantity}", vector, reads[quantity]))
             force = reads.pop("force")
             if force in reads.values():
-                raise BindingError(
-                    f"In port.{name} {self._whose}, force and motion are both "
-                    f"{'outputs' if force else 'inputs'} of the FMU; at a port one is given for the other."
-                )
+                what, both = f"port.{name} {self._whose}", "outputs" if force else "inputs"
+                raise BindingError(said("binding.port_sides", what=what, both=both))
         return found
 
     def _is_input(self, name: str) -> bool:
@@ -167,17 +161,12 @@ class Exchange:
         for (role, name, item, _), found in zip(wanted, places, strict=True):
             label = f"{role}.{name}"
             if len({(place.variable.unit, place.variable.kind) for place in found}) > 1:
-                raise BindingError(
-                    f"The variables of {label} {self._whose} have different units or types in the FMU; make "
-                    "one port of each."
-                )
+                raise BindingError(said("binding.port_units", label=label, whose=self._whose))
             positions = [position for place in found for position in self._inputs.positions(place)]
             for position in positions:
                 if position in taken:
-                    raise BindingError(
-                        f"In the binding {self.binding.name}, {label} and {taken[position]} set the same "
-                        f"value of {found[0].variable.name!r}; keep one."
-                    )
+                    both, variable = f"{label} and {taken[position]}", found[0].variable
+                    raise BindingError(said("binding.same_value", self=self, both=both, variable=variable))
                 taken[position] = label
             self._slots[role][name] = self._slot(label, item, found[0].variable, positions)
         # What is sent as it is: real numbers within these limits, which NaN and infinities are not.
@@ -210,10 +199,7 @@ class Exchange:
                 if self.description.major_version == 3
                 else "it does not declare `canInterpolateInputs`"
             )
-            raise BindingError(
-                f"{asked} {path} takes no derivatives of inputs: {why}. Leave `interpolation` out and take "
-                "smaller steps, or run it by model exchange if it has that."
-            )
+            raise BindingError(said("binding.no_derivatives", asked=asked, path=path, why=why))
         if not any(group.linear for group in self._inputs.groups):
             raise BindingError(f"{asked} none of them is a continuous real number in {path}; leave it out.")
 
@@ -222,10 +208,8 @@ class Exchange:
         variable = self.description.variable(name)
         bound = {slot.variable.name for slot in self._parameter_slots.values()}
         if variable is None or variable.causality != "parameter" or name in bound:
-            raise BindingError(
-                f"The binding {self.binding.name} has no parameter {name!r}; "
-                f"it has {', '.join(self._parameter_slots) or 'none'}."
-            )
+            known = self._parameter_slots
+            raise BindingError(said("binding.no_parameter", self=self, name=name, known=known))
         return self._parameter_slot(name, Input(variable=name, unit=variable.unit or "1"))
 
     def _slot(self, label: str, item: Input, variable: VariableInfo, positions: Sequence[int]) -> Slot:
@@ -233,10 +217,8 @@ class Exchange:
         low, high = variable.bounds
         least, most = sorted(scale.to_fmu(end) for end in item.ends)
         if least > high or most < low:
-            raise BindingError(
-                f"The range of {label} {self._whose} lies outside that of {variable.name!r}, {low:g} to "
-                f"{high:g}{variable.in_unit}; correct minimum or maximum."
-            )
+            ends, what = (low, high), f"{label} {self._whose}"
+            raise BindingError(said("binding.range", what=what, variable=variable, ends=ends))
         return Slot(label, positions, max(low, least), min(high, most), scale, variable)
 
     def _make_outputs(self) -> None:
@@ -398,14 +380,10 @@ class Exchange:
                 if count is None:
                     count, source = len(array), slot.label
                 elif len(array) != count:
-                    raise FmuInputError(
-                        f"{slot.label} has {len(array)} steps, but {source} says {count}; give as many of "
-                        "each."
-                    )
+                    came = len(array)
+                    raise FmuInputError(said("inputs.steps", slot=slot, came=came, source=source, of=count))
         if not count:
-            raise FmuInputError(
-                "Nothing says how many steps to make: give `steps`, or a history of an input."
-            )
+            raise FmuInputError(said("inputs.no_steps"))
         rows = np.tile(held, (count, 1))
         for slot, array in arrays:
             rows[:, list(slot.positions)] = array

@@ -8,6 +8,7 @@ import numpy as np
 
 from fmu_asset.archive.declared import FmuDescription
 from fmu_asset.errors import BindingError, FmuInputError
+from fmu_asset.sentences import said
 from reporting.progress import Progress
 
 from .binding import Binding, Header, Input, Parameter, Vector
@@ -80,11 +81,7 @@ def default_experiment(
     known = [*binding.parameter, *binding.load, *structural]
     for name in values:
         if name not in known:
-            some = ", ".join(known[:20]) or "none"
-            raise BindingError(
-                f"{description.path} has no parameter or input {name!r} that takes numbers; it has {some}"
-                f"{', ...' if len(known) > 20 else ''}."
-            )
+            raise BindingError(said("inputs.no_variable", fmu=description, name=name, known=known))
     parameters, load, sizes = (
         {name: value for name, value in values.items() if name in names}
         for names in (binding.parameter, binding.load, structural)
@@ -139,16 +136,12 @@ def _steps_to(start: float, end: float | None, size: float | None) -> tuple[int,
     """
     end = start + 1.0 if end is None else end
     if not (math.isfinite(end) and end > start):
-        raise FmuInputError(
-            f"The simulation starts at {start:g} s and cannot end at {end:g} s; give a later end."
-        )
+        raise FmuInputError(said("inputs.end", start=start, end=end))
     size = size or (end - start) / _STEPS
     steps = max(1, round((end - start) / size))
     if steps > _MOST_STEPS:
-        raise FmuInputError(
-            f"From {start:g} to {end:g} s there are {steps} steps of {size:g} s, more than {_MOST_STEPS}; "
-            "give another step size or end."
-        )
+        ends = start, end
+        raise FmuInputError(said("inputs.most_steps", ends=ends, steps=steps, size=size, most=_MOST_STEPS))
     return steps, size
 
 
@@ -168,9 +161,7 @@ def fly_histories(asset: FmiAsset, given: InputHistories, progress: Progress) ->
     if asset.binding.binding.interpolation == "zero-order":
         return asset.simulate(**given.roles, steps=given.steps, progress=progress)
     if given.steps < 2:
-        raise FmuInputError(
-            "Linear interpolation leads from one row of the inputs to the next: give two or more."
-        )
+        raise FmuInputError(said("inputs.one_row"))
     first = {role: {name: v[0] for name, v in table.items()} for role, table in given.roles.items()}
     rest = {role: {name: v[1:] for name, v in table.items()} for role, table in given.roles.items()}
     asset.reset(**first)

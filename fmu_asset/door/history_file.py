@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.errors import FmuInputError
+from fmu_asset.sentences import said
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.table_file import TableErrors, read_table
 
@@ -74,10 +75,8 @@ def read_histories(path: Path, binding: Binding) -> InputHistories:
         if key is None and (found := _ELEMENT.fullmatch(column)):
             key, element = names.get(found[1]), int(found[2])
         if key is None:
-            known = ", ".join(".".join(key) for key in dict.fromkeys(names.values())) or "none"
-            raise FmuInputError(
-                f"The column {column!r} of {path} is no input of the binding {binding.name}; it has {known}."
-            )
+            known = [".".join(key) for key in dict.fromkeys(names.values())]
+            raise FmuInputError(said("inputs.no_column", column=column, path=path, to=binding, known=known))
         taken = columns.setdefault(key, {})
         if element in taken or (taken and 0 in (element, *taken)):
             raise FmuInputError(f"{path} gives {'.'.join(key)} in more than one column; keep one.")
@@ -127,12 +126,8 @@ def _check_time(path: Path, time: npt.NDArray[np.float64], binding: Binding) -> 
     wrong = np.flatnonzero(np.abs(time - wanted) > _TIME_TOLERANCE * binding.interval)
     if wrong.size:
         step = int(wrong[0])
-        raise FmuInputError(
-            f"{path} has the time {time[step]:.12g} s where step {step} begins at {wanted[step]:.12g} s: the "
-            f"binding {binding.name} starts at {binding.binding.start_time:g} s and goes on by "
-            f"{binding.interval:g} s. Resample the inputs, or change `step_size` or `start_time` in the "
-            "binding."
-        )
+        times = time[step], wanted[step]
+        raise FmuInputError(said("inputs.times", path=path, times=times, step=step, binding=binding))
 
 
 def _input_names(binding: Binding) -> dict[str, tuple[str, str]]:

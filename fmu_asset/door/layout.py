@@ -13,6 +13,7 @@ import numpy as np
 from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
 from fmu_asset.instances.plan import Floats, Group, Settings
+from fmu_asset.sentences import said
 
 from .binding import Binding
 from .units import IDENTITY, Conversion
@@ -69,14 +70,10 @@ def find(description: FmuDescription, name: str, label: str, causality: str) -> 
     )
     started = causality == "parameter" and variable.startable
     if variable.causality not in _CAUSALITY[causality] and not sent and not started:
-        raise BindingError(
-            f"{label} must be of causality {causality}, but {name!r} is declared as {variable.causality} in "
-            f"{description.path}."
-        )
+        wanted = f"{label} must be of causality {causality}, but {name!r}"
+        raise BindingError(said("binding.causality", wanted=wanted, variable=variable, fmu=description))
     if not variable.numeric:
-        raise BindingError(
-            f"{label} names {name!r}, which is of type {variable.kind}; only numbers can be bound."
-        )
+        raise BindingError(said("binding.numbers_only", label=label, name=name, variable=variable))
     if variable.clocked:
         raise BindingError(f"{label} names {name!r}, which changes with a clock; clocks are not supported.")
     return place
@@ -91,9 +88,9 @@ def _element(description: FmuDescription, name: str, label: str) -> Place | None
     try:
         element = int(np.ravel_multi_index(index, variable.shape))
     except (TypeError, ValueError):
+        shape = " x ".join(map(str, variable.shape))
         raise BindingError(
-            f"{label} names {name!r}, but {variable.name!r} has {' x '.join(map(str, variable.shape))} "
-            "elements, counted from 1."
+            said("binding.element", label=label, name=name, variable=variable, shape=shape)
         ) from None
     return Place(variable, range(element, element + 1))
 
@@ -169,16 +166,12 @@ def start_values(description: FmuDescription, variable: VariableInfo, *, given: 
     try:
         values = [float({"true": "1", "false": "0"}.get(word, word)) for word in words]
     except ValueError as error:
-        raise FmuFileError(
-            f"{variable.name!r} of {description.path} has a start value that is no number ({error})."
-        ) from error
+        why = said("archive.start_value", variable=variable, fmu=description, error=error)
+        raise FmuFileError(why) from error
     if len(values) == 1:
         values *= variable.size
     if len(values) != variable.size:
-        raise FmuFileError(
-            f"{variable.name!r} of {description.path} has {variable.size} elements but {len(values)} "
-            "start values; give all of its values."
-        )
+        raise FmuFileError(said("archive.start_values", variable=variable, fmu=description, came=len(values)))
     return values
 
 
@@ -227,14 +220,12 @@ class Slot(NamedTuple):
         per_step = history and array.shape != cell
         if per_step and array.shape[1:] not in (cell, (count,)):
             wanted = "a number, or one" if count == 1 else f"{count} values, or as many"
-            raise FmuInputError(
-                f"{self.label} must be {wanted} for each step, but has the shape {array.shape}."
-            )
+            shape = str(array.shape)
+            raise FmuInputError(said("inputs.history_shape", self=self, wanted=wanted, shape=shape))
         if not history and array.size != count:
             wrong = f"takes {count} values, but {array.size} came"
-            raise FmuInputError(
-                f"{self.label} {f'must be a number, but is {given!r}' if count == 1 else wrong}."
-            )
+            wrong = f"must be a number, but is {given!r}" if count == 1 else wrong
+            raise FmuInputError(f"{self.label} {wrong}.")
         rows = array.reshape(-1, count)
         with np.errstate(all="ignore"):
             # The arithmetic of `Conversion.to_fmu`: the bits are those of a step.
@@ -286,10 +277,7 @@ def configured(description: FmuDescription, binding: Binding) -> tuple[FmuDescri
     if not lengths:
         return description, found
     if description.interface == "model-exchange":
-        raise BindingError(
-            f"{description.path} is run by model exchange; structural parameters are set in co-simulation "
-            "only."
-        )
+        raise BindingError(said("binding.structural", description=description))
     return replace(description, variables=tuple(v.resized(lengths) for v in description.variables)), found
 
 

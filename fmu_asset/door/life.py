@@ -14,6 +14,7 @@ from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.errors import FmuError, FmuOutputError, FmuStateError
 from fmu_asset.instances.base import status_name
 from fmu_asset.instances.plan import Instance
+from fmu_asset.sentences import said
 from fmu_asset.worker.client import WorkerInstance
 
 from .binding import Binding, load_binding
@@ -268,12 +269,8 @@ class OpenedFmu:
         bad = [name for name, good in zip(self._exchange.output_names, finite, strict=False) if not good]
         if bad:
             more = f" and {len(bad) - 5} more" if len(bad) > 5 else ""
-            raise FmuOutputError(
-                f"The FMU {self.description.path} gave values that are not finite at t = {self.time:g} s: "
-                f"{', '.join(bad[:5])}{more}. Its inputs or its step size are probably beyond what it can "
-                f"compute; reset the asset or restore a state to go on.{which}",
-                [text for _, text in self.log[-5:]],
-            )
+            why = said("running.not_finite", self=self, names=bad[:5], more=more, which=which)
+            raise FmuOutputError(why, [text for _, text in self.log[-5:]])
 
     def _collect_log(self) -> None:
         instance = self._housing.instance

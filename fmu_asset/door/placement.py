@@ -25,6 +25,7 @@ from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances import open_instance
 from fmu_asset.instances.base import FmuInstance, forget_modules
 from fmu_asset.instances.plan import Floats, Instance, Plan, Settings
+from fmu_asset.sentences import said
 from fmu_asset.worker.client import WorkerInstance, WorkerLimits
 from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
 
@@ -342,9 +343,7 @@ class Housing:
             return open_instance(plan)
         grants = self._limits.grants
         if grants is not None and (missing := missing_path(grants, plan.folder)):
-            raise FmuInputError(
-                f"The table [limits] of the binding grants {missing!r}, which does not exist; correct it."
-            )
+            raise FmuInputError(said("binding.grant", missing=missing))
         say_sandbox(self._description.path, grants)
         scratch = plain_folder()
         try:

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from fmu_asset.errors import FmuStateError
+from fmu_asset.sentences import said
 
 StateMethod = Literal["serialised", "replay"]
 """How a state is kept: serialised by the FMU, or as the inputs of all steps, to be replayed."""
@@ -120,7 +121,5 @@ class SavedState(PackedState):
                 "it declares canGetAndSetFMUstate but does not restore all of its state; write "
                 '`state = "replay"` into the table [binding] of its binding'
             )
-        raise FmuStateError(
-            f"After the state was restored the FMU gives {names[which]} = {float(now[which])!r} instead of "
-            f"{float(then[which])!r}: {cause}."
-        )
+        values = float(now[which]), float(then[which])
+        raise FmuStateError(said("state.differs", name=names[which], values=values, cause=cause))

@@ -6,6 +6,7 @@ import numpy as np
 
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError
 from fmu_asset.instances.plan import Floats, Instance
+from fmu_asset.sentences import said
 from reporting.progress import Progress, SilentProgress, Stage
 
 from .exchange import Histories, Values, plain_values
@@ -354,10 +355,7 @@ class FmiAsset(OpenedFmu):
     def _refuse_foreign(self, saved: SavedState, width: int) -> None:
         """Refuse a state of another FMU or binding; the inputs of one step have `width` bytes."""
         if saved.fmu != self.description.sha256:
-            raise FmuStateError(
-                f"The state was saved with another FMU than {self.description.path} (its hash differs); use "
-                "that one."
-            )
+            raise FmuStateError(said("state.other_fmu", self=self))
         if (saved.step_size, saved.start_time) != (self._interval, self._start_time):
             raise FmuStateError("The state was saved with another step size or start time; use that binding.")
         if (
@@ -366,9 +364,7 @@ class FmiAsset(OpenedFmu):
             or len(saved.start_inputs) not in (0, width)
             or (saved.method == "replay" and len(saved.body) != width * saved.index)
         ):
-            raise FmuStateError(
-                "The saved state is damaged, or another binding was in use; use that binding."
-            )
+            raise FmuStateError(said("state.damaged"))
 
     def _replay(self, inputs: bytes) -> None:
         self._request[0], self._request[1] = self.time, self._step_size

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from fmu_asset.archive.declared import BASE_UNITS, UnitInfo, VariableInfo
 from fmu_asset.errors import BindingError
+from fmu_asset.sentences import said
 
 Exponents = tuple[int, ...]
 """Of kg, m, s, A, K, mol, cd, rad, as FMI orders them."""
@@ -167,10 +168,7 @@ def conversion(
                 return Conversion(1.0 / factor, -offset / factor)
     found = between(unit, definitions, variable.unit, definitions)
     if found is None:
-        raise BindingError(
-            f"{where} is in {unit!r}, but the FMU has {variable.name!r} in {variable.unit!r}, and there is "
-            f"no conversion between the two; state the value in {variable.unit!r}."
-        )
+        raise BindingError(said("binding.no_conversion", where=where, unit=unit, variable=variable))
     return found
 
 

@@ -18,6 +18,7 @@ from fmpy.fmi1 import FMICallException
 from fmpy.logging import addLoggerProxy
 
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuStateError, FmuWorkerError, visible
+from fmu_asset.sentences import said
 
 from .plan import Group, Instance, Lines, Plan, Settings, exchanged, prepared
 
@@ -198,10 +199,7 @@ class FmuInstance(Instance):
         if self.lost:
             raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
         if self._ended is not None:
-            raise FmuEndedError(
-                f"The FMU has ended its simulation at t = {self._ended:g} s; reset the asset to start anew.",
-                time=self._ended,
-            )
+            raise FmuEndedError(said("running.ended", time=self._ended), time=self._ended)
         self._send()
         if self._plan.substeps == 1:
             self._advance()
@@ -223,11 +221,8 @@ class FmuInstance(Instance):
                 raise
             # Between two observations it cannot go back to the last one.
             self.lost = True
-            raise type(error)(
-                f"{error.sentence} It was step {number + 1} of the {self._plan.substeps} between two "
-                "observations: reset the asset or restore a state to go on.",
-                error.messages,
-            ) from error
+            why = said("running.substep", error=error, number=number + 1, of=self._plan)
+            raise type(error)(why, error.messages) from error
         finally:
             self._begin.value = first  # the request is the caller's, and what a later start is compared by
 

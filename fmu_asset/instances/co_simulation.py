@@ -8,6 +8,7 @@ from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
 
 from fmu_asset.errors import FmuCallError
+from fmu_asset.sentences import said
 
 from .base import ACCEPTED, DISCARD, OK, Calls, FmuInstance
 from .plan import Lines, Plan
@@ -83,11 +84,8 @@ class CoSimulation(FmuInstance):
             raise self._end(self._within(self._reached.value))
         if self._early.value:
             self.lost = True
-            raise FmuCallError(
-                f"The FMU returned early, at t = {self._reached.value:g} s, in {self._where()}, though it "
-                "was told that this is not supported; try a smaller step_size in the binding.",
-                self._texts(),
-            )
+            why = said("running.early", time=self._reached.value, where=self._where())
+            raise FmuCallError(why, self._texts())
 
     def _within(self, time: float) -> float:
         """Return a time that the FMU says to have reached, within the step."""

@@ -16,6 +16,7 @@ from fmpy.sundials.libraries import sundials_core
 from fmpy.sundials.nvector_serial import N_VDestroy_Serial
 
 from fmu_asset.errors import FmuCallError, FmuError
+from fmu_asset.sentences import said
 
 from .base import DISCARD, Calls, FmuInstance
 from .plan import Lines, Plan, Settings
@@ -234,10 +235,8 @@ class ModelExchange(FmuInstance):
                 if time >= end:
                     self._sent = bytes(self._values)[16:]
                     return
-        raise self._lost_to(
-            f"The FMU had {_MOST_EVENTS_IN_A_STEP} events in {self._where()} and is at t = {time:g} s; its "
-            "events probably pile up. Reset the asset, and try a smaller step_size."
-        )
+        where = self._where()
+        raise self._lost_to(said("running.events", most=_MOST_EVENTS_IN_A_STEP, where=where, time=time))
 
     def _advance_to_event(self, solver: Solver, time: float, end: float, close: float) -> float:
         """Integrate to the end or to the next event, and handle that; return the time reached."""
@@ -248,10 +247,7 @@ class ModelExchange(FmuInstance):
             try:
                 event, time = solver.advance(time, target)
             except RuntimeError as error:
-                raise self._lost_to(
-                    f"The solver could not integrate the FMU in the step from t = {time:g} s ({error}); "
-                    "reset the asset, and try a smaller step_size or another tolerance in the binding."
-                ) from error
+                raise self._lost_to(said("running.solver", time=time, error=error)) from error
         if not event and abs(time - end) <= close:
             time = end
         self._fmu.setTime(time)
@@ -276,10 +272,7 @@ class ModelExchange(FmuInstance):
             if not more:
                 break
         else:
-            raise self._lost_to(
-                f"The FMU's discrete states do not settle at t = {time:g} s: {_MOST_EVENT_ITERATIONS} event "
-                "iterations were made; the instance is lost."
-            )
+            raise self._lost_to(said("running.discrete", time=time, most=_MOST_EVENT_ITERATIONS))
         self._next_event = following if due and math.isfinite(following) else None
         self._fmu.enterContinuousTimeMode()
 

@@ -19,6 +19,7 @@ from fmu_asset.archive.declared import BASE_UNITS
 from fmu_asset.description import PLACEHOLDER, Declaration, description_members, rendered
 from fmu_asset.door.units import meaning_of
 from fmu_asset.errors import FmuBuildError, FmuError
+from fmu_asset.sentences import said
 from fmu_asset.slaves.variables import FmuVariable
 from reporting.files import atomic_write_bytes
 
@@ -79,9 +80,7 @@ def checked_target(
     if target.suffix != suffix:
         raise error(f"{what} must have the suffix {suffix}, but {target} was given.")
     if target.exists() and not replace:
-        raise error(
-            f"{target} exists: choose another --out or give --replace, in Python another path or replace."
-        )
+        raise error(said("packing.exists", target=target))
     return target
 
 
@@ -101,10 +100,7 @@ def check_start(table: Iterable[FmuVariable]) -> None:
             advice = "the reduced model; give another state or build a model with a wider range"
             if row.variability == "tunable":
                 advice = "that number of an effect; correct the patch"
-            raise FmuBuildError(
-                f"The start value {row.start:g} of {row.name} lies outside {low:g} to {high:g}, the range of "
-                f"{advice}."
-            )
+            raise FmuBuildError(said("packing.start", row=row, low=low, high=high, advice=advice))
 
 
 def units_of(table: Iterable[FmuVariable]) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
@@ -141,10 +137,7 @@ def pythonfmu_version() -> str:
     except PackageNotFoundError:
         installed = "none"
     if installed != PYTHONFMU_VERSION:
-        raise FmuBuildError(
-            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed} is installed; install the "
-            "project's requirements."
-        )
+        raise FmuBuildError(said("packing.pythonfmu", needed=PYTHONFMU_VERSION, installed=installed))
     return installed
 
 

@@ -35,6 +35,7 @@ from fe.runtime.patch import (
 )
 from fe.runtime.sensors import check_channels
 from fmu_asset.errors import PatchFileError
+from fmu_asset.sentences import said
 from fmu_asset.slaves.effects import output_channels
 from reporting.json_file import parse_json, read_json
 
@@ -124,25 +125,18 @@ class PatchFile:
             if isinstance(item, kind):
                 raise PatchFileError(f"{label}, which has no meaning inside an FMU: {reason}.")
         if isinstance(item, HighPass) and item.order not in (1.0, 2.0, 3.0, 4.0):
-            raise PatchFileError(
-                f"{label} of order {item.order:g}; an FMU remembers whole stages only, order 1 to 4."
-            )
+            raise PatchFileError(said("patch.high_pass", label=label, item=item))
         channel, quantity = getattr(item, "channel", EVERY_CHANNEL), getattr(item, "quantity", "")
         if channel == EVERY_CHANNEL:
             if quantity not in QUANTITIES:
-                raise PatchFileError(
-                    f"{label} for every channel of {quantity!r}; the outputs of the FMU are strains and "
-                    "displacements."
-                )
+                raise PatchFileError(said("patch.every_channel", label=label, quantity=quantity))
             return item
         item = replace(item, channel=self.channels.get(channel, channel))  # type: ignore[call-arg]
         try:
             check_channels(ModelPatch((item,)), outputs)
         except InvalidPatchError as cause:
-            raise PatchFileError(
-                f"{label} for the channel {channel!r}, which is no output of the FMU that it can act on "
-                f"({_listed(outputs)}); name an output, or map the channel to one in `channels`."
-            ) from cause
+            why = said("patch.channel", label=label, channel=channel, known=_listed(outputs))
+            raise PatchFileError(why) from cause
         return item
 
 
@@ -188,18 +182,12 @@ def _effects(rows: list[dict[str, Any]], where: str) -> tuple[Effect, ...]:
     for number, row in enumerate(rows, start=1):
         name = row.get("id", row.get("identifier"))
         if not isinstance(name, str) or not _IDENTIFIER.fullmatch(name):
-            raise PatchFileError(
-                f'{where}: the "id" of effect {number} must be letters, digits and underscores, but is '
-                f"{name!r}."
-            )
+            raise PatchFileError(said("patch.identifier", where=where, number=number, name=name))
         try:
             patch = ModelPatch.from_list(row.get("primitives", row.get("patch")), f"{where}, effect {name}")
             for item in patch:
                 if item.windows or item.courses:
-                    raise PatchFileError(
-                        f"{where}: the effect {name!r} is bound to the time of trials "
-                        f"({item.kind}), which means nothing in an FMU: leave it out."
-                    )
+                    raise PatchFileError(said("patch.windows", where=where, name=name, item=item))
                 if isinstance(item, PortForce) and item.magnitude:
                     item.check()
         except InvalidPatchError as cause:

@@ -21,6 +21,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 from fmu_asset.archive.declared import BASE_UNITS
 from fmu_asset.description import PLACEHOLDER, rendered
 from fmu_asset.errors import FmuBuildError
+from fmu_asset.sentences import said
 
 from .contents import (
     BASE_CLASS_FILES,
@@ -60,10 +61,7 @@ def script_fmu(script: str | os.PathLike[str]) -> tuple[bytes, str]:
     """Return the archive of a script and its GUID; see `build_script_fmu`."""
     file = Path(script)
     if not file.stem.isidentifier() or file.suffix != ".py":
-        raise FmuBuildError(
-            f"A model script must be a Python file whose name is an identifier, such as gear_pump.py, and "
-            f"{file} was given."
-        )
+        raise FmuBuildError(said("script.name", file=file))
     try:
         source = file.read_bytes()
     except OSError as error:
@@ -97,10 +95,8 @@ def _model_class(file: Path) -> type[Any]:
         if isinstance(item, type) and issubclass(item, Fmi2Slave) and item.__module__ == name
     ]
     if len(found) != 1:
-        raise FmuBuildError(
-            f"The model script {file} must define one subclass of pythonfmu's Fmi2Slave, and it defines "
-            f"{', '.join(item.__name__ for item in found) or 'none'}."
-        )
+        names = [item.__name__ for item in found]
+        raise FmuBuildError(said("script.slave", file=file, names=names))
     return found[0]
 
 
@@ -132,10 +128,7 @@ def _unit_definitions(file: Path, units: Mapping[str, Mapping[str, Any]]) -> Ele
     for name, entry in units.items():
         unknown = sorted({*entry} - {*BASE_UNITS, "factor", "offset", "displays"})
         if unknown:
-            raise FmuBuildError(
-                f"The unit {name} of {file} has the entry {unknown[0]}: give exponents of "
-                f"{', '.join(BASE_UNITS)}, and factor, offset or displays."
-            )
+            raise FmuBuildError(said("script.unit", name=name, file=file, entry=unknown[0], known=BASE_UNITS))
         unit = SubElement(definitions, "Unit", name=name)
         base = {symbol: str(int(entry[symbol])) for symbol in BASE_UNITS if symbol in entry}
         base |= {key: repr(float(entry[key])) for key in ("factor", "offset") if key in entry}
@@ -151,9 +144,7 @@ def _add_ranges(
     inner = {str(variable.get("name")): variable[0] for variable in variables}
     for name, (_, unit, low, high, _, _) in table.items():
         if name not in inner:
-            raise FmuBuildError(
-                f"The variable_table of {file} has {name}, which the model does not register."
-            )
+            raise FmuBuildError(said("script.variable_table", file=file, name=name))
         if unit is not None and unit not in units:
             raise FmuBuildError(f"{file} gives {name} in {unit}, which its unit_table does not have.")
         for key, value in (("unit", unit), ("min", low), ("max", high)):

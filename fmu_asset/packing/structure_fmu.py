@@ -27,6 +27,7 @@ from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binaries_of, compi
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.instances.plan import Interface
+from fmu_asset.sentences import said
 from fmu_asset.slaves.effects import effect_rows, switch_of
 from fmu_asset.slaves.table import is_wing, structure_table
 
@@ -190,15 +191,9 @@ def _patched_members(
     if not needs_structure(patch):
         return members
     if arrays is None:
-        raise PatchFileError(
-            "The patch changes structure or loads, for which the FMU needs the wing in the basis for "
-            "patches: give `arrays`, as `fe.reduction.model_cache.patch_arrays` returns them."
-        )
+        raise PatchFileError(said("packing.no_arrays"))
     if arrays.design_hash != model.design_hash:
-        raise PatchFileError(
-            f"The wing for patches is of the design {arrays.design_hash[:12]}, and the reduced model of "
-            f"{model.design_hash[:12]}; make both of one design."
-        )
+        raise PatchFileError(said("packing.other_design", arrays=arrays, model=model))
     try:
         ModalIntegrator(PatchedWing(arrays), model.nominal, *model.damping.tolist(), patch).modes  # noqa: B018
     except FiniteElementError as cause:
@@ -240,15 +235,9 @@ def check_form(
         The kind cannot carry missing effects.
     """
     if kind == "python" and (fmi, interface) != (2, "co-simulation"):
-        raise FmuBuildError(
-            f"The FMU of the kind 'python' is of FMI 2.0 for co-simulation, but FMI {fmi}.0 for {interface} "
-            "was asked for: build the kind 'compiled' or 'source'."
-        )
+        raise FmuBuildError(said("packing.python_kind", fmi=fmi, interface=interface))
     if patched and kind != "python":
-        raise PatchFileError(
-            f"The FMU of the kind {kind!r} cannot carry missing effects: build the kind 'python' with this "
-            "patch."
-        )
+        raise PatchFileError(said("packing.patched_kind", kind=kind))
     for platform in platforms if kind == "compiled" else ():
         find_compiler(platform)
 

@@ -13,6 +13,7 @@ from lxml import etree
 from fmu_asset.archive.fmu_file import check_archive
 from fmu_asset.errors import FmuFileError, SspError
 from fmu_asset.instances.plan import Interface
+from fmu_asset.sentences import said
 
 SSD_NAME = "SystemStructure.ssd"
 NAMESPACES = {
@@ -63,9 +64,7 @@ class SspPackage:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         if not self.path.is_file():
-            raise SspError(
-                f"There is no SSP file {self.path}; check the path, or write it with `uav-twin ssp export`."
-            )
+            raise SspError(said("ssp.absent", self=self))
         try:
             self.names = check_archive(self.path, self.path.stat().st_size, "SSP", "export")
         except FmuFileError as error:
@@ -93,10 +92,7 @@ class SspPackage:
         name = posixpath.normpath(unquote(parts.path))
         outside = parts.scheme or parts.netloc or parts.query or parts.fragment
         if outside or not parts.path or name.startswith(("/", "..")) or "\\" in name:
-            raise SspError(
-                f"{what} in {self.path} names the source {source!r}, which lies outside the archive; only "
-                "files inside it are used."
-            )
+            raise SspError(said("ssp.outside", what=what, self=self, source=source))
         if name not in self.names:
             raise SspError(f"{what} in {self.path} names the source {source!r}, which is not in the archive.")
         return name
@@ -136,9 +132,7 @@ def parse_xml(content: bytes, where: str) -> Any:
     except etree.XMLSyntaxError as error:
         raise SspError(f"{where} is not well-formed XML ({error.msg}).") from error
     if root.getroottree().docinfo.doctype:
-        raise SspError(
-            f"{where} has a document type declaration, which SSP files have no need of; it was refused."
-        )
+        raise SspError(said("ssp.document_type", where=where))
     return root
 
 
@@ -170,10 +164,7 @@ def _in_words_of_1(root: Any, where: str) -> None:
         if tag.localname == "Component" and element.get("source") is None:
             missing = f"the component {element.get('name')!r} without a source"
         if missing:
-            raise SspError(
-                f"{where} has {missing}, not supported (line {element.sourceline}); leave it out, or use "
-                "direct connections, single numbers and linear transformations."
-            )
+            raise SspError(said("ssp.unsupported", where=where, missing=missing, element=element))
 
 
 def _put_into_namespace(element: Any, kind: str) -> None:
@@ -201,6 +192,4 @@ def validate(root: Any, kind: str, where: str) -> None:
         text = str(first.message)
         for uri in NAMESPACES.values():
             text = text.replace(f"{{{uri}}}", "")
-        raise SspError(
-            f"{where} is not valid by the schema of SSP 1.0 (line {first.line}): {text[:400].rstrip('.')}."
-        )
+        raise SspError(said("ssp.schema", where=where, first=first, text=text[:400].rstrip(".")))

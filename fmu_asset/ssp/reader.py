@@ -27,6 +27,7 @@ from fmu_asset.coupling.structure import (
 )
 from fmu_asset.door.units import IDENTITY, Conversion
 from fmu_asset.errors import SspError
+from fmu_asset.sentences import said
 from reporting.files import atomic_write_bytes
 
 from .package import INTERFACES, NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage
@@ -144,9 +145,7 @@ class _Tree:
         source = self.package.resolve(str(element.get("source")), where)
         substeps = _annotation(element).get("substeps", "1")
         if not (substeps.isascii() and substeps.isdigit() and int(substeps) > 0):
-            raise self._error(
-                f"{where} has the number of steps {substeps!r}, which must be a positive whole number."
-            )
+            raise self._error(said("ssp.steps", where=where, substeps=substeps))
         interface = INTERFACES[element.get("implementation", "any")]
         self.components[path] = Component(path, Path(source), substeps=int(substeps), interface=interface)
         self._read_connectors(element, path)
@@ -159,9 +158,7 @@ class _Tree:
                 raise self._error(f"the connector {str(node)!r} is there twice.")
             kind, item = connector.get("kind"), connector.find("ssc:*", NAMESPACES)
             if not path and kind not in CONNECTOR_KINDS:
-                raise self._error(
-                    f"the connector {node.variable!r} of the system is of the kind {kind}, not supported."
-                )
+                raise self._error(said("ssp.connector", node=node, kind=kind))
             of_type = (
                 (None, None) if item is None else (item.get("unit") or None, etree.QName(item).localname)
             )
@@ -174,9 +171,7 @@ class _Tree:
             owner = element.get(f"{side}Element") or ""
             node = Endpoint(_path(path, owner), str(element.get(f"{side}Connector")))
             if node.component not in self._elements:
-                raise self._error(
-                    f"a connection names the element {owner!r}, which its system does not have."
-                )
+                raise self._error(said("ssp.element", owner=owner))
             declared = self.connectors.get(node)
             if declared is None:
                 raise self._error(f"a connection names the connector {str(node)!r}, which is not declared.")
@@ -184,17 +179,13 @@ class _Tree:
             # Seen from inside, an input of the system is where values come from.
             gives.append((declared.kind in _INWARD) == (not owner))
         if gives[0] == gives[1]:
-            raise self._error(
-                f"a connection joins {str(ends[0])!r} and {str(ends[1])!r}, which both "
-                f"{'give' if gives[0] else 'take'} a value; connect what gives one to what takes one."
-            )
+            both = [str(end) for end in ends]
+            raise self._error(said("ssp.ends", both=both, do="give" if gives[0] else "take"))
         # The kinds of the connectors say which way a value goes; "start" and "end" do not (SSP 1.0, 5.3).
         source, target = ends if gives[0] else reversed(ends)
         if target in self._edges:
-            raise self._error(
-                f"{str(target)!r} has two sources, {str(self._edges[target].source)!r} and {str(source)!r}; "
-                "keep one of the two connections."
-            )
+            to, *given = (repr(str(end)) for end in (target, self._edges[target].source, source))
+            raise self._error(said("coupling.two_sources", target=to, given=given))
         scale = self._transformation(element, f"the connection from {source} to {target}")
         convert, delayed = (
             not _flag(element, "suppressUnitConversion"),
@@ -317,10 +308,7 @@ class _Tree:
             for node in (node for node in nodes if node in self.settings):
                 rest = edges[[edge.source for edge in edges].index(node) :]
                 if any((edge.scale, edge.convert_units) != (IDENTITY, True) for edge in rest):
-                    raise self._error(
-                        f"{str(node)!r} is set and transformed on its way to {str(target)!r}; set that "
-                        "instead."
-                    )
+                    raise self._error(said("ssp.on_the_way", node=str(node), target=str(target)))
                 self.settings[target] = self.settings[node]
                 break
             if self._is_end(edges[0].source):  # else nothing comes to a connector of a nested system
@@ -333,11 +321,7 @@ class _Tree:
         with_units = any(self.connectors[edge.source].unit for edge in edges[1:])
         converted = {edge.convert_units for edge in edges}
         if len(converted) > 1 or (scale != IDENTITY and with_units):
-            raise self._error(
-                f"the connection to {str(target)!r} through a nested system is transformed between "
-                "connectors with units of their own, which is not supported; leave out the units of the "
-                "nested system's connectors."
-            )
+            raise self._error(said("ssp.nested", target=str(target)))
         return Connection(source, target, *scale, converted == {True}, any(edge.delayed for edge in edges))
 
 

@@ -12,6 +12,7 @@ from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.description import rendered
 from fmu_asset.errors import SspError
 from fmu_asset.packing.contents import archive_bytes, checked_target
+from fmu_asset.sentences import said
 from reporting.files import atomic_write_bytes
 
 from .package import INTERFACES, NAMESPACES, OWN_NAMESPACE, SSD_NAME, parse_xml, validate
@@ -57,10 +58,7 @@ def write_ssp(
     used = {end: wiring.variable(end) for end in ends if end.component}
     for variable in used.values():
         if variable.causality not in _CONNECTOR_KINDS:
-            raise SspError(
-                f"The variable {variable.name!r} is declared as {variable.causality}, which SSP 1.0 has no "
-                "connector for."
-            )
+            raise SspError(said("ssp.causality", variable=variable))
     values = {
         "structure": structure,
         "wiring": wiring,
@@ -114,9 +112,7 @@ def _parameters(
             variable = wiring.variable(end)
             name, kind = names.get(end, str(end)), variable.base_type
             if name in found:
-                raise SspError(
-                    f"Two parameters would be named {name!r} in the parameter set; rename one of them."
-                )
+                raise SspError(said("ssp.parameter", name=name))
             text = {
                 "Real": repr(value),
                 "Boolean": "true" if value else "false",

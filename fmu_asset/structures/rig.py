@@ -5,6 +5,7 @@ import numpy as np
 from fe.structure.design import Load, MatrixDesign, MatrixLoad, MeshDesign, NodeOutput, PointOutput
 from fmu_asset.description import rendered
 from fmu_asset.errors import FmuBuildError
+from fmu_asset.sentences import said
 
 
 def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
@@ -28,11 +29,7 @@ def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
     forces = [part.name for part in design.control if part.unit == "N"]
     flies = any(part.name == "load_factor" for part in design.control)
     if not forces and not flies:
-        raise FmuBuildError(
-            f"The structure {design.name} has no control in N and no load_factor, and a campaign needs a "
-            'load that is recorded: give a [[control]] with unit = "N" and a [[load]] of 1 N tied to it, or '
-            "a [[control]] load_factor."
-        )
+        raise FmuBuildError(said("packing.no_load", design=design))
     ports = [
         (load.control, output.name)
         for load in design.load

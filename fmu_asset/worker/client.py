@@ -15,6 +15,7 @@ from fmu_asset import errors
 from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
 from fmu_asset.folders import remove_folder
 from fmu_asset.instances.plan import REPORT_PERIOD, Floats, Instance, Plan, Settings
+from fmu_asset.sentences import said
 from reporting.section import Section
 
 from .process import CLOSE_LIMIT, WorkerProcess
@@ -287,22 +288,16 @@ class WorkerInstance(Instance):
         self._check_memory()
         if left <= 0.0:
             self._process.kill()
-            raise FmuTimeoutError(
-                f"The FMU took longer than {getattr(self._limits, self._limit):g} s for {self._what}; its "
-                f"worker was stopped. If it is only slow, give it more `{self._limit}` in the table [limits] "
-                "of its binding; otherwise it hangs."
-            )
+            most = getattr(self._limits, self._limit)
+            raise FmuTimeoutError(said("running.timeout", most=most, what=self._what, limit=self._limit))
 
     def _check_memory(self) -> None:
         self._next_glance = time.monotonic() + 5.0 * _GLANCE
         used, limit = self.memory, self._limits.memory * _MEBIBYTE
         if used > limit:
             self._process.kill()
-            raise FmuMemoryError(
-                f"The FMU took {used / _MEBIBYTE:.0f} MiB of memory during {self._what}, more than "
-                f"the limit of {self._limits.memory:g} MiB; its worker was stopped. If it needs that much, "
-                "give it more `memory` in the table [limits] of its binding; otherwise it leaks."
-            )
+            taken, most = used / _MEBIBYTE, self._limits.memory
+            raise FmuMemoryError(said("running.memory", used=taken, what=self._what, most=most))
 
     def _died(self) -> FmuWorkerError:
         self.lost = True

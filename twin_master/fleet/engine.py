@@ -5,10 +5,10 @@ Results come back in any order, and are the same to the last bit whoever flew th
 
 import logging
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import chain, islice
+from itertools import islice
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +27,7 @@ WAITING = 2
 CONNECTING = 10.0
 """Seconds in which a scheduler must answer."""
 LAUNCHES = 2
-"""Times that workers may die over a shard before it is cut in two."""
+"""Times that workers may die over a shard before its twins fly one by one."""
 
 
 @dataclass(frozen=True)
@@ -54,14 +54,14 @@ class Piece:
     ----------
     group : int
         Number of its group in the fleet.
-    kit : callable
-        Returns the packed `Kit` of its twins.
+    kit : bytes
+        The pickled `Kit` of its twins.
     members : tuple of Member
         Its twins.
     """
 
     group: int
-    kit: Callable[[], bytes]
+    kit: bytes
     members: tuple[Member, ...]
 
 
@@ -69,7 +69,7 @@ Flown = tuple[Piece, ShardResult | str]
 """A piece with its result, or with a sentence where its one twin ended the process that flew it."""
 
 
-def flown(engine: Engine, pieces: Iterable[Piece], progress: Progress) -> Iterator[Flown]:
+def flown(engine: Engine, pieces: Iterator[Piece], progress: Progress) -> Iterator[Flown]:
     """Yield what becomes of each piece, as it is done.
 
     Raises
@@ -77,30 +77,23 @@ def flown(engine: Engine, pieces: Iterable[Piece], progress: Progress) -> Iterat
     FleetError
         The scheduler does not answer, or workers run another version of the program.
     """
-    pieces = iter(pieces)
-    first = next(pieces, None)
-    if first is None:
-        return  # all is done: nobody need be called
-    pieces = chain([first], pieces)
     if engine.cluster is None and not engine.workers:
         for piece in pieces:
-            yield piece, fly_shard(piece.kit(), piece.members)
+            yield piece, fly_shard(piece.kit, piece.members)
         return
     with _client(engine) as client:
         progress.note(f"Dask dashboard: {client.dashboard_link}")
-        if engine.cluster is not None:
-            _check_version(set(client.run(program_version).values()))
         yield from _by_workers(client, pieces)
 
 
 def _by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown]:
-    from distributed import as_completed
+    from distributed import CancelledError, as_completed
     from distributed.scheduler import KilledWorker
 
     def submit(some: Iterable[Piece]) -> list[Any]:
         futures = []
         for piece in some:
-            future = client.submit(fly_shard, piece.kit(), piece.members, pure=False)
+            future = client.submit(_fly_there, piece.kit, piece.members, program_version(), pure=False)
             given[future.key] = piece
             futures.append(future)
         return futures
@@ -110,32 +103,24 @@ def _by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown]:
     waiting = as_completed(submit(islice(pieces, cores * (1 + WAITING))))
     for future in waiting:
         piece = given.pop(future.key)
-        error = future.exception() if future.status == "error" else None
-        if isinstance(error, KilledWorker):
-            if len(piece.members) == 1:
-                yield piece, "its flight ended the worker process: fly an FMU that crashes isolated."
-            else:
-                middle = len(piece.members) // 2
-                halves = piece.members[:middle], piece.members[middle:]
-                for again in submit(replace(piece, members=half) for half in halves):
-                    waiting.add(again)
+        try:
+            result: ShardResult | str = future.result()  # flown again where its worker died with it
+        except KilledWorker:
+            if len(piece.members) > 1:
+                waiting.update(submit(replace(piece, members=(one,)) for one in piece.members))
                 continue
-        elif error is not None:
-            raise error
-        elif future.status != "finished":
-            raise FleetError(said("fleet.lost"))
-        else:
-            result: ShardResult = future.result()
-            _check_version({result.version})
-            yield piece, result
+            result = "its flight ended the worker process: fly an FMU that crashes isolated."
+        except CancelledError:
+            raise FleetError(said("fleet.lost")) from None
+        yield piece, result
         del future
-        for more in submit(islice(pieces, 1)):
-            waiting.add(more)
+        waiting.update(submit(islice(pieces, 1)))
 
 
-def _check_version(versions: set[str]) -> None:
-    if versions - {program_version()}:
+def _fly_there(kit: bytes, members: Sequence[Member], version: str) -> ShardResult:
+    if version != program_version():
         raise FleetError(said("fleet.version"))
+    return fly_shard(kit, members)
 
 
 @contextmanager

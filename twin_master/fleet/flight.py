@@ -1,9 +1,10 @@
 """A fleet from its plan to its store: checked whole, prepared, flown in shards, resumed where it stopped."""
 
 import json
+import pickle
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from reporting.files import atomic_write_bytes, atomic_write_text
+from reporting.files import atomic_write_bytes, atomic_write_text, written
 from reporting.folders import lock_folder
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
@@ -21,9 +22,9 @@ from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.resolution import asset_source, believed_source
 from twin_master.errors import FleetError, RunFolderExistsError
 from twin_master.fleet.engine import Engine, Piece, flown
-from twin_master.fleet.plan import Fleet, Group, load_fleet
-from twin_master.fleet.shard import Kit, ShardResult, read_recording, with_parameters
-from twin_master.fleet.store import FAILED, STORE_NAME, check_installed, create_store, sizes_of, written
+from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
+from twin_master.fleet.shard import Kit, ShardResult, with_parameters
+from twin_master.fleet.store import FAILED, STORE_NAME, check_installed, create_store, sizes_of
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
@@ -35,7 +36,8 @@ from twin_master.watch.feeds import file_feed
 if TYPE_CHECKING:
     import zarr
 
-KIND = "uav-twin fleet"
+KIND, WATCHED_KIND = "uav-twin fleet", "uav-twin fleet watch"
+"""In the configuration of a fleet that is flown, and of one that is watched."""
 RESULT_NAME = "fleet.json"
 GROUPS = "groups"
 
@@ -47,8 +49,8 @@ class FleetOutcome:
     Attributes
     ----------
     folder : Path
-    twins, failed : int
-        How many flew, and how many of them failed in flight.
+    twins : int
+        How many there are.
     failures : dict of str to str
         What ended the flight of each that failed, by group and name.
     ended : dict of str to str
@@ -66,11 +68,6 @@ class FleetOutcome:
     seconds: float
     shards_flown: int
     shards_kept: int
-
-    @property
-    def failed(self) -> int:
-        """How many twins failed in flight."""
-        return len(self.failures)
 
 
 def fly_fleet(
@@ -112,29 +109,48 @@ def fly_fleet(
     folder, progress = Path(folder), progress or SilentProgress()
     engine = engine or Engine()
     check_installed("zarr", *(["distributed"] if engine.workers or engine.cluster else []))
-    config = {"kind": KIND, "format": 1, "fleet": fleet.record()}
-    see_folder(folder, config, fleet.seed, replace_old=replace_old)
-    _check(fleet)
-    if replace_old and folder.is_dir():
-        with held(_locked(folder)):
-            shutil.rmtree(folder)
-    with hold_folder(folder, config, fleet.seed):
+    ready = partial(_check, fleet)
+    with held_fleet(folder, KIND, fleet.record(), replace_old=replace_old, ready=ready) as config:
         if not (folder / JOURNAL_NAME).is_file():
             create_store(folder, fleet)
         with JournalFile(folder, hash_record(config)) as journal:
             shards, flown = _fly(fleet, folder, engine, journal, progress)
-            done = [record for record, *_ in records(journal.path)]
-        failures, ended = (
-            dict(sorted(item for told in done for item in told[key].items())) for key in ("failures", "ended")
-        )
-        told = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "twins": fleet.size}
-        atomic_write_text(folder / RESULT_NAME, to_json(told | {"failures": failures, "ended": ended}))
+        told = told_of(folder)
+        result = fleet.head.model_dump(exclude={"shard"}) | {"twins": fleet.size}
+        atomic_write_text(folder / RESULT_NAME, to_json(result | told))
     seconds = time.perf_counter() - begin
+    failures, ended = told["failures"], told["ended"]
     return FleetOutcome(folder, fleet.size, failures, ended, seconds, flown, shards - flown)
 
 
-def see_folder(folder: Path, config: Mapping[str, Any], seed: int, *, replace_old: bool = False) -> None:
-    """See that a folder is free, or holds the same fleet, begun with the same program.
+def told_of(folder: Path) -> dict[str, dict[str, str]]:
+    """Return `failures` and `ended` of a flown fleet by group and name: of its journal, else as it ended."""
+    path, result = folder / JOURNAL_NAME, folder / RESULT_NAME
+    done = [record for record, *_ in records(path)]
+    if not path.is_file() and result.is_file():
+        done = [read_json(result, FleetError)]
+    return {
+        key: dict(sorted(item for record in done for item in record[key].items()))
+        for key in ("failures", "ended")
+    }
+
+
+@contextmanager
+def held_fleet(
+    folder: Path, kind: str, record: Mapping[str, Any], *, replace_old: bool = False,
+    ready: Callable[[], None] = lambda: None,
+) -> Iterator[dict[str, Any]]:  # fmt: skip
+    """Make the folder of a fleet, or see that it holds the same; hold it, and give its configuration.
+
+    Parameters
+    ----------
+    folder : Path
+    kind, record
+        Of the configuration.
+    replace_old : bool
+        Begin anew where another fleet is.
+    ready : callable
+        Called before anything is written; may refuse.
 
     Raises
     ------
@@ -142,20 +158,39 @@ def see_folder(folder: Path, config: Mapping[str, Any], seed: int, *, replace_ol
         It holds something else.
     NotResumableError
         It was begun by another version.
+    FleetError
+        Another process holds it.
     """
+    config = {"kind": kind, "format": 1, "fleet": record}
     if folder.exists() and not folder.is_dir():
         raise RunFolderExistsError(f"{folder} exists and is no folder: choose another --out.")
-    if not folder.is_dir() or not any(folder.iterdir()):
-        return
-    found = fleet_config(folder, config["kind"])
-    if replace_old:
-        return
-    if {key: found.get(key) for key in config} != json.loads(to_json(config)):
-        other = (
-            "choose another --out, or give --replace" if config["kind"] == KIND else "choose another --out"
-        )
-        raise RunFolderExistsError(f"{folder} holds another fleet, or the same with other files: {other}.")
-    check_versions(folder, found, seed)
+    if folder.is_dir() and any(folder.iterdir()):
+        found = fleet_config(folder, kind)
+        if not replace_old and {key: found.get(key) for key in config} != json.loads(to_json(config)):
+            otherwise = ", or give --replace" if kind == KIND else ""
+            raise RunFolderExistsError(said("fleet.another", folder=folder, otherwise=otherwise))
+        if not replace_old:
+            check_versions(folder, found, record["seed"])
+    ready()
+    if replace_old and folder.is_dir():
+        with held(_locked(folder)):
+            shutil.rmtree(folder)
+    with written(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    with held(_locked(folder)):
+        if not (folder / CONFIG_NAME).is_file():
+            provenance = collect_provenance(record["seed"]).as_dict()
+            atomic_write_text(folder / CONFIG_NAME, to_json({**config, "provenance": provenance}))
+        yield config
+
+
+def fleet_record(folder: Path) -> dict[str, Any] | None:
+    """Return the configuration of a fleet, flown or watched; None where a folder holds none."""
+    path = folder / CONFIG_NAME
+    found = read_json(path, RunFolderExistsError) if path.is_file() else None
+    if isinstance(found, dict) and found.get("kind") in (KIND, WATCHED_KIND) and "fleet" in found:
+        return found
+    return None
 
 
 def fleet_config(folder: Path, kind: str = KIND) -> dict[str, Any]:
@@ -166,25 +201,12 @@ def fleet_config(folder: Path, kind: str = KIND) -> dict[str, Any]:
     RunFolderExistsError
         It holds no fleet.
     """
-    path = folder / CONFIG_NAME
-    found = read_json(path, RunFolderExistsError) if path.is_file() else None
-    if not isinstance(found, dict) or found.get("kind") != kind or not isinstance(found.get("fleet"), dict):
+    found = fleet_record(folder)
+    if found is None or found["kind"] != kind:
         raise RunFolderExistsError(
             f"{folder} is not the folder of a fleet." if folder.exists() else f"there is no folder {folder}."
         )
     return found
-
-
-@contextmanager
-def hold_folder(folder: Path, config: Mapping[str, Any], seed: int) -> Iterator[None]:
-    """Make the folder with its configuration, if it is not there, and hold it for this process."""
-    with written(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    with held(_locked(folder)):
-        if not (folder / CONFIG_NAME).is_file():
-            provenance = collect_provenance(seed).as_dict()
-            atomic_write_text(folder / CONFIG_NAME, to_json({**config, "provenance": provenance}))
-        yield
 
 
 def _locked(folder: Path) -> int:
@@ -282,14 +304,14 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
             raise FleetError(said("fleet.outside", low=low, high=high, **told))
 
 
-def prepared(scenario: Scenario, folder: Path, progress: Progress, *, real: bool = False) -> bytes:
-    """Return the packed `Kit` of a scenario, what belongs to it made in a folder."""
+def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:
+    """Return what `fly_shard` wants of a scenario, what belongs to it made in a folder."""
     located = scenario.portable().moved(folder)
     for name, content in source_of(scenario, real=real).files().items():
         if not (folder / name).exists():
             atomic_write_bytes(folder / name, content)
     source = source_of(located, real=real)
-    source.prepare(folder, progress)
+    source.prepare(folder, SilentProgress())
     if not (folder / KNOWLEDGE_NAME).is_file():
         keep_knowledge(folder, prepare_knowledge(located, source, scenario.mission.seed))
     wing = getattr(source, "wing", None) if flies_model(scenario) and not real else None
@@ -298,7 +320,7 @@ def prepared(scenario: Scenario, folder: Path, progress: Progress, *, real: bool
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
-    return Kit(scenario.portable().to_dict(), files, wing).packed()
+    return pickle.dumps(Kit(scenario.portable().to_dict(), files, wing), pickle.HIGHEST_PROTOCOL)
 
 
 def group_folder(folder: Path, group: Group, place: int) -> Path:
@@ -322,70 +344,63 @@ def _fly(
     def kit(number: int, place: int) -> bytes:
         group = fleet.groups[number]
         own = group_folder(folder, group, place)
-        real = bool(group.observations)
-        return prepared(group.scenarios[place], own, SilentProgress(), real=real)
+        return prepared(group.scenarios[place], own, real=bool(group.observations))
 
     def pieces() -> Iterator[Piece]:
-        for piece in left:
-            group = fleet.groups[piece.group]
+        for number, members in left:
+            group = fleet.groups[number]
             try:
-                if group.files:
-                    piece.kit()
-                ready = _recorded(group, piece)
+                packed = kit(number, members[0].row if group.files else 0)
+                ready = _recorded(group, members)
             except IN_FLIGHT as error:
                 if not group.files:
                     raise
-                keep(piece, str(error))  # of one asset with a file of its own
-                continue
-            yield ready
+                keep(number, members, str(error))  # of one asset with a file of its own
+            else:
+                yield Piece(number, packed, ready)
 
-    def keep(piece: Piece, result: ShardResult | str) -> None:
-        group = fleet.groups[piece.group]
-        rows = slice(piece.members[0].row, piece.members[-1].row + 1)
+    def keep(number: int, members: Sequence[Member], result: ShardResult | str) -> None:
+        group, first, end = fleet.groups[number], members[0].row, members[-1].row + 1
         if isinstance(result, str):
-            seed = np.array([piece.members[0].seed])
-            result = ShardResult({"status": np.array([FAILED]), "seed": seed}, {rows.start: result}, {}, "")
+            status = {"status": np.array([FAILED]), "seed": np.array([members[0].seed])}
+            result = ShardResult(status, {first: result}, {})
         with written(folder / STORE_NAME):
             for name, values in result.arrays.items():
-                arrays(group.name)[name][rows] = values
+                arrays(group.name)[name][first:end] = values
         failures, ended = (
             {f"{group.name}/{group.members[row].name}": text for row, text in texts.items()}
             for texts in (result.failures, result.ended)
         )
-        place = {"group": piece.group, "rows": [rows.start, rows.stop]}
-        journal.append({**place, "failures": failures, "ended": ended})
+        journal.append({"group": number, "rows": [first, end], "failures": failures, "ended": ended})
 
     there = {
         (record["group"], row)
         for record, *_ in records(journal.path)
         for row in range(*record["rows"])  # workers may cut a shard
     }
-    whole = list(_shards(fleet, kit))
-    left = [piece for piece in whole if not there.issuperset((piece.group, one.row) for one in piece.members)]
+    whole = list(_shards(fleet))
+    left = [(number, own) for number, own in whole if not there.issuperset((number, m.row) for m in own)]
     with progress.stage("Flying", total=fleet.size, unit="twins") as stage:
-        stage.advance(fleet.size - sum(len(piece.members) for piece in left))
-        for piece, result in flown(engine, pieces(), progress):
-            keep(piece, result)
+        stage.advance(fleet.size - sum(len(members) for _, members in left))
+        for piece, result in flown(engine, pieces(), progress) if left else ():
+            keep(piece.group, piece.members, result)
             stage.advance(len(piece.members))
     return len(whole), len(left)
 
 
-def _recorded(group: Group, piece: Piece) -> Piece:
-    """Return a piece with what its real assets have shown: workers need no files."""
+def _recorded(group: Group, members: Sequence[Member]) -> tuple[Member, ...]:
+    """Return members with what their real assets have shown: workers need no files."""
     if not group.recordings:
-        return piece
+        return tuple(members)
     scenario = group.scenarios[0]
-    members = (
-        replace(member, recording=read_recording(group.recordings[member.row], scenario))
-        for member in piece.members
-    )
-    return replace(piece, members=tuple(members))
+    feeds = (file_feed(group.recordings[member.row], scenario) for member in members)
+    pairs = zip(members, feeds, strict=True)
+    return tuple(replace(member, recording=tuple(feed.messages(None))) for member, feed in pairs)
 
 
-def _shards(fleet: Fleet, kit: Callable[[int, int], bytes]) -> Iterator[Piece]:
+def _shards(fleet: Fleet) -> Iterator[tuple[int, Sequence[Member]]]:
     """Yield all shards in their order: twins that share all files, no more of them than a shard holds."""
     for number, group in enumerate(fleet.groups):
-        size = 1 if group.files else fleet.shard
+        size = 1 if group.files else fleet.head.shard
         for first in range(0, len(group.members), size):
-            place = first if group.files else 0
-            yield Piece(number, partial(kit, number, place), group.members[first : first + size])
+            yield number, group.members[first : first + size]

@@ -19,19 +19,14 @@ from numpy.typing import NDArray
 from reporting import figures as style
 from reporting.arrays import Float
 from reporting.files import atomic_write_text
-from reporting.json_file import read_json
 from reporting.page import Column, Page, Words, numbers
 from twin_master.errors import FleetError, TwinMasterError
-from twin_master.fleet.flight import KIND as FLOWN_KIND
+from twin_master.fleet.flight import WATCHED_KIND, fleet_record, told_of
 from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
 from twin_master.fleet.reading import WITHIN, figure_rows, group_figures, last_turns, leaving, noticed
-from twin_master.fleet.standing import read_standing
 from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, has_flown, open_group
-from twin_master.fleet.watching import KIND as WATCHED_KIND
-from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.journal import records as records_of
+from twin_master.fleet.watching import counts_of, read_standing
 from twin_master.report.view import printed_factors
-from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
@@ -75,14 +70,6 @@ def write_fleet_report(folder: Path | str) -> Path:
     return atomic_write_text(Path(folder) / REPORT_NAME, fleet_page(Path(folder), NEXT))
 
 
-def fleet_record(folder: Path) -> dict[str, Any] | None:
-    """Return the configuration of a fleet, flown or watched; None where a folder holds none."""
-    path = folder / CONFIG_NAME
-    found = read_json(path, FleetError) if path.is_file() else None
-    whole = isinstance(found, dict) and found.get("kind") in (FLOWN_KIND, WATCHED_KIND)
-    return found if whole else None
-
-
 def fleet_page(folder: Path, most: int) -> str:
     """Return the page of a fleet as it stands, with so many assets in the table of who needs attention next.
 
@@ -116,10 +103,7 @@ def _add_flown(page: Page, folder: Path, records: list[dict[str, Any]], most: in
     figures = {name: group_figures(group) for name, group in groups.items()}
     WORDS.add_table(page, "fared", figure_rows(figures), more=list(figures))
     status = np.concatenate([group["status"].values for group in groups.values()])
-    failures: dict[str, str] = {}
-    for record, *_ in records_of(folder / JOURNAL_NAME):
-        failures |= record["failures"]
-    _add_failures(page, failures, "lost", assets=len(status))
+    _add_failures(page, told_of(folder)["failures"], "lost", assets=len(status))
     if ended := int(np.sum(status == ENDED)):
         page.add_notice(WORDS.say("short", ended=ended, assets=len(status)))
     _add_lessons(page, folder)
@@ -169,11 +153,7 @@ def _add_watched(page: Page, folder: Path, groups: list[dict[str, Any]], most: i
     record = read_standing(folder)
     known, failures = record["assets"], record["failures"]
     told = {name: asset for name, asset in known.items() if asset["last"] is not None}
-    turns = sum(asset["last"]["turn"] + 1 for asset in told.values())
-    alarms, refused = (sum(asset[name] for asset in known.values()) for name in ("alarms", "refused"))
-    counts = [len(known), turns, alarms, refused, len(failures)]
-    titles = ("assets", "turns", "alarms", "messages refused", "not watched")
-    page.add_highlights([(str(count), title) for count, title in zip(counts, titles, strict=True)])
+    page.add_highlights([(str(count), title) for title, count in counts_of(record).items()])
     _add_failures(page, failures, "not_watched", assets=len(known | failures))
     if silent := sorted(known.keys() - told.keys() - failures.keys()):
         page.add_notice(WORDS.say("silent", names=silent, most=most))

@@ -23,6 +23,7 @@ from reporting.progress import SilentProgress
 from reporting.provenance import collect_provenance, hash_record
 from twin_master.assets.asset_source import Asset, AssetSource, StatelessAsset
 from twin_master.assets.fmu_source import FmuSource
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import outcomes_of
@@ -33,24 +34,12 @@ from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one,
 from twin_master.mission.turns import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.feeds import file_feed
 from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed, Intake
 from twin_master.watch.message import Fed
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
-
-
-def read_recording(path: Path, scenario: Scenario) -> tuple[Fed, ...]:
-    """Return the messages of a recording.
-
-    Raises
-    ------
-    MissionInputError
-        It cannot be read, or is of another asset.
-    """
-    return tuple(file_feed(path, scenario).messages(None))
 
 
 class _Recorded(Feed):
@@ -119,10 +108,6 @@ class Kit:
     files: Mapping[str, bytes]
     wing: "ReducedModel | None"
 
-    def packed(self) -> bytes:
-        """Return it as bytes, for `fly_shard`."""
-        return pickle.dumps(self, protocol=pickle.HIGHEST_PROTOCOL)
-
 
 @dataclass(frozen=True)
 class ShardResult:
@@ -136,14 +121,11 @@ class ShardResult:
         What ended flights, by the number in the group.
     ended : dict of int to str
         How assets ended their simulations early, likewise.
-    version : str
-        Of the program that flew.
     """
 
     arrays: Mapping[str, NDArray[Any]]
     failures: Mapping[int, str]
     ended: Mapping[int, str]
-    version: str
 
 
 @cache
@@ -165,26 +147,16 @@ class _Unpacked:
         self.scenario = Scenario.model_validate(kit.scenario).moved(folder)
         self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
         self.wing = kit.wing
-        self._model: Asset | None = None
-
-    def model(self, parameters: Mapping[str, float]) -> Asset:
-        """Return the reduced model as an asset with true parameters; one object for all that share them."""
-        from twin_master.assets.reduced_model import ReducedModelSource
-
-        assert self.wing is not None
-        if parameters:
-            return ReducedModelSource(with_parameters(self.scenario, parameters), self.wing).open()
-        if self._model is None:
-            self._model = ReducedModelSource(self.scenario, self.wing).open()
-        return self._model
 
     def told(self, sentence: str) -> str:
         """Return a sentence without the folder of this process, which nobody else knows."""
         return sentence.replace(f"{self._folder}/", "")
 
-    def source(self, parameters: Mapping[str, float], seed: int | None) -> AssetSource:
-        """Return what is flown, ready to be opened."""
+    def opened(self, parameters: Mapping[str, float], seed: int | None = None) -> Asset:
+        """Return what is flown: the model, or an FMU."""
         scenario = with_parameters(self.scenario, parameters)
+        if self.wing is not None:
+            return ReducedModelSource(scenario, self.wing).open()
         if seed is not None:
             mission = scenario.mission.model_copy(update={"seed": seed})
             scenario = scenario.model_copy(update={"mission": mission})
@@ -193,7 +165,7 @@ class _Unpacked:
             source.use(self._folder)  # packed already
         else:
             source.prepare(self._folder, SilentProgress())
-        return source
+        return source.open()
 
 
 _unpacked = lru_cache(maxsize=1)(_Unpacked)
@@ -214,7 +186,7 @@ def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
     Parameters
     ----------
     packed : bytes
-        Of a `Kit`.
+        Of a `Kit`, pickled.
     members : sequence of Member
         B of them.
     """
@@ -226,24 +198,17 @@ def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
         for texts in (flights.failure, flights.ended)
     )
     arrays = outcomes_of(kit.knowledge, flights, members)
-    return ShardResult(arrays, failures, ended, program_version())
+    return ShardResult(arrays, failures, ended)
 
 
 def _flown(kit: _Unpacked, members: Sequence[Member]) -> Flights:
     """Fly twins with their assets."""
     truths = [kit.knowledge.truth(member.seed) for member in members]
-    alone = kit.scenario.learning is not None or kit.scenario.notice is not None
-    if kit.wing is not None:
-        models = [kit.model(member.parameters) for member in members]
-        if alone:
-            return fly_one_by_one(kit.knowledge, truths, lambda twin, _sound: models[twin])
-        return fly_side_by_side(kit.knowledge, truths, models)
     with _Hangar(kit, members) as hangar:
-        if not alone:
+        if kit.scenario.learning is None and kit.scenario.notice is None:
             with suppress(*IN_FLIGHT):  # which then happens to each of them
-                asset = hangar.asset(0, False)
-                if isinstance(asset, StatelessAsset) and hangar.alike:
-                    return fly_side_by_side(kit.knowledge, truths, [asset] * len(members))
+                if assets := hangar.together():
+                    return fly_side_by_side(kit.knowledge, truths, assets)
         return fly_one_by_one(kit.knowledge, truths, hangar.asset)
 
 
@@ -258,23 +223,30 @@ class _Hangar(ExitStack):
         self._asset: Asset | None = None
         self._start, self._opened = b"", self._wanted[0]
 
-    @property
-    def alike(self) -> bool:
-        return all(wanted == self._wanted[0] for wanted in self._wanted)
+    def together(self) -> list[Asset]:
+        """Return the assets of all twins where none has a memory, and one stands for all that are alike."""
+        if self._kit.wing is not None:
+            keys = [tuple(sorted(parameters.items())) for parameters, _ in self._wanted]
+            models = {key: self._kit.opened(dict(key)) for key in {*keys}}
+            return [models[key] for key in keys]
+        alike = all(wanted == self._wanted[0] for wanted in self._wanted)
+        asset = self._at_start(0, False) if alike else None
+        return [asset] * len(self._wanted) if isinstance(asset, StatelessAsset) else []
 
     def asset(self, twin: int, sound: bool) -> Asset:
-        """Return the asset of a twin at its start."""
+        """Return the asset of a twin, which flies alone, at its start."""
+        if self._kit.scenario.planner.inspections_a_turn is not None:
+            raise FleetError("`inspections_a_turn` needs assets without memory, which fly side by side")
+        return self._at_start(twin, sound)
+
+    def _at_start(self, twin: int, sound: bool) -> Asset:
         wanted = self._wanted[twin]
         if self._asset is not None and sound and wanted == self._opened:
             self._asset.restore_state(self._start)
         else:
             self._asset = None
             self.close()
-            self._asset = self._kit.source(*wanted).open()
+            self._asset = self._kit.opened(*wanted)
             self.callback(self._asset.close)
             self._start, self._opened = self._asset.save_state(), wanted
-        if self._kit.scenario.planner.inspections_a_turn is not None and not (
-            self.alike and isinstance(self._asset, StatelessAsset)
-        ):
-            raise FleetError("`inspections_a_turn` needs assets without memory, which fly side by side")
         return self._asset

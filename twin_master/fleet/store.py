@@ -1,7 +1,6 @@
 """The store of a fleet: what is kept of each twin, chunk by chunk, and which shards are there."""
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib import util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
-from reporting.files import write_error
+from reporting.files import written
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Fleet, Group, Member
 from twin_master.mission.preparation import Knowledge
@@ -159,15 +158,6 @@ def check_installed(*packages: str) -> None:
         raise FleetError(f"a fleet needs {' and '.join(missing)}: pip install 'uav-twin[fleet]'.")
 
 
-@contextmanager
-def written(path: Path) -> Iterator[None]:
-    """Turn what the system refuses into one sentence."""
-    try:
-        yield
-    except OSError as error:
-        raise write_error(error, path) from error
-
-
 def open_group(folder: Path, group: str) -> "xr.Dataset":
     """Return a group of the store, whose arrays are read as they are asked for.
 
@@ -207,7 +197,7 @@ def _create_group(made: "zarr.Group", group: Group, fleet: Fleet) -> None:
         made.create_array(
             name,
             shape=shape,
-            chunks=(min(fleet.shard, count), *shape[1:]),
+            chunks=(min(fleet.head.shard, count), *shape[1:]),
             dtype=kind,
             fill_value=np.nan if kind[0] == "f" else -int(name in ("control_index", "first_notice")),
             dimension_names=("twin", *axes.split()),
@@ -217,8 +207,8 @@ def _create_group(made: "zarr.Group", group: Group, fleet: Fleet) -> None:
     made.attrs.update(
         {
             "scenario": scenario.mission.name,
-            "fleet": fleet.name,
-            "fleet_seed": fleet.seed,
+            "fleet": fleet.head.name,
+            "fleet_seed": fleet.head.seed,
             "factors": list(scenario.state_names),
             "controls": list(scenario.control_names),
             "step_name": scenario.mission.step_name,

@@ -3,47 +3,122 @@
 import json
 import re
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from reporting.errors import DiskFullError
-from reporting.files import atomic_write_text
+from reporting.files import atomic_write_text, written
+from reporting.json_file import read_json
 from reporting.progress import SilentProgress
 from twin_master.errors import FleetError
-from twin_master.fleet.flight import hold_folder, see_folder
+from twin_master.fleet.flight import WATCHED_KIND, held_fleet
 from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
-from twin_master.fleet.standing import STATE_NAME, WatchedAsset, read_standing
-from twin_master.fleet.store import written
+from twin_master.fleet.reading import attention
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME
-from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
 from twin_master.watch.feeds import broker_of, file_feed, is_broker
 from twin_master.watch.folder import Watch
-from twin_master.watch.growing import Place
 from twin_master.watch.intake import Feed
-from twin_master.watch.message import Fed, MessageReader
-from twin_master.watch.mqtt import Outbox, Session, placed
+from twin_master.watch.mqtt import Session, Topic
 from twin_master.watch.opening import begun_watch, resumed_watch
 
-KIND = "uav-twin fleet watch"
 TURNS_AT_ONCE = 64
 """Turns of one asset before the next one is looked at."""
 SEARCH_SECONDS, STATE_SECONDS = 2.0, 2.0
 """Between two searches for new files, and between two writings of the state."""
 AGAIN_SECONDS, LONGEST_AGAIN = 30.0, 3600.0
 """After which an asset that was lost is taken up again; twice as long each time that it meets the same."""
-HELD = 200
-"""Messages of an asset that is lost, the last ones, that wait for it here."""
 IDLE_SECONDS, BUSY_SHARE = 0.05, 0.2
 """Shortest pause where nothing came, and share of a processor that looking in vain may take."""
 LARGEST_FLEET = 100_000
 """Assets; a broker could name more of them without end."""
+STATE_NAME = "watched.json"
+"""In the folder of a fleet that is watched: its assets as they stood a moment ago, for its view."""
+_OF_A_DECISION = ("turn", "control", "next_control", "probability", "health")
+"""What of its last decision is kept of each asset."""
 _NAME = re.compile(r"\w[\w.-]{0,63}")
+
+
+def read_standing(folder: Path) -> dict[str, Any]:
+    """Return `assets` and `failures` of a watched fleet, both empty where nothing was watched.
+
+    Of each asset `last` is what its last decision said, None before the first; `alarms` and `refused` are
+    numbers; `leaving` is the probability that its control is left within the steps that are predicted.
+    """
+    path = folder / STATE_NAME
+    return dict(read_json(path, FleetError)) if path.is_file() else {"assets": {}, "failures": {}}
+
+
+def counts_of(standing: Mapping[str, Any]) -> dict[str, int]:
+    """Return what `read_standing` tells in numbers."""
+    known = standing["assets"].values()
+    return {
+        "assets": len(known),
+        "turns": sum(asset["last"]["turn"] + 1 for asset in known if asset["last"] is not None),
+        "alarms": sum(asset["alarms"] for asset in known),
+        "messages refused": sum(asset["refused"] for asset in known),
+        "not watched": len(standing["failures"]),
+    }
+
+
+class WatchedAsset:
+    """An asset under watch.
+
+    Attributes
+    ----------
+    name : str
+        Of its group and its own: GROUP/NAME, which is its folder, too.
+    watch : Watch
+        Begun.
+    feed : Feed
+        Of its observations.
+    decision : dict or None
+        The last one.
+    alarms : set of str
+        The alarms that the operator was told since it was taken up, each sentence once.
+    first_untold : int
+        The first turn that the operator was not told before.
+    close : callable
+        Gives its folder free.
+    """
+
+    close: Callable[[], None]
+
+    def __init__(self, name: str, watch: Watch, feed: Feed, before: Mapping[str, Any] | None) -> None:
+        self.name, self.watch, self.feed = name, watch, feed
+        self._knowledge = watch.models[-1].knowledge
+        self.decision = watch.last_decision()
+        self.first_untold = self._alarms_before = 0
+        if before is not None and before["last"] is not None:
+            self.first_untold, self._alarms_before = before["last"]["turn"] + 1, before["alarms"]
+        told = [notice for _, notice in watch.told(self.first_untold)] if self.decision else []
+        self.alarms = {notice.sentence for notice in told if notice.kind == "alarm"}
+        if self.decision is not None:
+            watch.filtered = watch.twin.estimator.smoothed(watch.twin.carried[-1:])[0]
+
+    def record(self) -> dict[str, Any]:
+        """Return how it stands, for the view."""
+        last = leaving = None
+        if self.decision is not None and self.watch.filtered is not None:
+            last = {key: self.decision[key] for key in _OF_A_DECISION}
+            control = self.watch.scenario.control_names.index(last["control"])
+            leaving = float(attention(self._knowledge, self.watch.filtered, control))
+        alarms, refused = self._alarms_before + len(self.alarms), self.watch.intake.counts.rejected
+        return {"last": last, "alarms": alarms, "refused": refused, "leaving": leaving}
+
+
+@dataclass
+class _Lost:
+    """Why an asset was lost, how long it is left alone, and until when on the clock [s]."""
+
+    sentence: str
+    wait: float
+    again: float
 
 
 class FleetWatch:
@@ -76,8 +151,9 @@ class FleetWatch:
     Attributes
     ----------
     assets : dict of str to WatchedAsset
-    failures : dict of str to str
-        What ended the watch of an asset, until it is taken up again; the others go on.
+        Those that are not lost.
+    standing : dict
+        How all stood a moment ago, as `read_standing` has it.
     asked : bool
         Set it to end between two turns.
     """
@@ -94,9 +170,7 @@ class FleetWatch:
         authority: Path | None = None,
     ) -> None:
         self.folder, self.assets, self.asked = folder, dict[str, WatchedAsset](), False
-        self.failures: dict[str, str] = {}
-        self._again: dict[str, float] = {}
-        self._met: dict[str, tuple[str, float]] = {}  # why an asset was lost, and how long it was then left
+        self._lost: dict[str, _Lost] = {}
         self.note, self.closing, self.goodbyes = note, ExitStack(), ExitStack()
         self._tell, self._turns = tell, turns
         self._like: dict[str, Watch] = {}
@@ -109,12 +183,21 @@ class FleetWatch:
                 self._sources.append(_Topics(self, group, authority))
             else:
                 self._sources.append(_Files(self, group, follow))
-        self.closing.enter_context(_held(fleet, folder))
-        self._told_before = read_standing(folder)["assets"]
+        named = [(group.name, group.scenarios[0].portable().to_dict()) for group in fleet.groups]
+        groups = [{"name": name, "scenarios": [scenario]} for name, scenario in named]
+        record = fleet.head.model_dump(exclude={"shard"}) | {"groups": groups}
+        self.closing.enter_context(held_fleet(folder, WATCHED_KIND, record))
+        self.standing = read_standing(folder)
+        self._told_before = dict(self.standing["assets"])
         import resource
 
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (limits[1], limits[1]))  # three files for each asset
+
+    @property
+    def failures(self) -> dict[str, str]:
+        """What ended the watch of an asset, until it is taken up again; the others go on."""
+        return {name: lost.sentence for name, lost in self._lost.items() if name not in self.assets}
 
     def run(self, looked: Callable[[], None] = lambda: None) -> None:
         """Watch until all files are read to their end, or until it is asked to end.
@@ -131,12 +214,14 @@ class FleetWatch:
         MissionInputError
             A broker does not answer, or refuses the twin.
         """
-        state = 0.0
+        state = searched = -SEARCH_SECONDS
         with self.closing, self.goodbyes:  # what is said last may still write into the folders
             try:
                 while not self.asked:
                     begin = time.monotonic()
-                    turns = sum(source.look() for source in self._sources)
+                    searching = begin - searched >= SEARCH_SECONDS
+                    searched = begin if searching else searched
+                    turns = sum(source.look(searching) for source in self._sources)
                     if begin - state > STATE_SECONDS:
                         self._write_state()
                         state = begin
@@ -149,116 +234,96 @@ class FleetWatch:
             finally:
                 self._write_state()
 
-    def take_up(
-        self, group: Group, name: str, feed: Callable[[Scenario], Feed],
-        begun: Callable[[WatchedAsset], None] = lambda _asset: None,
-    ) -> WatchedAsset | None:  # fmt: skip
-        """Begin the watch of an asset, or go on with it; None where that cannot be."""
+    def advance(self, group: Group, name: str, feed: Callable[[], Feed], most: int | None = None) -> int:
+        """Take in what has come of an asset, in so many turns at most; return the number of turns.
+
+        It is begun, or taken up again, where it is not watched and it is time.
+        """
+        key, count = f"{group.name}/{name}", 0
+        if self.asked or (key not in self.assets and not self._due(key)):
+            return count
+        try:
+            if key not in self.assets:
+                self._take_up(group, name, feed())
+            asset = self.assets[key]
+            if self.enough(asset):
+                return count
+            for decision in asset.watch.decisions():
+                if self._lost.pop(key, None) is not None:
+                    self.note(f"{key} is watched again.")
+                self._decided(asset, decision)
+                count += 1
+                if count == most or self.enough(asset) or self.asked:
+                    break
+            if not count and not asset.watch.intake.ended:
+                asset.watch.quiet(partial(self._decided, asset))
+        except Exception as error:  # noqa: BLE001 - whatever one asset comes to, the others go on
+            self.lost(key, error)
+        return count
+
+    def _take_up(self, group: Group, name: str, feed: Feed) -> None:
+        """Begin the watch of an asset, or go on with it."""
         key, folder = f"{group.name}/{name}", self.folder / group.name / name
+        if not _NAME.fullmatch(name):
+            raise FleetError(f"letters, digits, dots and hyphens name an asset, and {name!r} came.")
+        if len(self.assets) == LARGEST_FLEET:
+            raise FleetError(f"a process watches {LARGEST_FLEET} assets at most.")
+        like = self._like.get(group.name)
+        opened = resumed_watch(folder, None, SilentProgress(), like)
+        if not (folder / CONFIG_NAME).is_file():
+            with written(folder):
+                folder.parent.mkdir(exist_ok=True)
+            opened = begun_watch(group.scenarios[0], group.file, folder, SilentProgress(), like=like)
         with ExitStack() as closing:
-            try:
-                if not _NAME.fullmatch(name):
-                    raise FleetError(f"letters, digits, dots and hyphens name an asset, and {name!r} came.")
-                if len(self.assets) == LARGEST_FLEET and key not in self.assets:
-                    raise FleetError(f"a process watches {LARGEST_FLEET} assets at most.")
-                source, like = feed(group.scenarios[0]), self._like.get(group.name)
-                opened = resumed_watch(folder, None, SilentProgress(), like)
-                if not (folder / CONFIG_NAME).is_file():
-                    with written(folder):
-                        folder.parent.mkdir(exist_ok=True)
-                    given = group.scenarios[0], group.file, folder, SilentProgress()
-                    opened = begun_watch(*given, like=like)
-                watch = closing.enter_context(opened)
-                closing.enter_context(watch.begun(source))
-                asset = WatchedAsset(key, watch, self._told_before.get(key))
-                begun(asset)
-                asset.close = closing.pop_all().close
-            except Exception as error:  # noqa: BLE001 - whatever one asset comes to, the others go on
-                self.lost(key, error)
-                return None
+            watch = closing.enter_context(opened)
+            closing.enter_context(watch.begun(feed))
+            asset = WatchedAsset(key, watch, feed, self._told_before.get(key))
+            asset.close = closing.pop_all().close
         self.closing.callback(asset.close)
-        self.failures.pop(key, None)
         self._like.setdefault(group.name, watch)
         self.assets[key] = asset
         last = asset.decision
         if last is not None and last["turn"] >= asset.first_untold:  # a kill may have left it untold
             self._decided(asset, last)
-        return asset
 
     def _decided(self, asset: WatchedAsset, decision: dict[str, Any]) -> None:
         if "control" in decision:
             asset.decision = decision
         self._tell(asset, decision)
-        asset.tell(decision)
+        asset.feed.decide(decision)
         asset.alarms |= {notice["sentence"] for notice in decision["notices"] if notice["kind"] == "alarm"}
-
-    def advance(self, asset: WatchedAsset, most: int | None = None) -> int:
-        """Take in what has come of an asset, in so many turns at most; return the number of turns."""
-        count = 0
-        if self.done(asset):
-            return count
-        try:
-            for decision in asset.watch.decisions():
-                if self._met.pop(asset.name, None) is not None:
-                    self.note(f"{asset.name} is watched again.")
-                self._decided(asset, decision)
-                count += 1
-                if count == most or self.done(asset) or self.asked:
-                    break
-            if not count and not asset.keep.intake.ended:
-                asset.watch.quiet(partial(self._decided, asset))
-        except Exception as error:  # noqa: BLE001 - likewise
-            self.lost(asset.name, error)
-        return count
 
     def ask(self) -> None:
         """Ask for an end between two turns."""
         self.asked = True
 
-    def done(self, asset: WatchedAsset) -> bool:
-        """Return whether an asset is left alone: it is lost, or has the turns that were wanted."""
-        return self.enough(asset) or asset.name in self.failures
-
     def enough(self, asset: WatchedAsset) -> bool:
         """Return whether an asset has the turns that were wanted."""
-        return self._turns is not None and asset.keep.twin.turns >= self._turns
+        return self._turns is not None and asset.watch.twin.turns >= self._turns
 
-    def due(self, name: str) -> bool:
-        """Return whether an asset that was lost is to be taken up again."""
-        return name in self.failures and time.monotonic() >= self._again[name]
+    def _due(self, key: str) -> bool:
+        """Return whether an asset was never lost, or is to be taken up again."""
+        return key not in self._lost or time.monotonic() >= self._lost[key].again
 
-    def lost(self, name: str, error: Exception) -> None:
+    def lost(self, key: str, error: Exception) -> None:
         """Say once why an asset is not watched, and give its folder free; a full disk ends all."""
         if isinstance(error, DiskFullError):
             raise error
-        if name not in self.assets and len(self.failures) >= LARGEST_FLEET:
-            return
         sentence = str(error) if isinstance(error, IN_FLIGHT) else f"{type(error).__name__}: {error}"
-        met, wait = self._met.get(name, ("", 0.0))
-        if met != sentence:
-            self.note(f"{name} is not watched: {sentence}")
-        wait = min(2.0 * wait, LONGEST_AGAIN) if met == sentence else AGAIN_SECONDS
-        self.failures[name], self._met[name] = sentence, (sentence, wait)
-        self._again[name] = time.monotonic() + wait
-        if name in self.assets:
-            self._told_before[name] = self.assets[name].record()
-            self.assets[name].close()
+        before, wait = self._lost.get(key), AGAIN_SECONDS
+        if before is not None and before.sentence == sentence:
+            wait = min(2.0 * before.wait, LONGEST_AGAIN)
+        else:
+            self.note(f"{key} is not watched: {sentence}")
+        self._lost[key] = _Lost(sentence, wait, time.monotonic() + wait)
+        if (asset := self.assets.pop(key, None)) is not None:
+            self._told_before[key] = asset.record()
+            asset.close()
 
     def _write_state(self) -> None:
         assets = {name: asset.record() for name, asset in sorted(self.assets.items())}
-        record = {"assets": {**self._told_before, **assets}, "failures": self.failures}
-        atomic_write_text(self.folder / STATE_NAME, json.dumps(record) + "\n")
-
-
-def _held(fleet: Fleet, folder: Path) -> AbstractContextManager[None]:
-    """Make the folder of a fleet, or see that it holds the same; return what holds it."""
-    groups = [
-        {"name": group.name, "scenarios": [group.scenarios[0].portable().to_dict()]} for group in fleet.groups
-    ]
-    heading = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "groups": groups}
-    config = {"kind": KIND, "format": 1, "fleet": heading}
-    see_folder(folder, config, fleet.seed)
-    return hold_folder(folder, config, fleet.seed)
+        self.standing = {"assets": {**self._told_before, **assets}, "failures": self.failures}
+        atomic_write_text(self.folder / STATE_NAME, json.dumps(self.standing) + "\n")
 
 
 class _Files:
@@ -268,64 +333,42 @@ class _Files:
         self._fleet, self._group, self._follow = fleet, group, follow
         if not follow and not recordings(group.observations):
             raise FleetError(said("fleet.follow", observations=group.observations))
-        self._assets: dict[Path, WatchedAsset | None] = {}
-        self._owner: dict[str, Path] = {}
-        self._searched = -SEARCH_SECONDS
+        self._files: dict[str, Path] = {}
 
     @property
     def ended(self) -> bool:
-        done = self._fleet.done
-        here = [asset for asset in self._assets.values() if asset is not None]
-        return all(asset.keep.intake.ended or done(asset) for asset in here) and not self._follow
+        """Whether nothing more is to be read."""
+        found = (self._fleet.assets.get(f"{self._group.name}/{name}") for name in self._files)
+        here = [asset for asset in found if asset is not None]
+        return not self._follow and all(
+            asset.watch.intake.ended or self._fleet.enough(asset) for asset in here
+        )
 
-    def look(self) -> int:
-        """Take in what is new; return the number of turns."""
-        if time.monotonic() - self._searched >= SEARCH_SECONDS:
-            self._searched = time.monotonic()
-            for path in recordings(self._group.observations):
-                name = asset_name(path)
-                key = f"{self._group.name}/{name}"
-                if self._owner.setdefault(name, path) != path:
-                    self._fleet.lost(f"{key} of {path.name}", FleetError("another file has the same name."))
-                elif (
-                    (path not in self._assets or self._fleet.due(key))
-                    and not self._fleet.asked
-                    and self._begun(path)
-                ):
-                    feed = partial(file_feed, path, follow=self._follow)
-                    self._assets[path] = self._fleet.take_up(self._group, name, feed)
-        turns = 0
-        for asset in self._assets.values():
-            if self._fleet.asked:
-                break
-            if asset is not None:
-                turns += self._fleet.advance(asset, TURNS_AT_ONCE)
-        return turns
-
-    def _begun(self, path: Path) -> bool:
-        """Return whether the header of a file that grows is whole."""
-        if not self._follow:
-            return True
-        try:
-            with path.open("rb") as file:
-                return file.readline(100_000)[-1:] == b"\n"
-        except OSError:
-            return False
+    def look(self, searching: bool) -> int:
+        """Take in what is new, and look for new files; return the number of turns."""
+        for path in recordings(self._group.observations) if searching else ():
+            name = asset_name(path)
+            if self._files.get(name, path) != path:
+                error = FleetError("another file has the same name.")
+                self._fleet.lost(f"{self._group.name}/{name} of {path.name}", error)
+            elif not self._follow or _has_header(path):
+                self._files[name] = path
+        scenario = self._group.scenarios[0]
+        return sum(
+            self._fleet.advance(
+                self._group, name, partial(file_feed, path, scenario, follow=self._follow), TURNS_AT_ONCE
+            )
+            for name, path in self._files.items()
+        )
 
 
-class _Inbox(Feed):
-    """What a broker sent of one asset, and what it is told."""
-
-    def __init__(self, topic: str, scenario: Scenario) -> None:
-        self.topic, self.name = topic, topic.rpartition("/")[2]
-        self._reader = MessageReader(scenario)
-        self.came: deque[bytes] = deque(maxlen=HELD)
-        self.asset: WatchedAsset | None = None
-        self.outbox: Outbox | None = None
-
-    def messages(self, place: Place | None) -> Iterator[Fed]:
-        while True:
-            yield placed(self._reader, self.came.popleft()) if self.came else (None, "")
+def _has_header(path: Path) -> bool:
+    """Return whether the header of a file that grows is whole."""
+    try:
+        with path.open("rb") as file:
+            return file.readline(100_000)[-1:] == b"\n"
+    except OSError:
+        return False
 
 
 class _Topics:
@@ -339,55 +382,42 @@ class _Topics:
         self._session = Session(broker, group.name, fleet.folder, fleet.note, self._pulse)
         fleet.goodbyes.callback(self._session.close)
         self._messages = self._session.messages(0.0)
-        self._inboxes: dict[str, _Inbox] = {}
-        self._searched = 0.0
+        self._topics: dict[str, Topic] = {}
 
-    def look(self) -> int:
+    def look(self, searching: bool) -> int:
         """Take in what the broker has sent; return the number of turns."""
         turns, begin = 0, time.monotonic()
-        if not self._searched:  # those that were watched before may be quiet, or have decisions to publish
+        if not self._topics:  # those that were watched before may be quiet, or have decisions to publish
             for path in sorted((self._fleet.folder / self._group.name).glob(f"*/{CONFIG_NAME}")):
-                self._inbox(self._topic[:-1] + path.parent.name)
-        if begin - self._searched >= SEARCH_SECONDS:
-            self._searched = begin
-            for inbox in self._inboxes.values():
-                if self._fleet.due(f"{self._group.name}/{inbox.name}"):
-                    self._take_up(inbox)
-                turns += self._advanced(inbox)
+                self._found(path.parent.name)
+        for name in [*self._topics] if searching else ():
+            turns += self._advanced(name)
         while not self._fleet.asked and (message := next(self._messages)) is not None:
-            box = self._inbox(message.topic)
-            if box is not None and not (box.asset and self._fleet.enough(box.asset)):
-                box.came.append(message.payload)
-                turns += self._advanced(box)
+            name = message.topic.rpartition("/")[2]
+            asset = self._fleet.assets.get(f"{self._group.name}/{name}")
+            topic = self._found(name)
+            if topic is not None and not (asset and self._fleet.enough(asset)):
+                topic.came.append(message.payload)
+                turns += self._advanced(name)
             if time.monotonic() - begin > STATE_SECONDS:
                 break
         return turns
 
-    def _inbox(self, topic: str) -> _Inbox | None:
-        """Return that of a topic, of which an asset is begun; None of one too many."""
-        if topic not in self._inboxes and len(self._inboxes) < LARGEST_FLEET:
-            self._inboxes[topic] = _Inbox(topic, self._group.scenarios[0])
-            self._take_up(self._inboxes[topic])
-        return self._inboxes.get(topic)
+    def _found(self, name: str) -> Topic | None:
+        """Return the topic of an asset; None of one too many."""
+        if name not in self._topics and len(self._topics) < LARGEST_FLEET:
+            failed = partial(self._fleet.lost, f"{self._group.name}/{name}")
+            topic = self._topic[:-1] + name
+            self._topics[name] = Topic(self._session, topic, self._group.scenarios[0], failed)
+        return self._topics.get(name)
 
-    def _advanced(self, inbox: _Inbox) -> int:
-        return 0 if inbox.asset is None else self._fleet.advance(inbox.asset)
-
-    def _take_up(self, inbox: _Inbox) -> None:
-        def begun(asset: WatchedAsset) -> None:
-            if inbox.outbox is None:
-                failed = partial(self._fleet.lost, asset.name)
-                inbox.outbox = Outbox(self._session, inbox.topic, asset.watch, failed)
-            else:
-                inbox.outbox.take_up(asset.watch)
-            inbox.asset, asset.tell = asset, inbox.outbox.tell
-
-        self._fleet.take_up(self._group, inbox.name, lambda _scenario: inbox, begun)
+    def _advanced(self, name: str) -> int:
+        return self._fleet.advance(self._group, name, lambda: self._topics[name])
 
     def _pulse(self) -> dict[str, Any]:
-        kept = [inbox.asset.keep for inbox in self._inboxes.values() if inbox.asset is not None]
+        kept = [topic.watch for topic in self._topics.values() if topic.watch is not None]
         return {
-            "state": "watching", "assets": len(kept), "turns": sum(keep.twin.turns for keep in kept),
-            "quiet": sum(keep.quiet for keep in kept), "lag": len(self._session.came),
-            "refused": sum(keep.intake.counts.rejected for keep in kept),
+            "state": "watching", "assets": len(kept), "turns": sum(watch.twin.turns for watch in kept),
+            "quiet": sum(watch.is_quiet for watch in kept), "lag": len(self._session.came),
+            "refused": sum(watch.intake.counts.rejected for watch in kept),
         }  # fmt: skip

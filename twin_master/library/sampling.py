@@ -22,7 +22,7 @@ from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.placement import say_sandbox
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuError
-from reporting.files import TEMPORARY_SUFFIX, atomic_write_text, remove_leftovers, write_error
+from reporting.files import TEMPORARY_SUFFIX, atomic_write_text, remove_leftovers, written
 from reporting.folders import lock_folder
 from reporting.json_file import parse_json
 from reporting.progress import Progress, SilentProgress
@@ -238,9 +238,8 @@ def _prepare_folder(out: Path, record: dict[str, Any], *, resume: bool, replace_
             raise InvalidObservationLibraryError(said("library.interrupted", folder=folder))
         kept = plan.read_bytes() if plan.is_file() else b""
         if kept and kept != text.encode("utf-8"):
-            raise InvalidObservationLibraryError(
-                said("library.another", folder=folder, what=_difference(kept, record))
-            )
+            what = _difference(kept, record)
+            raise InvalidObservationLibraryError(said("library.another", folder=folder, what=what))
         if kept:
             return folder
     atomic_write_text(plan, text)
@@ -266,11 +265,9 @@ def _keep_block(path: Path, values: Float) -> None:
     damages is recognised by its checksum and sampled again.
     """
     temporary = path.with_name(f".{path.stem}{TEMPORARY_SUFFIX}{path.suffix}")
-    try:
+    with written(path):
         temporary.write_bytes(arrays_to_bytes({"values": values}))
         temporary.replace(path)
-    except OSError as error:
-        raise write_error(error, path) from error
 
 
 def _read_blocks(grid: SamplingGrid, folder: Path) -> dict[int, Float]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reporting.arrays import Float
-from reporting.files import synchronise, write_error
+from reporting.files import synchronise, write_error, written
 from twin_master.errors import NotResumableError
 from twin_master.mission.turns import Happened, Reading, Turn
 from twin_master.sentences import said
@@ -109,7 +109,7 @@ class JournalFile:
     def __init__(self, folder: Path, config_hash: str, flush_seconds: float = 0.0) -> None:
         self.path, self._flush_seconds = folder / JOURNAL_NAME, flush_seconds
         self._flushed = time.monotonic()
-        try:
+        with written(self.path):
             check_header(self.path, config_hash)
             self.size = next((end for _, _, end in records_backwards(self.path)), 0)
             self._descriptor = os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
@@ -118,8 +118,6 @@ class JournalFile:
                 self.append({"config_hash": config_hash})
                 self.flush()
                 synchronise(folder)
-        except OSError as error:
-            raise write_error(error, self.path) from error
 
     def __enter__(self) -> Self:
         return self

@@ -1,5 +1,6 @@
 """A watch: its folder, begun or taken up again, its loop, and what it leaves."""
 
+import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -10,10 +11,11 @@ from pathlib import Path
 from threading import Thread
 from typing import Any
 
+from reporting.arrays import Float
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
-from twin_master.assets.asset_source import FlownAndBelieved, calibrated_with
+from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, calibrated_with
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import (
@@ -26,7 +28,9 @@ from twin_master.mission.journal import (
 from twin_master.mission.loop import operate
 from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
 from twin_master.mission.replay import BelievedModel, journalled_decision, replay
+from twin_master.mission.turns import Turn
 from twin_master.network.estimator import Notice
+from twin_master.network.twin import Twin
 from twin_master.run_folder import PATCH, PICTURE, TEACHING, VERDICT, tidy, with_inputs
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
@@ -34,7 +38,6 @@ from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import Figure
 from twin_master.store.writing import store_flight
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, listening
-from twin_master.watch.keeping import Keeper
 from twin_master.watch.teaching import (
     LEAST_GAIN,
     TRIAL_TURNS,
@@ -50,8 +53,6 @@ STORED_TURNS = 1_000
 """The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
 FLUSH_SECONDS = 1.0
 """Of a recorded file, which is read again after a power failure; live turns are flushed one by one."""
-
-
 Patched = tuple[Path, int]
 """A patch of the twin's model, and the turn from which on it is believed."""
 
@@ -74,11 +75,22 @@ class Watch:
 
     Attributes
     ----------
-    keep : Keeper
-        Writes down the turns, from `begun` on.
+    journal, intake, twin
+        From `begun` on; another twin where it was taught.
+    taught : bool
+        Whether the twin is taught.
+    filtered : (S,) or None
+        What was believed after the last turn; None before the first one of this process.
+    is_quiet : bool
+        Whether the operator was told that no turn comes any more.
     """
 
-    keep: Keeper
+    journal: JournalFile
+    intake: Intake
+    twin: Twin
+    filtered: Float | None
+    is_quiet: bool
+    taught = False
 
     def __init__(
         self, folder: Path, config: dict[str, Any], scenario: Scenario, progress: Progress,
@@ -86,11 +98,9 @@ class Watch:
     ) -> None:  # fmt: skip
         self.folder, self.scenario, self._progress = folder, scenario, progress
         tidy(folder)
-        if like is None:
-            self._source = believed_source(scenario)
-            self._inputs = dict(self._source.prepare(folder, progress))
-        else:
-            self._source, self._inputs = like._source, like._inputs
+        self._source: AssetSource = believed_source(scenario) if like is None else like._source
+        prepared = self._source.prepare(folder, progress) if like is None else like._inputs
+        self._inputs: Mapping[str, str] = prepared
         self._config = with_inputs(folder, config, self._inputs)
         self.models: list[BelievedModel] = [self._prepared() if like is None else like.models[0]]
         self._path = folder / JOURNAL_NAME
@@ -149,10 +159,10 @@ class Watch:
             decide(decision)
             feed.decide(decision)
 
-        with self.begun(feed, patched) as keep:
-            keep.intake.turns, keep.intake.look = turns, lambda: self.quiet(tell)
+        with self.begun(feed, patched):
+            self.intake.turns, self.intake.look = turns, lambda: self.quiet(tell)
             tutor = Tutor(self, search, wait=feed.replayable) if search else None
-            with listening(keep.intake.ask):
+            with listening(self.intake.ask):
                 try:
                     if untold is not None:
                         tell(untold)
@@ -168,14 +178,14 @@ class Watch:
                 finally:
                     if tutor is not None:
                         tutor.end()
-        return keep.intake.counts
+        return self.intake.counts
 
     @contextmanager
-    def begun(self, feed: Feed, patched: Patched | None = None) -> Iterator[Keeper]:
-        """Open the journal, and give what keeps the turns of the twin as it stands after it; see `run`."""
+    def begun(self, feed: Feed, patched: Patched | None = None) -> Iterator[None]:
+        """Open the journal, and take up the twin as it stands after it; see `run`."""
         intake = Intake(self.scenario, feed, self.folder / REJECTED_NAME)
         seconds = FLUSH_SECONDS if feed.replayable else 0.0
-        with JournalFile(self.folder, self._hash, seconds) as journal:
+        with JournalFile(self.folder, self._hash, seconds) as self.journal:
             self._take_up()
             found, last = replay(self._path, self.models, self.scenario.watch.lag)
             intake.restore(last.get("intake"))
@@ -183,42 +193,70 @@ class Watch:
                 self._progress.note(
                     f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
                 )
-            self.keep = Keeper(journal, intake, found.twin, self.teaching)
-            self.keep.quiet = "quiet" in last
+            self.intake, self.twin, self.filtered = intake, found.twin, None
+            self.is_quiet, self._heard = "quiet" in last, time.monotonic()
             if patched is not None:
                 self._patch(*patched)
-            yield self.keep
+            feed.begun(self)
+            yield
 
     def decisions(self) -> Iterator[dict[str, Any]]:
         """Yield what the operator is told of each turn, once it is written down, until no more comes."""
-        for _ in operate(self.keep.twin, self.keep.intake, self.keep):
-            yield journalled_decision(self.keep.line, self.scenario, self.models[-1].knowledge.model)
+        for turn in operate(self.twin, self.intake):
+            yield self.decision_of(self._kept(turn))
+
+    def decision_of(self, line: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what the operator is told with a line of the journal; nothing where it tells no decision."""
+        return journalled_decision(line, self.scenario, self.models[-1].knowledge.model)
+
+    def _kept(self, turn: Turn) -> dict[str, Any]:
+        """Write down a reading and what became of it; return the line."""
+        record, told = self.intake.line(turn, self.twin), self.teaching.untold if self.taught else []
+        if self.is_quiet:
+            sentence = f"Turn {record['turn']}: observations come again, after {self.silence:.0f} s."
+            told = [*told, Notice("heard", sentence).as_record()]
+        if told:
+            record["notices"] = record.get("notices", []) + told
+        self._append(record)
+        self.filtered, self.is_quiet, self._heard = turn.concluded.filtered, False, time.monotonic()
+        return record
+
+    def write(self, **record: Any) -> None:
+        """Write down something else than a turn."""
+        state = {"next_control": self.twin.proposed_control, "intake": self.intake.state()}
+        self._append({"turn": self.twin.turns - 1, **state, **record})
+
+    def _append(self, record: Mapping[str, Any]) -> None:
+        """Add a line to the journal, and take it in."""
+        standing = {"begin": self.journal.size, "teaching": vars(self.teaching)}
+        self.journal.append({**record, "standing": standing})
+        self.teaching.take(record)
+
+    @property
+    def silence(self) -> float:
+        """How long no turn has come [s]."""
+        return time.monotonic() - self._heard
 
     def last_decision(self) -> dict[str, Any] | None:
         """Return the last decision in the journal; None without any.
 
         A kill may have left it untold, and nobody knows: it has `told_again`.
         """
-        model = self.models[-1].knowledge.model
-        for line, *_ in records_backwards(self._path):
-            if "filtered" in line:
-                return {**journalled_decision(line, self.scenario, model), "told_again": True}
-        return None
+        lines = (line for line, *_ in records_backwards(self._path) if "filtered" in line)
+        last = next(lines, None)
+        return None if last is None else {**self.decision_of(last), "told_again": True}
 
     def quiet(self, decide: Callable[[dict[str, Any]], None]) -> None:
         """Tell the last decision with the notice that it grows old, once no turn has come for too long."""
-        keep = self.keep
         longest, step = self.scenario.watch.quiet_after_seconds, self.scenario.mission.step_name
-        if longest is None or keep.quiet or keep.silence < longest:
+        if longest is None or self.is_quiet or self.silence < longest:
             return
-        since = f"since {step} {keep.twin.turns - 1}" if keep.twin.turns else "and none before"
+        since = f"since {step} {self.twin.turns - 1}" if self.twin.turns else "and none before"
         sentence = f"No {step} has come for {longest:g} s, {since}: see whether logger and broker are there."
-        decision = {
-            **(self.last_decision() or {"turn": -1}),
-            "notices": [Notice("quiet", sentence).as_record()],
-        }
-        keep.write({"notices": decision["notices"], "quiet": decision})
-        keep.quiet = True
+        notices = [Notice("quiet", sentence).as_record()]
+        decision = {**(self.last_decision() or {"turn": -1}), "notices": notices}
+        self.write(notices=notices, quiet=decision)
+        self.is_quiet = True
         decide(decision)
 
     def trial(self, file: Path, from_turn: int, compared: tuple[int, int] = (0, 0)) -> Callable[..., Outcome]:
@@ -227,12 +265,12 @@ class Watch:
         believed = [model for model in models if model.from_turn <= from_turn][-1]
         patch = both_patches(believed.patch, file)
         return partial(
-            judged, self._path, self.keep.journal.size, self.scenario, models, patch, from_turn, compared
+            judged, self._path, self.journal.size, self.scenario, models, patch, from_turn, compared
         )
 
     def _patch(self, file: Path, first: int) -> None:
         """Believe a patch that is given from a turn on."""
-        turns = self.keep.twin.turns
+        turns = self.twin.turns
         if not turns or not 0 <= first <= turns:
             raise MissionInputError(said("watch.from_turn", turns=turns))
         outcome = self.trial(file, first)(progress=self._progress)
@@ -253,7 +291,7 @@ class Watch:
         atomic_write_bytes(self.folder / name, outcome.patch)
         again, _ = replay(self._path, self.models, self.scenario.watch.lag, question=outcome.model)
         alarms = [n for turn, n in again.notices if turn >= first and n.kind == "alarm"]
-        self.keep.twin = again.twin
+        self.twin = again.twin
         self.models.append(replace(outcome.model, patch=self.folder / name))
         model: dict[str, Any] = {
             "patch": name, "sha256": hash_file(self.folder / name), "from_turn": first,
@@ -261,7 +299,7 @@ class Watch:
             "policy_change": outcome.policy_change, **({} if notice is None else {"notice": dict(notice)}),
             **({"verdict": verdict} if verdict else {}),
         }  # fmt: skip
-        self.keep.write({"model": model})
+        self.write(model=model)
         keep_knowledge(self.folder, outcome.model.knowledge)
         gaps = [
             f"{name.replace('_', ' ')} {value:.4g} before, {outcome.after[name]:.4g} after"
@@ -350,7 +388,7 @@ class Tutor:
     """
 
     def __init__(self, watch: Watch, search: Search, *, wait: bool) -> None:
-        watch.keep.taught = True
+        watch.taught = True
         self._watch, self._search = watch, search
         self._teaching, self._wait = watch.teaching, wait
         self.outcome: Future[Outcome] | None = None
@@ -370,10 +408,10 @@ class Tutor:
         """Do what is due."""
         watch, teaching, step = self._watch, self._teaching, self._watch.scenario.mission.step_name
         if (question := teaching.question) is not None:
-            found = self._search.answer(question, self._wait, lambda: watch.keep.intake.asked)
+            found = self._search.answer(question, self._wait, lambda: watch.intake.asked)
             if found is not None:
                 verdict = verdict_of(watch.folder, question, found, teaching.turn, step)
-                watch.keep.write({"verdict": verdict})
+                watch.write(verdict=verdict)
         if (trial := teaching.trial) is None or not self._over:
             return
         file, compared = watch.folder / trial["folder"] / PATCH, (trial["turn"] + 1, TRIAL_TURNS)
@@ -394,7 +432,7 @@ class Tutor:
         if outcome is not None and outcome.gained >= LEAST_GAIN:
             watch.adopt(outcome, notice)
         else:
-            watch.keep.write({"verdict": {**trial, "tried": False, "notice": notice}})
+            watch.write(verdict={**trial, "tried": False, "notice": notice})
 
     def end(self) -> None:
         """End what is under way."""

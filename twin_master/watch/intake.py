@@ -1,9 +1,11 @@
 """From messages to readings: turns in order, gaps predicted through, late ones in their place."""
 
+import base64
 import json
 import signal
 import threading
 import time
+import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -14,10 +16,11 @@ from typing import Any
 import numpy as np
 
 from reporting.arrays import Float
-from reporting.files import atomic_write_text, write_error
+from reporting.files import atomic_write_text, written
 from twin_master.errors import TwinMasterError
 from twin_master.learning.setup import words_of
-from twin_master.mission.turns import Reading
+from twin_master.mission.journal import turn_record
+from twin_master.mission.turns import Reading, Turn
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
@@ -31,6 +34,8 @@ REJECTED_NAME = "rejected.jsonl"
 REJECTED_KEPT = 10_000
 """Refused messages that are written down; further ones are counted only, so that a flood fills no disk."""
 _TEXT_KEPT = 200
+SNAPSHOT_TURNS = 32
+"""Turns between two lines of the journal that also hold the state of the twin."""
 MISSING, _ASSUMED, _GIVEN = 0, 1, 2
 """Of a turn: not received; received; received with its control."""
 
@@ -50,6 +55,9 @@ class Feed:
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return the messages behind a place, or all of them."""
         raise NotImplementedError
+
+    def begun(self, watch: Any) -> None:
+        """Begin with a watch whose journal is open."""
 
     def decide(self, decision: Mapping[str, Any]) -> None:
         """Tell whoever sends the messages what was decided, where they listen."""
@@ -153,6 +161,24 @@ class Intake:
             **({} if self._first is None else {"first_timed": self._first}),
             **({"unreadable": sorted(self._unreadable)} if self._unreadable else {}),
         }
+
+    def line(self, turn: Turn, twin: Twin) -> dict[str, Any]:
+        """Return what a line of the journal says of the last reading and what became of it."""
+        concluded = turn.concluded
+        record = turn_record(turn) | {
+            "observation_turn": self.observation_turn,
+            "control_index": twin.control_of(self.observation_turn),
+            "intake": self.state(),
+        }
+        if turn.reading.revises is not None:
+            record["control_in_force"] = concluded.control_index
+        elif (concluded.turn + 1) % SNAPSHOT_TURNS == 0 and (settled := twin.settled()):
+            state = base64.b64encode(zlib.compress(settled[1], 1)).decode("ascii")
+            record["settled"] = {"turn": settled[0], "state": state}
+        known = {(notice.kind, notice.sensors) for notice in concluded.notices}
+        if told := [n.as_record() for n in self.notices if (n.kind, n.sensors) not in known]:
+            record["notices"] = record.get("notices", []) + told
+        return record
 
     def restore(self, state: Mapping[str, Any] | None) -> None:
         """Go on from a state; None is the begin.
@@ -263,11 +289,8 @@ class Intake:
             return
         self._kept += 1
         record = {"message": self.counts.received, "reason": reason, "text": self._text[:_TEXT_KEPT]}
-        try:
-            with self._rejected.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(record, ensure_ascii=True) + "\n")
-        except OSError as error:
-            raise write_error(error, self._rejected) from error
+        with written(self._rejected), self._rejected.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record, ensure_ascii=True) + "\n")
 
     def _turn_of(self, twin: Twin, message: Message) -> int:
         if message.turn is not None:

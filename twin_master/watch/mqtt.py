@@ -16,10 +16,9 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
-from reporting.files import atomic_write_text, write_error
+from reporting.files import atomic_write_text, written
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import JOURNAL_NAME, records
-from twin_master.mission.replay import journalled_decision
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
 from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, parsed, shown
@@ -40,6 +39,8 @@ _SESSION_SECONDS = 7 * 86_400
 """How long the broker keeps what comes while the watch is away."""
 _RETRY_SECONDS = (1.0, 30.0)
 HEARTBEAT_SECONDS = 10.0
+HELD = 200
+"""Messages of an asset that is lost, the last ones, that wait for it here."""
 _GOODBYE_SECONDS = 5.0
 """How long the end waits for the broker to take the last decisions."""
 
@@ -64,7 +65,7 @@ class Session:
     came : deque
         Messages that have come and are not worked off yet.
     behind : dict
-        Outboxes that have something to publish, as keys.
+        Topics with decisions to publish, as keys.
     """
 
     def __init__(
@@ -81,8 +82,8 @@ class Session:
         self._client: Any = None
         self.came: deque[Any] = deque()
         self._last: Any = None
-        self._flying: dict[int, Outbox] = {}
-        self.behind: dict[Outbox, None] = {}
+        self._flying: dict[int, Topic] = {}
+        self.behind: dict[Topic, None] = {}
         self._connected = self._begun = False
         self._failure = self._told = ""
         self._retry, self._pause, self._beat = 0.0, _RETRY_SECONDS[0], 0.0
@@ -93,7 +94,7 @@ class Session:
         return self._connected and len(self._flying) < _DECISIONS_WAITING
 
     def _connect(self) -> None:
-        """Connect with nothing of the connection before: it is in the outboxes, and at the broker."""
+        """Connect with nothing of the connection before: it is in the topices, and at the broker."""
         from paho.mqtt import client as paho
         from paho.mqtt.enums import CallbackAPIVersion
         from paho.mqtt.packettypes import PacketTypes
@@ -135,22 +136,22 @@ class Session:
 
     def _on_subscribe(self, _client: Any, _data: Any, _mid: Any, reasons: Any, _properties: Any) -> None:
         if reasons[0].is_failure:
-            topic = self._broker.topic
-            self._failure = said("watch.topic", where=self._where, topic=topic, why=reasons[0])
+            told = {"topic": self._broker.topic, "why": reasons[0]}
+            self._failure = said("watch.topic", where=self._where, **told)
             return
         atomic_write_text(self._path, self._name + "\n")  # which also ends the wish to begin anew
         self._begun = self._kept = True
         self._told, self._pause, self._beat = "", _RETRY_SECONDS[0], 0.0
-        for outbox in self.behind:
-            outbox.not_before = 0.0
+        for topic in self.behind:
+            topic.not_before = 0.0
         self.note(f"Connected to {self._broker.host}:{self._broker.port}.")
 
     def _on_disconnect(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         self._failure = self._failure or f"the {self._where} is away ({reason})"
 
     def _on_publish(self, _client: Any, _data: Any, mid: int, reason: Any, _properties: Any) -> None:
-        if (outbox := self._flying.pop(mid, None)) is not None:
-            outbox.answered(mid, str(reason) if reason.is_failure else None)
+        if (topic := self._flying.pop(mid, None)) is not None:
+            topic.answered(mid, str(reason) if reason.is_failure else None)
 
     def _lost(self) -> None:
         """Let go of a connection, to try again later; the first time it ends the watch."""
@@ -165,8 +166,8 @@ class Session:
         self._pause = min(2.0 * self._pause, _RETRY_SECONDS[1])
         self.came.clear()  # not acknowledged, so the broker sends them again
         self._last = None
-        for outbox in {*self._flying.values()}:
-            outbox.go_back()
+        for topic in {*self._flying.values()}:
+            topic.go_back()
         self._flying.clear()
 
     def _exchange(self, wait: float) -> None:
@@ -194,8 +195,8 @@ class Session:
             self._client.disconnect()
             self._client, self._clean, self._connected, self._failure = None, False, False, ""
             return
-        for outbox in [*self.behind] if self.room else ():
-            outbox.publish()
+        for topic in [*self.behind]:
+            topic.publish()
         if self._connected and time.monotonic() >= self._beat:
             self._beat = time.monotonic() + HEARTBEAT_SECONDS
             self._client.publish(self._heartbeat, json.dumps(self._pulse()), retain=True)
@@ -223,10 +224,10 @@ class Session:
             self._client.ack(self._last.mid, self._last.qos)
         self._last = None
 
-    def send(self, topic: str, decision: Mapping[str, Any], outbox: "Outbox") -> int:
-        """Send a decision; return the number by which the outbox is told of the answer."""
+    def send(self, topic: str, decision: Mapping[str, Any], by: "Topic") -> int:
+        """Send a decision; return the number by which the topic is told of the answer."""
         mid: int = self._client.publish(f"{topic}/decision", json.dumps(decision), qos=1).mid
-        self._flying[mid] = outbox
+        self._flying[mid] = by
         return mid
 
     def close(self) -> None:
@@ -250,40 +251,63 @@ class Session:
                     pass
 
 
-class Outbox:
-    """Brings the decisions of an asset to the broker: those in its journal that it has not acknowledged.
+class Topic(Feed):
+    """The observations of an asset that a session hands on, and its decisions, on their way to the broker.
 
-    How far the broker has them is on the disk, `published`: in bytes of the journal. After a kill they are
-    published again from there; each one at least once.
+    How far the broker has the decisions is on the disk, `published`: in bytes of the journal. After a kill
+    they are published again from there; each one at least once.
 
     Parameters
     ----------
     session : Session
     topic : str
-        Of the observations of the asset.
-    watch : Watch
-        Of the asset.
+        Of the observations.
+    scenario : Scenario
+        By which they are read.
     failed : callable
-        Told what keeps the decisions from being published; they are then left until it is taken up again.
+        Told what keeps the decisions from being published; they are then left until the watch is begun again.
+
+    Attributes
+    ----------
+    came : deque of bytes
+        Messages that the session has handed on.
+    watch : Watch or None
+        Of the asset; None before it is begun.
     """
 
     def __init__(
-        self, session: Session, topic: str, watch: Watch, failed: Callable[[Exception], None]
+        self, session: Session, topic: str, scenario: Scenario, failed: Callable[[Exception], None]
     ) -> None:
         self._session, self._topic, self._failed = session, topic, failed
+        self._reader = MessageReader(scenario)
+        self.came: deque[bytes] = deque(maxlen=HELD)
+        self.watch: Watch | None = None
         self._waiting: dict[int, int] = {}
         self.not_before, self._before = 0.0, 0
-        self.take_up(watch)
 
-    def take_up(self, watch: Watch) -> None:
+    def messages(self, place: Place | None) -> Iterator[Fed]:
+        """Return what has come, without end."""
+        while True:
+            yield self._read_message(self.came.popleft() if self.came else None)
+
+    def _read_message(self, payload: bytes | None) -> Fed:
+        """Return the observation in a message, which must name its turn or time."""
+        if payload is None:
+            return None, ""
+        message = parsed(self._reader, payload)
+        if isinstance(message, Message) and message.turn is None and message.time is None:
+            message = Refused("a broker may deliver it twice: `turn` or `time` is needed over MQTT")
+        return message, shown(payload)
+
+    def begun(self, watch: Watch) -> None:
         """Publish what the journal of a watch has, which was begun or taken up again."""
-        self._watch = watch
+        self.watch = watch
         self._path, self._journal = watch.folder / PUBLISHED_NAME, watch.folder / JOURNAL_NAME
         size = self._journal.stat().st_size  # decisions before may have been published
         if not self._path.is_file():
             atomic_write_text(self._path, f"{size:020d}\n")
         text = self._path.read_text(encoding="utf-8", errors="replace").strip()
-        self._done, self._read = min(int(text) if text.isdecimal() else 0, size), size
+        self._done, self._at = min(int(text) if text.isdecimal() else 0, size), size
         self.go_back()
         if self._done == size:
             self._session.behind.pop(self)
@@ -298,35 +322,26 @@ class Outbox:
             self._session.behind.pop(self, None)
             self._failed(error)
 
-    def _write(self, done: int) -> None:
-        try:
-            with self._path.open("r+b") as file:
-                file.write(b"%020d\n" % done)  # in place: whole, or as it was
-        except OSError as error:
-            raise write_error(error, self._path) from error
-        self._done = done
-
-    def tell(self, _decision: Mapping[str, Any]) -> None:
+    def decide(self, decision: Mapping[str, Any]) -> None:
         """Publish what was written down."""
-        if self._watch.keep.intake.settled:
+        if self.watch is not None and self.watch.intake.settled:
             self._session.acknowledge()
         self._session.behind[self] = None
         self.publish()
 
     def publish(self) -> None:
         """Publish what is in the journal, as far as the broker takes it."""
-        if time.monotonic() < self.not_before:
+        if time.monotonic() < self.not_before or self.watch is None:
             return
-        scenario, model = self._watch.scenario, self._watch.models[-1].knowledge.model
         with self._alone():
-            for line, _, end in records(self._journal, self._read):
+            for line, _, end in records(self._journal, self._at):
                 if not self._session.room:
                     return
-                decision = journalled_decision(line, scenario, model)
+                decision = self.watch.decision_of(line)
                 if decision:
                     decision |= {"told_again": True} if end <= self._before else {}
-                    self._waiting[self._session.send(self._topic, decision, self)] = self._read
-                self._read = end
+                    self._waiting[self._session.send(self._topic, decision, self)] = self._at
+                self._at = end
             self._session.behind.pop(self, None)
 
     def answered(self, mid: int, refusal: str | None) -> None:
@@ -337,19 +352,20 @@ class Outbox:
             self.not_before = time.monotonic() + _RETRY_SECONDS[1]
             self.go_back()
         if self._waiting.pop(mid, None) is not None:
-            with self._alone():
-                self._write(next(iter(self._waiting.values()), self._read))
+            with self._alone(), written(self._path), self._path.open("r+b") as file:
+                self._done = next(iter(self._waiting.values()), self._at)
+                file.write(b"%020d\n" % self._done)  # in place: whole, or as it was
 
     def go_back(self) -> None:
         """Publish again what the broker has not acknowledged."""
-        self._before = max(self._before, self._read)
-        self._read = self._done
+        self._before = max(self._before, self._at)
+        self._at = self._done
         self._waiting.clear()
         self._session.behind[self] = None
 
 
-class MqttFeed(Feed):
-    """The observations of the topic of one asset, and its decisions; see `Session` for the errors.
+class MqttFeed(Topic):
+    """The topic of one asset with a session of its own; see `Session` for the errors.
 
     Parameters
     ----------
@@ -365,45 +381,27 @@ class MqttFeed(Feed):
     def __init__(
         self, broker: Broker, watch: Watch, note: Callable[[str], None], scenario: Scenario | None = None
     ) -> None:
-        self._topic, self._watch = broker.topic, watch
-        self._reader = MessageReader(scenario or watch.scenario)
-        self._session = Session(broker, watch.scenario.mission.name, watch.folder, note, self._pulse)
-        self._outbox: Outbox | None = None
+        session = Session(broker, watch.scenario.mission.name, watch.folder, note, self._pulse)
+        super().__init__(session, broker.topic, scenario or watch.scenario, _raised)
 
     def _pulse(self) -> dict[str, Any]:
-        keep = self._watch.keep
-        counts = keep.intake.counts
+        assert self.watch is not None
+        watch, counts = self.watch, self.watch.intake.counts
         return {
-            "state": "quiet" if keep.quiet else "watching", "turn": keep.twin.turns - 1,
-            "seconds_since_turn": round(keep.silence, 1), "lag": len(self._session.came),
+            "state": "quiet" if watch.is_quiet else "watching", "turn": watch.twin.turns - 1,
+            "seconds_since_turn": round(watch.silence, 1), "lag": len(self._session.came),
             "received": counts.received, "refused": counts.rejected,
         }  # fmt: skip
 
     def messages(self, place: Place | None) -> Iterator[Fed]:
         """Return what comes, without end; a message is acknowledged when it is written down."""
-        self._outbox = Outbox(self._session, self._topic, self._watch, _raised)
         for message in self._session.messages(0.1):
-            yield (None, "") if message is None else placed(self._reader, message.payload)
-
-    def decide(self, decision: Mapping[str, Any]) -> None:
-        """Publish what was decided since the watch was taken up; what was before follows by itself."""
-        if self._outbox is not None:
-            self._outbox.tell(decision)
+            yield self._read_message(None if message is None else message.payload)
 
     def close(self) -> None:
-        """Say goodbye, see `Session.close`; what a kill left unpublished goes out, also without a turn."""
-        if self._outbox is None and sys.exc_info()[0] is None:
-            self._outbox = Outbox(self._session, self._topic, self._watch, _raised)
+        """Say goodbye, see `Session.close`."""
         self._session.close()
 
 
 def _raised(error: Exception) -> None:
     raise error
-
-
-def placed(reader: MessageReader, payload: bytes) -> Fed:
-    """Return the observation in the payload of a message, which must name its turn or time."""
-    message = parsed(reader, payload)
-    if isinstance(message, Message) and message.turn is None and message.time is None:
-        message = Refused("a broker may deliver it twice: `turn` or `time` is needed over MQTT")
-    return message, shown(payload)

@@ -1,5 +1,7 @@
 """The missing force of simulated rigs: where it is, how large, and what a law is of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -11,7 +13,7 @@ from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.naming import ForceSearch
+from discrepancy.missing_force.naming import WIDTHS, ForceSearch
 from discrepancy.missing_force.shares import ForceShares, missing_force, order_of
 from discrepancy.missing_force.trial import seen_trial
 from discrepancy.model_choice import load_model
@@ -107,11 +109,12 @@ def problem_of(folder, number):
         (STORES, "outflow", "lower outlet"),
     ],
 )
-def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, number, effect, port):
+def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, monkeypatch, number, effect, port):
+    monkeypatch.setattr("discrepancy.missing_force.naming.WIDTHS", (WIDTHS[0],))  # each law alone
     problem = problem_of(tmp_path, number)
     search = ForceSearch(problem)
     assert max(search.at, key=lambda name: search.at[name].log_evidence) == port
-    ranked = [item for item in search.name(available(problem)) if len(item.candidate.terms) == 1]
+    ranked = [item for item in search.name(available(problem)) if item.candidate.terms]
     (term,) = ranked[0].candidate.terms
     assert (term.effect.identifier, term.place) == (effect, port)
     families = {ranked[0].candidate.terms[0].effect.family}
@@ -182,7 +185,7 @@ def released(hidden):
     """Return ring-downs of the single-mass rig, which hides something."""
     rig = LumpedModel.load("single_mass_rig")
     plan = plan_for(rig, ("displacement", "leaf_strain"), "mass")
-    return example_campaign(rig, "ringdown", 3, plan, hidden)
+    return example_campaign(rig, "ringdown", 3, replace(plan, duration=0.5 * plan.duration), hidden)
 
 
 def assert_alike(campaign, one, other, share):
@@ -274,7 +277,7 @@ def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path):
     problem = read(tmp_path)
     search = ForceSearch(problem)
     found = [search.followed(search.whole, Candidate((term,)), start)
-             for _, term, start in search.screened(search.whole, available(problem))[:12]]  # fmt: skip
+             for _, term, start in search.screened(search.whole, available(problem))[:6]]  # fmt: skip
     best, *_ = sorted((item for item in found if item is not None), key=lambda item: -item.log_evidence)
     (term,) = best.candidate.terms
     assert term.effect.identifier == "coulomb_friction"
@@ -286,7 +289,7 @@ def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path):
 def chain(kind, effect, place, **values):
     """Return an example of the three-mass chain that hides an effect."""
     model = LumpedModel.load("three_mass_chain")
-    plan = plan_of(model)
+    plan = replace(plan_of(model), duration=0.5 * plan_of(model).duration)
     plain = example_campaign(model, kind, 3, plan)
     patch = effect_by_identifier(effect, library()).patch(
         Setting(plain, model, model.scales(plain)), values, place
@@ -313,7 +316,7 @@ def test_the_missing_force_does_not_depend_on_where_it_is_linear_about():
     candidate = Candidate((Term(FRICTION, "joint"),))
     there = fit(problem, candidate, problem.start(candidate)).point
     one, other = (ForceSearch(problem, about).at["joint"] for about in (None, there))
-    assert one.log_evidence == pytest.approx(other.log_evidence, abs=40.0)  # of 15,000 readings
+    assert one.log_evidence == pytest.approx(other.log_evidence, abs=20.0)  # of 7,500 readings
 
 
 def test_a_force_is_ordered_by_the_variable_that_it_is_a_function_of():

@@ -204,9 +204,9 @@ def test_a_slow_force_leads_through_the_static_states(name: str) -> None:
     acts = laws_of(ModelPatch(LAWS[name]), list(system.ports))
     time = np.linspace(0.0, 90.0, 3001)
     force = np.asarray(15.0 * np.sin(2.0 * np.pi * time / 90.0))
-    acting = Acting(time, time, [Load(TIP, Course(time, force))])
-    moved = values(motion_of(system, acting, acts), ROWS)
-    still = system.static(np.outer(force, TIP), acts)[0] @ ROWS.T
+    along = np.array([1.0, 0.0, 0.0, 1.0])  # at the joint too
+    moved = values(motion_of(system, Acting(time, time, [Load(along, Course(time, force))]), acts), ROWS)
+    still = system.static(np.outer(force, along), acts)[0] @ ROWS.T
     assert np.abs(moved - still).max(axis=0) == pytest.approx(np.zeros(2), abs=7e-3 * np.abs(still).max())
 
 

@@ -175,12 +175,7 @@ def test_an_fmu_that_is_not_linear_is_noticed_and_stepped(make) -> None:
 
 def test_a_port_whose_speed_jumps_with_a_force_is_stepped(foreign_fmu) -> None:
     """A plate in oil, x' = -2 x + 0.01 f, pulled by the spring of a law, f = -100 x."""
-    file: dict[str, Any] = {
-        "format": 1, "kind": "fmu", "name": "Plate", "fmu": str(foreign_fmu("linear2")), "isolated": False,
-        "motion": {"parameters": {"a11": -2.0, "b11": 0.01, "c11": 1.0, "c21": -2.0, "d21": 0.01}},
-        "release": {"displacement": "initial1"}, "output": [{"name": "displacement", "variable": "y1"}],
-        "port": [{"name": "plate", "force": "u1", "displacement": "y1", "velocity": "y2"}],
-    }  # fmt: skip
+    file = INPUTS.table("plate.toml") | {"fmu": str(foreign_fmu("linear2"))}
     what, law = (
         trial(TrialKind.RINGDOWN, 60, release=Release(0.1)),
         PowerStiffness("plate", 10.0, 1.0, 0, 0.1),

@@ -1,4 +1,4 @@
-"""Clocks of loggers: what a wrong rate is the same as, and who is on which."""
+"""Clocks of loggers: what a wrong rate is the same as."""
 
 from dataclasses import replace
 from typing import Any
@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from discrepancy.campaign.records import Campaign, Channel, Quantity, RecordedInput, Start, Trial, TrialKind
-from discrepancy.catalogue.entry import Setting
-from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import CatalogueError
 from discrepancy.models.interface import Conditions
 from discrepancy.models.sensing import observe
@@ -21,7 +19,7 @@ TIME = np.arange(0.0, 4.0, 0.01)
 SWEEP = RecordedInput("shaker", Quantity.FORCE, np.sin(9 * TIME**1.3))
 SEEN = {name: Channel(name, Quantity.DISPLACEMENT, "x", None) for name in ("laser", "camera")}
 SWEPT = trial(TrialKind.DRIVEN, TIME, channels=tuple(SEEN), inputs=(SWEEP,), begins=Start.STILL)
-ALL, BOTH = {"all": ("shaker", "laser", "camera")}, {"rack": ("shaker", "laser"), "film": ("camera",)}
+BOTH = {"rack": ("shaker", "laser"), "film": ("camera",)}
 RATE = 4e-3
 
 
@@ -54,17 +52,3 @@ def test_each_logger_has_its_own() -> None:
     np.testing.assert_allclose(rack[:, 1], true[:, 1], atol=1e-12)
     with pytest.raises(CatalogueError, match="no logger 'tape'; it has 'rack', 'film'"):
         shown(given, LoggerClock("tape", RATE))
-
-
-@pytest.mark.parametrize(
-    ("loggers", "places", "motion"), [({}, ("",), True), (ALL, ("",), False), (BOTH, ("rack", "film"), True)]
-)
-def test_what_is_offered(loggers: dict[str, Any], places: tuple[str, ...], motion: bool) -> None:
-    shared, own = (effect_by_identifier(name, library()) for name in ("logger_clock", "clock_error"))
-    given = with_loggers(loggers)
-    setting = Setting(given, MODEL, MODEL.scales(given))
-    assert shared.unavailable(setting) is None
-    assert shared.places(setting) == places
-    assert (own.unavailable(setting) is None) is motion
-    patch = shared.patch(setting, {"rate_error": RATE}, places[0])
-    assert patch == ModelPatch((LoggerClock(places[0] or "*", RATE),))

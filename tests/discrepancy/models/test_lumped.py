@@ -11,14 +11,10 @@ from scipy.linalg import eigh
 
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Quantity, Trial, TrialKind
-from discrepancy.models.acting import Acting, Course, Load
-from discrepancy.models.linear_system import LinearSystem
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS, LumpedDescription
-from discrepancy.models.motion import motion_of
 from discrepancy.models.system_model import State
 from fe.runtime import patch as patches
-from fe.runtime.motion import NO_LAWS
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
 from tests.discrepancy.asking import FloatArray, integrated, seen
 from tests.discrepancy.asking import trial as asked
@@ -178,17 +174,6 @@ def test_a_point_mass_sits_between_places(chain: LumpedModel) -> None:
     wanted = np.sqrt(eigh(STIFFNESS, MASS + 0.3 * np.outer(row, row), eigvals_only=True))
     state = State((1.0,) * 3, structure=patches.ModelPatch((patches.PointMass(0.3, 0.55),)))
     np.testing.assert_allclose(chain.system(state).angular_frequency, wanted, rtol=1e-10)
-
-
-def test_omitted_modes_follow_slow_forces() -> None:
-    # base excitation far below the second mode: with one mode and the residual the answer is nearly whole
-    whole, one = (LinearSystem(MASS, VISCOUS, STIFFNESS, {"joint": JOINT}, count) for count in (None, 1))
-    time = np.arange(500) * 0.01
-    acting = Acting(time, time, [Load(np.array([0.0, 1.0, 0.0]), Course(time, 1.0 - np.cos(4.0 * time)))])
-    exact, found = (motion_of(system, acting, NO_LAWS).at(np.eye(3))[0] for system in (whole, one))
-    scale, bare = np.max(np.abs(exact)), motion_of(one, acting, NO_LAWS).q @ one.shapes.T
-    assert np.max(np.abs(exact - found)) < 2e-3 * scale
-    assert np.max(np.abs(exact - bare)) > 2e-2 * scale
 
 
 @given(ratios=st.tuples(*[st.floats(0.0, 3.0)] * 3), clock=st.floats(0.0, 0.01))

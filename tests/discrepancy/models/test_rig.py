@@ -8,15 +8,12 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from benchmarks.tank import tank_setting
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Channel, Hold, Quantity, RecordedInput, Start, TrialKind
-from discrepancy.catalogue.entry import Setting
-from discrepancy.catalogue.library import effect_by_identifier, library
 from discrepancy.errors import ModelError
 from discrepancy.models.acting import Course, straight
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.port_scales import FORCES
+from discrepancy.models.system_model import FORCES
 from fe.runtime.patch import ModulusTemperature, Overflow, PowerDamping, PowerStiffness
 from tests.discrepancy.asking import FloatArray, campaign, integrated, seen
 from tests.discrepancy.asking import trial as asked
@@ -130,19 +127,6 @@ def test_what_leaves_one_store_enters_the_next_and_flows_over_when_full() -> Non
     coarse, fine = (np.abs(item - true).max() for item in found)
     assert fine < 2e-3
     assert coarse > 3.0 * fine  # of second order
-
-
-def test_flows_are_offered_at_states_and_forces_are_not() -> None:
-    setting = tank_setting()
-    what = setting.campaign.trials[0]
-    for effect in (effect_by_identifier(name, library()) for name in ("outflow", "overflow")):
-        assert effect.unavailable(setting) is None
-        assert effect.places(setting) == ("outlet",)
-        middle = {item.name: item.prior.value(0.0) for item in effect.parameters}
-        shown = seen(setting.model, what, {"level": Quantity.LEVEL}, *effect.patch(setting, middle, "outlet"))
-        assert 0.02 < np.abs(shown - what.values).max() / what.values.max() < 0.9
-    friction = effect_by_identifier("coulomb_friction", library())
-    assert "are of states, where flows act and no forces" in str(friction.unavailable(setting))
 
 
 # ---------------------------------------------------------------- drives
@@ -317,20 +301,6 @@ def test_scales_of_what_nothing_drives_come_from_its_readings(text, unit, rate: 
     given = campaign(trial(time, begins=Start.UNKNOWN, **read), shown=Channel("shown", unit, "shown", None))
     port = model.scales(given).ports["it"]
     assert (port.displacement, port.angular_frequency * port.displacement) == pytest.approx(largest, rel=0.5)
-
-
-def test_a_port_whose_motion_goes_one_way_shows_no_memory() -> None:
-    """A body that falls shows drag and no hysteresis; one that is pushed to and fro may show both."""
-    model, falls = rig("falling_body"), trial(np.linspace(0.0, 1.0, 101))
-    given = campaign(falls, height=Channel("height", Quantity.DISPLACEMENT, "height", None))
-    setting = Setting(given, model, model.scales(given))
-    assert not setting.scales.ports["air"].turns
-    remember = "joint_micro_slip", "bouc_wen_hysteresis", "cubic_stiffness", "free_play", "breathing_crack"
-    for name in remember:
-        assert "motion that turns" in (effect_by_identifier(name, library()).unavailable(setting) or "")
-    assert effect_by_identifier("quadratic_damping", library()).unavailable(setting) is None
-    still = replace(given, trials=(falls, replace(falls, name="load", kind=TrialKind.STATIC)))
-    assert model.scales(still).ports["air"].turns
 
 
 # ---------------------------------------------------------------- refusals

@@ -7,24 +7,22 @@ import pytest
 from discrepancy.judgement.separability import Separability, separability
 from discrepancy.report.figures import ReportInput
 from discrepancy.verdict_folder import write_verdict_folder
-from discrepancy.workflow import Investigation, investigate
-from tests.discrepancy.rigs import FEW, ORIGIN, measured
+from discrepancy.workflow import Investigation
+from tests.discrepancy.rigs import FEW, ORIGIN, drag_found
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def drag() -> Investigation:
-    """Quadratic damping, hidden in ring-downs and static trials, and found."""
-    campaign, model = measured("quadratic_damping", 0.01)
-    return investigate(campaign, model, FEW)
+    return drag_found()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def able(drag: Investigation) -> Separability:
     assert drag.problem is not None
     return separability(drag.campaign, drag.model, drag.problem.setting, FEW)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def written(drag: Investigation, able: Separability, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of that verdict."""
     folder = tmp_path_factory.mktemp("named") / "verdict"

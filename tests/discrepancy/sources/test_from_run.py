@@ -190,7 +190,7 @@ def test_a_drifting_gauge_is_found_in_the_run_and_applied(run, campaign, tmp_pat
 @pytest.mark.parametrize("mass", [0.2, 0.0])
 def test_a_mass_that_the_twin_does_not_know_is_found_in_the_run(tmp_path, mass):
     folder = tmp_path / "heavy"
-    fly_mission(folder, 7, (PointMass(mass, 2.0),) if mass else (), turns=TURNS)
+    fly_mission(folder, 7, (PointMass(mass, 2.0),) if mass else (), turns=12)
     effects = [effect_by_identifier(name, library()) for name in ("point_mass", "inertia_relief")]
     found = investigate(run_campaign(folder), run_model(folder), effects, thorough=False)
     if not mass:

@@ -301,7 +301,8 @@ def test_slopes_of_the_section_are_its_derivatives(shipped_layout, x, y):
         assert slope == pytest.approx((ends[1] - ends[0]) / (2.0 * step), rel=1e-5, abs=1e-7)
 
 
-def test_damage_of_the_plate_is_where_it_is_in_the_box(agreement):
+def test_damage_of_the_plate_is_where_it_is_in_the_box(coarse_design, coarse_operators):
+    agreement = compare_with_plate(coarse_design, coarse_operators)
     effect = agreement.box.damage_ratio - 1.0
     ours = agreement.plate.damage_ratio - 1.0
     large = np.abs(effect) > 0.1

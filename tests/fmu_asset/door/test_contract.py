@@ -98,7 +98,16 @@ def test_many_steps_in_one_go_are_single_ones_and_those_of_the_oracle(open_asset
         np.testing.assert_allclose(history.extra[name], expected, **within)
 
 
-@every_kind
+def ways() -> Iterator[Any]:
+    """Yield each kind here and in a worker; of what flies still and in motion one in each."""
+    for name, kind in KINDS.items():
+        moving = name.endswith(" in motion")
+        twice = moving or f"{name} in motion" in KINDS
+        for isolated in (moving,) if twice else (False, True):
+            yield pytest.param(kind, isolated, id=f"{'worker' if isolated else 'in process'}-{name}")
+
+
+@pytest.mark.parametrize(("kind", "isolated"), [*ways()])
 def test_a_state_goes_on_to_the_bit_and_copies_go_their_own_way(open_asset, kind, isolated) -> None:
     half = range(STEPS // 2)
     with (

@@ -115,7 +115,7 @@ def test_a_slow_leak_is_noticed_between_short_steps(hostile) -> None:
 
 @cases("start")
 def test_a_start_that_goes_wrong_is_one_sentence(hostile, scratch, what, kind, sentence) -> None:
-    asset = hostile(what, load_timeout=2.0 if kind is errors.FmuTimeoutError else 30.0)
+    asset = hostile(what, load_timeout=1.0 if kind is errors.FmuTimeoutError else 30.0)
     for _ in range(2):
         with pytest.raises(kind, match=sentence):
             asset.reset()

@@ -190,7 +190,10 @@ def test_one_calibration_that_fails_costs_its_own_asset(fleet_file, monkeypatch)
     south = FLEET[FLEET.index('[[group]]\nname = "south"') :]
     fleet = changed(fleet_file, (south, ""), ("count = 3", 'fmus = "*.fmu"'))
     outcome = fly_fleet(fleet, fleet_file.parent / "out", Engine(0))
-    assert outcome.failures == {"north/a": "no posterior.", "north/b": "it was flown"}
+    failures = {"north/a": "no posterior.", "north/b": "it was flown"}
+    assert outcome.failures == failures
+    (outcome.folder / "journal.jsonl").unlink()
+    assert flight.told_of(outcome.folder) == {"failures": failures, "ended": {}}
 
 
 def test_figures_are_those_of_the_flights(library_file, tmp_path):

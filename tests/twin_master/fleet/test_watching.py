@@ -29,9 +29,8 @@ from twin_master.fleet.plan import ensemble, load_fleet
 from twin_master.fleet.reading import attention, group_figures, leaving
 from twin_master.fleet.reading import open_fleet as fleet_groups
 from twin_master.fleet.report import fleet_page, write_fleet_report
-from twin_master.fleet.standing import WatchedAsset
 from twin_master.fleet.view import WORST, serve_fleet
-from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch
+from twin_master.fleet.watching import TURNS_AT_ONCE, FleetWatch, WatchedAsset
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import kept_knowledge
 from twin_master.scenario.reading import load_scenario
@@ -268,11 +267,12 @@ def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(broker
             for turn in range(TURNS):
                 for name in ("late", "wing-0"):
                     publish(publisher, name, turn)
-        boxes = fleet._sources[0]._inboxes  # type: ignore[union-attr]
+        boxes = fleet._sources[0]._topics  # type: ignore[union-attr]
         if [len(box.came) for box in boxes.values()] == [TURNS, TURNS - 3]:  # all that came meanwhile
             (north / "late").unlink(missing_ok=True)
             (north / "wing-0" / "published").write_text("")
-            fleet._again = dict.fromkeys(fleet._again, 0.0)
+            for lost in fleet._lost.values():
+                lost.again = 0.0
 
     def tell(_asset: WatchedAsset, decision: Decision) -> None:
         told.append(decision["turn"])
@@ -290,7 +290,7 @@ def test_a_topic_that_was_lost_is_taken_up_again_with_what_came_meanwhile(broker
         "north/late is watched again.",
         "north/wing-0 is watched again.",
     ]
-    assert fleet.assets["north/wing-0"].keep.intake.counts.missing == 0
+    assert fleet.assets["north/wing-0"].watch.intake.counts.missing == 0
 
 
 def test_a_topic_that_jumps_ahead_and_is_left_alone(broker, tmp_path):
@@ -313,8 +313,8 @@ def test_a_topic_that_jumps_ahead_and_is_left_alone(broker, tmp_path):
     fleet.run(send)
     lost = [0, *[24] * (last - 1), 0]
     assert told == [*(("north/wing-0", turn, lost[turn]) for turn in range(last + 1)), ("north/last", 0, 24)]
-    inboxes = fleet._sources[0]._inboxes  # type: ignore[union-attr]
-    assert [len(inbox.came) for inbox in inboxes.values() if inbox] == [0, 0]  # nineteen came too late
+    topics = fleet._sources[0]._topics  # type: ignore[union-attr]
+    assert [len(topic.came) for topic in topics.values()] == [0, 0]  # nineteen came too late
 
 
 def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, monkeypatch):

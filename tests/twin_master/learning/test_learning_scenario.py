@@ -12,7 +12,7 @@ from tests.command_line import said
 from tests.twin_master.runs import check_same, figures_of, journal, text_of, written
 from twin_master.errors import TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.mission.preparation import Knowledge, prepare_twin
+from twin_master.mission.preparation import prepare_twin
 from twin_master.network.estimator import ExactFilter
 from twin_master.network.twin import build_graphical_model
 from twin_master.report.page import render_page
@@ -23,25 +23,6 @@ from twin_master.store.writing import open_run
 from twin_master.workflow import resume as resume_run
 
 TEXT = text_of("level_turns_learning")
-
-
-@pytest.fixture(scope="module")
-def knowledge() -> Knowledge:
-    return prepare_twin("level_turns_learning")
-
-
-def test_a_twin_learns_a_soft_wing_and_the_noise_of_its_gauges(knowledge):
-    soft = int(knowledge.draws.values.argmin())
-    shown = knowledge.sensor_model.value_per_draw[soft, 0, 1]
-    random, twin = np.random.default_rng(0), knowledge.twin()
-    for _ in range(30):
-        turn = twin.turn(shown + 150e-6 * random.normal(size=24), "3g")
-    e = turn.learnt["young_modulus_factor"]
-    assert abs(e.mean - knowledge.draws.values[soft]) < 0.01
-    assert e.standard_deviation < 0.25 * knowledge.draws.standard_deviation
-    scales = [turn.learnt[f"noise_scale[{gauge}]"] for gauge in range(1, 25)]
-    assert sum(scale.mean for scale in scales) / 24 == pytest.approx(1.2, abs=0.06)  # 150 of 125 microstrain
-    assert sum(scale.lower < 1.2 < scale.upper for scale in scales) >= 18
 
 
 def test_without_the_table_the_filter_is_the_exact_one():

@@ -213,21 +213,6 @@ def test_false_alarms_are_rarer_than_the_threshold_says(width):
     assert np.mean(values.max(axis=1) >= 20.0) <= 0.05  # Ville: in the mean
 
 
-@settings(max_examples=25, deadline=None)
-@given(
-    lost=st.lists(st.lists(st.booleans(), min_size=2, max_size=2), min_size=1, max_size=6),
-    factor=st.sampled_from([-1e20, -1.0, 0.0, 1.0, 1.2, 3.0, 1e20]),
-)
-def test_probabilities_stay_probabilities_whatever_is_lost_or_shown(lost, factor):
-    seen = factor * drawn(np.random.default_rng(2), len(lost), 2)
-    estimates = run(watchful(2), np.where(np.array(lost), np.nan, seen))
-    for estimate in estimates:
-        suspicion = estimate.suspicion
-        assert 0.0 <= suspicion.none_of_these + suspicion.gauge_off <= 1.0 + 1e-12
-        assert np.all(np.isfinite(suspicion.log_evidence_gauge))
-        assert np.isfinite(estimate.filtered).all()
-
-
 def twins() -> dict[str, Twin]:
     """Return twins of two gauges that do not learn, learn, and give notice beside either."""
     model, sensors = small(2)
@@ -237,7 +222,7 @@ def twins() -> dict[str, Twin]:
     return {name: Twin(name, model, sensors, np.ones((3, 1)), estimator=e) for name, e in own.items()}
 
 
-EXTREME = st.floats(allow_nan=False, allow_infinity=False) | st.sampled_from([5e-324, 1e30, -1e154, 1e308])
+EXTREME = st.floats(allow_infinity=False) | st.sampled_from([5e-324, 1e30, -1e154, 1e308, np.nan])
 
 
 @settings(max_examples=60, deadline=None)
@@ -253,9 +238,10 @@ def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, la
                 assert twin.save_state() == before
                 turn = twin.turn(np.full(2, np.nan))
             assert turn.filtered.sum() == pytest.approx(1.0)
-            line_of(
-                turn_record(Turn(Reading(np.full(2, np.nan)), turn))
-            )  # which holds no NaN and no infinity
+            if turn.suspicion is not None:
+                assert 0.0 <= turn.suspicion.none_of_these + turn.suspicion.gauge_off <= 1.0 + 1e-12
+            record = Turn(Reading(np.full(2, np.nan)), turn)
+            line_of(turn_record(record))  # which holds no NaN and no infinity
 
 
 def test_a_turn_without_readings_changes_no_evidence():

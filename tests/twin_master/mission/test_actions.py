@@ -50,12 +50,18 @@ from twin_master.store.writing import open_run
 
 TEXT = text_of("inspected_wing", ("notice = false", ""))
 INSPECT, REPAIR_1 = 2, 3
+FIVE_LEVELS = "levels_percent = [0, 20, 40, 60, 80]\nprior = [1, 0, 0, 0, 0]"
 
 
 def scenario(*changes: tuple[str, str], **planner: Any) -> Scenario:
     table = tomllib.loads(edited(TEXT, *changes))
     table["planner"] |= planner
     return parse_scenario(table, "x")
+
+
+def of_two_levels(percent: int) -> tuple[tuple[str, str], ...]:
+    """Return the changes that leave four states, whose plan takes a second."""
+    return 2 * ((FIVE_LEVELS, f"levels_percent = [0, {percent}]\nprior = [1, 0]"),)
 
 
 @cache
@@ -229,13 +235,13 @@ def test_a_policy_file_is_flown_and_kept_with_what_the_twin_knew(tmp_path):
 
 def test_the_command_plans_draws_and_says_what_an_inspection_is_worth(tmp_path):
     policy, picture = tmp_path / "policy.npz", tmp_path / "plan.svg"
-    words = ("plan", "inspected_wing", "--out", policy, "--picture", picture, "--value-of", "inspect")
-    record = json.loads(said(*words, "--json"))
+    words = ("plan", written(tmp_path, TEXT, *of_two_levels(80)), "--value-of")
+    record = json.loads(said(*words, "inspect", "--out", policy, "--picture", picture, "--json"))
     assert record["lower"] < record["upper"]
     assert record["value"]["mean"] > record["value"]["half_width"] > 0.0
     assert policy.stat().st_size > 1000
     assert picture.read_bytes().startswith(b"<?xml")
-    assert "`25` came" in refused("plan", "inspected_wing", "--value-of", "25")
+    assert "`25` came" in refused(*words, "25")
 
 
 def test_inspections_of_a_fleet_go_where_they_are_worth_most():
@@ -275,10 +281,10 @@ def test_a_fleet_shares_its_inspections_in_one_shard(tmp_path):
 
 
 def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path):
-    text = text_of("inspected_wing")
+    text = text_of("inspected_wing", *of_two_levels(40))
     flown = text[text.index("# What flies.") : text.index("# What the twin believes")]
     path = written(tmp_path, text[: text.index("[truth]")], (flown, ""))
-    known = knowledge()
+    known = known_of(scenario(*of_two_levels(40)))
     plant = known.plant(known.truth(2), asset_of(known))
     told: list[dict[str, Any]] = []
     rows: list[np.ndarray] = []
@@ -303,7 +309,7 @@ def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path):
 
     uav_twin.watch(path, messages(), tmp_path / "watch", decide=decide, report=False)
     assert "inspect" in controls
-    twin = following(known, planned()[1].policy).twin()
+    twin = known.twin()
     for row, decision, control in zip(rows, told, controls[:-1], strict=True):
         turn = twin.turn(row, control)
         mean = known.model.states.mean(turn.filtered)

@@ -133,15 +133,14 @@ def test_smoothing_up_to_a_turn_equals_a_mission_that_ended_there(run, tmp_path,
     assert_allclose(run.smoothed_until(now), shorter["smoothed/probability"], atol=1e-12)
 
 
-@pytest.mark.usefixtures("no_drawing")
-def test_origins_and_references_are_told_where_there_are_any(run, tmp_path):
-    text = text_of(run, tmp_path / "same")
+def test_origins_and_references_are_told_where_there_are_any(run):
+    text = report.render_page(run, {}, {})
     assert "model differ" not in text
     assert "source of the reference" in text
     figures = [figure | {"reference": None} for figure in run.summary["figures"]]
     origin = {"asset": "strain library", "twin_model": "reduced model", "asset_and_model_differ": True}
     summary = {**run.summary, "figures": figures, **origin}
-    text = text_of(replace(run, summary=summary), tmp_path / "other")
+    text = report.render_page(replace(run, summary=summary), {}, {})
     assert "differ: flown was the strain library, and the twin believes the reduced model." in text
     assert "reference</th>" not in text
 
@@ -227,7 +226,7 @@ def test_lost_gauges_are_told_and_marked(run, tmp_path):
     observed[12:19, 16:20] = observed[3:5] = np.nan
     lost = altered(run, observed__strain=observed)
     assert lost_ranges(lost) == "gauges 17, 18, 19, 20 at turns 12–18; all gauges at turns 3–4"
-    assert "the belief followed the dynamics alone" in text_of(lost, tmp_path / "run")
+    assert "the belief followed the dynamics alone" in report.render_page(lost, {}, {})
     axes = panel(mission_figure(lost, 49, [16]), "Gauge 17")
     assert_array_equal(line(axes, "lost")[:, 0], [3, 4, *range(12, 19)])
     assert predictive_check(lost).count[16] == 50 - 2 - 7

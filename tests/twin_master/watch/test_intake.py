@@ -97,6 +97,10 @@ def test_late_doubled_garbage_and_out_of_order_messages_end_as_the_clean_ones(
     gap, counted = watched(knowledge, parts)
     assert counted.counts.missing == 1
     assert not same(gap, expected)
+    only = b'{"turn": 50, "control": "3g"}\n'  # not what the twin proposed: something new, without any sensor
+    late, told = watched(knowledge, [*parts, only])
+    assert (told.counts.late, told.counts.duplicates) == (1, 0)
+    assert same(late, watched(knowledge, [*clean[:50], only, *clean[51:]])[0])
     even = np.arange(24) % 2 == 0
     halves = [message(np.where(lost, np.nan, strains[50]), turn=50) for lost in (even, ~even)]
     assert same(watched(knowledge, [*parts, *halves])[0], expected)

@@ -12,17 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from discrepancy.catalogue.library import library
-from discrepancy.models.lumped import LumpedModel
 from discrepancy.report.figures import ReportInput
-from discrepancy.sources.examples import example_campaign, plan_for
-from discrepancy.verdict import VerdictKind
 from discrepancy.verdict_folder import write_verdict_folder
-from discrepancy.workflow import investigate
-from fe.runtime.patch import ModelPatch, PowerStiffness
 from tests.command_line import refused
-from tests.discrepancy.rigs import ORIGIN
-from tests.kept import FMU, ROOT, kept_folder
+from tests.discrepancy.rigs import ORIGIN, drag_found
 from tests.twin_master.runs import check_same, journal, text_of, written
 from tests.twin_master.watch.watches import of_gauge, patch_of, ran, viewed, watchful
 from twin_master.mission.journal import JOURNAL_NAME
@@ -35,7 +28,7 @@ from twin_master.watch.folder import Tutor, Watch
 from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence
 from twin_master.watch.trial import Outcome, patched_model, policy_change
 
-pytestmark = pytest.mark.xdist_group("watches")  # one worker makes the wing and its watches
+pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
 
 # A search that knows its answer: it waits for a gate, and leaves what `discrepancy run` leaves.
 ANSWER = """
@@ -102,24 +95,10 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
 
 
 def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(base, recorded, tmp_path):
-    """Releases on the ground, of the first mode as one mass, show a cubic spring at the tip."""
-
-    def motion_verdict() -> str:
-        rig = LumpedModel.load("single_mass_rig")
-        tip = rig.description.port[0].model_copy(update={"name": "tip"})
-        rig = LumpedModel(rig.description.model_copy(update={"port": (tip,)}))
-        plan = plan_for(rig, ("displacement", "leaf_strain"), "mass")
-        hidden = ModelPatch((PowerStiffness("tip", 2.0, 3.0, 0, 0.02),))
-        campaign = example_campaign(rig, "ringdown", 3, replace(plan, duration=0.5 * plan.duration), hidden)
-        few = [item for item in library() if item.identifier in ("cubic_stiffness", "coulomb_friction")]
-        found = investigate(campaign, rig, few)
-        assert found.verdict.kind is VerdictKind.NAMED
-        write_verdict_folder(folder, ReportInput(found, ORIGIN))
-        return found.verdict.sentence
-
-    folder = tmp_path / "motion_verdict"
-    places = (*FMU, ROOT / "calibration", ROOT / "discrepancy", Path(__file__))
-    sentence = kept_folder(folder, motion_verdict, places)
+    found, folder = drag_found(), tmp_path / "verdict"
+    alone = replace(found, before=None, proof=None)  # of its figures the missing force
+    write_verdict_folder(folder, ReportInput(alone, ORIGIN))
+    of_gauge(folder / "patch.json", -0.3)  # an effect that a table of a wing's strains takes at once
     watch = watchful(base, tmp_path / "watch")
     ran(watch, CsvFeed(recorded, watch.scenario), 20)
     assert viewed(watch).pictures == []  # turns are no motion
@@ -133,7 +112,7 @@ def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(base, recorded,
     asked = Request(number=1, flight=-1, first=0, end=0, turn=18, shown=-1, count=-1)
     assert json.loads(str(teller.answer(asked)))["picture"] is None  # as was known at the time
     shown = json.loads(str(teller.answer(asked.model_copy(update={"turn": 19}))))["picture"]
-    assert shown["said"] == sentence
+    assert shown["said"] == found.verdict.sentence
     (picture.drawing.parent.parent / "verdict.json").write_text("{}")
     assert viewed(watch).pictures == []
 

@@ -155,7 +155,7 @@ def test_a_watch_that_was_stopped_goes_on_as_if_it_had_never_ended(
         path = tmp_path / "m.csv"
         path.write_text("\n".join([*rows[:11], "what", *rows[21:], ""]))
     elif case == "learning":
-        monkeypatch.setattr("twin_master.watch.keeping.SNAPSHOT_TURNS", 8)
+        monkeypatch.setattr("twin_master.watch.intake.SNAPSHOT_TURNS", 8)
         tables = {"learning": given.learning}
     else:
         controls = np.where(np.arange(50) < 10, mission.control_index, 1 - mission.control_index)
@@ -233,7 +233,7 @@ def counting(seen: list[int], inner: Callable[..., object]) -> Callable[..., obj
 
 
 def test_a_long_watch_goes_on_from_its_snapshot(base, mission, plain, tmp_path, monkeypatch):
-    monkeypatch.setattr("twin_master.watch.keeping.SNAPSHOT_TURNS", 16)
+    monkeypatch.setattr("twin_master.watch.intake.SNAPSHOT_TURNS", 16)
     watch, seen = begun(base, tmp_path / "watch"), list[int]()
     monkeypatch.setattr(ExactFilter, "turn", counting(seen, ExactFilter.turn))
     counts = ran(watch, CsvFeed(plain, watch.scenario), 18, 40, None)
@@ -247,7 +247,7 @@ def test_a_long_watch_goes_on_from_its_snapshot(base, mission, plain, tmp_path, 
 
 def test_a_watch_is_taken_up_from_the_end_of_its_journal(base, mission, tmp_path, monkeypatch):
     """It costs the same however long it is; what is not read is not missed, and what is read is checked."""
-    monkeypatch.setattr("twin_master.watch.keeping.SNAPSHOT_TURNS", 8)
+    monkeypatch.setattr("twin_master.watch.intake.SNAPSHOT_TURNS", 8)
     monkeypatch.setattr("twin_master.watch.teaching.CHECKED", 1)
     observed, controls = np.tile(mission.observed, (4, 1)), np.tile(mission.control_index, 4)
     feed = CsvFeed(write_csv(tmp_path / "m.csv", observed, controls), base.scenario)
