@@ -16,7 +16,7 @@ from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.fits.candidate import Candidate, Point, Term
 from discrepancy.fits.fitting import CandidateFit, attempt, fit, objective
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
-from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
+from discrepancy.fits.other_optima import around, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
 from discrepancy.missing_force.hypotheses import sees_forces
@@ -35,13 +35,10 @@ class Search(Hypotheses):
 
     Attributes
     ----------
-    longest : int
-        Number of effects of the longest set that was the best one.
     forces : list of Explained
         Sets of effects along the missing force, if they were compared so, the most probable first.
     """
 
-    longest: int = field(init=False, default=0)
     forces: list[Explained] = field(init=False, default_factory=list)
 
     @cached_property
@@ -172,9 +169,9 @@ class Search(Hypotheses):
     def run(self) -> None:
         """Search: simple causes before others.
 
-        One effect, one law of free shape, more effects, any two; then fewer again. The best candidate is
-        computed finely before what rests on its evidence: finely divided, a joint may have the shape of the
-        name in place of one that is free.
+        One effect, one law of free shape, more effects, any two. The best candidate is computed finely before
+        what rests on its evidence: finely divided, a joint may have the shape of the name in place of one that
+        is free.
         """
         self.singles()
         self.settle()
@@ -184,13 +181,7 @@ class Search(Hypotheses):
             self.longer()
         if self._open and len(self.effects) > 1 and self.unexplained():
             self.fit_pairs()
-        if self._open:
-            self.shorter()
         self.settle()
-        if self._open and 0 < len(self.best().candidate.terms) < self.longest:
-            self._extended(self.best())  # what stood in for a smaller set hid what is beside it
-        self.settle()
-        self.keep(elsewhere(self.problem, self.best()), exact=True)  # from other places of the structure
 
     @property
     def _open(self) -> bool:
@@ -242,8 +233,7 @@ class Search(Hypotheses):
         """Add one effect at a time to the best set while that makes a better one."""
         current: CandidateFit | None = self.best()
         while current is not None and current.candidate.terms:
-            self.longest = len(current.candidate.terms)
-            if self.longest > 1 and self._far(current):
+            if len(current.candidate.terms) > 1 and self._far(current):
                 break  # a third effect is looked for only where two nearly do
             current = self._extended(current)
 
@@ -331,15 +321,6 @@ class Search(Hypotheses):
             self.keep(item, exact=False)
         rough.sort(key=lambda item: -self.score(item))
         self.refine(rough, self.score(self.best()) - SEARCH.close)
-
-    def shorter(self) -> None:
-        """Fit the best set less one effect, for each."""
-        best = self.best()
-        for less, effect in best.candidate.each_without(best.effect):
-            # from here even a set that was fitted before may find a better optimum
-            found = attempt(self.problem, less, Point(best.point.shared, best.point.local, effect))
-            if found is not None:
-                self.keep(found, exact=True)
 
 
 def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -> Search:
