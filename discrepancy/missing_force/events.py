@@ -16,8 +16,8 @@ from scipy.optimize import minimize
 from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.campaign.sampling import IntArray
 
-from .event_steps import Steps, joined, without
-from .filtered import Filtered, Process
+from .event_steps import Steps, joined
+from .filtered import Filtered, Process, without
 from .kalman_kernels import discretised
 from .view import SIZE_DOUBT, TIME_DOUBT, View
 
@@ -363,6 +363,13 @@ def events(view: View, port: int, process: Process, least: float = -np.inf) -> E
         best, steady = _in_full(best, view, turning, every), _in_full(steady, view, never, every)
     changed = any(len(changes(on)) for on in best.paths)
     return best if changed and best.score > max(least, steady.score) else steady
+
+
+def throughout(view: View, port: int, process: Process) -> Events:
+    """Return a force that acts in all records from the first sample to the last, nothing being weighed."""
+    search = EventSearch(view, port, process, turns(view, port)[0])
+    always = [np.ones(len(trial.time), dtype=bool) for trial in view.trials]
+    return Events(search, Acting(process, process), always, -np.inf)
 
 
 def _in_full(found: Events, view: View, turning: int, every: int) -> Events:

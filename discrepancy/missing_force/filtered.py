@@ -240,28 +240,16 @@ class Regression:
         return Solution(value, mean, np.outer(size, size) * cho_solve(factor, np.eye(len(prior))))
 
 
-def local_solution(
-    whitened: FloatArray, local: FloatArray, precision: FloatArray
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return how whitened columns (M, K) depend on unknowns of a trial (M, L), and what they take away.
-
-    Returns
-    -------
-    coefficients : (L, K) ndarray
-        Least squares with the prior.
-    products : (K, K) ndarray
-        Of the columns, these unknowns being gone.
-    half : float
-        Half the log determinant that they add [nat].
-    """
-    if not local.shape[1]:
-        return np.zeros((0, whitened.shape[1])), whitened.T @ whitened, 0.0
+def without(products: FloatArray, halves: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return products (..., W, W) and half log determinants (...) without the last, unknown, columns."""
+    if not len(precision):
+        return products, halves
     prior = np.maximum(precision, LEAST_PRECISION)
-    cross = local.T @ whitened
-    factor = cho_factor(local.T @ local + np.diag(prior))
-    coefficients = cho_solve(factor, cross)
-    half = float(np.sum(np.log(np.diag(factor[0])))) - 0.5 * float(np.sum(np.log(prior)))
-    return coefficients, whitened.T @ whitened - cross.T @ coefficients, half
+    count = products.shape[-1] - len(prior)
+    root = np.linalg.cholesky(products[..., count:, count:] + np.diag(prior))
+    along = np.asarray(np.linalg.solve(root, products[..., count:, :count]))
+    halves = halves + np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.log(prior).sum()
+    return products[..., :count, :count] - np.swapaxes(along, -1, -2) @ along, halves
 
 
 def regression(
@@ -273,8 +261,7 @@ def regression(
     for one, residual, given in zip(filtered, residuals, columns, strict=True):
         trial = one.trial
         whole = one.whitened(np.concatenate((residual[None], given, trial.local)))
-        split = 1 + len(given)
-        _, products, half = local_solution(whole[:, :split], whole[:, split:], trial.local_precision)
+        products, half = without(whole.T @ whole, np.zeros(()), trial.local_precision)
         total = total + products
-        log_determinant += one.log_determinant + half
+        log_determinant += one.log_determinant + float(half)
     return Regression(np.asarray(total), log_determinant)

@@ -169,9 +169,9 @@ class Search(Hypotheses):
     def run(self) -> None:
         """Search: simple causes before others.
 
-        One effect, one law of free shape, more effects, any two. The best candidate is computed finely before
-        what rests on its evidence: finely divided, a joint may have the shape of the name in place of one that
-        is free.
+        One effect, one law of free shape, more effects, any two. The best candidate is computed finely
+        before what rests on its evidence: finely divided, a joint may have the shape of the name in place of
+        one that is free.
         """
         self.singles()
         self.settle()
