@@ -5,7 +5,7 @@ states (Hartikainen and Sarkka 2010, IEEE Workshop on Machine Learning for Signa
 Unknowns that act in proportion follow from what whitened readings and columns share.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -62,12 +62,12 @@ class Filtered:
     ----------
     trial : SeenTrial
         Which.
-    processes : mapping of int to Process
-        The force at each port, by its number.
+    processes : sequence of (int, Process)
+        Forces, each with the number of its port; there may be several at one.
     """
 
     trial: SeenTrial
-    processes: Mapping[int, Process]
+    processes: Sequence[tuple[int, Process]]
 
     @cached_property
     def _scale(self) -> FloatArray:
@@ -75,7 +75,7 @@ class Filtered:
         system = self.trial.system
         n = len(system.generator)
         pace = max(float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9)
-        pushes = [np.abs(system.actions[p]).max(initial=0.0) * one.size for p, one in self.processes.items()]
+        pushes = [np.abs(system.actions[p]).max(initial=0.0) * one.size for p, one in self.processes]
         push = max(*pushes, 1e-300)
         units = np.full(n, push / pace)
         half = n // 2 if 2 * (n // 2) == n else 0
@@ -85,7 +85,7 @@ class Filtered:
     @cached_property
     def _places(self) -> list[int]:
         """Where each force stands in the whole state."""
-        counts = [len(one.generator) for one in self.processes.values()]
+        counts = [len(one.generator) for _, one in self.processes]
         begin = len(self.trial.system.generator)
         return [begin + sum(counts[:number]) for number in range(len(counts))]
 
@@ -102,13 +102,13 @@ class Filtered:
         """Generator, noise intensity, rows of the readings, covariance at the first sample."""
         trial = self.trial
         n, units, noises = len(trial.system.generator), self._scale, len(trial.coloured)
-        begin = n + sum(len(one.generator) for one in self.processes.values())
+        begin = n + sum(len(one.generator) for _, one in self.processes)
         whole = begin + noises
         generator, intensity, start = np.zeros((3, whole, whole))
         generator[:n, :n] = trial.system.generator * units / units[:, None]
         rows = np.zeros((len(trial.deviation), whole))
         rows[:, :n] = trial.system.outputs * units / trial.deviation[:, None]
-        for (port, one), at in zip(self.processes.items(), self._places, strict=True):
+        for (port, one), at in zip(self.processes, self._places, strict=True):
             force = slice(at, at + len(one.generator))
             generator[:n, at] = -trial.system.actions[port] * one.size / units
             generator[force, force] = one.generator
@@ -170,14 +170,15 @@ class Filtered:
         parts = self.trial.parts
         fine = self._steps(lengths / parts)
         found = kernels.between(parts, *fine, which, slot, filtered, means, later)
-        sizes = np.array([one.size for one in self.processes.values()])
+        sizes = np.array([one.size for _, one in self.processes])
         forces = found[:, self._places].T * sizes[:, None]
         return np.asarray(found[:, : len(self._scale)] * self._scale), np.asarray(forces)
 
     def deviation(self, port: int) -> FloatArray:
         """Return the deviation (N,) of the missing force of a port at the samples, columns being known."""
         shown = np.zeros(len(self.system[0]))
-        shown[self._places[list(self.processes).index(port)]] = self.processes[port].size
+        at = [number for number, _ in self.processes].index(port)
+        shown[self._places[at]] = self.processes[at][1].size
         return self._deviations(shown, slice(None))
 
     def speed_deviation(self, port: int) -> float:

@@ -142,7 +142,8 @@ class ForceShares:
         of_force, of_readings = [], []
         filters = view.filtered({**found.processes, **self.search.whole.processes})
         for trial, motion, bare, one in zip(view.trials, motions, without, filters, strict=True):
-            shown = dict(zip(one.processes, one.smoothed(_noise(trial))[1], strict=True))
+            forces = one.smoothed(_noise(trial))[1]
+            shown = {port: force for (port, _), force in zip(one.processes, forces, strict=True)}
             kinds = (bare.forces, motion.left, shown)
             count = len(trial.time)
             edges = np.linspace(0, count, min(WINDOWS, max(1, count // SHORTEST)) + 1).astype(int)

@@ -204,7 +204,7 @@ class View:
 
     def filtered(self, processes: Processes) -> list[Filtered]:
         """Return the filters of missing forces."""
-        return [Filtered(trial, processes) for trial in self.trials]
+        return [Filtered(trial, tuple(processes.items())) for trial in self.trials]
 
     def products(self, processes: Processes) -> Regression:
         """Return the products of all columns beside missing forces."""

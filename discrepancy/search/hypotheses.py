@@ -4,6 +4,7 @@ Fits begin at the most promising changes of each effect and of pairs of effects,
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from math import exp, inf
 from typing import TypeVar
@@ -138,17 +139,11 @@ def starts(screen: Screen, effect: Effect, count: int = SEARCH.starts) -> list[C
         for change in screen.changes(Term(effect, place), fine=few):
             tried = [change]
             if few and change.size > SEARCH.first_order and acts_within(effect, screen.problem.setting):
-                tried.append(_in_small(screen, change))
+                with suppress(DiscrepancyError):
+                    tried.append(screen.shrunk(change)[0])
             best = sorted([*best, *(item for item in tried if item.size > 0.0)], key=_worth)[:count]
         found.extend(best)
     return sorted(found, key=_worth)[:count]
-
-
-def _in_small(screen: Screen, change: Change) -> Change:
-    try:
-        return screen.shrunk(change)[0]
-    except DiscrepancyError:
-        return change
 
 
 def acts_within(effect: Effect, setting: Setting) -> bool:
