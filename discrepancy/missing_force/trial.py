@@ -264,15 +264,13 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
         conditions = unknowns.conditions(trial, shared.parameters(of_all), local)
         return np.stack(model.port_motion(trial, conditions, count))
 
-    here, local = moving(point.shared, point.local[number]), point.local[number]
+    local = point.local[number]
+    here = moving(point.shared, local)
+    ways = [(k, point.shared[k], moved(point.shared, k), local) for k in range(len(shared.parameter_mean))]
+    own = range(unknowns.zeros, unknowns.size)
+    ways += [(shared.size + k, local[k], point.shared, moved(local, k)) for k in own]
     by_unknowns = [
-        PortMotion(k, float(point.shared[k]), (moving(moved(point.shared, k), local) - here) / PARAMETER_STEP)
-        for k in range(len(shared.parameter_mean))
-    ] + [
-        PortMotion(
-            shared.size + k, float(local[k]), (moving(point.shared, moved(local, k)) - here) / PARAMETER_STEP
-        )
-        for k in range(unknowns.zeros, unknowns.size)
+        PortMotion(k, float(about), (moving(*there) - here) / PARAMETER_STEP) for k, about, *there in ways
     ]
     residual, by_shared, by_local = (item / deviation * used for item in (residual, by_shared, by_local))
     return SeenTrial(
