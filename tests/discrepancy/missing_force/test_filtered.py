@@ -306,6 +306,21 @@ def test_a_window_of_a_campaign_is_told_and_drawn():
     assert time_line_figure(()) is None
 
 
+def test_a_record_in_which_no_event_can_be_weighed_is_off_throughout(monkeypatch):
+    """It is told, not left out: the filter breaks down where a hypothesis leaves millions of noises."""
+
+    def broken(*_):
+        raise np.linalg.LinAlgError("Matrix is not positive definite")
+
+    event = np.zeros((300, 4))
+    event[120:200, 1] = 16.0
+    monkeypatch.setattr("discrepancy.missing_force.windows.events", broken)
+    (window,) = residual_windows(Bench(count=300).fit(np.random.default_rng(4), extra={1: event}))
+    assert (window.trial, window.channels, window.begin, window.end) == ("release 2", ("g2",), None, None)
+    assert window.size > 1.0
+    assert when_sentence((window,)) == "The gap is there throughout the records."
+
+
 def test_words_of_windows():
     whole = GapWindow("a", ("x",), None, None, 0.0, 9.0, 4.0)
     part = GapWindow("b", ("x",), Moment(1.0, 0.98, 1.04), None, 0.0, 9.0, 3.0)
