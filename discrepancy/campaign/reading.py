@@ -379,13 +379,8 @@ def _recorded_noise(
         there = np.isfinite(values)
         count = int(there.sum())
         if not there[:count].all():
-            raise CampaignDataError(
-                f"{table.name}: the column {item.table_column!r} has an empty cell between readings; a noise "
-                "record must be without gaps."
-            )
+            raise CampaignDataError(said("campaign.noise_gap", table=table, item=item))
         records[item.name] = pre_trigger_record(values[:count], interval, item.name, table.name)
     if not records:
-        raise CampaignFileError(
-            f"{table.name} holds the noise of no channel: its columns are {', '.join(table.columns)}."
-        )
+        raise CampaignFileError(said("campaign.noise_of_none", table=table))
     return records

@@ -269,7 +269,5 @@ def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:
     """
     came = table.get("format", FORMAT)
     if came != FORMAT or isinstance(came, bool):
-        raise CampaignFileError(
-            f"{source}: `format` is {came!r}; this version reads campaigns with `format = {FORMAT}`."
-        )
+        raise CampaignFileError(said("campaign.format", source=source, came=came, wanted=FORMAT))
     return checked(CampaignSection, dict(table), source, CampaignFileError, what="a campaign")

@@ -18,6 +18,7 @@ from discrepancy.campaign.records import USUAL_REGIONS, Channel, NoiseRecord, Qu
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import DiscrepancyError, VerdictFileError
 from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.sentences import said
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
 from reporting.netcdf import read_groups
@@ -98,9 +99,7 @@ def read_residuals(path: Path) -> ResidualSet:
             return _residuals(tree)
     except _DAMAGED as error:
         reason = f"{type(error).__name__}: {one_line(error)}"
-        raise VerdictFileError(
-            f"{path} is damaged or no file of residuals ({reason}); write it again."
-        ) from error
+        raise VerdictFileError(said("models.residuals_file", path=path, reason=reason)) from error
     raise VerdictFileError(f"{path} has the schema {schema!r}, but {SCHEMA!r} is needed.")
 
 

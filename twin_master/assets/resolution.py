@@ -267,14 +267,9 @@ def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) ->
         if {*learnt.transition.probability} != names or table["transition"][
             "kind"
         ] != "independent_worsening":
+            own, kind = learnt.transition.probability, table["transition"]["kind"]
             raise MissionInputError(
-                said(
-                    "assets.learnt_controls",
-                    path=path,
-                    learnt=", ".join(learnt.transition.probability),
-                    names=", ".join(sorted(names)),
-                    kind=table["transition"]["kind"],
-                )
+                said("assets.learnt_controls", path=path, own=own, names=sorted(names), kind=kind)
             )
         table["transition"]["probability"] = dict(learnt.transition.probability)
     if learnt.observation is not None:
@@ -282,14 +277,8 @@ def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) ->
     if learnt.calibration is not None:
         given: Mapping[str, Any] = table["calibration"]
         if learnt.calibration.parameter != given["parameter"]:
-            raise MissionInputError(
-                said(
-                    "assets.learnt_parameter",
-                    path=path,
-                    learnt=learnt.calibration.parameter,
-                    parameter=given["parameter"],
-                )
-            )
+            of = learnt.calibration.parameter, given["parameter"]
+            raise MissionInputError(said("assets.learnt_parameter", path=path, of=of))
         kept = {key: given[key] for key in ("parameter", "draws")}
         table["calibration"] = {
             **kept,

@@ -26,7 +26,6 @@ from twin_master.learning.switching import GAUGES, MENDED, NONE
 from twin_master.learning.words import Words
 from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion
 from twin_master.network.inference import smooth
-from twin_master.network.kernels import move_rows
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.tables import MOST_DRAWS, Noticing
 from twin_master.sentences import said
@@ -93,15 +92,8 @@ class WatchfulEstimator:
         sensors, states = sensor_model.sensor_count, inner.model.states.size
         self._shape = (sensors, len(_GAINS), len(places), states)
         if np.prod(self._shape, dtype=float) > _LARGEST:
-            raise InvalidModelError(
-                said(
-                    "learning.faults",
-                    states=states,
-                    draws=len(places),
-                    faults=sensors * len(_GAINS),
-                    most=_LARGEST,
-                )
-            )
+            parts = states, len(places), sensors * len(_GAINS), _LARGEST
+            raise InvalidModelError(said("learning.faults", parts=parts))
         # A model that takes the place of another, as one that was taught, begins without suspicion.
         digest = sha256(b"2" + np.ascontiguousarray(table).tobytes()).digest()
         self._key = np.frombuffer(digest[:8], dtype=np.uint64)
@@ -215,7 +207,8 @@ class WatchfulEstimator:
         own = self._unpacked(before.arrays)
         for name in ("model", "gauge", "none", "mended"):
             rows = own[name].reshape(-1, self._shape[-1])
-            move_rows(self.model.transition.forward_lists, before.control_index, rows)
+            held = rows.any(axis=1)
+            rows[held] = self.model.transition.forward(before.control_index, rows[held])
         turn = float(own["turns"][0])
         inflow = np.log(self._to_begin(turn - 1.0) - self._to_begin(turn))
         gauges = own["gauge"].reshape(-1, *self._shape[2:])

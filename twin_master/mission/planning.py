@@ -160,15 +160,9 @@ def read_policy(path: Path, model: GraphicalModel) -> BeliefPolicy:
     except (OSError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
         raise PlanningError(said("mission.no_policy", path=path, error=error)) from None
     if controls != model.controls or policy.vectors.shape[1] != model.states.size:
+        states = policy.vectors.shape[1]
         raise PlanningError(
-            said(
-                "mission.another_policy",
-                path=path,
-                states=policy.vectors.shape[1],
-                controls=", ".join(controls),
-                size=model.states.size,
-                known=", ".join(model.controls),
-            )
+            said("mission.another_policy", path=path, states=states, controls=controls, model=model)
         )
     return policy
 

@@ -94,9 +94,7 @@ class StateFactor(Section):
         if any(b <= a for a, b in zip(self.levels, self.levels[1:], strict=False)):
             raise ValueError(f"`levels` of state `{self.name}` must increase, and {short(self.levels)} came")
         if len(self.prior) != len(self.levels):
-            raise ValueError(
-                said("scenario.prior", name=self.name, levels=len(self.levels), prior=len(self.prior))
-            )
+            raise ValueError(said("scenario.prior", self=self, counts=(len(self.levels), len(self.prior))))
         if abs(sum(self.prior) - 1.0) > ROW_SUM_TOLERANCE:
             raise ValueError(said("scenario.prior_sum", name=self.name, total=sum(self.prior)))
         return self
@@ -307,15 +305,9 @@ class Scenario(Section):
         roles = set(self.control[0].values)
         for control in self.control:
             if set(control.values) != roles:
-                raise ValueError(
-                    said(
-                        "scenario.inputs",
-                        first=controls[0],
-                        roles=short(sorted(roles)),
-                        name=control.name,
-                        values=short(sorted(control.values)),
-                    )
-                )
+                names = controls[0], control.name
+                given = short(sorted(roles)), short(sorted(control.values))
+                raise ValueError(said("scenario.inputs", names=names, given=given))
         check_known(self.mission.first_control, controls, "mission.first_control", "control")
         check_same(self.rewards.control, controls, "rewards.control", "control")
         check_known(self.planner.safest or controls[0], controls, "planner.safest", "control")
@@ -348,9 +340,8 @@ class Scenario(Section):
         self._check_modes()
         for fault in self.truth.sensor_faults:
             if fault.sensors != "all" and max(fault.sensors) > self.observation.count:
-                raise ValueError(
-                    said("scenario.faults", count=self.observation.count, came=max(fault.sensors))
-                )
+                counts = self.observation.count, max(fault.sensors)
+                raise ValueError(said("scenario.faults", counts=counts))
         return self
 
     def _check_actions(self) -> None:
@@ -384,14 +375,8 @@ class Scenario(Section):
             record.input, tuple(sorted(self.control[0].values)), "truth.record.input", "control input"
         )
         if modes.bands[-1][1] > 0.5 * record.sampling_rate:
-            raise ValueError(
-                said(
-                    "scenario.sampling_rate",
-                    rate=record.sampling_rate,
-                    highest=0.5 * record.sampling_rate,
-                    band=modes.bands[-1][1],
-                )
-            )
+            rates = record.sampling_rate, 0.5 * record.sampling_rate, modes.bands[-1][1]
+            raise ValueError(said("scenario.sampling_rate", rates=rates))
 
     def _check_sensors(self) -> None:
         count, chosen = self.observation.count, self.rewards.health_sensors
@@ -417,6 +402,5 @@ class Scenario(Section):
         each = deviation if isinstance(deviation, tuple) else (deviation,) * len(units)
         for unit, given in zip(units, each, strict=True):
             if unit == "1" and given > LARGEST_STRAIN_NOISE:
-                raise ValueError(
-                    said("scenario.strain_noise", key=key, given=given, most=LARGEST_STRAIN_NOISE)
-                )
+                most = LARGEST_STRAIN_NOISE
+                raise ValueError(said("scenario.strain_noise", key=key, given=given, most=most))
