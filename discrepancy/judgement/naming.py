@@ -14,7 +14,7 @@ from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, shape_gate
 from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.predictive import residual_set, with_draws
 from discrepancy.fits.problem import Problem
-from discrepancy.search.hypotheses import Tell, acts_within, in_silence
+from discrepancy.search.starts import Tell, acts_within, in_silence
 from discrepancy.search.strategy import Search, search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said

@@ -1,31 +1,29 @@
-"""The hypotheses of a search: sets of effects with their fits, prior shares and probabilities.
-
-Fits begin at the most promising changes of each effect and of pairs of effects, from a screen.
-"""
+"""Where fits begin: the most promising changes of each effect and of pairs, from a screen or a grid."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from math import exp, inf
+from dataclasses import replace
+from itertools import product
+from math import inf
 from typing import TypeVar
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import ndtri
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate, Key, Term
-from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.candidate import Candidate, Point, Term
+from discrepancy.fits.fitting import CandidateFit, objective
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
-from discrepancy.missing_force.hypotheses import log_prior
-from discrepancy.missing_force.naming import Explained
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import SENSORS, MicroSlip
 
 T = TypeVar("T")
 Tell = Callable[[str], None]
+Start = tuple[Candidate, Point]
+Starts = list[Start]
 
 
 def in_silence(what: str) -> None:
@@ -37,94 +35,6 @@ def each(tell: Tell, items: Sequence[T], words: Callable[[T], str]) -> Iterator[
     for number, item in enumerate(items):
         tell(f"{words(item)}, {len(items) - number - 1} more")
         yield item
-
-
-@dataclass
-class Hypotheses:
-    """All candidates fitted so far.
-
-    Attributes
-    ----------
-    problem : Problem
-        Campaign and model.
-    effects : tuple of Effect
-        Those that can act here.
-    none : CandidateFit
-        Without effect.
-    exact : dict of Key to CandidateFit
-        Fitted to convergence.
-    rough : dict of Key to CandidateFit
-        Fitted by few steps only; their evidence is approximate.
-    judged : dict of Key to CandidateFit
-        Fitted with their remainders; where there are any, they alone are compared.
-    promised : dict of str to float
-        The most that a screen at the fit without effect promised of each effect [nat].
-    tell : callable
-        Takes a few words on what is fitted, and how much is left.
-    wide : Problem or None
-        That under what the best hypothesis leaves, by which the judged ones were fitted.
-    """
-
-    problem: Problem
-    effects: tuple[Effect, ...]
-    none: CandidateFit
-    exact: dict[Key, CandidateFit] = field(default_factory=dict)
-    rough: dict[Key, CandidateFit] = field(default_factory=dict)
-    judged: dict[Key, CandidateFit] = field(default_factory=dict)
-    promised: dict[str, float] = field(default_factory=dict)
-    tell: Tell = in_silence
-    wide: Problem | None = None
-
-    def __post_init__(self) -> None:
-        self.exact[()] = self.none
-
-    def log_prior(self, candidate: Candidate) -> float:
-        """Return ln of the prior probability of a candidate at its places."""
-        return log_prior(candidate, len(self.effects), self.problem.setting)
-
-    def score(self, found: CandidateFit | Explained) -> float:
-        """Return ln (evidence times prior), up to a constant."""
-        return found.log_evidence + self.log_prior(found.candidate)
-
-    def all(self) -> dict[Key, CandidateFit]:
-        """Return every candidate that is compared, the exact fit where there is one."""
-        return self.judged or {**self.rough, **self.exact}
-
-    def best(self) -> CandidateFit:
-        """Return the most probable candidate."""
-        return max((self.judged or self.exact).values(), key=self.score)
-
-    def best_of(self, identifiers: tuple[str, ...]) -> CandidateFit:
-        """Return the most probable fit of a set of effects."""
-        options = [item for item in self.all().values() if item.candidate.identifiers == identifiers]
-        return max(options, key=self.score)
-
-    def fitted(self) -> frozenset[str]:
-        """Return the identifiers of all effects that were fitted, alone or with others."""
-        kept = (*self.rough.values(), *self.exact.values(), *self.judged.values())
-        return frozenset(term.effect.identifier for item in kept for term in item.candidate.terms)
-
-    @property
-    def nothing(self) -> CandidateFit:
-        """The fit without effect as it is compared, with its remainder where others have theirs."""
-        return self.judged.get((), self.none)
-
-    def set_probabilities(self) -> dict[tuple[str, ...], float]:
-        """Return the probability of each set of identifiers, places summed, most probable first."""
-        scores: dict[tuple[str, ...], list[float]] = {}
-        for found in self.all().values():
-            scores.setdefault(found.candidate.identifiers, []).append(self.score(found))
-        sums = {identifiers: float(logsumexp(values)) for identifiers, values in scores.items()}
-        total = float(logsumexp(list(sums.values())))
-        ordered = sorted(sums.items(), key=lambda item: -item[1])
-        return {identifiers: min(exp(value - total), 1.0) for identifiers, value in ordered}
-
-    def keep(self, found: CandidateFit, *, exact: bool) -> None:
-        """Keep a fit if it is better than what is known of the same candidate."""
-        kept = self.exact if exact else self.rough
-        key = found.candidate.key
-        if key not in kept or kept[key].log_evidence < found.log_evidence:
-            kept[key] = found
 
 
 def starts(screen: Screen, effect: Effect, count: int = SEARCH.starts) -> list[Change]:
@@ -205,3 +115,25 @@ def slips(problem: Problem, found: CandidateFit) -> bool:
     """Whether a fit has a joint that slips."""
     patch = found.candidate.patch(problem.setting, found.point.effect) if found.candidate.terms else ()
     return any(isinstance(item, MicroSlip) for item in patch)
+
+
+def beside(base: CandidateFit, term: Term, values: FloatArray) -> Start:
+    """Return a base with one more effect, and where a fit of it begins."""
+    effect = np.concatenate((base.effect, values))
+    return base.candidate.plus(term), replace(base.point, effect=effect)
+
+
+def tried(problem: Problem, base: CandidateFit, effect: Effect) -> Starts:
+    """Return the most promising points of a grid of an effect's parameters, beside a base."""
+    found = []
+    for place in effect.places(problem.setting):
+        term = Term(effect, place)
+        known, size = SEARCH.far_levels, len(term.parameters)
+        count = known[min(size, len(known) - 1)]
+        levels = ndtri((np.arange(count) + 0.5) / max(count, 1))
+        for values in product(levels, repeat=size):
+            candidate, start = beside(base, term, np.array(values))
+            with suppress(DiscrepancyError):  # more than the structure can carry
+                found.append((objective(problem, candidate, start), candidate, start))
+    found.sort(key=lambda row: row[0])
+    return [row[1:] for row in found[: SEARCH.far_starts]]
