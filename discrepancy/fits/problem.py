@@ -19,6 +19,7 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import CampaignDataError, DiscrepancyError
 from discrepancy.models.interface import Model
 from discrepancy.models.sensing import observe
+from discrepancy.sentences import said
 from fe.runtime.patch import ModelPatch
 from reporting.memory import Memory
 
@@ -77,9 +78,7 @@ class Problem:
         self.model = model.remembering()
         chosen = campaign.fitted if trials is None else trials
         if not chosen:
-            raise CampaignDataError(
-                f"The campaign {campaign.name!r} has no trial to fit: all are held out; mark fewer."
-            )
+            raise CampaignDataError(said("campaign.all_held_out", campaign=campaign))
         self.channel_names = tuple(campaign.channels)
         self.refinement: int = 1 if like is None else like.refinement
         self.noise: dict[str, NoiseModel] = {

@@ -14,6 +14,7 @@ import numpy as np
 
 from discrepancy.campaign.records import BoolArray, Channel, FloatArray, Trial
 from discrepancy.errors import FitError
+from discrepancy.sentences import said
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +66,7 @@ class FittedTrial:
         finite = all(np.all(np.isfinite(part[used])) for part in parts if part is not None)
         positive = np.all(self.noise_deviation > 0.0) and np.all(self.predictive_deviation[used] > 0.0)
         if not (finite and positive and np.all(self.expected_variance[used] > -1e-9)):
-            raise FitError(
-                f"The fit of the trial {self.trial.name!r} has values that are not finite, deviations "
-                "that are not positive, or a leverage above one."
-            )
+            raise FitError(said("models.bad_fit", self=self))
 
     @property
     def used(self) -> BoolArray:
