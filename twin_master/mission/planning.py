@@ -160,10 +160,8 @@ def read_policy(path: Path, model: GraphicalModel) -> BeliefPolicy:
     except (OSError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
         raise PlanningError(said("mission.no_policy", path=path, error=error)) from None
     if controls != model.controls or policy.vectors.shape[1] != model.states.size:
-        states = policy.vectors.shape[1]
-        raise PlanningError(
-            said("mission.another_policy", path=path, states=states, controls=controls, model=model)
-        )
+        own = {"states": policy.vectors.shape[1], "controls": controls}
+        raise PlanningError(said("mission.another_policy", path=path, **own, model=model))
     return policy
 
 

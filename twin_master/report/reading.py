@@ -19,6 +19,7 @@ from twin_master.report.view import PrintedFactor, PrintedSensors, printed_facto
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
+from twin_master.sentences import said
 from twin_master.store.mission_result import MOMENTS, LearntQuantity, printed_learnt, titles_of
 from twin_master.store.writing import RUN_NAME, SUMMARY_NAME, open_run
 
@@ -59,10 +60,7 @@ class Run:
         try:
             return np.asarray(self.tree[path].values)
         except KeyError as error:
-            raise RunFolderError(
-                f"{RUN_NAME} does not have the layout of a run of this version (the variable {path} is "
-                "missing): fly the run again."
-            ) from error
+            raise RunFolderError(said("run_folder.layout", name=RUN_NAME, path=path)) from error
 
     def get(self, path: str) -> Float | None:
         """Return a variable; None where the run does not have it."""
