@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,9 +39,6 @@ from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import another_truth
 from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
-
-if TYPE_CHECKING:
-    from xarray import DataTree
 
 POLICY_NAME = "policy.npy"
 """In the run folder: the policy that was given in the place of a plan, (S, U) or on the belief."""
@@ -173,29 +170,28 @@ def _run(
     @contextmanager
     def timed(name: str) -> Iterator[None]:
         begin = time.perf_counter()
-        yield
+        with _noted(folder):
+            yield
         stages[name] = time.perf_counter() - begin
 
     source = asset_source(scenario)
-    with _noted(folder), timed("asset"):
+    with timed("asset"):
         hashes = dict(source.prepare(folder, progress))
         policy = _given_policy(folder, hashes)
     config = with_inputs(folder, config, hashes)
-    with _noted(folder), timed("calibration"), progress.stage("Calibrating and planning"):
+    with timed("calibration"), progress.stage("Calibrating and planning"):
         knowledge = _known(folder, config, scenario, source, policy, progress)
-    with timed("mission"), _noted(folder):
+    with timed("mission"):
         result = _fly(folder, config, knowledge, source, progress)
-    with timed("store"), progress.stage("Storing"), _noted(folder):
-        write_field = _field_writer(source, result)
-        misfit = _misfit(knowledge, source)
+    with timed("store"), progress.stage("Storing"):
         stored = store_flight(
-            folder, config, result, source.origin, steps=scenario.mission.steps, misfit=misfit,
-            write_field=write_field,
+            folder, config, result, source.origin, steps=scenario.mission.steps,
+            misfit=_misfit(knowledge, source), write_field=_field_writer(source, result),
         )  # fmt: skip
     timing = _timing(result.flight)
-    del knowledge, result, write_field  # before the report is drawn
+    del knowledge, result  # before the report is drawn
     if report:
-        with timed("report"), progress.stage("Writing the report"), _noted(folder):
+        with timed("report"), progress.stage("Writing the report"):
             _report(folder, stored())
     timing |= {"stages_seconds": stages, "total_seconds": time.perf_counter() - start}
     atomic_write_text(folder / TIMING_NAME, to_json(timing))  # the only file with figures of a clock
@@ -317,7 +313,7 @@ def _timing(flight: History) -> dict[str, Any]:
     return record
 
 
-def _report(folder: Path, tree: "DataTree") -> None:
+def _report(folder: Path, tree: Any) -> None:
     from twin_master.report.page import write_report
 
     write_report(folder, tree=tree)

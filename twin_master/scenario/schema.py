@@ -5,6 +5,7 @@ what is kept here, and in `config.json` of a run, is in SI. Nothing here knows a
 another scenario file.
 """
 
+import tomllib
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -50,20 +51,10 @@ _DECIMALS = 12
 """Sums of scripted gains are rounded to this many digits, so that ten times 2 % and 40 % are 60 %."""
 REWARD_NAMES = ("health", "control", "error")
 """The rewards (9)-(11)."""
-FALLBACK_FIGURES = (
-    "policy_switch_damage",
-    "damage_step",
-    "fallback_step",
-    "fallback_delay",
-    "early_fallback_step",
+FIGURES: dict[str, dict[str, tuple[str, str]]] = tomllib.loads(
+    Path(__file__).with_name("figures.toml").read_text(encoding="utf-8")
 )
-"""Figures of the summary that say when the control left that of the first turn."""
-MISFIT_FIGURES = ("model_misfit_rms", "model_misfit_largest")
-"""Figures of the summary that say by how much asset and twin's model differ."""
-
-
-NOTICE_FIGURES = ("alarm_step", "none_of_these", "gauge_off", "decided_by")
-"""Figures of the summary that say what was noticed."""
+"""Title and unit of each figure of the summary, by group and key."""
 
 
 class Mission(Section):
@@ -122,8 +113,6 @@ class Reference(Section):
     source: str
 
 
-OPTIONAL_TABLES = ("learning", "notice")
-"""Tables without which a scenario says what it said before there were any."""
 CALIBRATION_COPY = "asset/calibration.nc"
 """The calibration file inside a run folder."""
 
@@ -233,26 +222,25 @@ class Scenario(Section):
     @property
     def figure_names(self) -> tuple[str, ...]:
         """Names of all figures that the summary of this scenario can give, and a reference can name."""
-        names = [*FALLBACK_FIGURES]
-        names += [f"filtered_rms_error_{name}" for name in self.state_names]
-        names += [f"mean_reward_{name}" for name in REWARD_NAMES]
-        names += [f"{self.calibration.parameter}_{moment}" for moment in ("mean", "standard_deviation")]
-        if self.learning is not None and self.learning.parameter:
-            moments = ["prior_mean", "prior_standard_deviation"]
-            moments += ["true"] * (self.calibration.parameter in self.asset.true_parameters)
-            names += [f"{self.calibration.parameter}_{moment}" for moment in moments]
-        names += ["log_evidence"]
-        if self.learning is not None:
-            names += self.learning.figure_names
-        if self.truth.received or any(fault.kind == "dropout" for fault in self.truth.sensor_faults):
-            names += ["lost_observations", "blind_steps"]
-        if self.another_model:
-            names += [*MISFIT_FIGURES]
-        if set(self.observation.sensor_units) == {"1"}:
-            names += ["strain_error_bound"]
-        if self.notice is not None:
-            names += [*NOTICE_FIGURES]
-        return tuple(names)
+        parameter, learning = self.calibration.parameter, self.learning
+        learns, told = learning is not None and learning.parameter, parameter in self.asset.true_parameters
+        lost = self.truth.received or any(fault.kind == "dropout" for fault in self.truth.sensor_faults)
+        given: list[tuple[str, object, list[dict[str, str]]]] = [
+            ("fallback", True, [{}]),
+            ("error", True, [{"state": name} for name in self.state_names]),
+            ("reward", True, [{"reward": name} for name in REWARD_NAMES]),
+            ("parameter_learnt" if learns else "parameter", True, [{"parameter": parameter}]),
+            ("parameter_true", learns and told, [{"parameter": parameter}]),
+            ("evidence", True, [{}]),
+            *(learning.figures if learning is not None else ()),
+            ("lost", lost, [{}]),
+            ("blind", lost, [{}]),
+            ("misfit", self.another_model, [{}]),
+            ("bound", {*self.observation.sensor_units} == {"1"}, [{}]),
+            ("notice", self.notice, [{}]),
+        ]
+        groups = ((FIGURES[group], words) for group, there, each in given if there for words in each)
+        return tuple(key.format(**words) for group, words in groups for key in group)
 
     def scripted_history(self) -> NDArray[np.float64]:
         """Return the scripted true state (T, F), SI: the gain of a step is in the state of that step."""
@@ -282,15 +270,7 @@ class Scenario(Section):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the scenario as plain data in SI; `Scenario.model_validate` reads it back."""
-        absent: dict[str, Any] = {name: True for name in OPTIONAL_TABLES if getattr(self, name) is None}
-        absent["truth"] = {name for name in ("probability", "record") if not getattr(self.truth, name)}
-        if self.observation.modes is None:
-            absent["observation"] = {"modes"}
-        if not self.action:
-            absent |= {"action": True}
-        if self.planner.policy == "mode":
-            absent |= {"planner": {"policy", "limit_probability", "inspections_a_turn"}}
-        return self.model_dump(mode="json", exclude=absent)
+        return self.model_dump(mode="json")
 
     def faults(self) -> Iterator[Fault]:
         """Yield what the tables have wrong beside each other."""

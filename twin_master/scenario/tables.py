@@ -270,18 +270,14 @@ class Learning(Section):
         yield len(factors) == 1, f"{key} needs two or more factors to choose from"
 
     @property
-    def figure_names(self) -> tuple[str, ...]:
-        """Names of the figures of the summary on what is learnt beside the parameter."""
-        names = [f"transition_factor_{moment}" for moment in ("mean", "standard_deviation")]
-        names = names if self.transition_factors else []
-        for name, learnt in (
-            ("noise_scale", self.noise),
-            ("gauge_offset", _any(self.gauge_offset)),
-            ("gauge_gain", _any(self.gauge_gain)),
-        ):
-            if learnt:
-                names += [f"{name}_{figure}" for figure in ("mean", "most", "most_standard_deviation")]
-        return tuple(names)
+    def figures(self) -> list[tuple[str, object, list[dict[str, str]]]]:
+        """Groups of figures on what is learnt beside the parameter, whether it is, and their words."""
+        return [
+            ("learnt", self.transition_factors, [{"quantity": "transition_factor"}]),
+            ("learnt_of_sensors", self.noise, [{"quantity": "noise_scale"}]),
+            ("learnt_of_sensors", _any(self.gauge_offset), [{"quantity": "gauge_offset"}]),
+            ("learnt_of_sensors", _any(self.gauge_gain), [{"quantity": "gauge_gain"}]),
+        ]
 
 
 def _any(value: float | tuple[float, ...]) -> bool:

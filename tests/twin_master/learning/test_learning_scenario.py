@@ -27,7 +27,7 @@ TEXT = text_of("level_turns_learning")
 
 def test_without_the_table_the_filter_is_the_exact_one():
     loaded = load_scenario("level_turns")
-    assert "learning" not in loaded.scenario.to_dict()
+    assert loaded.scenario.to_dict()["learning"] is None
     assert isinstance(prepare_twin("paper_level_turns").twin().estimator, ExactFilter)
 
 
