@@ -265,9 +265,17 @@ def resumed_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
                 path=loaded.path,
             )
         )
-    with ExitStack() as holding:
-        holding.callback(os.close, lock_run_folder(folder))
+    with held(lock_run_folder(folder)):
         yield config, scenario.moved(folder)
+
+
+@contextmanager
+def held(lock: int) -> Iterator[None]:
+    """Let go of a folder at the end."""
+    try:
+        yield
+    finally:
+        os.close(lock)
 
 
 def restore(folder: Path, progress: Progress) -> None:
