@@ -1,20 +1,28 @@
 """Sentences in a TOML file beside a module, filled in where they are said."""
 
 import tomllib
-from collections.abc import Collection
+from collections.abc import Mapping, Set
 from pathlib import Path
 from string import Formatter
 from typing import Any
 
+MOST_LISTED = 30
+"""Of several things, those that are written out."""
+
 
 class _Written(Formatter):
-    """Braces as in `str.format`; several things are written one after the other, and "none" where none is."""
+    """Braces as in `str.format`; several things are written one after the other, "none" if there is none.
+
+    As Python writes them with `!s`: a place in an array, a shape.
+    """
 
     def convert_field(self, value: Any, conversion: str | None) -> Any:
-        if not isinstance(value, Collection) or isinstance(value, str | bytes) or hasattr(value, "_fields"):
+        several = isinstance(value, tuple | list | Set | Mapping) and not hasattr(value, "_fields")
+        if not several or conversion == "s":
             return super().convert_field(value, conversion)
-        each = (super(_Written, self).convert_field(item, conversion) for item in value)
-        return ", ".join(map(str, each)) or "none"
+        texts = [str(super(_Written, self).convert_field(item, conversion)) for item in value]
+        more = f" and {len(texts) - MOST_LISTED} more" if len(texts) > MOST_LISTED else ""
+        return (", ".join(texts[:MOST_LISTED]) or "none") + more
 
 
 class Sentences:

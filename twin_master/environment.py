@@ -139,9 +139,8 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         if self._plant is None or self._step >= self.scenario.mission.steps:
             raise gymnasium.error.ResetNeeded("the mission is over or has not begun: call reset().")
         if not self.action_space.contains(action):
-            raise gymnasium.error.InvalidAction(
-                said("environment.control", known=", ".join(self.scenario.control_names), action=action)
-            )
+            known = self.scenario.control_names
+            raise gymnasium.error.InvalidAction(said("environment.control", known=known, action=action))
         try:
             observation, reward, info = self._fly(int(action), self._control)
         except FmuEndedError as error:

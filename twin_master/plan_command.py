@@ -109,15 +109,8 @@ def _without(knowledge: "Knowledge", names: Sequence[str]) -> "Knowledge":
     titles, inspecting = _titles(scenario), [action.name for action in scenario.action if action.inspects]
     for name in names:
         if name not in (*titles, *inspecting):
-            raise MissionInputError(
-                said(
-                    "plan_command.value_of",
-                    inspecting=", ".join(inspecting) or "there is none",
-                    first=titles[0],
-                    last=titles[-1],
-                    name=name,
-                )
-            )
+            known, gauges = inspecting or ["there is none"], f"{titles[0]} to {titles[-1]}"
+            raise MissionInputError(said("plan_command.value_of", inspecting=known, gauges=gauges, name=name))
     given, count = scenario.observation.standard_deviation, scenario.observation.count
     each = given if isinstance(given, tuple) else (given,) * count
     each = tuple(_BLIND if title in names else own for title, own in zip(titles, each, strict=True))

@@ -171,9 +171,8 @@ def with_inputs(folder: Path, config: dict[str, Any], hashes: Mapping[str, str])
     recorded = config.get("inputs")
     if recorded is not None and recorded != dict(hashes):
         changed = sorted(name for name in {*recorded, *hashes} if recorded.get(name) != hashes.get(name))
-        raise NotResumableError(
-            said("run_folder.changed", names=", ".join(changed).replace("_", " "), folder=folder)
-        )
+        names = ", ".join(changed).replace("_", " ")
+        raise NotResumableError(said("run_folder.changed", names=names, folder=folder))
     if recorded is None:
         config = {**config, "inputs": dict(hashes)}
         atomic_write_text(folder / CONFIG_NAME, to_json(config))
@@ -255,15 +254,9 @@ def resumed_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
     scenario, file = kept_scenario(folder), config["scenario_file"]
     if loaded is not None and file.get("sha256") != loaded.content_hash:
         does = "watches" if config.get("watched") else "flies"
+        other = f"{scenario.mission.name}, {file.get('name')}"
         raise NotResumableError(
-            said(
-                "mission.another",
-                folder=folder,
-                does=does,
-                name=scenario.mission.name,
-                scenario_name=file.get("name"),
-                path=loaded.path,
-            )
+            said("mission.another", folder=folder, does=does, other=other, path=loaded.path)
         )
     with held(lock_run_folder(folder)):
         yield config, scenario.moved(folder)

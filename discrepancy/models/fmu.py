@@ -157,7 +157,7 @@ class FmuModel(DescribedModel):
         offsets, given = conditions.offset or (0.0,) * len(trial.inputs), dict[str, FloatArray]()
         for item, offset in zip(trial.inputs, offsets, strict=True):
             if item.name not in self._inputs:
-                known = ", ".join(self._inputs) or "none"
+                known = self._inputs
                 raise ModelError(said("models.no_input", trial=trial, item=item, model=self, known=known))
             variable = self._inputs[item.name]
             given[variable] = self.names.input_factors[variable] * (item.values + offset)

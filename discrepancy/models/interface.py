@@ -272,8 +272,7 @@ class Model(ABC):
             if name in self.regions:
                 losses[:, self.regions.index(name)] = column
             elif np.any(column):
-                known = ", ".join(self.regions) or "none"
-                raise ModelError(said("models.no_region", trial=trial, name=name, model=self, known=known))
+                raise ModelError(said("models.no_region", trial=trial, name=name, model=self))
         return [tuple(row) for row in losses.tolist()]
 
     @property

@@ -194,8 +194,7 @@ class LumpedModel(DescribedModel, SystemModel):
             loads.append(Load(self._moved_row(rig, section, change), Course(time, values, item.hold)))
         for load in (item for item in patch if isinstance(item, PortLoad)):
             if load.port not in self.acts:
-                known = ", ".join(self.acts) or "none"
-                raise ModelError(said("models.no_port", load=load, model=self, known=known))
+                raise ModelError(said("models.no_port", load=load, model=self))
             spans = tuple(window.span for window in load.windows)
             loads.append(Load(self.acts[load.port], FormulaCourse(course_of(load.force, load.kind), spans)))
         return loads, drives
@@ -213,7 +212,7 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the input that a trial records; raises `ModelError` if it is not the model's."""
         section = self._inputs.get(item.name)
         if section is None:
-            known = ", ".join(self._inputs) or "none"
+            known = self._inputs
             raise ModelError(said("models.unknown_input", trial=trial, item=item, model=self, known=known))
         moving = section.quantity.moving
         if item.quantity is not section.quantity and item.quantity not in moving:

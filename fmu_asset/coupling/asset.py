@@ -11,7 +11,7 @@ from fmu_asset.sentences import said
 
 from .instance import CoupledFmus, naming
 from .schedule import Schedule, loop_sentence
-from .structure import SystemStructure, listed
+from .structure import SystemStructure
 from .system import parts_of, system_description, wiring_hash
 from .wiring import Wiring
 
@@ -76,7 +76,7 @@ class CoupledAsset(FmiAsset):
         parameters: Values | None = None,
     ) -> None:
         if algorithm not in ALGORITHMS:
-            raise CouplingError(f"The algorithm must be one of {listed(ALGORITHMS)}, and {algorithm!r} came.")
+            raise CouplingError(said("coupling.algorithm", known=ALGORITHMS, algorithm=algorithm))
         if iterations < 1 or not (tolerance > 0.0 and math.isfinite(tolerance)):
             raise CouplingError(said("coupling.iterations", iterations=iterations, tolerance=tolerance))
         self._wiring = wiring = structure if isinstance(structure, Wiring) else Wiring(structure)

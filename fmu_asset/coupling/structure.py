@@ -187,13 +187,6 @@ class SystemStructure:
         return replace(self, connections=tuple(delayed))
 
 
-def listed(names: object) -> str:
-    """Return names as a list for people; a long one is cut."""
-    texts = [str(name) for name in names]  # type: ignore[attr-defined]
-    more = f" and {len(texts) - 12} more" if len(texts) > 12 else ""
-    return (", ".join(texts[:12]) or "none") + more
-
-
 def parse_endpoint(text: str, components: Sequence[str]) -> Endpoint:
     """Return the end that a scenario file names: `component.variable`; without a dot, a system connector.
 

@@ -11,7 +11,7 @@ from fmu_asset.errors import CouplingError
 from fmu_asset.sentences import said
 
 from .schedule import Link, Schedule, schedule
-from .structure import Component, Connection, Endpoint, Setting, SystemStructure, listed
+from .structure import Component, Connection, Endpoint, Setting, SystemStructure
 
 _FITS = {
     "Real": {"Real"},
@@ -224,10 +224,8 @@ class Wiring:
         if isinstance(value, str):
             if value in variable.items:
                 return float(variable.items[value])
-            items = (
-                f" with the items {listed(variable.items)}" if variable.items else ", and a number is needed"
-            )
-            raise CouplingError(said("coupling.setting", end=end, value=value, found=variable, items=items))
+            wanted = variable.items or "a number"
+            raise CouplingError(said("coupling.setting", end=end, value=value, found=variable, wanted=wanted))
         units = (*setting.units, *self.structure.units, *own)
         conversion = between(setting.unit, units, variable.unit, own)
         if conversion is None:

@@ -81,7 +81,6 @@ def default_experiment(
     known = [*binding.parameter, *binding.load, *structural]
     for name in values:
         if name not in known:
-            known = [*known[:20], *["..."] * (len(known) > 20)]
             raise BindingError(said("inputs.no_variable", fmu=description, name=name, known=known))
     parameters, load, sizes = (
         {name: value for name, value in values.items() if name in names}

@@ -8,13 +8,14 @@ from pathlib import Path
 
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.schedule import loop_sentence
-from fmu_asset.coupling.structure import SystemStructure, listed
+from fmu_asset.coupling.structure import SystemStructure
 from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.experiment import whole_binding
 from fmu_asset.door.units import IDENTITY, between
 from fmu_asset.errors import FmuError, SspError
 from fmu_asset.folders import scratch_folder
+from fmu_asset.sentences import said
 
 from .reader import read_ssp
 
@@ -103,7 +104,7 @@ def left_out_sentence(wiring: Wiring, file: Path) -> str:
             right = owner + near
             hint = "its set lacks the value" if right == name else f"did you mean {right!r}?"
             names[index] = f"{name} ({hint})"
-    return f"{file} sets parameters that nothing takes: {listed(names)}; correct or remove them."
+    return said("ssp.untaken", file=file, names=names)
 
 
 def check_ssp(path: str | os.PathLike[str]) -> SspCheck:

@@ -313,24 +313,16 @@ class FmuSource(AssetSource):
         bound, given = binding.observation[role].units, self._scenario.observation.sensor_units
         for number, (there, here) in enumerate(zip(bound, given, strict=True), 1):
             if there != here != "1":
-                raise MissionInputError(
-                    said("assets.unit", name=binding.name, number=number, role=role, there=there, here=here)
-                )
+                which, units = f"value {number} of `{role}`", (there, here)
+                raise MissionInputError(said("assets.unit", binding=binding, which=which, units=units))
         return chosen
 
     def _slice(self, binding: Binding, role: str) -> slice:
         expected = self._scenario.observation.count
         chosen = binding.observation_slice(role)
         if chosen.stop - chosen.start != expected:
-            raise MissionInputError(
-                said(
-                    "assets.width",
-                    name=binding.name,
-                    count=chosen.stop - chosen.start,
-                    role=role,
-                    expected=expected,
-                )
-            )
+            came = binding.name, chosen.stop - chosen.start
+            raise MissionInputError(said("assets.width", came=came, role=role, expected=expected))
         return chosen
 
     def _inner_roles(self, binding: Binding) -> InnerRoles | None:

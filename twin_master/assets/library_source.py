@@ -21,7 +21,7 @@ from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import Asset, AssetSource, FlownAndBelieved
+from twin_master.assets.asset_source import AssetSource, FlownAndBelieved
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection
 from twin_master.assets.parameter import ParameterDraws
@@ -125,9 +125,7 @@ class ObservationLibrary:
             The library has other states, or a level is none of its levels.
         """
         if set(names) != set(self.states.names):
-            raise InvalidObservationLibraryError(
-                said("assets.states", own=", ".join(self.states.names), names=", ".join(names))
-            )
+            raise InvalidObservationLibraryError(said("assets.states", self=self, names=names))
         wanted = coordinates[:, [names.index(name) for name in self.states.names]]
         for factor, asked in zip(self.states.factors, wanted.T, strict=True):
             levels = np.array(factor.levels)
@@ -147,15 +145,11 @@ class ObservationLibrary:
             There is none, or the library has other control inputs.
         """
         if set(values) != set(self.control_values):
-            raise InvalidObservationLibraryError(
-                said("assets.inputs", own=", ".join(self.control_values), values=", ".join(values))
-            )
+            raise InvalidObservationLibraryError(said("assets.inputs", self=self, values=values))
         known = np.column_stack([self.control_values[key] for key in values])
         if (place := _place(known, np.array([*values.values()]))) is None:
             shown = ", ".join(f"{key} = {value:g}" for key, value in values.items())
-            raise InvalidObservationLibraryError(
-                said("assets.control", shown=shown, name=name, known=", ".join(self.controls))
-            )
+            raise InvalidObservationLibraryError(said("assets.control", shown=shown, name=name, self=self))
         return place
 
     def at_draws(self, name: str, draws: Float) -> Float:
@@ -169,23 +163,14 @@ class ObservationLibrary:
         if not self.parameter and len(draws) == 1:
             return self.values
         if name != self.parameter:
-            raise InvalidObservationLibraryError(
-                said("assets.parameter", own=self.parameter or "none", name=name)
-            )
+            own = self.parameter or "none"
+            raise InvalidObservationLibraryError(said("assets.parameter", own=own, name=name))
         order = np.argsort(self.draws, kind="stable")
         nodes = self.draws[order]
         slack = _SAME * max(1.0, float(np.abs(nodes).max()))
         if draws.min() < nodes[0] - slack or draws.max() > nodes[-1] + slack:
-            raise InvalidObservationLibraryError(
-                said(
-                    "assets.draws",
-                    name=name,
-                    least=draws.min(),
-                    most=draws.max(),
-                    low=nodes[0],
-                    high=nodes[-1],
-                )
-            )
+            ends = draws.min(), draws.max(), nodes[0], nodes[-1]
+            raise InvalidObservationLibraryError(said("assets.draws", name=name, ends=ends))
         share = np.array([np.interp(draws, nodes, own) for own in np.eye(len(nodes))])
         return np.tensordot(share.T, self.values[order], axes=1)
 
@@ -319,15 +304,9 @@ class LibrarySource(AssetSource):
             ("was sampled under the load", _shown(library.load), _shown(scenario.asset.constant_load)),
         ):
             if has != wanted:
-                raise InvalidObservationLibraryError(
-                    said(
-                        "assets.differs",
-                        name=self.path(OBSERVATIONS_COPY).name,
-                        what=what,
-                        has=", ".join(has) or "none",
-                        wanted=", ".join(wanted) or "none",
-                    )
-                )
+                what = f"{self.path(OBSERVATIONS_COPY).name} {what}"
+                both = [", ".join(names) or "none" for names in (has, wanted)]
+                raise InvalidObservationLibraryError(said("assets.differs", what=what, both=both))
         if not library.parameter or library.parameter == scenario.calibration.parameter:
             self._places(library, build_graphical_model(scenario))
         else:
@@ -379,10 +358,6 @@ class LibrarySource(AssetSource):
         """
         rows, controls = self._places(self.library, model)
         return self.library.at_draws(draws.name, draws.values)[:, rows][:, :, controls]
-
-    def open(self) -> Asset:
-        """Return the asset of the model: a library is flown by nobody."""
-        return self._model.open()
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write the field of the model."""

@@ -209,29 +209,12 @@ def check_calibration(
     rows = [("parameter", names, known)]
     check_names(f"the calibration of {found.asset} has the", where, rows, advice=advice)
     if design_hash and found.design_hash not in ("", design_hash):
-        raise MissionInputError(
-            said(
-                "assets.another_design",
-                asset=found.asset,
-                model=found.model,
-                own=found.design_hash[:12],
-                where=where,
-                believed=design_hash[:12],
-            )
-        )
+        asked = where, design_hash[:12]
+        raise MissionInputError(said("assets.another_design", found=found, asked=asked))
     for name, (low, high) in ranges.items():
         if name in names and not low <= found.mean(name) <= high:
-            raise MissionInputError(
-                said(
-                    "assets.range",
-                    asset=found.asset,
-                    name=name,
-                    value=found.mean(name),
-                    where=where,
-                    low=low,
-                    high=high,
-                )
-            )
+            value, of = f"{name} = {found.mean(name):.6g}", found.asset
+            raise MissionInputError(said("assets.range", of=of, value=value, where=where, low=low, high=high))
 
 
 def is_of_parameters(file: Path | str) -> bool:

@@ -296,6 +296,5 @@ def check_model_patch(patch: "PatchFile", gauge_count: int, where: str = "The pa
         for item in effect.patch:
             drifts = isinstance(item, SensorDrift) and item.exponent != 0.0
             if drifts or (isinstance(item, PortForce) and item.hysteretic):
-                raise MissionInputError(
-                    said("assets.remembers", id=effect.id, what="time" if drifts else "the loads before")
-                )
+                what = "time" if drifts else "the loads before"
+                raise MissionInputError(said("assets.remembers", effect=effect, what=what))

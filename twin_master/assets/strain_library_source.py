@@ -95,9 +95,8 @@ class StrainLibrary:
         for factor, value in zip(self.states.factors, stiffness_loss, strict=True):
             known = factor.levels
             if not known[0] <= value <= known[-1]:
-                raise InvalidStrainLibraryError(
-                    said("assets.covers", name=factor.name, low=known[0], high=known[-1], value=value)
-                )
+                ends = known[0], known[-1]
+                raise InvalidStrainLibraryError(said("assets.covers", factor=factor, ends=ends, value=value))
             weights = [np.interp(value, known, level) for level in np.eye(len(known))]
             strain = np.tensordot(weights, strain, axes=1)
         return strain
@@ -123,9 +122,8 @@ def load_strain_library(path: str | Path) -> StrainLibrary:
     try:
         return _arranged(content)
     except KeyError as error:
-        raise InvalidStrainLibraryError(
-            said("assets.lacks", file=file, error=error, file_name=FILE_NAME)
-        ) from error
+        why = said("assets.lacks", file=file, error=error, file_name=FILE_NAME)
+        raise InvalidStrainLibraryError(why) from error
     except (TypeError, ValueError, AttributeError, IndexError) as error:
         raise InvalidStrainLibraryError(said("assets.unread", file=file, error=error)) from error
 
@@ -183,9 +181,8 @@ class StrainLibrarySection(AssetSection):
             The library is missing, damaged or does not fit the scenario.
         """
         if self.file is None:
-            raise MissionInputError(
-                said("assets.authors", name=scenario.mission.name, repository=REPOSITORY, file_name=FILE_NAME)
-            )
+            where = REPOSITORY, FILE_NAME
+            raise MissionInputError(said("assets.authors", scenario=scenario, where=where))
         return _read(scenario, Path(self.file), compared=self.differs_from(scenario.belief))
 
 
@@ -232,15 +229,7 @@ class StrainLibrarySource(AssetSource):
         check_names("the scenario has the", "the strain library", rows, MissingObservationModelError)
         self._control_index = [library.controls.index(name) for name in scenario.control_names]
         if scenario.observation.count != library.gauge_count or scenario.state_names != library.states.names:
-            raise MissingObservationModelError(
-                said(
-                    "assets.gauges",
-                    gauges=library.gauge_count,
-                    own=", ".join(library.states.names),
-                    count=scenario.observation.count,
-                    names=", ".join(scenario.state_names),
-                )
-            )
+            raise MissingObservationModelError(said("assets.gauges", library=library, scenario=scenario))
 
     def _make(self, progress: Progress) -> dict[str, str]:
         return {"strain_library": self._hash}
@@ -293,7 +282,6 @@ def _read(scenario: Scenario, path: Path, *, compared: bool) -> StrainLibrarySou
         except ValueError:
             continue
         if given is not None and abs(given - expected) > _TOLERANCE:
-            raise MissingObservationModelError(
-                said("assets.load_factor", name=control.name, expected=expected, given=given)
-            )
+            factors = expected, given
+            raise MissingObservationModelError(said("assets.load_factor", control=control, factors=factors))
     return StrainLibrarySource(scenario, load_strain_library(path), hash_file(path), path)

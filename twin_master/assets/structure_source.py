@@ -221,20 +221,18 @@ class NamedStructure(AssetSource):
             row, table = ("accelerometer", [*modes.accelerometers], there), "acceleration"
             most = StructureSettings.mode_count
             if max(modes.places) >= most:
-                raise MissingObservationModelError(
-                    said("assets.modes", most=most, number=max(modes.places) + 1)
-                )
+                number = max(modes.places) + 1
+                raise MissingObservationModelError(said("assets.modes", most=most, number=number))
         advice = self.advice["state"] or f"give it in a table [[{table}]]"
         check_names("the scenario has the", where, [row], MissingObservationModelError, advice)
         if observation.count != known[role]:
+            has, count = known[role], observation.count
             raise MissingObservationModelError(
-                said("assets.sensors", where=where, has=known[role], role=role, count=observation.count)
+                said("assets.sensors", where=where, has=has, role=role, count=count)
             )
         titles, own = [*observation.titles], names.get(role, [])
         if titles != own and sorted(titles) == sorted(own):
-            raise MissionInputError(
-                said("assets.titles", titles=", ".join(titles), where=where, own=", ".join(own))
-            )
+            raise MissionInputError(said("assets.titles", titles=titles, where=where, own=own))
 
     def _check_parameter(self, *, believed: bool) -> None:
         """Refuse a calibration that the structure cannot have; raises `MissionInputError`."""
@@ -274,17 +272,8 @@ class NamedStructure(AssetSource):
         for what, name, value in given:
             low, high = ranges.get(name, (value, value))
             if not low <= value <= high:
-                raise MissionInputError(
-                    said(
-                        "assets.outside",
-                        what=what,
-                        value=value,
-                        where=self.where,
-                        name=name,
-                        low=low,
-                        high=high,
-                    )
-                )
+                what, ends = f"{what} is {value:g}, but {self.where}", (low, high)
+                raise MissionInputError(said("assets.outside", what=what, name=name, ends=ends))
 
 
 class StructureFmuSource(NamedStructure, FmuSource):

@@ -49,8 +49,8 @@ class FleetOutcome:
     Attributes
     ----------
     folder : Path
-    twins, failed : int
-        How many flew, and how many of them failed in flight.
+    twins : int
+        How many there are.
     failures : dict of str to str
         What ended the flight of each that failed, by group and name.
     ended : dict of str to str
@@ -68,11 +68,6 @@ class FleetOutcome:
     seconds: float
     shards_flown: int
     shards_kept: int
-
-    @property
-    def failed(self) -> int:
-        """How many twins failed in flight."""
-        return len(self.failures)
 
 
 def fly_fleet(
@@ -121,7 +116,7 @@ def fly_fleet(
         with JournalFile(folder, hash_record(config)) as journal:
             shards, flown = _fly(fleet, folder, engine, journal, progress)
         told = told_of(folder)
-        result = {"name": fleet.name, "title": fleet.title, "seed": fleet.seed, "twins": fleet.size}
+        result = fleet.head.model_dump(exclude={"shard"}) | {"twins": fleet.size}
         atomic_write_text(folder / RESULT_NAME, to_json(result | told))
     seconds = time.perf_counter() - begin
     failures, ended = told["failures"], told["ended"]
@@ -406,6 +401,6 @@ def _recorded(group: Group, members: Sequence[Member]) -> tuple[Member, ...]:
 def _shards(fleet: Fleet) -> Iterator[tuple[int, Sequence[Member]]]:
     """Yield all shards in their order: twins that share all files, no more of them than a shard holds."""
     for number, group in enumerate(fleet.groups):
-        size = 1 if group.files else fleet.shard
+        size = 1 if group.files else fleet.head.shard
         for first in range(0, len(group.members), size):
             yield number, group.members[first : first + size]

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,10 +21,6 @@ from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
 from twin_master.sentences import said
-
-if TYPE_CHECKING:
-    import xarray as xr
-
 
 NOISE_TWINS = 100
 """Twins of a group from which the noise is learnt: they know it to one part in a few hundred."""
@@ -72,11 +68,12 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
     """
     folder, progress = Path(folder), progress or SilentProgress()
     config = fleet_config(folder)
-    found: list[_Lessons] = []
     records = config["fleet"]["groups"]
+    found = []
     with progress.stage("Learning", total=len(records), unit="groups") as stage:
         for record in records:
-            found += _lessons(folder, record)
+            if parts := list(_seen(folder, record)):
+                found.append(_lessons(record["name"], parts))
             stage.advance()
     if not found:
         raise FleetError(f"{folder} holds no twin that has flown to its end: fly the fleet first.")
@@ -84,7 +81,7 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
     alike = {lessons.worsening.names for lessons in found} == {names} and len(names) <= 2
     together = shared([lessons.grid for lessons in found]) if alike and len(found) > 1 else None
     lines = [lessons.grid.marginals for lessons in found] if together is None else together.groups
-    everywhere = frozenset[str]().union(*(lessons.flown for lessons in found if together is not None))
+    everywhere = {control for lessons in found if together is not None for control in lessons.flown}
     groups = {}
     for lessons, own in zip(found, lines, strict=True):
         told = zip(lessons.worsening.names, lessons.worsening.assumed.tolist(), own, strict=True)
@@ -106,83 +103,81 @@ def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict
     }
     result: dict[str, Any] = {"source": source, "groups": groups}
     if together is not None:
-        titles = "mean", "standard_deviation", "log10_concentration", "log10_concentration_standard_deviation"
-        pairs = zip(names, together.mean, together.concentration, strict=True)
         result["shared"] = {
-            name: dict(zip(titles, (*mean, *size), strict=True)) for name, mean, size in pairs
+            name: {
+                "mean": mean.mean,
+                "standard_deviation": mean.standard_deviation,
+                "log10_concentration": size.mean,
+                "log10_concentration_standard_deviation": size.standard_deviation,
+            }
+            for name, mean, size in zip(names, together.mean, together.concentration, strict=True)
         }
     return result
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What some twins of a group saw, and what they knew."""
+    """What some twins of a group saw, what they knew, and under which controls turns were followed."""
 
     knowledge: Knowledge
     observed: Float
     control: Index
     folder: Path
     real: bool
-    controls: frozenset[str]
+    flown: frozenset[str]
+    alarmed: int
 
 
-def _lessons(folder: Path, record: dict[str, Any]) -> Iterator[_Lessons]:
+def _lessons(name: str, parts: list[_Seen]) -> _Lessons:
     """Learn the noise first, for what else is learnt rests on it, then the rates, then the population."""
-    group = open_group(folder, record["name"])
-    parts = list(_seen(folder, record, group))
-    if not parts:
-        return
     worsening = Worsening.of(parts[0].knowledge.scenario)
+    if (count := len(worsening.names)) > max(POINTS):
+        raise FleetError(said("fleet.probabilities", group=name, count=count, most=max(POINTS)))
     nodes = _nodes(parts)
     noise = _noise(parts[0], worsening, nodes)
-    models = [_noisier(part.knowledge.sensor_model, noise.mean) for part in parts]
-    likelihoods = [
-        scaled_likelihood(model, part.observed, part.control)[0]
-        for model, part in zip(models, parts, strict=True)
-    ]
-
-    def evidence(points: Float) -> list[Float]:
-        pairs = zip(likelihoods, parts, strict=True)
-        return [transition_evidence(worsening, points, own, part.control) for own, part in pairs]
-
-    if len(worsening.names) > max(POINTS):
-        raise FleetError(
-            said("fleet.probabilities", group=record["name"], count=len(worsening.names), most=max(POINTS))
-        )
-    explained = [np.isfinite(own[:, 0]) for own in evidence(worsening.assumed.clip(1e-3, 0.9)[None])]
+    seen = []
+    for part in parts:
+        model = _noisier(part.knowledge.sensor_model, noise.mean)
+        likelihood = scaled_likelihood(model, part.observed, part.control)[0]
+        evidence = transition_evidence(worsening, _possible(worsening)[None], likelihood, part.control)
+        explained = np.isfinite(evidence[:, 0])
+        seen.append((likelihood[explained], part.control[explained]))
+    twins = sum(len(control) for _, control in seen)
+    if not twins:
+        raise FleetError(said("fleet.unexplained", group=name))
 
     def log_likelihood(points: Float) -> Float:
-        pairs = zip(evidence(points), explained, strict=True)
-        return np.asarray(np.sum([own[kept].sum(axis=0) for own, kept in pairs], axis=0))
+        return np.asarray(sum(transition_evidence(worsening, points, *some).sum(axis=0) for some in seen))
 
-    grid = refined(log_likelihood, len(worsening.names))
-    learnt = np.array([marginal.mean for marginal in grid.marginals])
-    twins = sum(int(kept.sum()) for kept in explained)
-    if not twins:
-        raise FleetError(said("fleet.unexplained", group=record["name"]))
+    grid = refined(log_likelihood, count)
     figures: dict[str, Any] = {"noise_factor": noise.figures}
     if nodes is not None:
-        at_nodes = _noisier(models[0], 1.0, nodes)
+        learnt = np.array([marginal.mean for marginal in grid.marginals])
+        at_nodes = _noisier(parts[0].knowledge.sensor_model, noise.mean, nodes)
         each = node_evidence(worsening, learnt, at_nodes, parts[0].observed, parts[0].control)
         draws = parts[0].knowledge.draws
         mean, spread = population(nodes.values, each, draws.standard_deviation)
         figures["population"] = {"parameter": draws.name, "mean": mean.figures, "spread": spread.figures}
-    left_out = sum(len(kept) for kept in explained) - twins
-    alarmed = int(np.sum(noticed(group, "alarm")[has_flown(group["status"].values)] > 0))
-    counts = {"twins": twins, "left_out": left_out, "alarmed": alarmed}
-    flown = frozenset[str]().union(*(part.controls for part in parts))
-    yield _Lessons(record["name"], worsening, grid, flown, counts, figures)
+    left_out = sum(len(part.control) for part in parts) - twins
+    counts = {"twins": twins, "left_out": left_out, "alarmed": sum(part.alarmed for part in parts)}
+    return _Lessons(
+        name, worsening, grid, frozenset().union(*(part.flown for part in parts)), counts, figures
+    )
 
 
-def _seen(folder: Path, record: dict[str, Any], group: "xr.Dataset") -> Iterator[_Seen]:
+def _possible(worsening: Worsening) -> Float:
+    """Return what is assumed, so that any worsening may happen."""
+    return worsening.assumed.clip(1e-3, 0.9)
+
+
+def _seen(folder: Path, record: dict[str, Any]) -> Iterator[_Seen]:
     """Yield the twins of a group that flew, those together that share what they know."""
+    group = open_group(folder, record["name"])
     flown = has_flown(group["status"].values)
-    if not len(flown):
-        return
+    alarmed = noticed(group, "alarm")[flown] > 0
     observed = group["observed"].values[flown].astype(np.float64)
     # Behind the end of a recording nothing is observed, so that any control says the same.
     given = group["control_index"].values[flown].astype(np.int64)
-    control = np.maximum(given, 0)
     for place, table in enumerate(record["scenarios"]):
         own = folder / GROUPS / record["name"]
         mine = np.arange(len(flown))
@@ -190,10 +185,12 @@ def _seen(folder: Path, record: dict[str, Any], group: "xr.Dataset") -> Iterator
             own, mine = own / str(place), np.flatnonzero(flown == place)
         if len(mine):
             scenario = Scenario.model_validate(table).moved(own)
-            known = kept_knowledge(own, scenario)
             followed = np.unique(given[mine][:, :-1][given[mine][:, 1:] >= 0])
-            controls = frozenset(scenario.control_names[index] for index in followed)
-            yield _Seen(known, observed[mine], control[mine], own, "recordings" in record, controls)
+            yield _Seen(
+                kept_knowledge(own, scenario), observed[mine], np.maximum(given[mine], 0), own,
+                "recordings" in record, frozenset(scenario.control_names[index] for index in followed),
+                int(alarmed[mine].sum()),
+            )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -240,7 +237,7 @@ def _noise(part: _Seen, worsening: Worsening, nodes: _Nodes | None) -> Line:
     the noise for it.
     """
     observed, control = part.observed[:NOISE_TWINS], part.control[:NOISE_TWINS]
-    assumed = worsening.assumed.clip(1e-3, 0.9)
+    assumed = _possible(worsening)
 
     def log_density(axes: tuple[Float, ...]) -> Float:
         return np.array([log_likelihood(float(factor)) for factor in np.exp(axes[0])])

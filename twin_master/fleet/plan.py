@@ -172,12 +172,9 @@ class Group:
 
 @dataclass(frozen=True)
 class Fleet:
-    """What is to be flown; see `FleetSection`."""
+    """What is to be flown."""
 
-    name: str
-    title: str
-    seed: int
-    shard: int
+    head: FleetSection
     groups: tuple[Group, ...]
 
     @property
@@ -187,8 +184,7 @@ class Fleet:
 
     def record(self) -> dict[str, Any]:
         """Return the fleet for `config.json`."""
-        heading = {"name": self.name, "title": self.title, "seed": self.seed, "shard": self.shard}
-        return heading | {"groups": [group.record() for group in self.groups]}
+        return self.head.model_dump() | {"groups": [group.record() for group in self.groups]}
 
 
 def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
@@ -223,7 +219,7 @@ def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
             wrong.append(f"group {section.name}: {error}")
     if wrong:
         raise FleetError("\n".join([f"{path}: nothing was begun, for", *wrong]))
-    return Fleet(head.name, head.title, head.seed, head.shard, tuple(groups))
+    return Fleet(head, tuple(groups))
 
 
 def ensemble(scenario: str, seeds: range, overrides: Overrides | None = None, *, shard: int = SHARD) -> Fleet:
@@ -236,7 +232,8 @@ def ensemble(scenario: str, seeds: range, overrides: Overrides | None = None, *,
     members = tuple(Member(row, f"seed-{seed}", seed, {}) for row, seed in enumerate(seeds))
     group = Group(resolved.mission.name, (resolved,), {}, members)
     mission = resolved.mission
-    return Fleet(mission.name, mission.title, mission.seed, shard, (group,))
+    head = FleetSection(name=mission.name, title=mission.title, seed=mission.seed, shard=shard)
+    return Fleet(head, (group,))
 
 
 def seed_range(text: str) -> range:

@@ -47,7 +47,7 @@ class Line:
     Attributes
     ----------
     x : (N,)
-        Equally spaced.
+        Equally spaced, where an interval is asked for.
     weight : (N,)
         Probability of each; they sum to 1.
     of : callable
@@ -177,14 +177,14 @@ class Shared:
 
     Attributes
     ----------
-    mean, concentration : tuple of (float, float)
-        Mean and standard deviation of m, and of log10 kappa, for each of the K probabilities.
+    mean, concentration : tuple of Line
+        m, and log10 kappa, for each of the K probabilities.
     groups : tuple of tuple of Line
         The K probabilities of each group.
     """
 
-    mean: tuple[tuple[float, float], ...]
-    concentration: tuple[tuple[float, float], ...]
+    mean: tuple[Line, ...]
+    concentration: tuple[Line, ...]
     groups: tuple[tuple[Line, ...], ...]
 
 
@@ -230,15 +230,10 @@ def shared(grids: Sequence[Grid]) -> Shared:
         groups.append(tuple(Line(x, np.asarray(one), logistic) for x, one in zip(own, sums, strict=False)))
     hyper = (weight.sum(axis=1), weight.sum(axis=0))[:count]
     return Shared(
-        tuple(_moments(one, means) for one in hyper),
-        tuple(_moments(one, np.log10(sizes)) for one in hyper),
+        tuple(Line(means, one) for one in hyper),
+        tuple(Line(np.log10(sizes), one) for one in hyper),
         tuple(groups),
     )
-
-
-def _moments(weight: Float, values: Float) -> tuple[float, float]:
-    mean = float(weight @ values)
-    return mean, float(np.sqrt(max(0.0, float(weight @ (values - mean) ** 2))))
 
 
 def _resampled(grid: Grid, axes: tuple[Float, ...]) -> Float:

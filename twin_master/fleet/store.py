@@ -197,7 +197,7 @@ def _create_group(made: "zarr.Group", group: Group, fleet: Fleet) -> None:
         made.create_array(
             name,
             shape=shape,
-            chunks=(min(fleet.shard, count), *shape[1:]),
+            chunks=(min(fleet.head.shard, count), *shape[1:]),
             dtype=kind,
             fill_value=np.nan if kind[0] == "f" else -int(name in ("control_index", "first_notice")),
             dimension_names=("twin", *axes.split()),
@@ -207,8 +207,8 @@ def _create_group(made: "zarr.Group", group: Group, fleet: Fleet) -> None:
     made.attrs.update(
         {
             "scenario": scenario.mission.name,
-            "fleet": fleet.name,
-            "fleet_seed": fleet.seed,
+            "fleet": fleet.head.name,
+            "fleet_seed": fleet.head.seed,
             "factors": list(scenario.state_names),
             "controls": list(scenario.control_names),
             "step_name": scenario.mission.step_name,

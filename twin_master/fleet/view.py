@@ -6,6 +6,7 @@ bands of all, and the fifty that are worst.
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from tornado.web import Application
@@ -21,8 +22,6 @@ from twin_master.viewer.server import OWN_NAMES, handlers_of, serve_application,
 
 WORST = 50
 """Assets in the table."""
-LOOK_SECONDS = 1.0
-"""Between two looks at the fleet."""
 
 
 def is_fleet(folder: Path) -> bool:
@@ -30,52 +29,36 @@ def is_fleet(folder: Path) -> bool:
     return fleet_record(folder) is not None
 
 
-class _Fleet:
-    """The page, made again when the fleet has changed."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self.version, self._seen, self.html = 0, self._stamp(), fleet_page(folder, WORST)
-
-    def _stamp(self) -> str:
-        names = (JOURNAL_NAME, STATE_NAME, LESSONS_NAME)
-        paths = [self._folder / name for name in names if (self._folder / name).is_file()]
-        return str([(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in paths])
-
-    async def follow(self) -> None:
-        """Look now and then, without end; what cannot be read is looked at again."""
-        while True:
-            await asyncio.sleep(LOOK_SECONDS)
-            try:
-                stamp = self._stamp()
-                if stamp != self._seen:
-                    self.html = await asyncio.to_thread(fleet_page, self._folder, WORST)
-                    self.version, self._seen = self.version + 1, stamp
-            except (TwinMasterError, ReportingError, OSError, ValueError):
-                continue  # it was just being written, or another fleet takes its place
-
-
 def serve_fleet(
     folder: Path, port: int, ready: Callable[[str], None], wanted: Callable[[], bool] = lambda: True
 ) -> None:
     """Show a fleet to browsers of this machine, as `viewer.server.serve` shows a flight."""
-    fleet = _Fleet(folder)
+    seen, version, html = _stamp(folder), 0, fleet_page(folder, WORST)
+
+    def current() -> str:
+        """Make the page again where the fleet has changed; what cannot be read is looked at again."""
+        nonlocal seen, version, html
+        with suppress(TwinMasterError, ReportingError, OSError, ValueError):  # it was just being written
+            if (stamp := _stamp(folder)) != seen:
+                html = fleet_page(folder, WORST)
+                seen, version = stamp, version + 1
+        return str(version)
 
     def page() -> str:
-        tag = f'<script src="/view.js" data-version="{fleet.version}"></script></body>'
-        return fleet.html.replace("</body>", tag)
+        tag = f'<script src="/view.js" data-version="{current()}"></script></body>'
+        return html.replace("</body>", tag)
 
     texts = {
         "/": (page, "text/html"),
-        "/version": (lambda: str(fleet.version), "text/plain"),
+        "/version": (current, "text/plain"),
         "/view.js": (text_of("twin_master.fleet", "view.js"), "text/javascript"),
     }
     application = Application()
     application.add_handlers(OWN_NAMES, handlers_of(texts))
+    asyncio.run(serve_application(application, port, ready, wanted))
 
-    async def follow_and_serve() -> None:
-        following = asyncio.create_task(fleet.follow())
-        await serve_application(application, port, ready, wanted)
-        following.cancel()
 
-    asyncio.run(follow_and_serve())
+def _stamp(folder: Path) -> list[tuple[str, int, int]]:
+    paths = [folder / name for name in (JOURNAL_NAME, STATE_NAME, LESSONS_NAME)]
+    stats = [(path.name, path.stat()) for path in paths if path.is_file()]
+    return [(name, stat.st_mtime_ns, stat.st_size) for name, stat in stats]

@@ -96,9 +96,8 @@ class LearningFilter:
             raise InvalidModelError(said("learning.inside", what="learning"))
         moves = transitions or [model.transition]
         if len(moves) != len(priors.transition_factors):
-            raise InvalidModelError(
-                said("learning.tables", factors=len(priors.transition_factors), tables=len(moves))
-            )
+            counts = len(priors.transition_factors), len(moves)
+            raise InvalidModelError(said("learning.tables", counts=counts))
         self.model, self.sensor_model, self._name = model, sensor_model, name
         self.priors = priors
         draws, factors, sensors = sensor_model.draw_count, len(moves), sensor_model.sensor_count

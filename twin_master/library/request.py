@@ -46,10 +46,9 @@ def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tu
         else:
             places = [(role, name) for role in _ROLES if name in tables[role]]
         if not equals or not places:
-            known = ", ".join(f"{role}.{key}" for role in _ROLES for key in tables[role])
-            raise InvalidObservationLibraryError(
-                said("library.grid", name=binding.name, known=known, text=text)
-            )
+            known = [f"{role}.{key}" for role in _ROLES for key in tables[role]]
+            why = said("library.grid", binding=binding, known=known, text=text)
+            raise InvalidObservationLibraryError(why)
         if len(places) > 1:
             full = " or ".join(f"{role}.{key}" for role, key in places)
             raise InvalidObservationLibraryError(f"{name} is a name of several roles: write {full}.")
@@ -94,9 +93,7 @@ def grid_of_fmu(
     given = parse_grid(texts, binding)
     if role is None:
         if len(binding.observation) != 1:
-            raise InvalidObservationLibraryError(
-                said("library.role", name=binding.name, known=", ".join(binding.observation))
-            )
+            raise InvalidObservationLibraryError(said("library.role", binding=binding))
         role = next(iter(binding.observation))
     swept = [name for name, values in given["parameter"].items() if len(values) > 1]
     if len(swept) > 1:
@@ -106,8 +103,9 @@ def grid_of_fmu(
     controls = {}
     combinations = math.prod(len(values) for values in inputs.values())
     if combinations > LARGEST_COUNT:
+        most = LARGEST_COUNT
         raise InvalidObservationLibraryError(
-            said("library.controls", inputs=", ".join(inputs), combinations=combinations, most=LARGEST_COUNT)
+            said("library.controls", inputs=inputs, combinations=combinations, most=most)
         )
     for values in itertools.product(*inputs.values()):
         setting = dict(zip(inputs, values, strict=True))
@@ -130,9 +128,8 @@ def grid_of_fmu(
 def _single(role: str, given: dict[str, tuple[float, ...]]) -> dict[str, float]:
     for name, values in given.items():
         if len(values) > 1:
-            raise InvalidObservationLibraryError(
-                said("library.single", role=role, name=name, number=len(values))
-            )
+            what = f"{role} {name}"
+            raise InvalidObservationLibraryError(said("library.single", what=what, number=len(values)))
     return {name: values[0] for name, values in given.items()}
 
 
@@ -160,9 +157,7 @@ def grid_of_scenario(
     scenario = resolve_scenario(_without_library(loaded), overrides or Overrides())
     flown = scenario.asset.source(scenario)
     if not isinstance(flown, FmuSource) or isinstance(flown, SeveralSource):
-        raise InvalidObservationLibraryError(
-            said("library.kind", name=scenario.mission.name, kind=scenario.asset.kind)
-        )
+        raise InvalidObservationLibraryError(said("library.kind", scenario=scenario))
     believed = scenario.belief.source(scenario, flown)
     source = flown if believed is flown else PairedSource(flown, believed)
     source.check()

@@ -238,9 +238,8 @@ def _prepare_folder(out: Path, record: dict[str, Any], *, resume: bool, replace_
             raise InvalidObservationLibraryError(said("library.interrupted", folder=folder))
         kept = plan.read_bytes() if plan.is_file() else b""
         if kept and kept != text.encode("utf-8"):
-            raise InvalidObservationLibraryError(
-                said("library.another", folder=folder, what=_difference(kept, record))
-            )
+            what = _difference(kept, record)
+            raise InvalidObservationLibraryError(said("library.another", folder=folder, what=what))
         if kept:
             return folder
     atomic_write_text(plan, text)

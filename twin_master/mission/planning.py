@@ -160,9 +160,9 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
     except (OSError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
         raise PlanningError(said("mission.no_policy", path=path, error=error)) from None
     if controls != model.controls or policy.vectors.shape[1] != model.states.size:
-        size = policy.vectors.shape[1]
+        states = policy.vectors.shape[1]
         raise PlanningError(
-            said("mission.another_policy", path=path, states=size, controls=controls, model=model)
+            said("mission.another_policy", path=path, states=states, controls=controls, model=model)
         )
     return policy
 

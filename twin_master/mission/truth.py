@@ -171,20 +171,12 @@ def checked_values(scenario: Scenario, reading: AssetReading, step: int, control
     """
     values = np.asarray(reading.values, dtype=np.float64)
     if values.shape != (scenario.observation.count,):
-        raise AssetOutputError(
-            said(
-                "mission.width",
-                step=step,
-                count=scenario.observation.count,
-                role=scenario.observation.role,
-                came=values.shape,
-            )
-        )
+        came, wanted = str(values.shape), scenario.observation
+        raise AssetOutputError(said("mission.width", step=step, wanted=wanted, came=came))
     if not np.all(np.isfinite(values)):
         bad = ", ".join(str(index + 1) for index in np.flatnonzero(~np.isfinite(values)))
-        raise AssetOutputError(
-            said("mission.no_number", step=step, role=scenario.observation.role, bad=bad, control=control)
-        )
+        what = f"`{scenario.observation.role}` {bad} under the control `{control}`"
+        raise AssetOutputError(said("mission.no_number", step=step, what=what))
     return values
 
 

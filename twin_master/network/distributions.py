@@ -40,16 +40,8 @@ def stochastic_matrix(rows: ArrayLike, *, name: str) -> Float:
             where = tuple(int(i) for i in np.argwhere(np.atleast_1d(bad))[0]) if matrix.ndim > 1 else ()
             row = matrix[where]
             label = f"row {where[0] if len(where) == 1 else where}" if where else "the distribution"
-            raise InvalidDistributionError(
-                said(
-                    "network.no_distribution",
-                    name=name,
-                    label=label,
-                    reason=reason,
-                    total=row.sum(),
-                    least=row.min(),
-                )
-            )
+            sizes, what = (row.sum(), row.min()), f"{name}: {label} {reason}"
+            raise InvalidDistributionError(said("network.no_distribution", what=what, sizes=sizes))
     matrix.setflags(write=False)
     return matrix
 

@@ -99,9 +99,7 @@ class StateSpace:
             distance = np.abs(np.asarray(factor.levels) - value)
             best = int(distance.argmin())
             if not distance[best] <= 1e-9:
-                raise InvalidModelError(
-                    said("network.no_level", value=value, name=factor.name, levels=factor.levels)
-                )
+                raise InvalidModelError(said("network.no_level", value=value, factor=factor))
             indices.append(best)
         return int(np.ravel_multi_index(indices, self.shape))
 
@@ -219,14 +217,7 @@ class GraphicalModel:
         given = {"prior": prior, **tables} if prior is not None else dict(tables)
         for control, rows in given.items():
             if set(rows) != set(levels):
-                raise InvalidModelError(
-                    said(
-                        "network.tables",
-                        control=control,
-                        levels=", ".join(levels),
-                        rows=", ".join(rows) or "none",
-                    )
-                )
+                raise InvalidModelError(said("network.tables", control=control, levels=levels, rows=rows))
         joint: Float = np.ones(1)
         for factor in states.factors:
             size = len(factor.levels)

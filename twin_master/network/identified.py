@@ -38,9 +38,8 @@ class IdentifiedSensorModel(GaussianSensorModel):
         values = self.checked(row[:count])
         covariance = np.zeros((count, count))
         if len(row) not in (count, row_width(count)) or np.isinf(row).any():
-            raise InvalidObservationError(
-                said("network.covariance", count=count, width=row_width(count), came=len(row))
-            )
+            widths = count, row_width(count), len(row)
+            raise InvalidObservationError(said("network.covariance", widths=widths))
         covariance[np.tril_indices(count)] = np.nan_to_num(row[count:]) if len(row) > count else 0.0
         covariance += np.tril(covariance, -1).T
         seen = np.flatnonzero(~np.isnan(values))

@@ -59,11 +59,8 @@ class InspectedSensorModel(GaussianSensorModel):
         if not read.shape[-1]:
             return gauges, np.zeros((*read.shape[:-1], self.state_count))
         if read.shape[-1] != self.reading.shape[1] or np.isinf(read).any():
-            raise InvalidObservationError(
-                said(
-                    "network.readings", count=count, width=count + self.reading.shape[1], came=rows.shape[-1]
-                )
-            )
+            widths = count, count + self.reading.shape[1], rows.shape[-1]
+            raise InvalidObservationError(said("network.readings", widths=widths))
         residual = (read[..., None, :] - self.reading) / self.reading_deviation
         density = -0.5 * residual**2 - np.log(self.reading_deviation) - LOG_ROOT_TWO_PI
         return gauges, np.where(np.isnan(read)[..., None, :], 0.0, density).sum(axis=-1)

@@ -36,15 +36,8 @@ def check_fits(parts: Mapping[str, float], advice: str) -> None:
     needed, there = sum(parts.values()), memory_left()
     if needed > there:
         listed = ", ".join(f"{_gigabytes(size)} for {what}" for what, size in parts.items())
-        raise InvalidModelError(
-            said(
-                "network.memory",
-                listed=listed,
-                needed=_gigabytes(needed),
-                there=_gigabytes(there),
-                advice=advice,
-            )
-        )
+        sizes = _gigabytes(needed), _gigabytes(there)
+        raise InvalidModelError(said("network.memory", listed=listed, sizes=sizes, advice=advice))
 
 
 def scenario_bytes(scenario: Scenario) -> dict[str, float]:

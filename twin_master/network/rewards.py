@@ -117,14 +117,8 @@ class RewardModel:
     ) -> None:
         normaliser = settings.control_normaliser or (1.0,) * len(settings.control_reward)
         if not len(settings.control_reward) == len(normaliser) == quantity.control_count:
-            raise InvalidModelError(
-                said(
-                    "network.rewards",
-                    controls=quantity.control_count,
-                    rewards=len(settings.control_reward),
-                    normalisers=len(normaliser),
-                )
-            )
+            counts = quantity.control_count, len(settings.control_reward), len(normaliser)
+            raise InvalidModelError(said("network.rewards", counts=counts))
         if true_per_draw is not None:
             shape = quantity.value_per_draw.shape
             expect_shape("what is there at the sensors", true_per_draw.shape, *shape)

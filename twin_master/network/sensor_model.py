@@ -109,9 +109,8 @@ class GaussianSensorModel(QuantityModel):
             value = np.array(given, dtype=np.float64)
             enough = value > 0.0 if positive else value >= 0.0
             if value.shape not in ((), (self.sensor_count,)) or not np.all(np.isfinite(value) & enough):
-                raise InvalidModelError(
-                    said("network.one_or_each", what=what, sensors=self.sensor_count, value=value)
-                )
+                count = self.sensor_count
+                raise InvalidModelError(said("network.one_or_each", what=what, sensors=count, value=value))
         if average not in ("outside", "inside"):
             raise InvalidModelError(f"expected average 'outside' or 'inside', got {average!r}")
         self.standard_deviation: Float = np.full(self.sensor_count, standard_deviation, np.float64)
@@ -326,15 +325,7 @@ def check_noise(key: str, deviation: ArrayLike, predicted: Float, units: Sequenc
             advice = "give it as a strain, without unit"
             if given * 1e-6 <= reach:
                 advice = f"it is likely meant in microstrain: write `{key}_microstrain = {given:g}`"
+        which, ends = f"{given:g} for sensor {sensor + 1}", (least, largest)
         raise InvalidModelError(
-            said(
-                "network.noise",
-                key=key,
-                given=given,
-                sensor=sensor + 1,
-                unit=unit,
-                least=least,
-                largest=largest,
-                advice=advice,
-            )
+            said("network.noise", key=key, which=which, unit=unit, ends=ends, advice=advice)
         )

@@ -83,10 +83,10 @@ class CsvFeed(RecordedFeed):
             try:
                 with path.open("rb") as file:
                     return self._take_columns(_cells(file.readline(LARGEST_MESSAGE)))
-            except (OSError, ValueError) as error:
-                errors.append(MissionInputError(f"{path} cannot be read as CSV: {str(error).rstrip('.')}."))
             except MissionInputError as error:
                 errors.append(error)
+            except (OSError, ValueError) as error:
+                errors.append(MissionInputError(f"{path} cannot be read as CSV: {str(error).rstrip('.')}."))
         raise errors[0] from None
 
     def _take_columns(self, names: list[str]) -> None:
@@ -177,11 +177,9 @@ class RunFeed(RecordedFeed):
             reason = str(error).rstrip(".")
             raise MissionInputError(said("watch.netcdf", path=path, role=role, reason=reason)) from None
 
-        first = (json.dumps(self._records[:count]).encode() for count in range(_FIRST + 1))
-        self._beginnings = [sha256(records).hexdigest() for records in first]
-
     def _place(self, read: int) -> Place:
-        return {"beginning": self._beginnings[min(read, _FIRST)], "read": read}
+        first = json.dumps(self._records[: min(read, _FIRST)]).encode()
+        return {"beginning": sha256(first).hexdigest(), "read": read}
 
     def holds(self, place: Place) -> bool:
         """Return whether its first steps are those of a place."""
@@ -293,17 +291,14 @@ def file_feed(path: Path, scenario: Scenario, *, follow: bool = False) -> CsvFee
     """
     if not path.exists():
         raise MissionInputError(f"there is no file {path} to read observations from.")
-    if follow and (path.is_dir() or _is_netcdf(path)):
+    is_netcdf = path.suffix.lower() == ".nc"
+    if follow and (path.is_dir() or is_netcdf):
         raise MissionInputError(f"{path} is recorded: only a CSV file can be followed.")
     if path.is_dir():
         return FolderFeed(path, scenario)
-    if _is_netcdf(path):
+    if is_netcdf:
         return RunFeed(path, scenario)
     return CsvFeed(path, scenario, follow=follow)
-
-
-def _is_netcdf(path: Path) -> bool:
-    return path.suffix.lower() == ".nc"
 
 
 def _whole(cell: str) -> int:
@@ -320,13 +315,10 @@ def _came(record: Mapping[str, Any]) -> bool:
 
 
 def _cells(line: bytes) -> list[str]:
-    text = line.decode("utf-8-sig").rstrip("\r\n")
-    if '"' in text:
-        try:
-            return [cell.strip() for cell in next(csv.reader([text]), [])]
-        except csv.Error as error:
-            raise ValueError(str(error)) from None
-    return [cell.strip() for cell in text.split(",")]
+    try:
+        return [cell.strip() for cell in next(csv.reader([line.decode("utf-8-sig").rstrip("\r\n")]), [])]
+    except csv.Error as error:
+        raise ValueError(str(error)) from None
 
 
 def shown(line: bytes | Refused) -> str:

@@ -15,7 +15,7 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file, hash_record
-from twin_master.assets.asset_source import FlownAndBelieved, calibrated_with
+from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, calibrated_with
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import (
@@ -98,11 +98,9 @@ class Watch:
     ) -> None:  # fmt: skip
         self.folder, self.scenario, self._progress = folder, scenario, progress
         tidy(folder)
-        if like is None:
-            self._source = believed_source(scenario)
-            self._inputs = dict(self._source.prepare(folder, progress))
-        else:
-            self._source, self._inputs = like._source, like._inputs
+        self._source: AssetSource = believed_source(scenario) if like is None else like._source
+        prepared = self._source.prepare(folder, progress) if like is None else like._inputs
+        self._inputs: Mapping[str, str] = prepared
         self._config = with_inputs(folder, config, self._inputs)
         self.models: list[BelievedModel] = [self._prepared() if like is None else like.models[0]]
         self._path = folder / JOURNAL_NAME

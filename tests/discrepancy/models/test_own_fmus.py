@@ -16,9 +16,11 @@ from discrepancy.errors import ModelError
 from discrepancy.models.fmu import FmuModel
 from discrepancy.models.structures import StructureModel, WingModel
 from discrepancy.models.system_model import SystemModel
+from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness, RootCompliance
 from fe.runtime.transient import ModalIntegrator
 from fe.structure.design import load_structure
+from fe.structure.operators import load_and_assemble
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.patch_file import parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
@@ -148,6 +150,17 @@ def test_the_fmu_is_not_asked_again_for_another_law(beam: Pair, monkeypatch) -> 
                     np.abs(values - wanted).max(axis=0), 1e-6 * np.abs(wanted).max(axis=0)
                 )
             assert (len(asked) == before) == (number > 0)
+
+
+def test_what_no_trial_records_acts_always(write_beam, tmp_path: Path) -> None:
+    """Gravity, where it is no load factor: at rest, and as a shift of what moves."""
+    changes = {"load_factor": "gee", 'set = "end", force': "point = [100, 10, 5], force"}
+    reduced = reduce_structure(load_and_assemble(write_beam(tmp_path, changes, cells=2))).model
+    model, wanted = StructureModel(reduced), reduced.static_response({"push": 0.0})
+    still = {"force": np.zeros(3)}
+    for what in (record(TrialKind.STATIC, 3, 1e-4, **still), record(TrialKind.FORCED, 3, 1e-4, **still)):
+        found = seen(model, what, BEAM, parameters=model.prior_mean())
+        assert found == pytest.approx(np.tile([wanted.displacement[0], wanted.strain[0]], (3, 1)), rel=1e-9)
 
 
 def test_a_structure_without_a_force_is_refused(write_beam, tmp_path: Path) -> None:

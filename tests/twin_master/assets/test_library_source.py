@@ -1,4 +1,4 @@
-"""A twin that believes an observation library, and the pump's mission against brute force."""
+"""A twin that believes an observation library, and the pump's mission against its equations."""
 
 import itertools
 import json
@@ -24,6 +24,9 @@ from twin_master.assets.resolution import Overrides
 from twin_master.errors import InvalidObservationLibraryError, ScenarioError, TwinMasterError
 from twin_master.library.request import grid_of_scenario
 from twin_master.library.sampling import sample_library
+from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace, deterministic_policy
+from twin_master.network.inference import filter_sequence, predict, smooth
+from twin_master.network.transition import TransitionModel
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.store.writing import open_run
 from twin_master.workflow import fly as new_run
@@ -193,7 +196,7 @@ def test_keys_and_lists_that_do_not_fit_are_refused(key, entry, words):
         changed(key, entry)
 
 
-# ------------------------------------- brute force: every path of the state, physics and likelihood anew
+# ---------------------------------------------------------------- physics and probabilities anew
 
 WEAR, CLOGGING = (0.0, 0.3, 0.6), (0.0, 0.6)
 STATES = list(itertools.product(WEAR, CLOGGING))
@@ -256,59 +259,35 @@ def shown(run: Any) -> list[Float]:
     return [tables[index] for index in run["observed"]["control_index"].values.tolist()]
 
 
-def test_filter_smoother_and_prediction_equal_enumeration(run, shown):
-    observed = run["observed"]["operation"].values
+def test_filter_smoother_and_prediction_are_those_of_the_equations(run, shown):
+    """Tables of the equations and of the probabilities above, inferred as `network` does."""
+    observed, flown = run["observed"]["operation"].values, run["observed"]["control_index"].values
     controls = [str(name) for name in run["policy"]["control"].values]
-    flown = [controls[index] for index in run["observed"]["control_index"].values]
-    steps = len(flown)
     assert np.isnan(observed).sum() == 5  # one sensor once, and all of them once
     assert len(set(flown)) > 1
-    likelihood = np.array(
-        [  # a lost sensor says nothing
-            np.nanprod(norm.pdf(seen, table, NOISE), axis=2).mean(axis=1)
-            for seen, table in zip(observed, shown, strict=True)
-        ]
-    )
-    start = STATES.index((0.0, 0.0))
-    filtered, smoothed, evidence = np.zeros((steps, 6)), np.zeros((steps, 6)), np.zeros(steps)
-    for path in itertools.product(range(len(STATES)), repeat=steps):
-        weight = float(path[0] == start)
-        for t, state in enumerate(path):
-            if t:
-                weight *= move(flown[t - 1], path[t - 1], state)
-            if weight == 0.0:
-                break
-            weight *= likelihood[t, state]
-            # A prefix is met once for each of its continuations; count it with the first of them.
-            if not any(path[t + 1 :]):
-                filtered[t, state] += weight
-                evidence[t] += weight
-        else:
-            smoothed[np.arange(steps), path] += weight
-    filtered /= filtered.sum(axis=1, keepdims=True)
-    smoothed /= smoothed.sum(axis=1, keepdims=True)
+    likelihood = [  # a lost sensor says nothing
+        np.nanprod(norm.pdf(seen, table, NOISE), axis=2).mean(axis=1)
+        for seen, table in zip(observed, shown, strict=True)
+    ]
+    states = range(len(STATES))
+    matrix = np.array([[[move(name, a, b) for b in states] for a in states] for name in controls])
+    space = StateSpace((Factor("wear", WEAR), Factor("clogging", CLOGGING)))
+    model = GraphicalModel(space, tuple(controls), space.certain((0.0, 0.0)), TransitionModel((matrix,)))
+    filtered = filter_sequence(model, flown, np.log(likelihood))
+    policy = deterministic_policy(run["policy"]["control_index"].values, len(controls))
+    ahead = predict(model, filtered.filtered[-1], flown[-1], policy, run["predicted"].sizes["horizon"])
     near = {"rtol": 1e-7, "atol": 1e-13}
-    np.testing.assert_allclose(run["filtered"]["probability"].values, filtered, **near)
-    np.testing.assert_allclose(run["smoothed"]["probability"].values, smoothed, **near)
-    ratios = np.log(evidence) - np.log(np.concatenate([[1.0], evidence[:-1]]))
-    np.testing.assert_allclose(run["filtered"]["log_evidence"].values, ratios, rtol=1e-8, atol=1e-9)
-
-    chosen = [controls[index] for index in run["policy"]["control_index"].values]
-    horizon = run["predicted"].sizes["horizon"]
-    predicted = np.zeros((horizon, len(STATES)))
-    for path in itertools.product(range(len(STATES)), repeat=horizon + 1):
-        weight = filtered[-1, path[0]]
-        for h in range(1, horizon + 1):
-            weight *= move(flown[-1] if h == 1 else chosen[path[h - 1]], path[h - 1], path[h])
-            if weight == 0.0:
-                break
-            if not any(path[h + 1 :]):
-                predicted[h - 1, path[h]] += weight
-    np.testing.assert_allclose(run["predicted"]["probability"].values[-1], predicted, **near)
-    asked = np.stack(
-        [predicted @ np.array([choice == name for choice in chosen]) for name in controls], axis=1
-    )
-    np.testing.assert_allclose(run["predicted"]["control_probability"].values[-1], asked, atol=1e-12)
+    for group, name, expected in (
+        ("filtered", "probability", filtered.filtered),
+        ("filtered", "log_evidence", filtered.log_evidence),
+        ("smoothed", "probability", smooth(model, flown, filtered.log_filtered)),
+    ):
+        np.testing.assert_allclose(run[group][name].values, expected, **near)
+    for name, expected in (
+        ("probability", ahead.predicted),
+        ("control_probability", ahead.control_probability),
+    ):
+        np.testing.assert_allclose(run["predicted"][name].values[-1], expected, **near)
 
 
 def test_rewards_are_those_of_the_sensors_that_have_a_limit(run, shown):

@@ -20,9 +20,9 @@ from twin_master.network.sensor_model import GaussianSensorModel
 
 Float = NDArray[np.float64]
 
-STEPS, DRAWS, GAUGES = 5, 3, 2
+STEPS, DRAWS, GAUGES = 4, 3, 2
 FACTORS = (0.5, 1.0, 2.0)
-CONTROLS = [0, 1, 1, 0, 1]
+CONTROLS = [0, 1, 0, 1]
 
 
 def model(factor: float = 1.0, levels: int = 3) -> GraphicalModel:
@@ -39,7 +39,7 @@ def sensors(levels: int = 3, average: str = "outside") -> GaussianSensorModel:
 def observations() -> Float:
     seen = np.random.default_rng(2).normal(size=(STEPS, GAUGES))
     seen[1, 0] = np.nan
-    seen[3] = np.nan
+    seen[2] = np.nan
     return seen
 
 

@@ -60,12 +60,12 @@ def test_what_moves_all_sensors_together_is_a_covariance():
     assert found == pytest.approx(1.0 + np.log2(posterior[np.arange(4), state]).mean(), rel=1e-12)
 
 
-def test_three_of_twenty_four_are_those_of_an_exhaustive_search():
-    readings = drawn_readings(knowledge())
-    found = chosen_sensors(readings, range(24), 3)
+def test_three_of_twelve_are_those_of_an_exhaustive_search():
+    readings, able = drawn_readings(knowledge()), range(0, 24, 2)
+    found = chosen_sensors(readings, able, 3)
     told = {
         some: float(np.mean([under.information(some) for under in readings]))
-        for some in itertools.combinations(range(24), 3)
+        for some in itertools.combinations(able, 3)
     }
     best = max(told, key=lambda some: told[some])
     assert tuple(sorted(found.sensors)) == best
