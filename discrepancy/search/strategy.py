@@ -149,8 +149,8 @@ class Search:
         found = self._scan_near(base, near)
         explained = any(absolute_gate(self.problem, item).passed for item in found)
         if self._misfits(base) or (self._far(base) and not explained):
-            # Nuisances of a wrong model are far off and make a bad start; beside a force that is free they are
-            # where they belong. Beside trials at rest, which know no force, they are as before the data.
+            # nuisances of a wrong model are far off, a bad start; beside a force that is free they are
+            # where they belong; beside trials at rest, which know no force, they are as before the data
             there = self._unbiased(base)
             within = [one for one in effects if acts_within(one, self.problem.setting)]
             grids = [row for one in within if (row := tried(self.problem, there, one))]
