@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from reporting import terminal
 from reporting.words import counted
 from uav_twin.options import told
+from uav_twin.sentences import said
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
@@ -130,10 +131,8 @@ def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> d
     from discrepancy.errors import CatalogueError
 
     if len(parts) > len(names):
-        raise CatalogueError(
-            f"{identifier} has {counted(len(names), 'parameter')} ({', '.join(names)}), but "
-            f"{counted(len(parts), 'value')} came."
-        )
+        both = {"has": counted(len(names), "parameter"), "came": counted(len(parts), "value")}
+        raise CatalogueError(said("effects.count", identifier=identifier, names=names, **both))
     values = {}
     for position, part in enumerate(parts):
         name, equals, number = part.rpartition("=")
@@ -142,9 +141,8 @@ def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> d
         try:
             values[name or names[position]] = float(number)
         except ValueError:
-            raise CatalogueError(
-                f"{text!r} must end with numbers, such as {identifier}:{names[0]}=0.1."
-            ) from None
+            example = {"identifier": identifier, "name": names[0]}
+            raise CatalogueError(said("effects.numbers", text=text, **example)) from None
     return values
 
 

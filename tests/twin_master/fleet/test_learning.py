@@ -244,7 +244,7 @@ def test_true_rates_may_differ_from_those_believed(tmp_path):
     scenario = load_fleet(path).groups[0].scenarios[0]
     assert scenario.truth.probability == {"2g": 0.0, "3g": 0.0}
     assert scenario.transition.probability == {"2g": 0.05, "3g": 0.1}
-    assert "probability" not in load_scenario("growing_damage").scenario.to_dict()["truth"]
+    assert load_scenario("growing_damage").scenario.to_dict()["truth"]["probability"] == {}
     path.write_text(path.read_text().replace("growing_damage", "level_turns"))
     with pytest.raises(FleetError, match=r"truth\.probability"):
         load_fleet(path)
