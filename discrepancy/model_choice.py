@@ -13,6 +13,7 @@ from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
 from discrepancy.models.lumped_file import SHIPPED_MODELS
 from discrepancy.models.structures import StructureModel, WingModel
+from discrepancy.sentences import said
 from discrepancy.sources import from_run
 from fe.reduction.model_cache import reduced_structure
 from fe.runtime.errors import FiniteElementError
@@ -104,11 +105,7 @@ def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
     if path.is_dir():
         return choice_of_run(path)
     if path.suffix == ".fmu":
-        raise ModelError(
-            f"{path} is an FMU: give a TOML file that says which of its variables are load, outputs and "
-            "ports "
-            '(kind = "fmu", docs/fmu_models.md), or for the wing its calibration.nc or design.'
-        )
+        raise ModelError(said("models.bare_fmu", path=path))
     if path.suffix and not path.is_file():
         raise ModelError(f"There is no model file {path}; give a calibration (.nc) or a model (.toml).")
     if path.suffix == ".nc":
@@ -117,10 +114,7 @@ def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
         return _patched(path, progress)
     if path.suffix not in ("", ".toml"):
         names = sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml"))
-        raise ModelError(
-            f"{path} is no model: a calibration (.nc), a wing design, a structure or a lumped model (.toml), "
-            f"a patch (.json), or the name of a shipped lumped model ({', '.join(names)}) is expected."
-        )
+        raise ModelError(said("models.no_model", path=path, names=names))
     if path.suffix == ".toml":
         content = read_toml(path, ModelError, what="model")
         if content.get("kind") == "fmu":
@@ -173,24 +167,16 @@ def model_of(origin: Origin, file: Path, progress: Progress | None = None) -> Mo
         If the model is gone, has changed since, or is not known.
     """
     if origin.model_file is None:
-        raise VerdictFileError(
-            f"{file} was left by an earlier version, which did not record where its model is: run "
-            "`uav-twin discrepancy run` again."
-        )
+        raise VerdictFileError(said("models.earlier", file=file))
     place = Path(origin.model_file)
     if place.is_absolute() and not place.exists():
         place = Path(file).parent / place.name
         if not place.exists():
-            raise ModelError(
-                f"The model {origin.model_file}, on which {file} rests, is gone: put it back there, or "
-                f"beside {Path(file).name}."
-            )
+            raise ModelError(said("models.gone", origin=origin, file=file, name=Path(file).name))
     choice = choose_model(place if origin.model_file else None, progress)
     if choice.source_hash != origin.model_hash:
-        raise ModelError(
-            f"The model {choice.file or 'of the shipped wing'} has changed since {file} was written (SHA-256 "
-            f"{choice.source_hash[:12]}, not {origin.model_hash[:12]}): run `uav-twin discrepancy run` again."
-        )
+        which = choice.file or "of the shipped wing"
+        raise ModelError(said("models.changed", which=which, file=file, choice=choice, origin=origin))
     return choice
 
 

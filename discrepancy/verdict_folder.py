@@ -10,6 +10,7 @@ from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import render_report
 from discrepancy.report.text import added_label
 from discrepancy.self_calibration import SELF_CALIBRATION_NAME, write_self_calibration
+from discrepancy.sentences import said
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import patch_draws
 from reporting.errors import FileNotWrittenError
@@ -36,13 +37,9 @@ def check_folder(folder: Path, *, replace_it: bool) -> None:
     if not folder.is_dir() or not any(folder.iterdir()):
         return
     if not (folder / files.VERDICT_NAME).is_file():
-        raise FileNotWrittenError(
-            f"{folder} exists and holds no {files.VERDICT_NAME}, so it is not touched: choose another --out."
-        )
+        raise FileNotWrittenError(said("models.no_verdict", folder=folder, name=files.VERDICT_NAME))
     if not replace_it:
-        raise FileNotWrittenError(
-            f"{folder} holds a verdict already: choose another --out or give --replace."
-        )
+        raise FileNotWrittenError(said("models.verdict_there", folder=folder))
 
 
 def write_verdict_folder(

@@ -20,6 +20,7 @@ from markupsafe import Markup, escape
 
 from reporting import words
 from reporting.errors import InvalidFigureError
+from reporting.sentences import said
 
 if TYPE_CHECKING:  # words are said where nothing is drawn, too
     from matplotlib.figure import Figure
@@ -73,10 +74,8 @@ class Table:
 
     def __post_init__(self) -> None:
         for number, row in enumerate(self.rows):
-            if len(row) != len(self.columns):
-                raise InvalidFigureError(
-                    f"Row {number} of a table has {len(row)} cells; {len(self.columns)} are needed."
-                )
+            if (came := len(row)) != (needed := len(self.columns)):
+                raise InvalidFigureError(said("page.row", number=number, came=came, needed=needed))
 
 
 class ReportFigure(NamedTuple):

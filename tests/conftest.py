@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from hypothesis import settings
+from threadpoolctl import threadpool_limits
 
 from tests.kept import FE, ROOT, kept, packed, remove_old
 
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from fe.runtime.patch_arrays import PatchArrays
     from fe.runtime.reduced import ReducedModel
     from fe.structure.operators import Structure
+    from fe.wing.design import WingDesign
+    from fe.wing.operators import AffineOperators
 
 LEVELS = (0, 20, 40, 60, 80)
 
@@ -67,15 +70,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Let one worker run all tests that share what is made once.
 
     That is all tests of a file, of all files that use a fixture of `SHARED`, and of all files in which a test
-    names the same group. The largest group comes first, then those with slow tests: at the end a long one
-    would keep one worker alone. Tests marked `long` are skipped unless they are asked for.
+    names the same group. The largest group comes first, and last those of `COMPILED`; among each of them slow
+    ones, then those with many tests that are not quick: at the end a long one would keep one worker alone.
+    Tests marked `long` are skipped unless they are asked for.
     """
     if not os.environ.get("UAV_TWIN_LONG_TESTS"):
         for item in items:
             if item.get_closest_marker("long"):
                 item.add_marker(pytest.mark.skip(LONG))
+    listed = set(NOT_QUICK.read_text("utf-8").split())
     if config.getoption("quick"):
-        listed = set(NOT_QUICK.read_text("utf-8").split())
         left_out = [
             item
             for item in items
@@ -96,12 +100,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             group[item.path] = named.args[0]
     slow = {group[item.path] for item in items if item.get_closest_marker("slow")}
     waiting = {group[item.path] for item in items if set(COMPILED) & set(item.path.parts)}
+    long = Counter(group[item.path] for item in items if item.nodeid.partition("[")[0] in listed)
     items.sort(
         key=lambda item: (
             group[item.path] != LARGEST,
             group[item.path] != COMPILING,
-            group[item.path] not in slow,
             group[item.path] in waiting,
+            group[item.path] not in slow,
+            -long[group[item.path]],
         )
     )
     for item in items:
@@ -255,13 +261,46 @@ def make_calibration() -> Callable[..., Calibration]:
 
 
 @pytest.fixture(scope="session")
-def coarse_patch_arrays() -> PatchArrays:
-    """The shipped wing for patches, on a coarse mesh."""
-    from fe.reduction.model_cache import build_patch_arrays
+def shipped_design() -> WingDesign:
     from fe.wing.design import load_design
 
-    design = load_design().changed(mesh={"refinement": 0.25})
-    return kept("coarse-patches", lambda: build_patch_arrays(design), FE, design.hash)
+    return load_design()
+
+
+@pytest.fixture(scope="session")
+def coarse_design(shipped_design: WingDesign) -> WingDesign:
+    return shipped_design.changed(mesh={"refinement": 0.25})
+
+
+@pytest.fixture(scope="session")
+def shipped_operators(shipped_design: WingDesign) -> AffineOperators:
+    from fe.wing.operators import assemble
+
+    return assemble(shipped_design)
+
+
+@pytest.fixture(scope="session")
+def coarse_operators(coarse_design: WingDesign) -> AffineOperators:
+    from fe.wing.operators import assemble
+
+    with threadpool_limits(1):  # as `fe.reduction.model_cache` builds, so that their bytes can be compared
+        return assemble(coarse_design)
+
+
+@pytest.fixture(scope="session")
+def wing() -> ReducedModel:
+    """The shipped wing, from the cache if an earlier test or run built it."""
+    from fe.reduction.model_cache import reduced_model
+
+    return reduced_model()
+
+
+@pytest.fixture(scope="session")
+def coarse_patch_arrays(coarse_design: WingDesign) -> PatchArrays:
+    """That wing for patches, on the coarse mesh."""
+    from fe.reduction.model_cache import build_patch_arrays
+
+    return kept("coarse-patches", lambda: build_patch_arrays(coarse_design), FE, coarse_design.hash)
 
 
 REFERENCE = ROOT.parent / "shared" / "reference"

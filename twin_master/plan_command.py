@@ -37,14 +37,15 @@ def plan(
     json: bool = False,
 ) -> None:
     """Plan on the belief: expected return with its bounds, beside simpler rules."""
-    from twin_master.mission.planning import compared, risk_of, write_policy
+    from reporting.files import atomic_write_bytes
+    from twin_master.mission.planning import compared, policy_file, risk_of
     from twin_master.report.plan import plan_figure
 
     knowledge, _ = _knowledge(scenario, seed, calibration)
     blind = _without(knowledge, [value_of]) if value_of is not None else None
     problem, plan, promised = _planned(knowledge)
     if out is not None:
-        write_policy(out, plan.policy, knowledge.model)
+        atomic_write_bytes(out, policy_file(plan.policy, knowledge.model))
     if picture is not None:
         _draw(picture, plan_figure(plan.policy, knowledge.model))
     record: dict[str, Any] = {

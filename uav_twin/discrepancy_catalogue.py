@@ -9,6 +9,7 @@ from reporting import terminal
 from reporting.files import refuse_filled
 from reporting.words import counted
 from uav_twin.options import told
+from uav_twin.sentences import said
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
@@ -128,10 +129,8 @@ def _hidden(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
 def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> dict[str, float]:
     """Return the values that `parts` give, "VALUE" in the order of `names` or "NAME=VALUE"."""
     if len(parts) > len(names):
-        raise CatalogueError(
-            f"{identifier} has {counted(len(names), 'parameter')} ({', '.join(names)}), but "
-            f"{counted(len(parts), 'value')} came."
-        )
+        both = {"has": counted(len(names), "parameter"), "came": counted(len(parts), "value")}
+        raise CatalogueError(said("effects.count", identifier=identifier, names=names, **both))
     values = {}
     for position, part in enumerate(parts):
         name, equals, number = part.rpartition("=")
@@ -140,9 +139,8 @@ def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> d
         try:
             values[name or names[position]] = float(number)
         except ValueError:
-            raise CatalogueError(
-                f"{text!r} must end with numbers, such as {identifier}:{names[0]}=0.1."
-            ) from None
+            example = {"identifier": identifier, "name": names[0]}
+            raise CatalogueError(said("effects.numbers", text=text, **example)) from None
     return values
 
 

@@ -12,6 +12,7 @@ from reporting.files import atomic_write_text, refuse_existing
 from reporting.words import counted
 from scenarios import asset_scripts
 from uav_twin.options import say_packed, told
+from uav_twin.sentences import said
 from uav_twin.simulated import simulate
 from uav_twin.structure import fmu as build_structure
 from uav_twin.structure import names_structure
@@ -109,9 +110,7 @@ def build(
     """Pack a wing, a structure or a model script as an FMU; equal input gives equal bytes."""
     if script is None and calibration is None and design is not None and names_structure(design):
         if patch is not None or activate or interface != "co-simulation" or windows:
-            raise typer.BadParameter(
-                "--patch, --activate, --interface and --windows are for wings; the design is a structure."
-            )
+            raise typer.BadParameter(said("fmu.of_wings"))
         build_structure(design, out=out, kind=kind, fmi=fmi, replace=replace)
         return
     out = out or Path("uav_wing.fmu")
@@ -127,10 +126,7 @@ def build(
         say_packed(info)
         return
     if any((design, calibration, patch, windows)) or (kind, fmi, interface) != ("python", 2, "co-simulation"):
-        raise typer.BadParameter(
-            "--design, --calibration, --patch, --kind, --fmi, --interface and --windows are for the wing.",
-            param_hint="--script",
-        )
+        raise typer.BadParameter(said("fmu.of_the_wing"), param_hint="--script")
     from fmu_asset.packing.script import build_script_fmu
 
     built = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)

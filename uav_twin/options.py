@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from reporting import terminal
+from uav_twin.sentences import said
 
 if TYPE_CHECKING:
     from fmu_asset.packing.contents import FmuInfo
@@ -17,9 +18,7 @@ def refuse_before(context: typer.Context) -> None:
     """Refuse options that stand before a sub-command, which would not see them; raises `BadParameter`."""
     sources = map(context.get_parameter_source, context.params)
     if any(source is not None and source.name == "COMMANDLINE" for source in sources):
-        raise typer.BadParameter(
-            f"options go behind the command: {context.info_name} {context.invoked_subcommand} ..."
-        )
+        raise typer.BadParameter(said("options.before", context=context))
 
 
 def show(command: str, *, words: "Words | None" = None, **values: Any) -> None:

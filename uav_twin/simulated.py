@@ -8,6 +8,7 @@ from fmu_asset.errors import FmuInputError
 from reporting import terminal
 from reporting.files import atomic_write_bytes, refuse_existing
 from uav_twin.options import told
+from uav_twin.sentences import said
 
 if TYPE_CHECKING:
     import numpy as np
@@ -40,10 +41,7 @@ def values_of(texts: list[str]) -> dict[str, float | list[float]]:
         except ValueError:
             numbers = []
         if not (name and sign and numbers):
-            raise FmuInputError(
-                f"--set {text} is not understood; write NAME=NUMBER, such as --set mass=2.5, and for an "
-                "array NAME=1,2,3."
-            )
+            raise FmuInputError(said("fmu.set", text=text))
         found[name] = numbers[0] if len(numbers) == 1 else numbers
     return found
 
@@ -177,9 +175,6 @@ def _refuse_mixture(
     if (binding is None) != (inputs is None):
         raise FmuInputError("--binding and --inputs go together: one names the columns of the other.")
     if binding is not None and others:
-        raise FmuInputError(
-            "--stop-time, --step-size and --set are for a simulation without --binding, which says these "
-            "itself."
-        )
+        raise FmuInputError(said("fmu.without_binding"))
     if interpolation is not None and inputs is None:
         raise FmuInputError("--interpolation says how inputs go on between the rows of --inputs: give these.")

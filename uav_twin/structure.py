@@ -17,6 +17,7 @@ from reporting.files import atomic_write_text, refuse_existing, refuse_filled
 from reporting.toml_file import read_toml
 from scenarios import structure_files
 from uav_twin.options import say_packed, show, told
+from uav_twin.sentences import said
 from uav_twin.wing import Check, end_with, print_checks
 
 if TYPE_CHECKING:
@@ -254,14 +255,9 @@ def field(
         except ValueError:
             value = nan
         if name in values or not low <= value <= high:
-            known = ", ".join(
-                f"{own} from {low:g} to {high:g}" for own, (low, high) in structure.ranges.items()
-            )
-            raise typer.BadParameter(
-                f"NAME=VALUE is expected, each name once, but {text!r} came; there are {known}. Give a value "
-                "inside, or widen its range in the structure file.",
-                param_hint="--at",
-            )
+            ranges = structure.ranges.items()
+            known = [f"{own} from {low:g} to {high:g}" for own, (low, high) in ranges]
+            raise typer.BadParameter(said("structure.at", text=text, known=known), param_hint="--at")
         values[name] = value
     with terminal.progress().stage("Solving and writing the field"):
         write_structure_vtu(out, structure, values)

@@ -152,9 +152,7 @@ class Understanding:
             for quantity in (item for item in _HELD if item in quantities_of(found[2])):
                 size = conversion_of(quantity, found[2]).si_text(found[1])
                 return {"displacement": float(size), "unit": UNITS[quantity].si}
-        raise CampaignFileError(
-            f"--release must be a length or a voltage such as 15.5mm, and {given!r} came."
-        )
+        raise CampaignFileError(said("campaign.release", given=given))
 
     # ---------------------------------------------------------------- columns
 

@@ -4,15 +4,14 @@ Coloured noise is whitened by an autoregression fitted to the record, so that sa
 are not counted as evidence. Lines of the mains are taken out first: they are an effect, not noise.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil, inf
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
-from scipy.optimize import minimize_scalar
-from scipy.signal import lfilter
+from scipy.signal import lfilter, zoom_fft
 from scipy.stats import chi2
 
 from discrepancy.campaign.noise_tests import ljung_box
@@ -25,7 +24,7 @@ MAINS = (50.0, 60.0, 400.0)
 """Mains frequencies [Hz], of land and aircraft: an effect, and looked for in noise records."""
 MAINS_DEVIATION = 1e-3
 """Share of its frequency by which the mains may be off."""
-LINE_STEPS = 4
+LINE_STEPS = 1000
 """Frequencies that are looked at within the resolution of a record."""
 LARGEST_ORDER = 12
 WHITE_LEVEL = 1e-6
@@ -175,29 +174,12 @@ def line_near(samples: FloatArray, interval: float, shown: float, reach: float) 
 
 
 def _strongest_line(samples: FloatArray, interval: float, low: float, high: float) -> FloatArray:
-    """Return the line of most power between two frequencies [Hz]."""
-    count = LINE_STEPS * len(samples)
-    power = np.abs(np.fft.rfft(samples, count)) ** 2
-    step = 1.0 / (count * interval)
-    first = max(int(np.ceil(low / step)), 1)
-    inside = power[first : int(high / step) + 1]
-    best = step * (first + int(np.argmax(inside))) if inside.size else 0.5 * (low + high)
-
-    def missed(frequency: float) -> float:
-        line = _line(samples, interval, frequency)
-        return -float(line @ line)
-
-    bounds = (max(best - step, low, step), min(best + step, high))
-    if bounds[1] > bounds[0]:
-        best = float(
-            minimize_scalar(missed, bounds=bounds, method="bounded", options={"xatol": 1e-3 * step}).x
-        )
-    return _line(samples, interval, best)
-
-
-def _line(samples: FloatArray, interval: float, frequency: float) -> FloatArray:
-    """Return the line of a frequency in a record, by least squares."""
-    phase = 2.0 * np.pi * frequency * interval * np.arange(len(samples))
+    """Return the line of most power between two frequencies [Hz], by least squares."""
+    step = 1.0 / (LINE_STEPS * len(samples) * interval)
+    low = max(low, step)
+    frequencies = np.linspace(low, high, 2 + int((high - low) / step))
+    power = np.abs(zoom_fft(samples, (low, high), len(frequencies), fs=1.0 / interval, endpoint=True))
+    phase = 2.0 * np.pi * frequencies[power.argmax()] * interval * np.arange(len(samples))
     waves = np.stack((np.cos(phase), np.sin(phase)), axis=1)
     amplitude, *_ = np.linalg.lstsq(waves, samples, rcond=None)
     return np.asarray(waves @ amplitude)
@@ -309,24 +291,3 @@ def _repeats(first: Trial, second: Trial) -> bool:
         np.max(np.abs(one - other)) <= SAME_INPUT * np.max(np.abs(one))
         for one, other in zip(acting(first), acting(second), strict=True)
     )
-
-
-def with_noise(
-    channel: Channel,
-    recorded: Mapping[str, NoiseRecord],
-    stated: NoiseRecord | None,
-    trials: Sequence[Trial],
-) -> tuple[NoiseRecord | None, str]:
-    """Return a channel's noise record and a remark (empty if there is nothing to say).
-
-    Samples at rest come first, then what is stated, then repeats: repeats hold whatever differs from trial to
-    trial (a zero that drifts, a seating), which may be the effect that is looked for.
-    """
-    if channel.name in recorded:
-        return recorded[channel.name], ""
-    if stated is not None:
-        return stated, ""
-    found = repeat_record(channel, trials)
-    if found is not None:
-        return found, said("remarks.repeats", channel=channel, found=found)
-    return None, ""  # said by the checks

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
+from discrepancy.errors import CampaignFileError
 from discrepancy.sentences import said
 from fe.runtime.expression import RESERVED
 from reporting.section import Name, NotNegative, Number, Positive
@@ -37,6 +38,11 @@ class Release:
         Prior standard deviation of the time between release and first sample [s].
     unit : str
         m or V, or 1 of another signal; of a file any that is known, until it is read.
+
+    Raises
+    ------
+    CampaignFileError
+        The displacement is zero, or no mode is free.
     """
 
     displacement: Number
@@ -50,9 +56,9 @@ class Release:
 
     def __post_init__(self) -> None:
         if self.displacement == 0.0:
-            raise ValueError("must not be zero: its sign is the side to which the structure is held")
+            raise CampaignFileError(said("campaign.no_side"))
         if self.mode_count < 1:  # its amplitude would count as exact, unseen
-            raise ValueError(said("campaign.mode_count", count=self.mode_count))
+            raise CampaignFileError(said("campaign.mode_count", count=self.mode_count))
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,11 @@ class Event:
         When it was over [s]; None where nothing is said.
     trial : str or None
         Of a file, in the place of `trials`; without both it happened in all that are samples in time.
+
+    Raises
+    ------
+    CampaignFileError
+        The name cannot be used in expressions, or trials or end are none.
     """
 
     name: Name
@@ -89,4 +100,4 @@ class Event:
             (self.until is not None and self.until <= self.time, "event_end"),
         ):
             if wrong:
-                raise ValueError(said(f"campaign.{sentence}", event=self))
+                raise CampaignFileError(said(f"campaign.{sentence}", event=self))

@@ -1,6 +1,6 @@
 """Reading a campaign: a folder with `campaign.toml` and tables in, a checked `Campaign` in SI units out."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from math import inf
 from pathlib import Path, PurePosixPath
@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from discrepancy.campaign import schema
-from discrepancy.campaign.noise import pre_trigger_record, with_noise
+from discrepancy.campaign.noise import pre_trigger_record, repeat_record
 from discrepancy.campaign.protocol import Event
 from discrepancy.campaign.records import (
     USUAL_REGIONS,
@@ -107,14 +107,14 @@ def assemble(section: schema.CampaignSection, tables: Mapping[str, TextTable], d
         parameters={name: (item.mean, item.deviation) for name, item in section.parameters.items()},
         data_hash=data_hash,
         loggers=section.loggers,
-        events=tuple(_events(section, trials)),
+        events=tuple(placed_events(section.event, trials, CAMPAIGN_FILE)),
         remarks=(*section.remarks, *(remark for remark in remarks if remark not in section.remarks)),
     )
 
 
 def _unused(section: schema.CampaignSection, tables: Mapping[str, TextTable]) -> list[str]:
     """Return a remark on each column that no channel and no input has."""
-    known = {*schema.INPUT_COLUMNS, *(item.table_column for item in (*section.channel, *section.input))}
+    known = {*schema.INPUT_COLUMNS, *(item.table_column for item in section.columns)}
     files: dict[str, list[str]] = {}
     for name in dict.fromkeys(trial.file for trial in section.trial):
         for column in tables[name].columns:
@@ -127,18 +127,25 @@ def _unused(section: schema.CampaignSection, tables: Mapping[str, TextTable]) ->
     ]
 
 
-def _events(section: schema.CampaignSection, trials: tuple[Trial, ...]) -> Iterator[Event]:
-    """Yield the events in the trials in which they happened, once each and within their records in time."""
+def placed_events(events: Iterable[Event], trials: tuple[Trial, ...], source: str) -> Iterator[Event]:
+    """Yield the events in the trials in which they happened, once each and within their records in time.
+
+    Raises
+    ------
+    CampaignFileError, CampaignDataError
+        A trial is not there or has no course, or a moment comes twice or lies outside its record; `source` is
+        named.
+    """
     known, seen = {trial.name: trial for trial in trials}, set[tuple[str, str]]()
     courses = tuple(trial.name for trial in trials if trial.is_dynamic)
-    for event in section.event:
+    for event in events:
         found = replace(event, trial=None, trials=(event.trial,) if event.trial else event.trials or courses)
         for name in found.trials:
             told = {"event": event, "trial": name, "known": ", ".join(known)}
             if name not in courses:
                 wrong = "no_course" if name in known else "no_trial"
                 kind = known[name].kind.value if name in known else ""
-                raise CampaignFileError(f"{CAMPAIGN_FILE}: {said(f'campaign.{wrong}', kind=kind, **told)}.")
+                raise CampaignFileError(f"{source}: {said(f'campaign.{wrong}', kind=kind, **told)}.")
             first, last = known[name].time[[0, -1]].tolist()
             # its end has a name, too, by which expressions know it
             for key, word, moment in (
@@ -148,7 +155,7 @@ def _events(section: schema.CampaignSection, trials: tuple[Trial, ...]) -> Itera
                     continue
                 if (word, name) in seen:
                     twice = said("campaign.two_moments", word=word, trial=name)
-                    raise CampaignFileError(f"{CAMPAIGN_FILE}: {twice}.")
+                    raise CampaignFileError(f"{source}: {twice}.")
                 if not first <= moment <= last:
                     told |= {"key": key, "moment": moment, "first": first, "last": last}
                     raise CampaignDataError(said("campaign.not_then", **told))
@@ -226,9 +233,7 @@ def _inputs(
     )  # fmt: skip
 
 
-def _numbers(
-    table: TextTable, item: schema.ColumnSection, user: str, *, empty_allowed: bool = False
-) -> FloatArray:
+def _numbers(table: TextTable, item: schema.Column, user: str, *, empty_allowed: bool = False) -> FloatArray:
     numbers = table.numbers(item.table_column, user, empty_allowed=empty_allowed)
     return conversion_of(item.quantity, item.unit).to_si(numbers)
 
@@ -250,7 +255,7 @@ def _times(section: schema.TrialSection, table: TextTable, user: str) -> tuple[F
 
 def _measured(
     section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection
-) -> tuple[schema.ChannelSection, ...]:
+) -> tuple[Channel, ...]:
     """Return the channels of a trial: those that it names, or all whose columns are there."""
     channels = {channel.name: channel for channel in campaign.channel}
     there = (name for name, channel in channels.items() if channel.table_column in table.columns)
@@ -266,7 +271,7 @@ def _measured(
 
 
 def _readings(
-    channel: schema.ChannelSection, section: schema.TrialSection, table: TextTable, remarks: list[str]
+    channel: Channel, section: schema.TrialSection, table: TextTable, remarks: list[str]
 ) -> tuple[FloatArray, BoolArray]:
     """Return a channel's readings and which of them are used; an empty cell is bridged and left out."""
     values = _numbers(table, channel, f"the channel {channel.name!r}", empty_allowed=True)
@@ -345,17 +350,11 @@ def _channels(
     recorded = _recorded_noise(section, tables)
     channels = {}
     for item in section.channel:
-        to_si = conversion_of(item.quantity, item.unit).to_si
-        given = item.model_dump(exclude={"noise", "column", "offset_deviation"})
-        free = to_si(item.offset_deviation)
-        channel = Channel(**given, noise=None, offset_deviation=free, column=item.table_column)
-        stated = None
-        if item.noise is not None:
-            stated = NoiseRecord(**item.noise.model_dump())
-            stated = replace(stated, standard_deviation=to_si(stated.standard_deviation))
-        noise, remark = with_noise(channel, recorded, stated, trials)
-        remarks += [remark] if remark else []
-        channels[item.name] = replace(channel, noise=noise)
+        # repeats come last: they hold what differs from trial to trial, which may be what is looked for
+        noise = recorded.get(item.name) or item.noise or repeat_record(item, trials)
+        if noise is not None and noise.source == "repeats" and item.noise is None:
+            remarks.append(said("remarks.repeats", channel=item, found=noise))
+        channels[item.name] = replace(item, column=item.table_column, noise=noise)
     return channels
 
 
@@ -379,13 +378,8 @@ def _recorded_noise(
         there = np.isfinite(values)
         count = int(there.sum())
         if not there[:count].all():
-            raise CampaignDataError(
-                f"{table.name}: the column {item.table_column!r} has an empty cell between readings; a noise "
-                "record must be without gaps."
-            )
+            raise CampaignDataError(said("campaign.noise_gap", table=table, item=item))
         records[item.name] = pre_trigger_record(values[:count], interval, item.name, table.name)
     if not records:
-        raise CampaignFileError(
-            f"{table.name} holds the noise of no channel: its columns are {', '.join(table.columns)}."
-        )
+        raise CampaignFileError(said("campaign.noise_of_none", table=table))
     return records

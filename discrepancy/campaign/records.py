@@ -7,13 +7,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
-from typing import Any, Literal
+from math import inf, isinf
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer, WrapValidator
+from pydantic_core import PydanticKnownError
 
-from discrepancy.campaign.protocol import Event, Release
+from discrepancy.campaign.protocol import IN_FILES, Event, Release
 from discrepancy.campaign.sampling import IntArray, nearly_even
+from reporting.section import Name, NotNegative, Number, Positive
 from reporting.words import brief
 
 FloatArray = NDArray[np.float64]
@@ -122,9 +126,31 @@ class TrialKind(StrEnum):
     FLIGHT = "flight"  # rows are steady turns: a load factor
 
 
+def _refused(value: object) -> object:
+    raise PydanticKnownError("unexpected_keyword_argument")
+
+
+def _needed(value: str) -> str:
+    if not value:
+        raise PydanticKnownError("missing")
+    return value
+
+
+NOT_IN_FILES = BeforeValidator(_refused)
+"""Of a key that the tables of samples at rest say, and a file cannot."""
+Unit = Annotated[str, AfterValidator(_needed), Field(max_length=200, validate_default=True)]
+"""Of a column: every one in a file has it."""
+Deviation = Annotated[
+    NotNegative,
+    WrapValidator(lambda value, check: inf if value == "free" else check(value)),
+    PlainSerializer(lambda value: "free" if isinf(value) else value, when_used="json"),
+]
+"""In files an infinite one is "free"."""
+
+
 @dataclass(frozen=True)
 class NoiseRecord:
-    """What is known of a channel's noise.
+    """What is known of a channel's noise; `noise` of a channel in a file.
 
     Attributes
     ----------
@@ -142,17 +168,19 @@ class NoiseRecord:
         That holds `samples`; empty where there is none.
     """
 
-    standard_deviation: float
-    degrees_of_freedom: float
-    samples: FloatArray | None = None
-    interval: float | None = None
+    standard_deviation: Positive
+    degrees_of_freedom: Positive = inf
+    samples: Annotated[FloatArray | None, NOT_IN_FILES] = None
+    interval: Annotated[float | None, NOT_IN_FILES] = None
     source: Literal["pre-trigger", "repeats", "stated"] = "stated"
-    file: str = field(default="", compare=False)
+    file: Annotated[str, NOT_IN_FILES] = field(default="", compare=False)
+
+    __pydantic_config__ = ConfigDict(**IN_FILES, arbitrary_types_allowed=True)
 
 
 @dataclass(frozen=True)
 class Channel:
-    """One measuring channel.
+    """One measuring channel; `[[channel]]` of a file, until it is read in its unit.
 
     Attributes
     ----------
@@ -174,19 +202,26 @@ class Channel:
     chord : float or None
         Place along the chord [fraction], for maps.
     column, unit : str
-        Of the files; empty where there are none.
+        Of the files; empty where there are none, or the column is called as the channel.
     """
 
-    name: str
+    name: Name
     quantity: Quantity
-    output: str
-    noise: NoiseRecord | None
-    gain_deviation: float = 0.0
-    offset_deviation: float = 0.0
-    station: float | None = None
-    chord: float | None = None
-    column: str = field(default="", compare=False)
-    unit: str = field(default="", compare=False)
+    output: Name
+    noise: NoiseRecord | None = None
+    gain_deviation: Deviation = 0.0
+    offset_deviation: Deviation = 0.0
+    station: Number | None = None
+    chord: Number | None = None
+    column: Name = field(default="", compare=False)
+    unit: Unit = field(default="", compare=False)
+
+    __pydantic_config__ = IN_FILES
+
+    @property
+    def table_column(self) -> str:
+        """Column of the tables."""
+        return self.column or self.name
 
     def noise_in(self, trial: "Trial") -> float:
         """Return the deviation of its noise in a trial [its unit], 0 where it is not known."""

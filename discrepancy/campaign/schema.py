@@ -1,24 +1,23 @@
 """The schema of `campaign.toml`: what it may say, checked strictly; units are still those of the file."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from math import inf, isinf
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
     ConfigDict,
     Field,
-    PlainSerializer,
-    WrapValidator,
+    SerializerFunctionWrapHandler,
+    WrapSerializer,
     field_validator,
     model_validator,
 )
 
 from discrepancy.campaign.protocol import LIST, Event, Release
-from discrepancy.campaign.records import Hold, Quantity, Start, TrialKind
-from discrepancy.campaign.units import conversion_of
+from discrepancy.campaign.records import Channel, Hold, Quantity, Start, TrialKind
+from discrepancy.campaign.units import conversion, conversion_of
 from discrepancy.errors import CampaignFileError
 from discrepancy.sentences import said
 from fe.runtime.patch import EVERY_CHANNEL
@@ -34,11 +33,6 @@ OF_REGION = "health."
 """Begins the column of the losses of a damage region by its name."""
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
-Deviation = Annotated[
-    NotNegative,
-    WrapValidator(lambda value, check: inf if value == "free" else check(value)),
-    PlainSerializer(lambda value: "free" if isinf(value) else value, when_used="json"),
-]
 
 
 class ParameterSection(Section):
@@ -55,62 +49,20 @@ class NoiseFileSection(Section):
     interval: Positive | None = None
 
 
-class StatedNoise(Section):
-    """`noise` of a channel [its unit]; exact without degrees of freedom."""
-
-    standard_deviation: Positive
-    degrees_of_freedom: Positive = inf
-    source: Literal["stated", "repeats", "pre-trigger"] = "stated"
-
-
-class ColumnSection(Section):
-    """What a channel and an input have in common: a column of the tables."""
+class InputSection(Section):
+    """`[[input]]`: a recorded input of driven trials, or what is held in each row of a static one."""
 
     name: Name
     quantity: Quantity = Field(strict=False)
     unit: Name
-    column: Name | None = None
-
-    @property
-    def table_column(self) -> str:
-        """Column of the tables."""
-        return self.column or self.name
-
-    @model_validator(mode="after")
-    def _check_unit(self) -> Self:
-        try:
-            conversion_of(self.quantity, self.unit)
-        except ValueError as cause:
-            raise ValueError(f"the unit of {self.name!r}: {cause}") from None
-        return self
-
-
-class ChannelSection(ColumnSection):
-    """`[[channel]]`."""
-
-    output: Name
-    station: Number | None = None
-    chord: Number | None = None
-    gain_deviation: Deviation = 0.0
-    offset_deviation: Deviation = 0.0
-    noise: StatedNoise | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.name == EVERY_CHANNEL or self.name.startswith("#"):
-            raise ValueError(f"a channel cannot be called {self.name!r}")
-        return self
-
-
-class InputSection(ColumnSection):
-    """`[[input]]`: a recorded input of driven trials, or what is held in each row of a static one."""
-
+    column: Name = ""
     hold: Hold | None = Field(default=None, strict=False)
     reference: bool = False
     offset_deviation: NotNegative = 0.0
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        _check_unit(self)
         if self.table_column in INPUT_COLUMNS and self.table_column != "force":
             raise ValueError(said("campaign.reserved", item=self))
         if self.quantity.moving and not self.reference and self.hold not in (None, Hold.SMOOTH):
@@ -118,16 +70,55 @@ class InputSection(ColumnSection):
         return self
 
     @property
+    def table_column(self) -> str:
+        """Column of the tables."""
+        return self.column or self.name
+
+    @property
     def holds(self) -> Hold | None:
         """What it does between its samples: a motion is smooth, of the rest it is said or not."""
         return Hold.SMOOTH if self.quantity.moving and not self.reference else self.hold
 
 
+Column = Channel | InputSection
+"""What has a column of the tables."""
+
+
+def _check_unit(item: Column) -> None:
+    try:
+        conversion_of(item.quantity, item.unit)
+    except ValueError as cause:
+        raise ValueError(f"the unit of {item.name!r}: {cause}") from None
+
+
+def _scaled(channel: Channel, scale: Callable[[float], float]) -> Channel:
+    """Return a channel with its deviations in another unit."""
+    noise = channel.noise
+    noise = noise and replace(noise, standard_deviation=scale(noise.standard_deviation))
+    return replace(channel, noise=noise, offset_deviation=scale(channel.offset_deviation))
+
+
+def _read(channel: Channel) -> Channel:
+    if channel.name == EVERY_CHANNEL or channel.name.startswith("#"):
+        raise ValueError(f"a channel cannot be called {channel.name!r}")
+    _check_unit(channel)
+    return _scaled(channel, conversion_of(channel.quantity, channel.unit).to_si)
+
+
+def _written(channel: Channel, dump: SerializerFunctionWrapHandler) -> object:
+    return dump(_scaled(channel, conversion_of(channel.quantity, channel.unit).from_si))
+
+
+ChannelInFile = Annotated[Channel, AfterValidator(_read), WrapSerializer(_written)]
+"""Its deviations are in its unit there."""
+
+
 def _in_si(release: Release) -> Release:
-    """Return a release in metres or volts."""
-    quantity = Quantity.DISPLACEMENT if release.unit in ("m", "mm", "um") else Quantity.SIGNAL
-    held = conversion_of(quantity, release.unit).to_si(release.displacement)
-    return replace(release, displacement=held, unit="m" if quantity is Quantity.DISPLACEMENT else "V")
+    """Return a release in metres, volts or as a plain number."""
+    unit: Literal["m", "V", "1"]
+    unit = "m" if release.unit.endswith("m") else "V" if release.unit.endswith("V") else "1"
+    held = conversion(release.unit, unit).to_si(release.displacement)
+    return replace(release, displacement=held, unit=unit)
 
 
 class HealthSection(Section):
@@ -204,12 +195,17 @@ class CampaignSection(Section):
     reference_temperature: Annotated[float, Field(allow_inf_nan=False, ge=-273.15)] | None = None
     parameters: dict[Name, ParameterSection] = Field(default_factory=dict)
     noise: NoiseFileSection | None = None
-    channel: Annotated[tuple[ChannelSection, ...], Field(min_length=1), LIST]
+    channel: Annotated[tuple[ChannelInFile, ...], Field(min_length=1), LIST]
     input: Annotated[tuple[InputSection, ...], LIST] = ()
     trial: Annotated[tuple[TrialSection, ...], Field(min_length=1), LIST]
     event: Annotated[tuple[Event, ...], LIST] = ()
     remarks: Annotated[tuple[str, ...], LIST] = ()
     loggers: dict[Name, Annotated[tuple[Name, ...], LIST]] = Field(default_factory=dict)
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Channels and inputs."""
+        return (*self.channel, *self.input)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -218,8 +214,7 @@ class CampaignSection(Section):
                 raise ValueError(f"there is more than one {kind} called {twice!r}: rename one")
         if self.input and not any(item.kind in (TrialKind.DRIVEN, TrialKind.STATIC) for item in self.trial):
             raise ValueError('[[input]] is for trials of the kind "driven" or "static", and there is none')
-        every: tuple[ColumnSection, ...] = (*self.channel, *self.input)
-        if twice := _twice(item.table_column for item in every):
+        if twice := _twice(item.table_column for item in self.columns):
             what = "channel or input" if self.input else "channel"
             raise ValueError(f"more than one {what} reads the column {twice!r}: give each its own `column`")
         # the force is one of static and forced trials only: a load cell may be called so in a driven one
@@ -228,7 +223,7 @@ class CampaignSection(Section):
         for channel in self.channel:
             if channel.table_column in taken:
                 raise ValueError(said("campaign.taken", item=channel))
-        scales = {item.unit == "K" for item in every if item.quantity is Quantity.TEMPERATURE}
+        scales = {item.unit == "K" for item in self.columns if item.quantity is Quantity.TEMPERATURE}
         if len(scales) > 1:
             raise ValueError("temperatures are given in degC and in K: give all of them in one of the two")
         self._check_loggers()
@@ -269,7 +264,5 @@ def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:
     """
     came = table.get("format", FORMAT)
     if came != FORMAT or isinstance(came, bool):
-        raise CampaignFileError(
-            f"{source}: `format` is {came!r}; this version reads campaigns with `format = {FORMAT}`."
-        )
+        raise CampaignFileError(said("campaign.format", source=source, came=came, wanted=FORMAT))
     return checked(CampaignSection, dict(table), source, CampaignFileError, what="a campaign")

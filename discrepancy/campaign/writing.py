@@ -1,14 +1,13 @@
 """Writing a campaign as a folder that `campaign.reading.read_campaign` reads back."""
 
 import re
-from dataclasses import asdict
-from math import isinf
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from discrepancy.campaign.reading import CAMPAIGN_FILE
+from discrepancy.campaign import schema
+from discrepancy.campaign.reading import CAMPAIGN_FILE, placed_events
 from discrepancy.campaign.records import (
     USUAL_REGIONS,
     Campaign,
@@ -20,7 +19,6 @@ from discrepancy.campaign.records import (
     Trial,
     TrialKind,
 )
-from discrepancy.campaign.schema import FORMAT, OF_REGION, parse_campaign
 from discrepancy.campaign.units import UNITS, conversion_of
 from discrepancy.errors import CampaignFileError
 from discrepancy.sentences import said
@@ -91,7 +89,7 @@ def _trial_table(campaign: Campaign, trial: Trial, si: bool) -> str:
             raise CampaignFileError(said("campaign.temperature_of_none", trial=trial))
         columns["temperature"] = campaign.reference_temperature + trial.temperature
     for index, region in enumerate(trial.regions):
-        name = region if region in USUAL_REGIONS else f"{OF_REGION}{region}"
+        name = region if region in USUAL_REGIONS else f"{schema.OF_REGION}{region}"
         for key, values in ((name, trial.health), (f"{name}_deviation", trial.health_deviation)):
             if np.any(values[:, index] != 0.0):
                 columns[key] = values[:, index]
@@ -134,67 +132,58 @@ def _noise_table(campaign: Campaign, si: bool) -> tuple[str, float] | None:
 
 
 def _campaign_text(campaign: Campaign, files: list[str], noise_interval: float | None, si: bool) -> str:
+    source = f"The campaign {campaign.name!r}"
     inputs = {item.name: item for trial in campaign.trials for item in trial.inputs}
-    content = {
-        "format": FORMAT,
-        "name": campaign.name,
-        "reference_temperature": campaign.reference_temperature,
-        "remarks": campaign.remarks,
-        "parameters": {
-            name: {"mean": mean, "deviation": deviation}
+    section = schema.CampaignSection.model_construct(
+        format=schema.FORMAT,
+        name=campaign.name,
+        reference_temperature=campaign.reference_temperature,
+        remarks=campaign.remarks,
+        parameters={
+            name: schema.ParameterSection.model_construct(mean=mean, deviation=deviation)
             for name, (mean, deviation) in campaign.parameters.items()
         },
-        "noise": None if noise_interval is None else {"file": NOISE_FILE, "interval": noise_interval},
-        "loggers": dict(campaign.loggers),
-        "channel": [_channel(channel, si) for channel in campaign.channels.values()],
-        "input": [_input(item) for item in inputs.values()],
-        "trial": [_trial(campaign, *pair) for pair in zip(campaign.trials, files, strict=True)],
-        "event": [asdict(event) for event in campaign.events],
-    }
-    section = parse_campaign(content, f"The campaign {campaign.name!r}")
-    return toml_text(section.model_dump(mode="json", exclude_defaults=True))
-
-
-def _channel(channel: Channel, si: bool) -> dict[str, Any]:
-    unit, record, noise = _unit(channel, si), channel.noise, None
-    from_si = conversion_of(channel.quantity, unit).from_si
-    if record is not None and record.samples is None:
-        noise = {"standard_deviation": from_si(record.standard_deviation), "source": record.source}
-        if not isinf(record.degrees_of_freedom):
-            noise["degrees_of_freedom"] = record.degrees_of_freedom
-    gain, offset = (
-        "free" if isinf(deviation) else deviation
-        for deviation in (channel.gain_deviation, from_si(channel.offset_deviation))
+        noise=noise_interval and schema.NoiseFileSection(file=NOISE_FILE, interval=noise_interval),
+        loggers=dict(campaign.loggers),
+        channel=tuple(_channel(channel, si) for channel in campaign.channels.values()),
+        input=tuple(_input(item) for item in inputs.values()),
+        trial=tuple(_trial(campaign, *pair) for pair in zip(campaign.trials, files, strict=True)),
+        event=tuple(placed_events(campaign.events, campaign.trials, source)),
     )
-    return {
-        "name": channel.name, "quantity": channel.quantity, "unit": unit, "output": channel.output,
-        "station": channel.station, "chord": channel.chord, "gain_deviation": gain,
-        "offset_deviation": offset, "noise": noise,
-    }  # fmt: skip
+    content = section.model_dump(mode="json", exclude_defaults=True)
+    schema.parse_campaign(content, source)
+    return toml_text(content)
 
 
-def _input(item: RecordedInput) -> dict[str, Any]:
-    return {
-        "name": item.name, "quantity": item.quantity, "unit": UNITS[item.quantity].si, "hold": item.hold,
-        "reference": bool(item.quantity.moving) and item.hold is not Hold.SMOOTH,
-        "offset_deviation": item.offset_deviation,
-    }  # fmt: skip
+def _channel(channel: Channel, si: bool) -> Channel:
+    """Return a channel as a file has it; samples at rest are in a table of their own."""
+    noise = channel.noise
+    if noise is not None:
+        noise = None if noise.samples is not None else replace(noise, interval=None, file="")
+    return replace(channel, unit=_unit(channel, si), column="", noise=noise)
 
 
-def _trial(campaign: Campaign, trial: Trial, file: str) -> dict[str, Any]:
+def _input(item: RecordedInput) -> schema.InputSection:
+    return schema.InputSection.model_construct(
+        name=item.name, quantity=item.quantity, unit=UNITS[item.quantity].si, hold=item.hold,
+        reference=bool(item.quantity.moving) and item.hold is not Hold.SMOOTH,
+        offset_deviation=item.offset_deviation,
+    )  # fmt: skip
+
+
+def _trial(campaign: Campaign, trial: Trial, file: str) -> schema.TrialSection:
     left_out = {
-        name: (np.flatnonzero(~trial.used[:, index]) + 1).tolist()
+        name: tuple((np.flatnonzero(~trial.used[:, index]) + 1).tolist())
         for index, name in enumerate(trial.channels)
         if not trial.used[:, index].all()
     }
     driven = trial.kind is TrialKind.DRIVEN and not trial.begin_assumed
     said = driven or trial.begins is not Start.SETTLED
     in_order = list(trial.channels) == [name for name in campaign.channels if name in trial.channels]
-    return {
-        "name": trial.name, "kind": trial.kind, "file": file, "run": trial.run, "held_out": trial.held_out,
-        "noise_factor": trial.noise_factor,
-        "start": trial.start if trial.start or not trial.is_dynamic else None,
-        "begins": trial.begins if said else None, "hold": trial.hold, "load_place": trial.load_place,
-        "channels": None if in_order else trial.channels, "left_out": left_out,
-        "release": None if trial.release is None else asdict(trial.release),
-    }  # fmt: skip
+    return schema.TrialSection.model_construct(
+        name=trial.name, kind=trial.kind, file=file, run=trial.run, held_out=trial.held_out,
+        noise_factor=trial.noise_factor, release=trial.release, left_out=left_out,
+        start=trial.start if trial.start or not trial.is_dynamic else None,
+        begins=trial.begins if said else None, hold=trial.hold, load_place=trial.load_place,
+        channels=None if in_order else trial.channels,
+    )  # fmt: skip

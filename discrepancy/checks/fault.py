@@ -80,6 +80,6 @@ def place_of(channel: Channel, trial: Trial, start: int = 0, stop: int | None = 
     time = trial.time[start:stop]
     file = f" of {trial.file}" if trial.file else ""
     return (
-        f"the column {(channel.column or channel.name)!r}{file} (the trial {trial.name!r}, {time[0]:.6g} to "
+        f"the column {channel.table_column!r}{file} (the trial {trial.name!r}, {time[0]:.6g} to "
         f"{time[-1]:.6g} s)"
     )

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.stats import theilslopes
 
 from discrepancy.campaign.records import (
     BoolArray,
@@ -218,16 +219,11 @@ def _amplitude(values: FloatArray, trial: Trial) -> float:
 
 
 def _slope(data: FloatArray, model: FloatArray) -> float:
-    """Return the robust slope of data over prediction: median of pairs (Theil and Sen), or a plain ratio."""
-    if len(data) > 400:
-        rows = np.linspace(0, len(data) - 1, 400).round().astype(int)
-        data, model = data[rows], model[rows]
-    first, second = np.triu_indices(len(data), 1)
-    run = model[second] - model[first]
-    far = np.abs(run) > 0.2 * np.max(np.abs(model))
-    if not far.any():
+    """Return the robust slope of data over prediction (Theil and Sen), or a plain ratio at one load."""
+    if np.ptp(model) <= 0.2 * np.max(np.abs(model)):
         return float(np.median(data) / np.median(model)) if np.median(model) else 0.0
-    return float(np.median((data[second] - data[first])[far] / run[far]))
+    rows = np.linspace(0, len(data) - 1, min(len(data), 400)).round().astype(int)
+    return float(theilslopes(data[rows], model[rows]).slope)
 
 
 def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, used: BoolArray) -> float:

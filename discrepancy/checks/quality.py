@@ -38,7 +38,7 @@ def rest_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[
     for name, channel in campaign.channels.items():
         if channel.noise is not None and (what := moves(channel.noise, frequency)) is not None:
             file = f" of {channel.noise.file}" if channel.noise.file else ""
-            column = f"{(channel.column or name)!r}{file}"
+            column = f"{channel.table_column!r}{file}"
             yield fault(FaultKind.MOVES_AT_REST, name, column=column, what=what)
 
 

@@ -18,6 +18,7 @@ from discrepancy.campaign.records import USUAL_REGIONS, Channel, NoiseRecord, Qu
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import DiscrepancyError, VerdictFileError
 from discrepancy.location.residuals import FittedTrial, ResidualSet
+from discrepancy.sentences import said
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
 from reporting.netcdf import read_groups
@@ -33,17 +34,27 @@ _DAMAGED = (
 )  # fmt: skip
 _PLAIN = ("name", "output", "gain_deviation", "offset_deviation", "station", "chord")
 """What the file has of a channel as it is."""
-_BY_CHANNEL = {
-    "measured": "measured value",
-    "prediction": "mean of the posterior prediction, gains and offsets included",
-    "residual": "measured less predicted",
-    "predictive_deviation": "standard deviation of a measured value under the posterior prediction",
+_NOTE = "unit of each channel: see the coordinate `unit`"
+_OF_TRIAL = {
+    "time": ("row", "s", "time"),
+    "force": ("row", "N", "applied force, upwards positive"),
+    "load_factor": ("row", "1", "load factor"),
+    "temperature": ("row", "K", "temperature less the reference"),
+    "health": ("row region", "1", "stiffness losses"),
+    "health_deviation": ("row region", "1", "prior standard deviations of the stiffness losses"),
 }
-_BY_ROW = {
-    "force": ("N", "applied force, upwards positive"),
-    "load_factor": ("1", "load factor"),
-    "temperature": ("K", "temperature less the reference"),
-}
+_OF_FIT = {
+    "prediction": ("row channel", "", "mean of the posterior prediction, gains and offsets included"),
+    "residual": ("row channel", "", "measured less predicted"),
+    "noise_deviation": ("channel", "", "standard deviation of the noise"),
+    "predictive_deviation": (
+        "row channel", "", "standard deviation of a measured value under the posterior prediction",
+    ),
+    "standardised": ("row channel", "1", "residual over noise"),
+    "leverage": ("row channel", "1", "share of the fit in the variance"),
+    "rates": ("row channel", "", "time derivative of the prediction, per s"),
+}  # fmt: skip
+"""Dimensions, unit (empty: of the channel) and words of the arrays of a trial and of its fit, by name."""
 
 
 def write_residuals(path: Path, residuals: ResidualSet, attributes: Mapping[str, str] | None = None) -> Path:
@@ -98,9 +109,7 @@ def read_residuals(path: Path) -> ResidualSet:
             return _residuals(tree)
     except _DAMAGED as error:
         reason = f"{type(error).__name__}: {one_line(error)}"
-        raise VerdictFileError(
-            f"{path} is damaged or no file of residuals ({reason}); write it again."
-        ) from error
+        raise VerdictFileError(said("models.residuals_file", path=path, reason=reason)) from error
     raise VerdictFileError(f"{path} has the schema {schema!r}, but {SCHEMA!r} is needed.")
 
 
@@ -131,43 +140,33 @@ def _channel(row: Mapping[str, Any], samples: Mapping[str, xr.Dataset]) -> Chann
 
 
 def _dataset(item: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
-    trial, plane = item.trial, ("row", "channel")
-    note = "unit of each channel: see the coordinate `unit`"
+    trial = item.trial
     variables: dict[str, Any] = {
-        name: (plane, getattr(item, name, trial.values), {"long_name": text, "comment": note})
-        for name, text in _BY_CHANNEL.items()
+        "measured": (("row", "channel"), trial.values, {"long_name": "measured value", "comment": _NOTE}),
+        "used": (("row", "channel"), item.used.astype(np.int8), {"long_name": "1 where the sample counts"}),
     }
-    variables["standardised"] = (plane, item.standardised, {"long_name": "residual over noise", "units": "1"})
-    variables["leverage"] = (plane, item.leverage, {"units": "1"})
-    variables["used"] = (plane, item.used.astype(np.int8), {"long_name": "1 where the sample counts"})
-    variables["noise_deviation"] = ("channel", item.noise_deviation, {"comment": note})
-    if item.rates is not None:
-        text = "time derivative of the prediction"
-        variables["rates"] = (plane, item.rates, {"long_name": text, "comment": f"{note}, per s"})
-    for name, (unit, text) in _BY_ROW.items():
-        variables[name] = ("row", getattr(trial, name), {"units": unit, "long_name": text})
-    for name in ("health", "health_deviation"):
-        variables[name] = (("row", "region"), getattr(trial, name), {"units": "1"})
-    attributes: dict[str, Any] = {
+    for record, known in ((trial, _OF_TRIAL), (item, _OF_FIT)):
+        for name, (dimensions, unit, text) in known.items():
+            if (values := getattr(record, name)) is not None:
+                of_unit = {"units": unit} if unit else {"comment": _NOTE}
+                variables[name] = (dimensions.split(), values, {"long_name": text, **of_unit})
+    said: dict[str, Any] = {
         "name": trial.name, "kind": trial.kind.value, "run": trial.run, "start": trial.start,
         "held_out": int(trial.held_out), "load_place": json.dumps(trial.load_place),
         "regions": json.dumps(trial.regions),
     }  # fmt: skip
     if trial.release is not None:
-        attributes["release"] = json.dumps(astuple(trial.release))
+        said["release"] = json.dumps(astuple(trial.release))
     coordinates = {
-        "time": ("row", trial.time, {"units": "s"}),
         "channel": ("channel", list(trial.channels)),
         "unit": ("channel", [UNITS[channels[name].quantity].si for name in trial.channels]),
     }
-    return xr.Dataset(variables, coords=coordinates, attrs=attributes)
+    return xr.Dataset(variables, coords=coordinates, attrs=said).set_coords("time")
 
 
 def _trial(group: xr.Dataset) -> FittedTrial:
     attributes = group.attrs
-    rows: dict[str, Any] = {
-        name: group[name].values for name in (*_BY_ROW, "time", "health", "health_deviation")
-    }
+    rows: dict[str, Any] = {name: group[name].values for name in _OF_TRIAL}
     for name, values in rows.items():
         if not np.all(np.isfinite(values)):
             raise ValueError(f"{name} is not finite")
@@ -186,6 +185,5 @@ def _trial(group: xr.Dataset) -> FittedTrial:
         regions=tuple(json.loads(attributes["regions"])) if "regions" in attributes else USUAL_REGIONS,
         **rows,
     )
-    found = ("prediction", "residual", "noise_deviation", "predictive_deviation", "leverage")
-    rates = group["rates"].values if "rates" in group else None
-    return FittedTrial(trial, **{name: group[name].values for name in found}, rates=rates)
+    found = {name: group[name].values for name in _OF_FIT.keys() - {"standardised"} if name in group}
+    return FittedTrial(trial, **found)

@@ -12,6 +12,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
+from discrepancy.sentences import said
 
 from .candidate import Candidate, Linearisation, Point, Remainder, State
 from .normal_equations import finite, normal_equations, solved, upper_factor
@@ -127,10 +128,8 @@ def fit(
     damping = 1e-3
     state = descent.state(_bounded(start), known=known)
     if not np.isfinite(state.objective):
-        raise FitError(
-            f"The model gives values that are not finite for {candidate.identifiers or ('no effect',)}; "
-            "check the ranges of its parameters."
-        )
+        names = candidate.identifiers or "no effect"
+        raise FitError(said("models.not_finite", names=names))
     converged, fresh, before, stalled = False, known is None, np.inf, 0
     for _ in range(iterations):
         step, promised = descent.step(state, damping)

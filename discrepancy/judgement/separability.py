@@ -22,6 +22,7 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, is_magnitude
 from discrepancy.fits.trial_data import stand_in
 from discrepancy.models.interface import Model
+from discrepancy.sentences import said
 
 CONFUSED = 9.0
 """Squared distance [sigma^2] below which two effects form a confusion group."""
@@ -271,8 +272,5 @@ def usable(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
     """
     found = tuple(effect for effect in effects if effect.unavailable(setting) is None)
     if not found:
-        raise DiscrepancyError(
-            "No effect of the catalogue can be tested with this campaign and model: the campaign needs "
-            "static, ring-down, forced or flight trials whose channels are outputs of the model."
-        )
+        raise DiscrepancyError(said("effects.none_testable"))
     return found

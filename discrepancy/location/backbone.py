@@ -17,6 +17,7 @@ import numpy as np
 from calibration.dynamics.damped_cosine import DampedCosines, Solution
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
+from discrepancy.sentences import said
 
 SMALLEST_SIGNAL = 4.0
 """A mode counts in a window while its amplitude there is this many standard errors."""
@@ -90,11 +91,8 @@ def backbones(
     width = round(periods * 2.0 * np.pi / (start[0] * interval)) + 1
     unknown = 4 * start.size + 2
     if width < _FEWEST_PER_UNKNOWN * unknown or width > time.size:
-        raise FitError(
-            f"A window of {periods:g} periods has {width} samples, but at least "
-            f"{_FEWEST_PER_UNKNOWN * unknown:.0f} and at most {time.size}, the record's length, are needed: "
-            "give a longer or more finely sampled record."
-        )
+        ends = width, _FEWEST_PER_UNKNOWN * unknown, time.size
+        raise FitError(said("campaign.window", periods=periods, ends=ends))
     active = np.ones(start.size, dtype=bool)
     pole = (1j - 0.02) * start
     rows: list[list[tuple[float, ...]]] = [[] for _ in start]

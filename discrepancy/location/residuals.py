@@ -6,14 +6,16 @@ S = J L / s0, J the derivatives of the predictions and L L^T the posterior covar
 trials have I + S S^T. The diagonal of S S^T is the leverage.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from discrepancy.campaign.noise_tests import SHORTEST_SERIES
 from discrepancy.campaign.records import BoolArray, Channel, FloatArray, Trial
 from discrepancy.errors import FitError
+from discrepancy.sentences import said
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +67,7 @@ class FittedTrial:
         finite = all(np.all(np.isfinite(part[used])) for part in parts if part is not None)
         positive = np.all(self.noise_deviation > 0.0) and np.all(self.predictive_deviation[used] > 0.0)
         if not (finite and positive and np.all(self.expected_variance[used] > -1e-9)):
-            raise FitError(
-                f"The fit of the trial {self.trial.name!r} has values that are not finite, deviations "
-                "that are not positive, or a leverage above one."
-            )
+            raise FitError(said("models.bad_fit", self=self))
 
     @property
     def used(self) -> BoolArray:
@@ -158,6 +157,17 @@ class ResidualSet:
                 residual = residual + item.sensitivity @ draw
             white.append(np.where(item.used, residual, filler))
         return tuple(white)
+
+    def series(self, white: Sequence[FloatArray]) -> Iterator[tuple[FittedTrial, str, FloatArray]]:
+        """Yield trial, channel and its white residuals (N,) of all that are long enough for tests in time.
+
+        `white` is what the method of this name returned.
+        """
+        for item, values in zip(self.trials, white, strict=True):
+            if item.trial.is_dynamic and len(values) >= SHORTEST_SERIES:
+                for column, name in enumerate(item.trial.channels):
+                    if item.used[:, column].any():
+                        yield item, name, values[:, column]
 
     def _held_out_draw(self, draw: FloatArray) -> FloatArray:
         """Return a draw of the parameters' error given the held-out trials.

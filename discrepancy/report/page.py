@@ -17,7 +17,7 @@ from discrepancy.self_calibration import outcomes
 from discrepancy.verdict import Proof, Scores, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page, ReportFigure
-from reporting.words import listing
+from reporting.words import listing, plus_minus
 
 SHOWN_HYPOTHESES = 8
 NINETY = 1.6449
@@ -76,8 +76,7 @@ def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
 
 
 def _beside(value: float, deviation: float) -> str:
-    show = words.rounded(value, NINETY * deviation)
-    return f"{show(value)} ± {show(NINETY * deviation)}" if deviation > 0.0 else f"{value:.6g}, exact"
+    return plus_minus(value, NINETY * deviation) if deviation > 0.0 else f"{value:.6g}, exact"
 
 
 _SCORES: dict[str, Callable[[Scores], str]] = {
@@ -159,15 +158,11 @@ def add_origin(page: Page, origin: Origin) -> None:
     page.add_section("Where it comes from")
     provenance = origin.provenance
     rows = [
-        ("campaign", f"{origin.campaign}, SHA-256 {origin.data_hash}"),
-        ("model", f"{origin.model}, SHA-256 {origin.model_hash}"),
-        ("command", origin.short_command),
-        ("seed", str(provenance.seed)),
         *((f"input {name}", f"SHA-256 {value}") for name, value in provenance.input_hashes.items()),
         ("software", ", ".join(f"{name} {version}" for name, version in provenance.versions.items())),
         ("sources", ", ".join(f"{name} {value[:12]}" for name, value in provenance.source_hashes.items())),
     ]
-    WORDS.add_table(page, "origin", rows)
+    WORDS.add_table(page, "origin", rows, origin=origin)
 
 
 def render_report(content: ReportInput, drawings: dict[str, bytes], figures: dict[str, ReportFigure]) -> str:

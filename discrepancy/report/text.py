@@ -1,8 +1,8 @@
 """Numbers, sizes in SI units and sentences of the report and of the summary on the terminal."""
 
 import re
-from collections.abc import Callable, Iterable, Sequence
-from math import floor, isfinite, isnan, log10
+from collections.abc import Iterable, Sequence
+from math import isfinite, isnan
 from typing import Any
 
 from discrepancy.campaign.records import Campaign, Quantity
@@ -26,6 +26,7 @@ from discrepancy.verdict import (
 from discrepancy.workflow import Investigation
 from fe.runtime.patch import CHANNEL_UNIT, ModelPatch, Primitive
 from reporting.page import Words
+from reporting.words import between, rounded
 
 BEYOND_DOUBT = 1e6
 """Evidence [nat] of which no more is told."""
@@ -47,31 +48,8 @@ def estimate_text(estimate: Estimate) -> tuple[str, str]:
     """Return a value, and its 90 % interval, with two digits of the half-width."""
     if not (isfinite(estimate.low) and isfinite(estimate.high)):
         return f"{estimate.value:.4g}", "not known"
-    show = rounded(estimate.value, 0.5 * (estimate.high - estimate.low))
-    return show(estimate.value), f"{show(estimate.low)} to {show(estimate.high)}"
-
-
-def rounded(value: float, spread: float) -> Callable[[float], str]:
-    """Return what formats numbers alike: with two significant digits of a spread.
-
-    Parameters
-    ----------
-    value, spread : float
-        Typical value and its uncertainty.
-    """
-    largest, power, decimals = max(abs(value), abs(spread)), 0, 3
-    if largest > 0.0 and not 1e-3 <= largest < 1e5:
-        power = floor(log10(largest))
-    if spread > 0.0 and isfinite(spread):
-        decimals = min(max(1 - floor(log10(spread)) + power, 0), 12)
-
-    def show(value: float) -> str:
-        if not isfinite(value):
-            return "not known" if isnan(value) else "unbounded"
-        text = f"{value / 10.0**power:.{decimals}f}".replace("-", "\N{MINUS SIGN}")
-        return text + (f"e{power}" if power else "")
-
-    return show
+    half = 0.5 * (estimate.high - estimate.low)
+    return rounded(estimate.value, half), between(estimate.low, estimate.high, half)
 
 
 def p_value_text(p: float) -> str:
@@ -262,10 +240,10 @@ def si_sizes(
         if not unit or item.parameter in BESIDE or item.value == 0.0:
             continue
         known = isfinite(item.low) and isfinite(item.high) and item.low < item.high
-        show = rounded(item.value, 0.5 * (item.high - item.low) if known else 0.0)
-        between = f" ({show(item.low)} to {show(item.high)})" if known else ""
+        half = 0.5 * (item.high - item.low) if known else 0.0
+        interval = f" ({between(item.low, item.high, half)})" if known else ""
         words, where = _words(item.parameter, primitive, unit), _where(primitive, item, model, campaign)
-        found[f"{words} {show(item.value)} {unit}{between}{where}"] = None
+        found[f"{words} {rounded(item.value, half)} {unit}{interval}{where}"] = None
     return ", ".join(found)
 
 

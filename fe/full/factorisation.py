@@ -22,6 +22,7 @@ from threadpoolctl import ThreadpoolController
 
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import SolutionError
+from fe.sentences import said
 
 from .dissection import elimination_blocks
 
@@ -177,10 +178,7 @@ class Factorisation:
             self._eliminate(matrix)
 
     def _refuse(self, matrix: sparse.csr_array, why: str) -> NoReturn:
-        raise SolutionError(
-            "The matrix cannot be factorised; some part of the structure is not held or has no stiffness: of "
-            f"{matrix.shape[0]} unknowns, {why}."
-        )
+        raise SolutionError(said("solution.singular", unknowns=matrix.shape[0], why=why))
 
     def _eliminate(self, matrix: sparse.csr_array) -> None:
         size = matrix.shape[0]
@@ -259,11 +257,8 @@ class Factorisation:
         error = self.backward_error(solution, right_hand_side)
         change = float(np.linalg.norm(correction)) / max(float(np.linalg.norm(solution)), 1e-300)
         if not (error <= BACKWARD_ERROR_LIMIT and change <= CORRECTION_LIMIT):
-            raise SolutionError(
-                f"The static solution has a backward error of {error:.2g} (at most {BACKWARD_ERROR_LIMIT:g}) "
-                f"and is accurate to {change:.2g} (at most {CORRECTION_LIMIT:g}); the stiffness matrix is "
-                "nearly singular, some part of the structure is hardly held."
-            )
+            limits = BACKWARD_ERROR_LIMIT, CORRECTION_LIMIT
+            raise SolutionError(said("solution.inaccurate", error=error, change=change, limits=limits))
         return solution
 
     def backward_error(self, solution: FloatArray, right_hand_side: FloatArray) -> float:
@@ -331,8 +326,6 @@ def lowest_eigenpairs(
     scale = float(norm(stiffness, np.inf)) * np.abs(shapes).max(axis=0)
     residual = np.abs(stiffness @ shapes - (mass @ shapes) * values).max(axis=0) / scale
     if not residual.max() <= MODE_RESIDUAL_LIMIT:
-        raise SolutionError(
-            f"Eigenmode {int(residual.argmax())} has a residual of {residual.max():.2g}, more than "
-            f"{MODE_RESIDUAL_LIMIT:g}; the stiffness matrix is nearly singular."
-        )
+        worst = int(residual.argmax()), residual.max(), MODE_RESIDUAL_LIMIT
+        raise SolutionError(said("solution.eigenmode", worst=worst))
     return values, shapes

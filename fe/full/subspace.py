@@ -14,6 +14,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import SolutionError
+from fe.sentences import said
 
 from .factorisation import Factorisation
 
@@ -73,10 +74,7 @@ def solved_near(
     given = ((right / size).ravel(), (start / size).ravel())
     found, missed = cg(operator, *given, rtol=0.0, atol=tolerance, maxiter=MOST_ITERATIONS)
     if missed:
-        raise SolutionError(
-            f"Conjugate gradients did not reach a residual of {tolerance:g} in {MOST_ITERATIONS} iterations; "
-            "the stiffness terms must be positive semi-definite."
-        )
+        raise SolutionError(said("solution.iterations", tolerance=tolerance, most=MOST_ITERATIONS))
     return np.asarray(found.reshape(right.shape) * size)
 
 

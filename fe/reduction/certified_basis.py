@@ -17,6 +17,7 @@ from fe.full.subspace import OrthonormalBasis, ProjectedBasis, solved_near, turn
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel, StaticResponse
+from fe.sentences import said
 from reporting.progress import Stage
 from reporting.words import counted
 
@@ -269,13 +270,9 @@ class StaticReduction:
                 break
             chosen = _spread(places, bounds, min(TOGETHER, left), wanted)
         if history[-1] > settings.bound_tolerance:
-            raise ReductionError(
-                f"After {counted(len(self.snapshots), 'full solution')} the error bound of "
-                f"{self.terms.structure.design.name} is {history[-1]:.2g} of the largest output, but "
-                f"{settings.bound_tolerance:.2g} was asked for; raise most_solutions (now "
-                f"{settings.most_snapshots}) or tolerance in the table [reduction] of a structure file, or "
-                "narrow the ranges of parameters and losses."
-            )
+            made, design = counted(len(self.snapshots), "full solution"), self.terms.structure.design
+            why = {"made": made, "design": design, "reached": history[-1], "settings": settings}
+            raise ReductionError(said("reduction.bound", **why))
         return tuple(history)
 
     def compressed(self, tolerance: float) -> FloatArray:

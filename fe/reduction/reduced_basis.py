@@ -18,6 +18,7 @@ from fe.full.subspace import ProjectedBasis, affine_product, turned
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
+from fe.sentences import said
 from fe.structure.affine import AffineStructure, natural_frequencies, static_response
 from reporting.progress import Progress, SilentProgress, Stage
 
@@ -64,9 +65,7 @@ def modal_basis(terms: ReductionTerms, count: int, stage: Stage) -> tuple[FloatA
     """
     structure, factors, sought = terms.structure, terms.factors, count + FURTHER_MODES
     if structure.unknowns <= 2 * sought:
-        raise ReductionError(
-            f"{count} modes cannot be had from {structure.unknowns} unknowns; ask for fewer or refine."
-        )
+        raise ReductionError(said("reduction.few_unknowns", count=count, structure=structure))
     working = ProjectedBasis(factors, terms.stiffness_terms, structure.mass_terms, drop=1e-6)
     middle = np.append(1.0, terms.masses.mean(axis=1))
     # inverse iteration on a block; what it leaves is refined below
@@ -82,10 +81,8 @@ def modal_basis(terms: ReductionTerms, count: int, stage: Stage) -> tuple[FloatA
                 stage.advance()
         directions = _compressed(working, terms.compressed_modes(), count)
     except np.linalg.LinAlgError:
-        raise ReductionError(
-            f"The masses of {structure.design.name} move in fewer ways than the {sought} modes that are "
-            "looked for; give its materials a density."
-        ) from None
+        why = said("reduction.few_masses", design=structure.design, sought=sought)
+        raise ReductionError(why) from None
     stiffness, mass = (turned(inner, directions) for inner in working.inner)
     basis = working.displacements @ directions
     load, followed = terms.loads.T @ basis, np.empty((0, basis.shape[1]))
@@ -128,10 +125,8 @@ def _refined(
         largest = float(sizes.max())
         working.add(corrections[:, too_large])
         states = [state for state, chosen in zip(states, still, strict=True) if chosen]
-    raise ReductionError(
-        f"The modes of a sampled state reached a residual of {largest:.2g} only in {MOST_CORRECTIONS} "
-        f"corrections, but {RESIDUAL_TOLERANCE:g} is needed."
-    )
+    reached = largest, MOST_CORRECTIONS, RESIDUAL_TOLERANCE
+    raise ReductionError(said("reduction.corrections", reached=reached))
 
 
 def _compressed(working: ProjectedBasis, states: list[ModalState], count: int) -> FloatArray:
@@ -220,9 +215,7 @@ def _check(terms: ReductionTerms) -> None:
         if missing:
             raise ReductionError(f"The structure {name} has no {what}.")
     if not structure.mass().diagonal().any():
-        raise ReductionError(
-            f"The structure {name} has no mass, hence no modes; give its materials a density."
-        )
+        raise ReductionError(said("reduction.no_mass", name=name))
 
 
 def _named(terms: ReductionTerms) -> dict[str, Any]:

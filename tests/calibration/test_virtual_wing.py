@@ -49,13 +49,6 @@ class Beam:
         return time, 0.4 * initial_tip_displacement * signal
 
 
-@pytest.fixture(scope="module")
-def wing():
-    from fe.reduction.model_cache import reduced_model
-
-    return reduced_model()
-
-
 @pytest.mark.slow
 def test_the_release_is_the_integrators(wing):
     time, signal = VirtualWing(wing, TRUTH).ring_down(0.03, 0.4, 1000.0)

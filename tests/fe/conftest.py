@@ -6,30 +6,9 @@ from fe.reduction.reduced_basis import Reduction, reduce_structure
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
-from fe.wing.design import WingDesign, load_design
-from fe.wing.operators import AffineOperators, assemble
+from fe.wing.design import WingDesign
+from fe.wing.operators import AffineOperators
 from tests.kept import FE, kept
-
-
-@pytest.fixture(scope="session")
-def shipped_design() -> WingDesign:
-    return load_design()
-
-
-@pytest.fixture(scope="session")
-def coarse_design(shipped_design: WingDesign) -> WingDesign:
-    return shipped_design.changed(mesh={"refinement": 0.25})
-
-
-@pytest.fixture(scope="session")
-def coarse_operators(coarse_design: WingDesign) -> AffineOperators:
-    with threadpool_limits(1):  # as `fe.reduction.model_cache` builds, so that their bytes can be compared
-        return assemble(coarse_design)
-
-
-@pytest.fixture(scope="session")
-def shipped_operators(shipped_design: WingDesign) -> AffineOperators:
-    return assemble(shipped_design)
 
 
 @pytest.fixture(scope="session")

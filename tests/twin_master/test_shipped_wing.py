@@ -9,8 +9,6 @@ import pytest
 import xarray as xr
 
 from benchmarks.seeds import fly_seeds
-from fe.reduction.model_cache import reduced_model
-from fe.runtime.reduced import ReducedModel
 from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
 from tests.twin_master.runs import check_same, cut_off_after
@@ -22,12 +20,6 @@ from twin_master.workflow import fly as new_run
 from twin_master.workflow import resume as resume_run
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wing"), pytest.mark.usefixtures("no_report")]
-
-
-@pytest.fixture(scope="module")
-def wing() -> ReducedModel:
-    """The shipped wing, from the cache if an earlier test or run built it."""
-    return reduced_model()
 
 
 def test_the_papers_policy(wing):

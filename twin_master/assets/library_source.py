@@ -21,7 +21,7 @@ from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
 from reporting.progress import Progress
 from reporting.provenance import hash_file
-from twin_master.assets.asset_source import Asset, AssetSource, FlownAndBelieved
+from twin_master.assets.asset_source import AssetSource, FlownAndBelieved
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection
 from twin_master.assets.parameter import ParameterDraws
@@ -358,10 +358,6 @@ class LibrarySource(AssetSource):
         """
         rows, controls = self._places(self.library, model)
         return self.library.at_draws(draws.name, draws.values)[:, rows][:, :, controls]
-
-    def open(self) -> Asset:
-        """Return the asset of the model: a library is flown by nobody."""
-        return self._model.open()
 
     def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
         """Write the field of the model."""

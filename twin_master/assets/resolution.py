@@ -262,27 +262,17 @@ def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) ->
     """
     found = load_learnt(path)
     learnt: LearntTables = found.group.get(group or "", found)
+    moves, given = table["transition"]["kind"], table["calibration"]
     if learnt.transition is not None:
-        names = {entry["name"] for entry in table["control"]}
-        if {*learnt.transition.probability} != names or table["transition"][
-            "kind"
-        ] != "independent_worsening":
-            own, kind = learnt.transition.probability, table["transition"]["kind"]
+        own, names = learnt.transition.probability, sorted(entry["name"] for entry in table["control"])
+        if sorted(own) != names or moves != "independent_worsening":
             raise MissionInputError(
-                said("assets.learnt_controls", path=path, own=own, names=sorted(names), kind=kind)
+                said("assets.learnt_controls", path=path, own=own, names=names, kind=moves)
             )
-        table["transition"]["probability"] = dict(learnt.transition.probability)
-    if learnt.observation is not None:
-        table["observation"]["standard_deviation"] = learnt.observation.standard_deviation
-    if learnt.calibration is not None:
-        given: Mapping[str, Any] = table["calibration"]
-        if learnt.calibration.parameter != given["parameter"]:
-            of = learnt.calibration.parameter, given["parameter"]
-            raise MissionInputError(said("assets.learnt_parameter", path=path, of=of))
-        kept = {key: given[key] for key in ("parameter", "draws")}
-        table["calibration"] = {
-            **kept,
-            "source": "normal",
-            "mean": learnt.calibration.mean,
-            "standard_deviation": learnt.calibration.standard_deviation,
-        }
+    if learnt.calibration is not None and learnt.calibration.parameter != given["parameter"]:
+        of = learnt.calibration.parameter, given["parameter"]
+        raise MissionInputError(said("assets.learnt_parameter", path=path, of=of))
+    anew = {"calibration": {"draws": given["draws"], "source": "normal"}}
+    for name in LearntTables.model_fields:
+        if (part := getattr(learnt, name)) is not None:
+            table[name] = anew.get(name, table[name]) | part.model_dump()

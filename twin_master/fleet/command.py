@@ -3,8 +3,8 @@
 import json
 import signal
 import sys
-import time
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,12 +23,11 @@ if TYPE_CHECKING:
     from twin_master.fleet.flight import FleetOutcome
     from twin_master.fleet.plan import Fleet
     from twin_master.fleet.reading import Estimated
-    from twin_master.fleet.watching import FleetWatch, WatchedAsset
+    from twin_master.fleet.watching import WatchedAsset
 
 
 ROWS = 20
 """Assets that the table on the console shows, the worst first."""
-TABLE_SECONDS = 1.0
 
 
 @told("fleet watch")
@@ -61,14 +60,14 @@ def watch(
 
     fleet_view = is_fleet, serve_fleet
     try:
-        with listening(watched.ask), shown(view, fleet_view) as begun, console.showing(watched):
+        with listening(watched.ask), shown(view, fleet_view) as begun, console.showing():
             if begun is not None:
                 begun(folder)
-            watched.run(console.refresh)
+            watched.run(lambda: console.refresh(watched.standing))
     except Exception as error:
         error.add_note("What was observed is kept: repeat the command to go on.")
         raise
-    console.say(_heading(watched) + f": {folder}.")
+    console.say(f"{_heading(watched.standing)}: {folder}.")
     if watched.failures and not watched.assets:
         raise typer.Exit(1)
 
@@ -82,13 +81,9 @@ class _Console:
 
         self._people = sys.stdout.isatty()
         self._live = Live(console=Console(), auto_refresh=False, transient=False)
-        self._shown = 0.0
-        self._watched: FleetWatch | None = None
+        self._shown: Mapping[str, Any] = {}
 
-    def showing(self, watched: "FleetWatch") -> "Any":
-        from contextlib import nullcontext
-
-        self._watched = watched
+    def showing(self) -> "Any":
         return self._live if self._people and not terminal.loudness.quiet else nullcontext()
 
     def tell(self, asset: "WatchedAsset", decision: Mapping[str, Any]) -> None:
@@ -110,45 +105,44 @@ class _Console:
         else:
             typer.echo(text, err=True)
 
-    def refresh(self) -> None:
-        """Show the table now and then, and hand on what was told."""
+    def refresh(self, standing: Mapping[str, Any]) -> None:
+        """Show the table where it has changed, and hand on what was told."""
         if not self._people:
             sys.stdout.flush()
-        elif self._watched is not None and time.monotonic() - self._shown > TABLE_SECONDS:
-            self._shown = time.monotonic()
-            self._live.update(_watched_table(self._watched), refresh=True)
+        elif standing is not self._shown:
+            self._shown = standing
+            self._live.update(_watched_table(standing), refresh=True)
 
 
-def _heading(watched: "FleetWatch") -> str:
-    assets = watched.assets.values()
-    turns = sum(asset.watch.twin.turns for asset in assets)
-    alarms = sum(asset.alarm_count for asset in assets)
-    refused = sum(asset.watch.intake.counts.rejected for asset in assets)
-    told = [counted(len(assets), "asset"), counted(turns, "turn"), counted(alarms, "alarm")]
-    told += [f"{counted(refused, 'message')} refused"] * (refused > 0)
-    told += [f"{len(watched.failures)} not watched"] * bool(watched.failures)
+def _heading(standing: Mapping[str, Any]) -> str:
+    from twin_master.fleet.watching import counts_of
+
+    counts = counts_of(standing)
+    told = [counted(counts[f"{name}s"], name) for name in ("asset", "turn", "alarm")]
+    told += [f"{counted(counts['messages refused'], 'message')} refused"] * bool(counts["messages refused"])
+    told += [f"{counts['not watched']} not watched"] * bool(counts["not watched"])
     return ", ".join(told)
 
 
-def _watched_table(watched: "FleetWatch") -> "Table":
+def _watched_table(standing: Mapping[str, Any]) -> "Table":
     from rich import box
     from rich.table import Table
 
     from twin_master.mission.replay import health_in_words
 
-    def badness(row: "tuple[WatchedAsset, dict[str, Any]]") -> tuple[int, float]:
-        return row[0].alarm_count, sum(known["mean"] for known in row[1]["health"].values())
+    def badness(row: tuple[str, dict[str, Any]]) -> tuple[int, float]:
+        return row[1]["alarms"], sum(known["mean"] for known in row[1]["last"]["health"].values())
 
-    told = [(asset, asset.decision) for asset in watched.assets.values() if asset.decision is not None]
+    told = [(name, asset) for name, asset in standing["assets"].items() if asset["last"] is not None]
     rows = sorted(told, key=badness, reverse=True)[:ROWS]
-    states = list(dict.fromkeys(name for _, decision in rows for name in decision["health"]))
+    states = list(dict.fromkeys(name for _, asset in rows for name in asset["last"]["health"]))
     table = Table("asset", "turn", "control", *states, "next", "alarms", box=box.SIMPLE_HEAD)
-    table.title = _heading(watched)
-    for asset, decision in rows:
-        health = health_in_words(decision)
-        cells, alarms = [health.get(name, "") for name in states], str(asset.alarm_count or "")
-        turn, control, coming = (str(decision[name]) for name in ("turn", "control", "next_control"))
-        table.add_row(asset.name, turn, control, *cells, coming, alarms)
+    table.title = _heading(standing)
+    for name, asset in rows:
+        last, health = asset["last"], health_in_words(asset["last"])
+        turn, control, coming = (str(last[key]) for key in ("turn", "control", "next_control"))
+        cells = [health.get(state, "") for state in states]
+        table.add_row(name, turn, control, *cells, coming, str(asset["alarms"] or ""))
     return table
 
 

@@ -25,7 +25,7 @@ from twin_master.fleet.flight import WATCHED_KIND, fleet_record, told_of
 from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
 from twin_master.fleet.reading import WITHIN, figure_rows, group_figures, last_turns, leaving, noticed
 from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, has_flown, open_group
-from twin_master.fleet.watching import read_standing
+from twin_master.fleet.watching import counts_of, read_standing
 from twin_master.report.view import printed_factors
 from twin_master.scenario.schema import Scenario
 
@@ -153,11 +153,7 @@ def _add_watched(page: Page, folder: Path, groups: list[dict[str, Any]], most: i
     record = read_standing(folder)
     known, failures = record["assets"], record["failures"]
     told = {name: asset for name, asset in known.items() if asset["last"] is not None}
-    turns = sum(asset["last"]["turn"] + 1 for asset in told.values())
-    alarms, refused = (sum(asset[name] for asset in known.values()) for name in ("alarms", "refused"))
-    counts = [len(known), turns, alarms, refused, len(failures)]
-    titles = ("assets", "turns", "alarms", "messages refused", "not watched")
-    page.add_highlights([(str(count), title) for count, title in zip(counts, titles, strict=True)])
+    page.add_highlights([(str(count), title) for title, count in counts_of(record).items()])
     _add_failures(page, failures, "not_watched", assets=len(known | failures))
     if silent := sorted(known.keys() - told.keys() - failures.keys()):
         page.add_notice(WORDS.say("silent", names=silent, most=most))

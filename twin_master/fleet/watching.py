@@ -54,6 +54,18 @@ def read_standing(folder: Path) -> dict[str, Any]:
     return dict(read_json(path, FleetError)) if path.is_file() else {"assets": {}, "failures": {}}
 
 
+def counts_of(standing: Mapping[str, Any]) -> dict[str, int]:
+    """Return what `read_standing` tells in numbers."""
+    known = standing["assets"].values()
+    return {
+        "assets": len(known),
+        "turns": sum(asset["last"]["turn"] + 1 for asset in known if asset["last"] is not None),
+        "alarms": sum(asset["alarms"] for asset in known),
+        "messages refused": sum(asset["refused"] for asset in known),
+        "not watched": len(standing["failures"]),
+    }
+
+
 class WatchedAsset:
     """An asset under watch.
 
@@ -89,11 +101,6 @@ class WatchedAsset:
         if self.decision is not None:
             watch.filtered = watch.twin.estimator.smoothed(watch.twin.carried[-1:])[0]
 
-    @property
-    def alarm_count(self) -> int:
-        """How many alarms the operator was told."""
-        return self._alarms_before + len(self.alarms)
-
     def record(self) -> dict[str, Any]:
         """Return how it stands, for the view."""
         last = leaving = None
@@ -101,8 +108,8 @@ class WatchedAsset:
             last = {key: self.decision[key] for key in _OF_A_DECISION}
             control = self.watch.scenario.control_names.index(last["control"])
             leaving = float(attention(self._knowledge, self.watch.filtered, control))
-        refused = self.watch.intake.counts.rejected
-        return {"last": last, "alarms": self.alarm_count, "refused": refused, "leaving": leaving}
+        alarms, refused = self._alarms_before + len(self.alarms), self.watch.intake.counts.rejected
+        return {"last": last, "alarms": alarms, "refused": refused, "leaving": leaving}
 
 
 @dataclass
@@ -145,6 +152,8 @@ class FleetWatch:
     ----------
     assets : dict of str to WatchedAsset
         Those that are not lost.
+    standing : dict
+        How all stood a moment ago, as `read_standing` has it.
     asked : bool
         Set it to end between two turns.
     """
@@ -178,7 +187,8 @@ class FleetWatch:
         groups = [{"name": name, "scenarios": [scenario]} for name, scenario in named]
         record = fleet.head.model_dump(exclude={"shard"}) | {"groups": groups}
         self.closing.enter_context(held_fleet(folder, WATCHED_KIND, record))
-        self._told_before = read_standing(folder)["assets"]
+        self.standing = read_standing(folder)
+        self._told_before = dict(self.standing["assets"])
         import resource
 
         limits = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -312,8 +322,8 @@ class FleetWatch:
 
     def _write_state(self) -> None:
         assets = {name: asset.record() for name, asset in sorted(self.assets.items())}
-        record = {"assets": {**self._told_before, **assets}, "failures": self.failures}
-        atomic_write_text(self.folder / STATE_NAME, json.dumps(record) + "\n")
+        self.standing = {"assets": {**self._told_before, **assets}, "failures": self.failures}
+        atomic_write_text(self.folder / STATE_NAME, json.dumps(self.standing) + "\n")
 
 
 class _Files:

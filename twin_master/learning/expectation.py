@@ -114,21 +114,15 @@ class LearntExpectation:
         if (parameter := learnt.get(priors.parameter or "")) is not None:
             draws = np.asarray(priors.draws, dtype=np.float64)
             order = np.argsort(draws)
-            share = np.zeros(len(order))
-            for side in (-1.0, 1.0):
-                at = parameter.mean + side * parameter.standard_deviation
-                place = float(np.interp(at, draws[order], np.arange(len(order))))
-                low, part = int(place), place - int(place)
-                share[order[low]] += 0.5 * (1.0 - part)
-                share[order[min(low + 1, len(order) - 1)]] += 0.5 * part
+            at = parameter.mean + np.array([-1.0, 1.0]) * parameter.standard_deviation
+            near = np.eye(len(draws))[:, order]
+            share = np.array([np.interp(at, draws[order], own).mean() for own in near])
         draw = np.flatnonzero(share)
 
-        def of_sensors(name: str, otherwise: float) -> tuple[Float, Float]:
-            known = [learnt.get(f"{name}[{number}]") for number in range(1, sensors + 1)]
-            means = [otherwise if own is None else own.mean for own in known]
-            return np.array(means), np.array(
-                [0.0 if own is None else own.standard_deviation for own in known]
-            )
+        def of_sensors(name: str, otherwise: float) -> Float:
+            plain = Learnt(otherwise, 0.0, otherwise, otherwise)
+            known = [learnt.get(f"{name}[{number}]", plain) for number in range(1, sensors + 1)]
+            return np.array([own.figures[:2] for own in known]).T
 
         (gain, gain_spread), (offset, offset_spread), (scale, scale_spread) = (
             of_sensors(name, otherwise)

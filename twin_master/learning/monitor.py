@@ -26,7 +26,6 @@ from twin_master.learning.switching import GAUGES, MENDED, NONE
 from twin_master.learning.words import Words
 from twin_master.network.estimator import Carried, Estimate, Estimator, Hypothesis, Notice, Suspicion
 from twin_master.network.inference import smooth
-from twin_master.network.kernels import move_rows
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.tables import MOST_DRAWS, Noticing
 from twin_master.sentences import said
@@ -166,14 +165,10 @@ class WatchfulEstimator:
         if first.probability <= 0.5 or number == own["leading"][0]:
             return []
         own["leading"][0] = number
-        when = f"{self._words.step.capitalize()} {turn}"
-        sensors = f"{self._words.sensor}s"
-        what = f"{first.name}: belief and decision follow the other {sensors}"
-        if number <= 0:
-            what = f"the model explains the {sensors} again"
+        told = {"words": self._words, "step": self._words.step.capitalize(), "turn": turn, "first": first}
+        sentence = said("learning.follows" if number else "learning.explained", **told)
         if number < 0:
-            what = f"no state explains the {sensors}, none is believed, and the control is the safest"
-        sentence = f"{when}: {what} (probability {first.probability:.3g})."
+            sentence = said("learning.unexplained", **told)
         return [Notice("hypothesis", sentence, (number,) if number > 0 else (), first.probability)]
 
     def _start(self, forecast: Float) -> Arrays:
@@ -208,7 +203,8 @@ class WatchfulEstimator:
         own = self._unpacked(before.arrays)
         for name in ("model", "gauge", "none", "mended"):
             rows = own[name].reshape(-1, self._shape[-1])
-            move_rows(self.model.transition.forward_lists, before.control_index, rows)
+            held = rows.any(axis=1)
+            rows[held] = self.model.transition.forward(before.control_index, rows[held])
         turn = float(own["turns"][0])
         inflow = np.log(self._to_begin(turn - 1.0) - self._to_begin(turn))
         gauges = own["gauge"].reshape(-1, *self._shape[2:])
@@ -324,18 +320,10 @@ class WatchfulEstimator:
         notices, words = [], self._words
         when = f"{words.step.capitalize()} {turn}"
         for g in np.flatnonzero(absurd & ~before).tolist():
-            shown, low, high = words.value(
-                g, seen[g], self._low[control_index, g], self._high[control_index, g]
-            )
-            notices.append(
-                Notice(
-                    "gauge_left_out",
-                    f"{when}: {words.sensors([g])} shows {shown}, and no state can show less than {low} or "
-                    f"more than {high}; its readings are left out until they come back.",
-                    (g + 1,),
-                    float(seen[g]),
-                )
-            )
+            low, high = self._low[control_index, g], self._high[control_index, g]
+            values = words.value(g, seen[g], low, high)
+            sentence = said("learning.left_out", when=when, sensor=words.sensors([g]), values=values)
+            notices.append(Notice("gauge_left_out", sentence, (g + 1,), float(seen[g])))
         for g in np.flatnonzero(before & ~absurd & ~np.isnan(seen)).tolist():
             sentence = f"{when}: the readings of {words.sensors([g])} are back, and used again."
             notices.append(Notice("gauge_back", sentence, (g + 1,), float(seen[g])))
@@ -359,9 +347,7 @@ class WatchfulEstimator:
             order = np.argsort(-deviations, kind="stable").tolist()
             named = [g for g in order if deviations[g] >= _NAMED_DEVIATIONS][:_MOST_NAMED] or order[:1]
             what = f"no state of the model explains all gauges together, least {self._words.sensors(named)}"
-            notices.append(
-                self._alarm(turn, what, named, none, _began(own, turn) + float(own["none_onset"][0]))
-            )
+            notices.append(self._alarm(own, turn, what, named, none, float(own["none_onset"][0])))
         return notices
 
     def _gauge_alarm(self, own: Arrays, log_value: float, turn: int) -> Notice:
@@ -369,33 +355,29 @@ class WatchfulEstimator:
         share = np.exp(log_weight - np.logaddexp.reduce(log_weight, axis=None))
         order = np.argsort(-share.sum(axis=1), kind="stable").tolist()
         named = [g for g in order if share[g].sum() >= _NAMED_SHARE][:_MOST_NAMED] or order[:1]
-        onset = _began(own, turn) + float(np.sum(share * own["gauge_onset"]))
+        onset = float(np.sum(share * own["gauge_onset"]))
         sign = share @ np.sign(self._gains)
         if len(named) > 1:
             what = f"one of {self._words.sensors(named)} does not show what the model says"
         else:
             what = f"{self._words.sensors(named)} shows too {'much' if sign[named[0]] > 0.0 else 'little'}"
-        return self._alarm(turn, what, named, log_value, onset)
+        return self._alarm(own, turn, what, named, log_value, onset)
 
-    def _alarm(self, turn: int, what: str, gauges: list[int], log_value: float, onset: float) -> Notice:
-        odds, step, first = float(np.exp(min(log_value, 700.0))), self._words.step, round(onset)
-        since = f"since about {step} {first}" if first else "from the start"
-        search = f"; to find the cause: {self._words.command}" if self._words.command else ""
+    def _alarm(
+        self, own: Arrays, turn: int, what: str, gauges: list[int], log_value: float, onset: float
+    ) -> Notice:
+        """Return an alarm; its onset is counted from the first turn of this model, which may be taught."""
+        odds, words = float(np.exp(min(log_value, 700.0))), self._words
+        first = round(turn + 1.0 - float(own["turns"][0]) + onset)
+        since = f"since about {words.step} {first}" if first else "from the start"
+        search = f"; to find the cause: {words.command}" if words.command else ""
         search += f" --from-turn {first}" if search and first else ""
         evidence = f"{odds:,.0f}" if 1e3 <= odds < 1e6 else f"{odds:.3g}"
-        return Notice(
-            "alarm",
-            f"{step.capitalize()} {turn}: {what}, {since} (evidence {evidence} against the model, alarm from "
-            f"{self._settings.threshold:g}){search}",
-            tuple(g + 1 for g in gauges),
-            odds,
-            first,
-        )
-
-
-def _began(own: Arrays, turn: int) -> float:
-    """Return the first turn of this model: that of the flight, or that from which on a patch is believed."""
-    return turn + 1.0 - float(own["turns"][0])
+        sentence = said(
+            "learning.alarm", when=f"{words.step.capitalize()} {turn}", what=what, since=since,
+            evidence=evidence, threshold=self._settings.threshold, search=search,
+        )  # fmt: skip
+        return Notice("alarm", sentence, tuple(g + 1 for g in gauges), odds, first)
 
 
 def _spread(draws: Float, weight: Float) -> tuple[NDArray[np.int64], Float]:

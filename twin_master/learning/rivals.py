@@ -4,7 +4,7 @@ A pair of a draw and a state is a place, of which there are N. Beliefs are weigh
 negligible.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,7 @@ NEGLIGIBLE_RIVAL = 1e-7
 """The same of a rival: what is left out makes its evidence smaller, and an alarm later."""
 
 
-@dataclass(frozen=True)
-class Shown:
+class Shown(NamedTuple):
     """One observation beside what is predicted at each place, in units of the assumed noise.
 
     Attributes
@@ -80,6 +79,7 @@ def weigh_model(shown: Shown, squares: Float, belief: Float, log_likelihood: Flo
     return float(best + np.log(mass)), known
 
 
+@compiled
 def weigh_gauges(
     shown: Shown,
     gains: Float,
@@ -98,33 +98,8 @@ def weigh_gauges(
     log_likelihood are of the model. belief (G K, N), squares (G, K) and sums are brought up to date;
     returned is the log evidence (G, K).
     """
-    result = np.empty_like(squares)
-    _weigh_gauges(
-        shown.there, shown.residual, shown.size, shown.power, shown.degrees, gains, reach, squares_of_model,
-        known, log_likelihood, belief, squares, sums, result,
-    )  # fmt: skip
-    return result
-
-
-@compiled
-def _weigh_gauges(
-    there: NDArray[np.bool_],
-    residual: Float,
-    size: Float,
-    power: Float,
-    degrees: float,
-    gains: Float,
-    reach: Float,
-    squares_of_model: Float,
-    known: Float,
-    log_likelihood: Float,
-    belief: Single,
-    squares: Float,
-    sums: Float,
-    result: Float,
-) -> None:
-    """Fill result (G, K), see `weigh_gauges`."""
-    weight = np.empty(len(log_likelihood))
+    there, residual, size, power, degrees = shown
+    result, weight = np.empty_like(squares), np.empty(len(log_likelihood))
     for rival in range(len(belief)):
         g, k = divmod(rival, len(gains))
         left, unknown = degrees + squares[g, k], 1.0 / (1.0 + sums[g, k, 0])
@@ -158,6 +133,7 @@ def _weigh_gauges(
             squares[g, k] += added / mass
             sums[g, k, 0] += cc / mass
             sums[g, k, 1] += cx / mass
+    return result
 
 
 def weigh_none(

@@ -23,7 +23,6 @@ SETTLED_TOLERANCE = 1e-3
 
 _LONGEST_BLOCK = 4096
 _BLOCKS = 64
-_LONG_BLOCK = 32
 
 
 @dataclass(frozen=True)
@@ -132,12 +131,8 @@ class GridSampler:
             self._start(begin)
             parts.append(self._ask(begin, end))
         values = np.concatenate(parts)
-        # Once more, with other points in between and in another order; one is enough of a short block.
-        again = {last - 1} if self._grid.settling_steps else {begin}
-        if not self._grid.settling_steps and last - first >= _LONG_BLOCK:
-            again.add((begin + last) // 2)
-        for index in sorted(again):
-            self._check_again(index, values[index - first])
+        again = last - 1 if self._grid.settling_steps else begin  # with other points in between
+        self._check_again(again, values[again - first])
         return values
 
     def _start(self, index: int) -> None:

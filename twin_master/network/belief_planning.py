@@ -14,7 +14,7 @@ from fe.compilation import compiled
 from reporting.arrays import Float, Index
 from twin_master.errors import PlanningError
 from twin_master.network.distributions import expect_shape
-from twin_master.network.planner import BeliefPolicy, evaluate_policy, value_iteration
+from twin_master.network.planner import BeliefPolicy, given_policy, value_iteration
 from twin_master.network.transition import TransitionModel
 
 _STEP = 1e-12
@@ -249,7 +249,9 @@ class _Bounds:
     def __init__(self, problem: DecisionProblem) -> None:
         controls, states, _ = problem.transition.shape
         always = [np.tile(row, (states, 1)) for row in np.eye(controls)]
-        blind = [evaluate_policy(problem.transition, problem.reward, problem.discount, row) for row in always]
+        blind = [
+            given_policy(problem.transition, problem.reward, problem.discount, row).value for row in always
+        ]
         self.problem, self.upper = problem, _Upper(problem)
         self.vectors, self.control = np.array(blind), np.arange(controls)
 

@@ -72,21 +72,19 @@ class Predicted:
         return Predicted(self.predicted, chosen, joint)
 
 
-def _checked_controls(model: GraphicalModel, control_index: ArrayLike) -> Index:
-    """Return the controls as the compiled loops expect them."""
+def _checked(
+    model: GraphicalModel, control_index: ArrayLike, rows: ArrayLike, *, what: str
+) -> tuple[Index, Float]:
+    """Return controls (1, T), and rows of logarithms (1, T, S), as the compiled loops expect them."""
     control = np.array(control_index, dtype=np.int64, order="C")
+    expect_shape("controls", control.shape, control.size)
     expect_controls(control, len(model.controls))
-    return control
-
-
-def _checked_rows(model: GraphicalModel, control: Index, rows: ArrayLike, *, what: str) -> Float:
-    """Return rows of logarithms, one for each control, as the compiled loops expect them."""
     rows = np.require(rows, np.float64, ["C", "W"])
     expect_shape(what, rows.shape, *control.shape, model.states.size)
     if not np.all(rows < np.inf):  # NaN fails this as well
         where = tuple(np.argwhere(~(rows < np.inf))[0].tolist())
         raise InvalidObservationError(f"{what} at {where} is {rows[where]}; expected a number or -inf")
-    return rows
+    return control[None], rows[None]
 
 
 def log_forecast(transition: TransitionModel, control: ArrayLike, log_filtered: ArrayLike) -> Float:
@@ -160,10 +158,8 @@ def filter_sequence(
     InvalidModelError, InvalidObservationError
         If shapes do not fit, or a log-likelihood is NaN or plus infinity.
     """
-    control = _checked_controls(model, control_index)
-    expect_shape("controls", control.shape, control.size)
-    rows = _checked_rows(model, control, log_likelihood, what="log-likelihood")
-    found, failed = filter_many(model, control[None], rows[None], *(before or (model.log_prior,)))
+    control, rows = _checked(model, control_index, log_likelihood, what="log-likelihood")
+    found, failed = filter_many(model, control, rows, *(before or (model.log_prior,)))
     if failed[0] >= 0:
         raise ImpossibleObservation("twin", int(failed[0]))
     return found[0]
@@ -185,11 +181,8 @@ def smooth(model: GraphicalModel, control_index: ArrayLike, log_filtered: ArrayL
     InvalidModelError, InvalidObservationError
         If shapes do not fit, or a log belief is NaN or plus infinity.
     """
-    control = _checked_controls(model, control_index)
-    expect_shape("controls", control.shape, control.size)
-    rows = _checked_rows(model, control, log_filtered, what="log belief")
-    found = smooth_many(model.transition, control[None], np.exp(rows)[None], rows[None])
-    return np.asarray(found[0])
+    control, rows = _checked(model, control_index, log_filtered, what="log belief")
+    return np.asarray(smooth_many(model.transition, control, np.exp(rows), rows)[0])
 
 
 def predict(

@@ -9,7 +9,6 @@ summed. Numbers are copied one by one: numba takes two seconds to compile the co
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fe.compilation import callable_when_compiled, compiled
 from reporting.arrays import Float, Index, Unsigned
@@ -210,12 +209,14 @@ def backward_pass(
 
 @compiled
 def sweep(
-    backward: Lists, reward: Float, discount: Float, limit: float, most: int, value: Float, first: Float
-) -> tuple[int, float]:
+    backward: Lists, reward: Float, discount: Float, policy: Float, limit: float, most: int, value: Float,
+    first: Float,
+) -> tuple[int, float]:  # fmt: skip
     """Iterate the Bellman equation until the value (S,) changes by `limit` at most, or `most` times.
 
-    Filled are the value and `first` (S, U), the same where a control is taken first; returned are the number
-    of sweeps and the last change.
+    The value is that of a policy (S, U), or where that has no rows (0, U) of the best control. Filled are the
+    value and `first` (S, U), the same where a control is taken first; returned are the number of sweeps and
+    the last change.
     """
     later, work, change, iterations = np.empty(len(value)), np.empty(len(value)), np.inf, 0
     while True:
@@ -227,18 +228,7 @@ def sweep(
             return iterations, change
         change = 0.0
         for state in range(len(value)):
-            improved = np.max(first[state])
+            improved = np.sum(policy[state] * first[state]) if len(policy) else np.max(first[state])
             change = max(change, abs(improved - value[state]))
             value[state] = improved
         iterations += 1
-
-
-@compiled
-def move_rows(lists: Lists, control: int, rows: NDArray[np.floating]) -> None:
-    """Bring beliefs (N, S) as they are one transition further; those of zeros stay."""
-    after, work = np.empty_like(rows[0]), np.empty_like(rows[0])
-    for row in range(len(rows)):
-        if np.any(rows[row]):
-            _apply(lists, control, rows[row], after, work)
-            for state in range(len(after)):
-                rows[row, state] = after[state]

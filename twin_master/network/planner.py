@@ -80,7 +80,7 @@ class PlannedPolicy:
     policy : (S, U)
         The same as a row-stochastic matrix p(U | D).
     iterations : int
-        Sweeps until convergence; 0 for a policy that was given.
+        Sweeps until convergence.
     on_belief : BeliefPolicy or None
         What decides by the belief in the place of `policy`, which then predicts alone.
     """
@@ -158,27 +158,40 @@ def rationed(
     return result
 
 
-def _checked(
-    transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: ArrayLike
-) -> tuple[TransitionModel, Float, Float]:
-    """Return the transitions, the reward (S, U) and the discount (U,)."""
-    if not isinstance(transition, TransitionModel):
-        transition = TransitionModel((np.asarray(transition, dtype=np.float64),))
+def _swept(
+    transition: TransitionModel,
+    reward: ArrayLike,
+    discount: ArrayLike,
+    policy: Float | None = None,
+    tolerance: float = 0.0,
+    most: int = 10_000_000,
+) -> tuple[Float, Float, int, float]:
+    """Iterate the Bellman equation until the value is known to a tolerance, or to rounding.
+
+    Returns
+    -------
+    tuple of (S,), (S, U), int, float
+        Value of a policy, the best one by default; the same if a control is taken first; sweeps; how well
+        both are known.
+    """
     rewards = np.array(reward, dtype=np.float64, order="C")
     expect_shape("rewards", rewards.shape, *transition.shape[1::-1], error=PlanningError)
     if not np.all(np.isfinite(rewards)):
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(rewards))[0])
         raise PlanningError(said("network.reward", where=where, reward=rewards[where]))
-    factors = np.asarray(discount, dtype=np.float64)
+    factors = np.array(discount, dtype=np.float64)
     if factors.shape not in ((), rewards.shape[1:]) or not np.all((factors >= 0.0) & (factors < 1.0)):
         raise PlanningError(said("network.discount", controls=rewards.shape[1], factors=factors))
-    return transition, rewards, np.broadcast_to(factors, rewards.shape[1:])
-
-
-def _action_value(transition: TransitionModel, reward: Float, discount: Float, value: Float) -> Float:
-    """Return the reward of each control first and the value afterwards: (S, U)."""
-    later = [transition.expected(control, value) for control in range(reward.shape[1])]
-    return np.asarray(reward + discount * np.stack(later, axis=1))
+    each, largest = np.full(rewards.shape[1], factors), float(factors.max())
+    scale = float(np.abs(rewards).max()) or 1.0
+    # |V_k - V*| <= gamma / (1 - gamma) |V_k - V_{k-1}|; below rounding nothing changes any more.
+    limit = max(tolerance * scale * (1.0 - largest), 4e-16 * scale / (1.0 - largest))
+    rows = np.empty((0, len(each))) if policy is None else policy.copy()
+    value, first = np.zeros(len(rewards)), np.empty_like(rewards)
+    sweeps, change = sweep(transition.backward_lists, rewards, each, rows, limit, most, value, first)
+    if change > limit:
+        raise PlanningError(said("network.sweeps", change=change, sweeps=most, largest=largest))
+    return value, first, sweeps, max(tolerance * scale, limit / (1.0 - largest))
 
 
 def value_iteration(
@@ -217,60 +230,19 @@ def value_iteration(
     InvalidDistributionError
         If a row of the transition does not sum to one.
     """
-    model, rewards, factors = _checked(transition, reward, discount)
-    largest = float(factors.max())
-    scale = float(np.abs(rewards).max()) or 1.0
-    # |V_k - V*| <= gamma / (1 - gamma) |V_k - V_{k-1}|; below rounding nothing changes any more.
-    limit = max(tolerance * scale * (1.0 - largest), 4e-16 * scale / (1.0 - largest))
-    value, action_value = np.zeros(len(rewards)), np.empty_like(rewards)
-    iterations, change = sweep(
-        model.backward_lists, rewards, factors.copy(), limit, max_iterations, value, action_value
-    )
-    if change > limit:
-        raise PlanningError(said("network.sweeps", change=change, sweeps=max_iterations, largest=largest))
-    tie = 2.0 * max(tolerance * scale, limit / (1.0 - largest))
+    if not isinstance(transition, TransitionModel):
+        transition = TransitionModel((np.asarray(transition, dtype=np.float64),))
+    value, action_value, sweeps, error = _swept(transition, reward, discount, None, tolerance, max_iterations)
     best = action_value.max(axis=1, keepdims=True)
-    control_index = np.argmax(action_value >= best - tie, axis=1).astype(np.int64)
-    return PlannedPolicy(
-        value=value,
-        action_value=action_value,
-        control_index=control_index,
-        policy=deterministic_policy(control_index, rewards.shape[1]),
-        iterations=iterations,
-    )
-
-
-def evaluate_policy(
-    transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: ArrayLike, policy: ArrayLike
-) -> Float:
-    """Return the exact value (S,) of a policy: one linear solve, or iterated to rounding over a product.
-
-    Parameters
-    ----------
-    transition, reward, discount
-        As `value_iteration`.
-    policy : (S, U)
-        p(U | D), row-stochastic.
-    """
-    model, rewards, factors = _checked(transition, reward, discount)
-    rows = stochastic_matrix(policy, name="policy[state]")
-    expect_shape("a policy", rows.shape, *rewards.shape, error=PlanningError)
-    expected = np.einsum("su,su->s", rows, rewards)
-    if not model.is_product:
-        closed_loop = np.einsum("su,ust->st", rows * factors, model.matrix)
-        return np.asarray(np.linalg.solve(np.eye(len(expected)) - closed_loop, expected))
-    value: Float = np.zeros_like(expected)
-    # Each sweep shrinks the error by the discount at least.
-    largest = float(factors.max())
-    for _ in range(int(np.ceil(np.log(1e-17) / np.log(largest))) if largest > 0.0 else 1):
-        value = np.einsum("su,su->s", rows, _action_value(model, rewards, factors, value))
-    return value
+    control_index = np.argmax(action_value >= best - 2.0 * error, axis=1).astype(np.int64)
+    policy = deterministic_policy(control_index, action_value.shape[1])
+    return PlannedPolicy(value, action_value, control_index, policy, sweeps)
 
 
 def given_policy(
-    transition: TransitionModel | ArrayLike, reward: ArrayLike, discount: ArrayLike, policy: ArrayLike
+    transition: TransitionModel, reward: ArrayLike, discount: ArrayLike, policy: ArrayLike
 ) -> PlannedPolicy:
-    """Return a policy that was made elsewhere, with its exact value.
+    """Return a policy that was made elsewhere, with its value, iterated to rounding.
 
     Parameters
     ----------
@@ -279,7 +251,7 @@ def given_policy(
     policy : (S, U)
         p(U | D), row-stochastic; `control_index` is its mode, the first of equals.
     """
-    value = evaluate_policy(transition, reward, discount, policy)
-    action_value = _action_value(*_checked(transition, reward, discount), value)
     rows = stochastic_matrix(policy, name="policy[state]")
-    return PlannedPolicy(value, action_value, np.argmax(rows, axis=1).astype(np.int64), rows, 0)
+    expect_shape("a policy", rows.shape, *transition.shape[1::-1], error=PlanningError)
+    value, action_value, sweeps, _ = _swept(transition, reward, discount, rows)
+    return PlannedPolicy(value, action_value, np.argmax(rows, axis=1).astype(np.int64), rows, sweeps)

@@ -83,10 +83,10 @@ class CsvFeed(RecordedFeed):
             try:
                 with path.open("rb") as file:
                     return self._take_columns(_cells(file.readline(LARGEST_MESSAGE)))
-            except (OSError, ValueError) as error:
-                errors.append(MissionInputError(f"{path} cannot be read as CSV: {str(error).rstrip('.')}."))
             except MissionInputError as error:
                 errors.append(error)
+            except (OSError, ValueError) as error:
+                errors.append(MissionInputError(f"{path} cannot be read as CSV: {str(error).rstrip('.')}."))
         raise errors[0] from None
 
     def _take_columns(self, names: list[str]) -> None:

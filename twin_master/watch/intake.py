@@ -211,41 +211,43 @@ class Intake:
         """Return the next reading, see `Source.read`; None also where the end was asked for."""
         with suppress(_Asked):
             while not self.asked and (self.turns is None or twin.turns < self.turns):
-                begin, self._waiting = time.monotonic(), self.look is not None
-                try:
-                    reading = self._next(twin)
-                finally:
-                    self._waiting = False
-                if reading is not None or self.ended or self.look is None:
-                    return reading
-                self.look()
-                time.sleep(max(0.0, begin + POLL_SECONDS - time.monotonic()))
+                begin = time.monotonic()
+                came = bool(self._pending) or self._took(twin)
+                if self._pending:
+                    return self._next(twin)
+                if self.ended or not (came or self.look):
+                    return None
+                if self.look is not None:  # there may be silence among messages that are not taken, too
+                    self.look()
+                if not came:
+                    time.sleep(max(0.0, begin + POLL_SECONDS - time.monotonic()))
         return None
 
-    def _next(self, twin: Twin) -> Reading | None:
-        """Return the next reading; None where nothing has come yet."""
+    def _took(self, twin: Twin) -> bool:
+        """Take in the next message; return whether one has come."""
         if self._messages is None:
             self._messages = self._feed.messages(self._place)
-        while not self._pending:
+        self._waiting = self.look is not None
+        try:
             came = next(self._messages, None)
-            self.ended = came is None
-            message, self._text = came or (None, "")
-            if message is None:
-                return None
-            self.counts.received += 1
-            self._before_last, self._place = self._place, self._feed.place
-            try:
-                if isinstance(message, Refused):
-                    raise message
-                self._sort(twin, message)
-            except Refused as refusal:
-                self._refuse(str(refusal))
-            if not self._pending and self.look is not None:  # silence among messages that are not taken
-                self._waiting = False
-                self.look()
-                self._waiting = True
-                if self.asked:
-                    return None
+        finally:
+            self._waiting = False
+        self.ended = came is None
+        message, self._text = came or (None, "")
+        if message is None:
+            return False
+        self.counts.received += 1
+        self._before_last, self._place = self._place, self._feed.place
+        try:
+            if isinstance(message, Refused):
+                raise message
+            self._sort(twin, message)
+        except Refused as refusal:
+            self._refuse(str(refusal))
+        return True
+
+    def _next(self, twin: Twin) -> Reading:
+        """Return the next of the readings that have come."""
         turn, reading, given = self._pending.popleft()
         self.observation_turn = turn
         self._known = self._unreadable

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from discrepancy import errors
 from discrepancy.campaign.noise import pre_trigger_record, repeated
-from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.protocol import Event, Release
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import (
     Campaign,
@@ -274,6 +274,24 @@ def test_what_cannot_be_written_says_so(tmp_path):
     )
     with pytest.raises(CampaignFileError, match="one sampling interval"):
         write_campaign(replace(campaign, channels={**campaign.channels, "tip": other}), tmp_path / "b")
+    lost = Event("hit", ("nowhere",), time=0.1)
+    with pytest.raises(CampaignFileError, match="'nowhere'"):
+        write_campaign(replace(campaign, events=(lost,)), tmp_path / "b")
+
+
+def test_releases_and_events_that_are_none_are_refused_in_python_too(tmp_path):
+    for make in (
+        lambda: Release(0.0),
+        lambda: Release(0.1, mode_count=0),
+        lambda: Event("a b", time=0.0),
+        lambda: Event("pi", time=0.0),
+        lambda: Event("hit", time=1.0, until=1.0),
+    ):
+        with pytest.raises(CampaignFileError):
+            make()
+    plain = TOML.replace('displacement = 50, unit = "mm"', 'displacement = 50, unit = "1"')
+    release = read_campaign(folder_of(tmp_path, plain)).trials[1].release
+    assert (release.displacement, release.unit) == (50.0, "1")
     assert not (tmp_path / "b").exists()
 
 
@@ -391,7 +409,7 @@ def test_all_missing_and_all_unknown_keys_are_named_at_once(tmp_path):
     with pytest.raises(CampaignFileError) as caught:
         read_campaign(folder_of(tmp_path, toml))
     assert str(caught.value).endswith(
-        "campaign.toml: 'format', 'name', 'channel[1].quantity', 'channel[1].unit', 'channel[1].output', "
+        "campaign.toml: 'format', 'name', 'channel[1].quantity', 'channel[1].output', 'channel[1].unit', "
         "'channel[2].name', 'trial[1].name', 'trial[1].file' and 'trial[1].release.displacement' are missing."
     )
     with pytest.raises(

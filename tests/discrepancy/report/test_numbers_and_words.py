@@ -17,7 +17,7 @@ from discrepancy.report.residual_figures import (
     size,
     size_table,
 )
-from discrepancy.report.text import formula, headline, number, rounded, si_sizes, size_sentence
+from discrepancy.report.text import formula, headline, number, si_sizes, size_sentence
 from discrepancy.verdict import Verdict, VerdictKind
 from discrepancy.workflow import patch_draws
 from fe.runtime.patch import (
@@ -30,7 +30,7 @@ from fe.runtime.patch import (
     SensorGain,
 )
 from fe.wing.design import load_design
-from reporting.words import listing
+from reporting.words import listing, rounded
 from tests.discrepancy.bench import Bench
 from tests.discrepancy.rigs import model_of
 
@@ -44,7 +44,6 @@ def test_numbers_formulas_and_lists_as_they_are_written():
     # numbers that nobody should read as certain
     for value, text in ((1.0 - 1e-6, "> 0.999"), (1e-200, "< 1e-99"), (float("nan"), "not known")):
         assert probability_text(value) == text
-    assert rounded(float("nan"), 1.0)(float("nan")) == "not known"
     assert formula("zeta_eq = 4 c A w^2 / (3 pi k) -> zeta") == "ζ_eq = 4 c A w² / (3 π k) → ζ"
     assert formula("x^n, beta2, multiplier mu") == "x^n, beta2, multiplier μ"
     assert listing(["a"]) == "a"
@@ -64,7 +63,7 @@ pytestmark = pytest.mark.xdist_group("verdict")  # one worker finds it
 
 @given(st.floats(-1e6, 1e6), st.floats(1e-9, 1e3))
 def test_rounding_keeps_values_within_a_twentieth_of_their_spread(value, spread):
-    text = rounded(value, spread)(value).replace("\N{MINUS SIGN}", "-")
+    text = rounded(value, spread).replace("\N{MINUS SIGN}", "-")
     assert abs(float(text) - value) <= 0.051 * spread + 1e-9 * abs(value)
 
 
@@ -117,7 +116,7 @@ def test_gauges_lie_where_the_design_has_them():
             for row in (
                 (PowerDamping("slide", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.5000 N"),
                 (PowerDamping("slide", 0.5, 2.0, 0.0, 0.25, 1.0), "force 0.5000 N at 0.25 m/s"),
-                (PowerStiffness("slide", 3.0, 3.0, 0, 0.01), "force 3.000 N at 0.01 m"),
+                (PowerStiffness("slide", 3.0, 3.0, 0, 0.01), "force 3 N at 0.01 m"),
                 (PointMass(0.2, 0.4), "mass 0.200 kg at 0.4 m"),
                 (SensorGain("displacement", 0.02), ""),
                 (SensorDrift("displacement", 0.002, 10.0), "amplitude 0.002 m"),
@@ -128,7 +127,7 @@ def test_gauges_lie_where_the_design_has_them():
         (lambda: model_of(TANK), PowerDamping("outlet", 0.5, 0.5, 0.0, 2.0, 1.0),
          "flow 0.500 m/s times capacity at 2 m"),
         (lambda: model_of(TANK), Overflow("outlet", 0.5, 1.5, 3.0, 2.0),
-         "flow 0.500 m/s times capacity, level 3.000 m"),
+         "flow 0.500 m/s times capacity, level 3 m"),
         (WingModel.of_design, PowerDamping("root", 0.5, 0.0, 0.0, 1.0, 1.0), "moment 0.500 N m"),
         (WingModel.of_design, PowerDamping("tip", 0.5, 0.0, 0.0, 1.0, 1.0), "force 0.500 N"),
     ],

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from benchmarks.misfit import find_misfit
 from benchmarks.seeds import fly_seeds
 from calibration.result.file import load_calibration, save_calibration
-from fe.reduction.model_cache import reduced_model
 from fe.runtime.patch import ModelPatch, SensorGain
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.packing.patch_file import SCHEMA
@@ -258,12 +257,6 @@ def library_of(wing: ReducedModel, scale: np.ndarray, path: Path) -> Path:
             cell[f"{load}g"] = {name: (1e6 * scale * strain).tolist() for name, strain in strains.items()}
     path.write_text(json.dumps(content), encoding="utf-8")
     return path
-
-
-@pytest.fixture(scope="module")
-def wing() -> ReducedModel:
-    """The shipped wing, from the cache if an earlier test or run built it."""
-    return reduced_model()
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from calibration.virtual_wing import VirtualWing, measure_load_test, measure_ring_down
-from fe.reduction.model_cache import reduced_model
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
 from fmu_asset.errors import FmuError
@@ -23,11 +22,6 @@ TRUTH = DigitalState(
     damping_beta=6e-4,
     stiffness_loss=(0.1, 0.0),
 )
-
-
-@pytest.fixture(scope="module")
-def wing() -> ReducedModel:
-    return reduced_model()
 
 
 @pytest.fixture(scope="module")

@@ -1,11 +1,11 @@
 """What a fleet teaches, against enumeration, closed forms and the truth."""
 
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.twin_master.network.decision_oracles import enumerate_trajectories
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, MissionInputError
 from twin_master.fleet.evidence import Worsening, node_evidence, scaled_likelihood, transition_evidence
@@ -35,18 +35,6 @@ def tiny(probability: object, levels: int = 3) -> Scenario:
     return parse_scenario(table, "tiny")
 
 
-def enumerated(scenario: Scenario, control: list[int], likelihood: np.ndarray) -> float:
-    """Return the evidence as the sum over all paths of the state."""
-    model = build_graphical_model(scenario)
-    total = 0.0
-    for path in product(range(model.states.size), repeat=len(control)):
-        share = model.prior[path[0]] * likelihood[0, path[0]]
-        for t in range(1, len(path)):
-            share *= model.transition.matrix[control[t - 1], path[t - 1], path[t]] * likelihood[t, path[t]]
-        total += share
-    return float(np.log(total))
-
-
 @pytest.mark.parametrize(
     "probability", [{"2g": 0.07, "3g": 0.2}, {"2g": {"z1": 0.07, "z2": 0.3}, "3g": {"z1": 0.2, "z2": 0.01}}]
 )
@@ -67,10 +55,10 @@ def test_evidence_of_a_twin_is_that_of_all_paths(probability):
                 given.setdefault(own, {})[factor] = value  # type: ignore[index]
             else:
                 given[own] = value
-        other = tiny(given)
+        model = build_graphical_model(tiny(given))
         for twin in range(2):
-            expected = enumerated(other, control[twin].tolist(), likelihood[twin])
-            assert found[twin, row] == pytest.approx(expected, abs=1e-12)
+            *_, expected = enumerate_trajectories(model, control[twin], np.log(likelihood[twin]))
+            assert found[twin, row] == pytest.approx(expected.sum(), abs=1e-12)
 
 
 def test_evidence_is_that_of_the_filter():
@@ -256,7 +244,7 @@ def test_true_rates_may_differ_from_those_believed(tmp_path):
     scenario = load_fleet(path).groups[0].scenarios[0]
     assert scenario.truth.probability == {"2g": 0.0, "3g": 0.0}
     assert scenario.transition.probability == {"2g": 0.05, "3g": 0.1}
-    assert "probability" not in load_scenario("growing_damage").scenario.to_dict()["truth"]
+    assert load_scenario("growing_damage").scenario.to_dict()["truth"]["probability"] == {}
     path.write_text(path.read_text().replace("growing_damage", "level_turns"))
     with pytest.raises(FleetError, match=r"truth\.probability"):
         load_fleet(path)

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from twin_master.errors import InvalidDistributionError, InvalidModelError, PlanningError
 from twin_master.network.inference import known_control
-from twin_master.network.planner import evaluate_policy, value_iteration
+from twin_master.network.planner import given_policy, value_iteration
 from twin_master.network.quantity import QuantityModel
 from twin_master.network.rewards import RewardModel, RewardSettings, health_reward
+from twin_master.network.transition import TransitionModel
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -114,9 +115,13 @@ def random_problem(seed, states=7, controls=3):
 @given(seed=SEEDS, discount=st.sampled_from([0.0, 0.6, 0.9, 0.99]))
 def test_the_value_is_optimal_and_that_of_its_policy(seed, discount):
     transition, reward = random_problem(seed)
-    plan = value_iteration(transition, reward, discount)
+    model = TransitionModel((transition,))
+    plan = value_iteration(model, reward, discount)
     scale = np.abs(reward).max() / (1.0 - discount)
-    exact = evaluate_policy(transition, reward, discount, plan.policy)
+    closed_loop = discount * np.einsum("su,ust->st", plan.policy, transition)
+    exact = np.linalg.solve(np.eye(7) - closed_loop, (plan.policy * reward).sum(axis=1))
+    found = given_policy(model, reward, discount, plan.policy)
+    np.testing.assert_allclose(found.value, exact, rtol=0, atol=1e-12 * scale)
     np.testing.assert_allclose(plan.value, exact, rtol=0, atol=1e-11 * scale)
     action_value = reward + discount * np.einsum("ust,t->su", transition, plan.value)
     np.testing.assert_allclose(plan.action_value, action_value, rtol=0, atol=1e-12 * scale)
@@ -135,24 +140,25 @@ def test_equal_to_pymdptoolbox(seed):
         iteration.run()
         exact = PolicyIteration(transition, reward, 0.6)
         exact.run()
-    plan = value_iteration(transition, reward, 0.6)
+    plan = value_iteration(TransitionModel((transition,)), reward, 0.6)
     np.testing.assert_array_equal(plan.control_index, iteration.policy)
     np.testing.assert_array_equal(plan.control_index, exact.policy)
     np.testing.assert_allclose(plan.value, exact.V, rtol=0, atol=1e-10)
 
 
 def test_closed_form_of_one_state_and_ties_go_to_the_first_control():
-    plan = value_iteration(np.ones((2, 1, 1)), [[1.0, 3.0]], 0.75)
+    plan = value_iteration(TransitionModel((np.ones((2, 1, 1)),)), [[1.0, 3.0]], 0.75)
     assert plan.value == pytest.approx(12.0, rel=1e-12)
     assert plan.control_index == [1]
     transition, reward = random_problem(0)
-    doubled = np.concatenate([transition, transition])
+    doubled = TransitionModel((np.concatenate([transition, transition]),))
     plan = value_iteration(doubled, np.concatenate([reward, reward + 1e-15], axis=1), 0.9)
     assert np.all(plan.control_index < 3)
-    assert np.all(value_iteration(transition, np.zeros((7, 3)), 0.9).control_index == 0)
+    assert np.all(value_iteration(TransitionModel((transition,)), np.zeros((7, 3)), 0.9).control_index == 0)
 
 
-MOVES, REWARD = random_problem(0)
+TABLE, REWARD = random_problem(0)
+MOVES = TransitionModel((TABLE,))
 VALUES, WEIGHT, JOINT = random_case(0)
 HOLED = np.where(np.arange(VALUES.size).reshape(VALUES.shape) == 12, np.nan, VALUES)  # at (0, 1, 0, 2)
 QUANTITY = QuantityModel(VALUES, WEIGHT)
@@ -175,8 +181,8 @@ REFUSED = [
     *((lambda bad=bad: value_iteration(MOVES, REWARD, bad), r"discount factor in \[0, 1\)")
       for bad in (1.0, -0.1, np.nan)),
     (lambda: value_iteration(MOVES, REWARD, 0.9, max_iterations=3), "after 3 sweeps"),
-    (lambda: value_iteration(MOVES * 0.95, REWARD, 0.6), "does not sum to one"),
-    (lambda: evaluate_policy(MOVES, REWARD, 0.6, np.ones((7, 1))), "expected a policy of shape"),
+    (lambda: value_iteration(TABLE * 0.95, REWARD, 0.6), "does not sum to one"),
+    (lambda: given_policy(MOVES, REWARD, 0.6, np.ones((7, 1))), "expected a policy of shape"),
     (lambda: value_iteration(MOVES, np.full((7, 3), np.nan), 0.6), r"\(0, 0\) is nan"),
 ]  # fmt: skip
 
