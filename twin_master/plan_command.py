@@ -74,7 +74,7 @@ def _knowledge(
     """Return what the twin knows before any plan on the belief, and where its gauges are, see `_places`."""
     from twin_master.assets.candidates import with_candidates
     from twin_master.assets.resolution import Overrides, believed_source, resolve_scenario
-    from twin_master.mission.preparation import prepare_knowledge
+    from twin_master.mission.preparation import prepared_alone
     from twin_master.scenario.reading import load_scenario
 
     resolved = resolve_scenario(load_scenario(scenario), Overrides(seed=seed, calibration=calibration))
@@ -84,9 +84,7 @@ def _knowledge(
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         if candidates is not None:
             unplanned = with_candidates(unplanned, candidates, Path(folder, "candidates"))
-        source = believed_source(unplanned)
-        source.prepare(Path(folder), terminal.progress())
-        found = prepare_knowledge(unplanned, source, unplanned.mission.seed)
+        found = prepared_alone(unplanned, believed_source(unplanned), terminal.progress())
         places = _places(unplanned)
     return replace(found, scenario=unplanned.model_copy(update={"planner": planner})), places
 

@@ -44,7 +44,6 @@ from .text import WORDS, added_label, force_sentence, motion_of, scored
 _LARGEST_DISTANCE = 1e4
 
 
-@publication_style()
 def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
     """Draw histograms of probability integral transforms; keys are titles, in order before and after."""
     if not scores:
@@ -80,7 +79,6 @@ def _map_of_names(
     return figure, axes, image
 
 
-@publication_style()
 def separability_figure(found: Separability) -> Figure | None:
     """Draw how well each effect can be told from each other one; None with fewer than two effects."""
     names = found.identifiers
@@ -106,7 +104,6 @@ def separability_figure(found: Separability) -> Figure | None:
     return figure
 
 
-@publication_style()
 def confusion_figure(found: SelfCalibration) -> Figure:
     """Draw the confusion matrix of the workflow on simulated campaigns of this geometry."""
     rows, columns, counts = found.confusion()
@@ -123,7 +120,6 @@ MOST_TURNS = 400
 """Samples of the course in time: the stretch where the force is largest."""
 
 
-@publication_style()
 def missing_force_figure(missing: MissingForce) -> Figure:
     """Draw a missing force and what is told of it, with its law and what is left where there is one."""
     parts = [("missing force", "force"), ("what is left", "left")][: 2 if missing.law else 1]
@@ -212,6 +208,7 @@ class ReportInput:
     pack: Pack | None = None
 
 
+@publication_style()
 def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     """Draw every figure that these data allow, by name; their words are in `words.toml`.
 

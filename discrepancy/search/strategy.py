@@ -149,7 +149,12 @@ class Search:
         found = self._scan_near(base, near)
         explained = any(absolute_gate(self.problem, item).passed for item in found)
         if self._misfits(base) or (self._far(base) and not explained):
-            found += self._scan_far(base, [one for one in effects if acts_within(one, self.problem.setting)])
+            # nuisances of a wrong model are far off, a bad start; beside a force that is free they are
+            # where they belong; beside trials at rest, which know no force, they are as before the data
+            there = self._unbiased(base)
+            within = [one for one in effects if acts_within(one, self.problem.setting)]
+            grids = [row for one in within if (row := tried(self.problem, there, one))]
+            found += self._best_of(grids, there, 0.0)
         best: dict[tuple[str, ...], CandidateFit] = {}
         for item in sorted(found, key=self.score):
             self.keep(item, exact=False)
@@ -175,16 +180,6 @@ class Search:
         ranked.sort(key=lambda changes: -max(change.gain for change in changes))
         starts = [[beside(base, change.term, rescaled(change)) for change in row] for row in ranked]
         return self._best_of(starts, base, least if base.candidate.terms else 0.0)
-
-    def _scan_far(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
-        """Fit effects from the best of a grid of their parameters, nuisances as the missing force has them.
-
-        Those of a wrong model are far off and make a bad start; beside a force that is free they are where
-        they belong. Beside trials at rest, which know no force, they are as expected before the data.
-        """
-        there = self._unbiased(base)
-        starts = [tried(self.problem, there, effect) for effect in effects]
-        return self._best_of([row for row in starts if row], there, 0.0)
 
     def _unbiased(self, base: CandidateFit) -> CandidateFit:
         """Return a base with its nuisances where they are beside a missing force."""
