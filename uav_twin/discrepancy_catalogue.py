@@ -4,7 +4,9 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from discrepancy.errors import CatalogueError
 from reporting import terminal
+from reporting.files import refuse_filled
 from reporting.words import counted
 from uav_twin.options import told
 from uav_twin.sentences import said
@@ -71,7 +73,6 @@ def example(
     from discrepancy.model_choice import choose_model
     from discrepancy.sources.examples import plan_of, write_example
     from fe.runtime.patch import ModelPatch
-    from reporting.files import refuse_filled
 
     refuse_filled(out, "folder")
     choice = choose_model(model, terminal.progress())
@@ -102,7 +103,6 @@ def _hidden(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
     """Return the patch of ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,..; raises `CatalogueError`."""
     from discrepancy.catalogue.entry import Setting
     from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
-    from discrepancy.errors import CatalogueError
 
     head, named, numbers = text.partition(":")
     if not named:
@@ -128,8 +128,6 @@ def _hidden(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
 
 def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> dict[str, float]:
     """Return the values that `parts` give, "VALUE" in the order of `names` or "NAME=VALUE"."""
-    from discrepancy.errors import CatalogueError
-
     if len(parts) > len(names):
         both = {"has": counted(len(names), "parameter"), "came": counted(len(parts), "value")}
         raise CatalogueError(said("effects.count", identifier=identifier, names=names, **both))
