@@ -23,6 +23,7 @@ from discrepancy.models.structures import WingModel
 from discrepancy.report.figures import missing_force_figure
 from discrepancy.sources.measured_rigs import SIGNAL, wing_campaign
 from discrepancy.workflow import Investigation, investigate
+from reporting.figures import publication_style
 
 BEGINS = (0.8, 1.0, 1.25)
 
@@ -125,7 +126,8 @@ def draw(found: Investigation, folder: Path) -> None:
     figure.savefig(folder / "real_wing_residuals.png", dpi=90)
     plt.close(figure)
     if found.missing is not None:
-        missing_force_figure(found.missing).savefig(folder / "real_wing_force.png", dpi=110)
+        with publication_style():
+            missing_force_figure(found.missing).savefig(folder / "real_wing_force.png", dpi=110)
 
 
 def main() -> int:

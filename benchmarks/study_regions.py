@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from evidence.make_meshes import hexahedra
 from fe.reduction.reduced_basis import MeasuredErrors, measured_errors, reduce_structure
 from fe.runtime.reduced import ReducedModel
 from fe.structure.operators import load_and_assemble
@@ -28,7 +29,6 @@ from fe.wing.operators import AffineOperators, assemble
 from fe.wing.responses import solve_static
 from fmu_asset.packing.structure_fmu import build_fmu
 from scenarios import structure_files
-from scenarios.structures.make_meshes import hexahedra
 
 FloatArray = NDArray[np.float64]
 

@@ -90,8 +90,6 @@ class SearchSettings:
     """Steps along the direction that the data tell least of."""
     place_steps: tuple[float, ...] = (-0.15, -0.05, 0.05, 0.15)
     """Steps of parameters that are not mere sizes: a place has an optimum at each sensor that it passes."""
-    places: tuple[float, ...] = (-1.0, 0.0, 1.0)
-    """Where along the structure, in prior deviations, the best candidate is begun once more."""
     neighbour_iterations: int = 8
     """Steps of each fit beside an optimum."""
     neighbour_gain: float = 1.0

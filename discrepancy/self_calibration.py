@@ -253,7 +253,9 @@ def _investigated(
         generator = np.random.default_rng(seed.spawn(1)[0])
         campaign = simulator.simulate(hidden, generator)
     found = investigate(campaign, simulator.model, effects, thorough=False).verdict
-    true = NOTHING if hidden is None else hidden.term.effect.identifier
+    true, place, distance = NOTHING, "", 0.0
+    if hidden is not None:
+        true, place, distance = hidden.term.effect.identifier, hidden.term.place, hidden.distance
     named = tuple(dict.fromkeys(effect.identifier for effect in found.effects))
     outcome = outcome_of(true, found.kind, named, found.group)
     covered: tuple[Covered, ...] = ()
@@ -265,15 +267,7 @@ def _investigated(
             if effect.place == hidden.term.place
             for item in effect.parameters
         )
-    return CalibrationCase(
-        true,
-        "" if hidden is None else hidden.term.place,
-        0.0 if hidden is None else hidden.distance,
-        found.kind,
-        named,
-        outcome,
-        covered,
-    )
+    return CalibrationCase(true, place, distance, found.kind, named, outcome, covered)
 
 
 def outcome_of(hidden: str, kind: VerdictKind, named: tuple[str, ...], group: tuple[str, ...]) -> str:

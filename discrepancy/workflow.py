@@ -20,11 +20,11 @@ from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, wrong_ends
 from discrepancy.checks.quality import check_data
 from discrepancy.errors import CampaignDataError
-from discrepancy.fits.candidate import Candidate, Point
+from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import solver_share
-from discrepancy.fits.predictive import residual_set
+from discrepancy.fits.predictive import held_out_fit, residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.naming import name
@@ -38,7 +38,7 @@ from discrepancy.missing_force.windows import gap_windows, residual_windows
 from discrepancy.model_choice import load_model
 from discrepancy.models.interface import Model
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.search.hypotheses import Tell
+from discrepancy.search.starts import Tell
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
@@ -172,7 +172,7 @@ def investigate(
     with stage("Residuals", "residuals"):
         before = residual_set(problem, search.none, sensitivities=thorough)
         after = residual_set(problem, fit, sensitivities=False) if fit is not search.none else before
-    location, missing, force, proof = None, None, None, None
+    location, missing, proof = None, None, None
     windows: tuple[GapWindow, ...] = ()
     if thorough:
         with stage("Locating the gap", "locate"):
@@ -184,7 +184,7 @@ def investigate(
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     if thorough and verdict.kind not in NO_GAP:
         with stage("Seeing the missing force", "force"):
-            missing, force = seen_force(problem, search.force, search.forces, fit)
+            missing = seen_force(problem, search.force, search.forces, fit)
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
             proof = prove(before, after, seed=seed)
@@ -195,7 +195,7 @@ def investigate(
     verdict = replace(
         verdict, sentence=dated(verdict, windows), remarks=tuple(remarks), next_experiments=experiments,
         not_fitted=not_fitted(problem.setting, catalogue, search), windows=windows,
-        parameters=calibrated_parameters(problem, fit), force=force,
+        parameters=calibrated_parameters(problem, fit), force=None if missing is None else missing.told,
     )  # fmt: skip
     return Investigation(
         campaign, model, faults, verdict, location, proof, before, after, problem, search, fit, seconds,
@@ -259,10 +259,7 @@ def without_wrong_ends(problem: Problem) -> Problem:
     none = fit_to(problem, Candidate(), problem.start(Candidate()), evidence=False)
     fits = [(problem, none)]
     if problem.campaign.held_out:
-        there = problem.with_trials(problem.campaign.held_out)
-        local = tuple(np.zeros(data.unknowns.size) for data in there.trials)
-        start = Point(none.point.shared, local, none.point.effect)
-        fits.append((there, fit_to(there, Candidate(), start, local_only=True, evidence=False)))
+        fits.append(held_out_fit(problem, none, evidence=False))
     trials = {trial.name: trial for trial in problem.campaign.trials}
     remarks = list(problem.campaign.remarks)
     for part, fitted in fits:

@@ -20,6 +20,7 @@ from markupsafe import Markup, escape
 
 from reporting import words
 from reporting.errors import InvalidFigureError
+from reporting.sentences import said
 
 if TYPE_CHECKING:  # words are said where nothing is drawn, too
     from matplotlib.figure import Figure
@@ -73,10 +74,8 @@ class Table:
 
     def __post_init__(self) -> None:
         for number, row in enumerate(self.rows):
-            if len(row) != len(self.columns):
-                raise InvalidFigureError(
-                    f"Row {number} of a table has {len(row)} cells; {len(self.columns)} are needed."
-                )
+            if (came := len(row)) != (needed := len(self.columns)):
+                raise InvalidFigureError(said("page.row", number=number, came=came, needed=needed))
 
 
 class ReportFigure(NamedTuple):
@@ -108,9 +107,9 @@ class Words:
     name
         Of the file: ``[said]`` holds sentences by name, ``[figures]`` titles and captions, and ``[tables]``
         titles, captions and columns, each a heading, or ``{ number = heading, unit = unit }``. `cell` says
-        what a column shows of each `row`, where rows are records and no ready cells; a column with `when` is
-        left out where the value of that name is false. `rows` are rows of templates before those that are
-        given, each left out where its last cell is empty.
+        what a column shows of each `row` and its `row_number`, where rows are records and no ready cells; a
+        column with `when` is left out where the value of that name is false. `rows` are rows of templates
+        before those that are given, each left out where it has nothing behind its first cell.
     **shared
         What every template may name beside its own values, such as functions that print numbers.
     """
@@ -137,11 +136,14 @@ class Words:
         columns += [head if isinstance(head, Column) else numbers(head) for head in values.get("more", ())]
         values |= self._shared
         if heads and "cell" in heads[0]:  # a table may have no columns but `more`
-            rows = [[filled(head["cell"], **values, row=row) for head in heads] for row in rows]
+            rows = [
+                [filled(head["cell"], **values, row=row, row_number=number) for head in heads]
+                for number, row in enumerate(rows, start=1)
+            ]
         fixed = [
             [filled(cell, **values) for cell in row] for row in self.content["tables"][name].get("rows", ())
         ]
-        rows = [*(row for row in fixed if row[-1]), *rows]
+        rows = [*(row for row in fixed if any(row[1:])), *rows]
         return columns[: len(rows[0])] if rows else columns, rows
 
     def words(self, kind: str, name: str, /, **values: Any) -> dict[str, str]:
@@ -244,7 +246,17 @@ class Page:
 
 def filled(template: str, /, **values: Any) -> str:
     """Return a text whose Jinja2 expressions are filled with values, in one line."""
-    return " ".join(_plain(template).render(**values).split())
+    return " ".join(rendered(template, **values).split())
+
+
+def rendered(template: str, /, **values: Any) -> str:
+    """Return a text whose Jinja2 expressions are filled with values, as it is written."""
+    return _plain(template).render(**values)
+
+
+def evaluated(expression: str, /, **values: Any) -> Any:
+    """Return what a Jinja2 expression gives; what is not there is None."""
+    return _environment(plain=True).compile_expression(expression)(**values)
 
 
 @cache

@@ -2,6 +2,7 @@
 
 import tomllib
 from collections.abc import Mapping, Set
+from functools import cached_property
 from pathlib import Path
 from string import Formatter
 from typing import Any
@@ -32,16 +33,15 @@ class Sentences:
     ----------
     module : str
         File of the module; the sentences stand beside it, ``sentences.py`` -> ``sentences.toml``.
-
-    Attributes
-    ----------
-    tables : dict
-        Sentences by table and name; braces stand for what the caller gives.
     """
 
     def __init__(self, module: str) -> None:
-        text = Path(module).with_suffix(".toml").read_text(encoding="utf-8")
-        self.tables: dict[str, Any] = tomllib.loads(text)
+        self._file = Path(module).with_suffix(".toml")
+
+    @cached_property
+    def tables(self) -> dict[str, Any]:
+        """Sentences by table and name; braces stand for what the caller gives. Read when one is said."""
+        return tomllib.loads(self._file.read_text(encoding="utf-8"))
 
     def said(self, sentence: str, /, **values: object) -> str:
         """Return a sentence by table and name, such as "mesh.empty", with its values.
@@ -51,3 +51,7 @@ class Sentences:
         table, _, key = sentence.partition(".")
         text: str = self.tables[table][key]
         return _Written().vformat(text, (), values)
+
+
+said = Sentences(__file__).said
+"""A sentence of this package by "table.name", with its values."""

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from reporting.sentences import said
 from reporting.text_file import read_text
 from reporting.words import counted
 
@@ -77,10 +78,8 @@ class TextTable:
             There is no such column; the sentence says what there is.
         """
         if column not in self.columns:
-            raise self.errors.layout(
-                f"{self.name} has no column {column!r}, which {needed_by} needs; its columns are "
-                f"{', '.join(self.columns)}."
-            )
+            lacks = said("table.no_column", table=self, column=column, needed_by=needed_by)
+            raise self.errors.layout(lacks)
         return self.columns[column]
 
     def numbers(self, column: str, needed_by: str, *, empty_allowed: bool = False) -> FloatArray:
@@ -111,10 +110,8 @@ class TextTable:
         """Return a cell as a positive number; rows count from 0, errors as `positive_numbers`."""
         value = self.number(column, row)
         if value <= 0.0:
-            raise self.errors.value(
-                f"{self._place(column, row)} holds {self.columns[column][row]}, and a positive number is "
-                "needed; leave out readings of zero."
-            )
+            place, cell = self._place(column, row), self.columns[column][row]
+            raise self.errors.value(said("table.not_positive", place=place, cell=cell))
         return value
 
     def number(self, column: str, row: int, empty_allowed: bool = False) -> float:
@@ -124,9 +121,8 @@ class TextTable:
             value = plain_number(cell)
         except ValueError:
             came = repr(cell) if cell else "nothing"
-            raise self.errors.layout(
-                f"{self._place(column, row)} must hold a number, and {came} came."
-            ) from None
+            place = self._place(column, row)
+            raise self.errors.layout(said("table.no_number", place=place, came=came)) from None
         if not isfinite(value):
             remedy = (
                 "; leave the cell of a reading empty that is to be left out"
@@ -152,9 +148,8 @@ class TextTable:
         first: dict[object, int] = {}
         for key, line in zip(keys, self.lines, strict=True):
             if first.setdefault(key, line) != line:
-                raise self.errors.layout(
-                    f"{self.name}: the lines {first[key]} and {line} hold the same {what}; {remedy}."
-                )
+                of = {"name": self.name, "lines": (first[key], line)}
+                raise self.errors.layout(said("table.repeated", **of, what=what, remedy=remedy))
 
 
 def read_table(path: Path | str, errors: TableErrors, *, name: str | None = None) -> TextTable:
@@ -201,9 +196,7 @@ def parse_table(
         raise errors.layout(f"{name} is empty: it needs a header line with the names of its columns.")
     columns = found.pop(0)[1] if header is None else [*header]
     if len(columns) == 1 and (";" in columns[0] or "\t" in columns[0]):
-        raise errors.layout(
-            f"{name} is not separated by commas: write it with commas between cells and points in numbers."
-        )
+        raise errors.layout(said("table.separated", name=name))
     twice = sorted(column for column, count in Counter(columns).items() if count > 1)
     if twice:
         raise errors.layout(f"{name} has more than one column {twice[0]!r}: rename or remove one.")
@@ -212,15 +205,11 @@ def parse_table(
     for line, row in found:
         if len(row) != len(columns):
             comma = separator and len(row) > len(columns) and all(map(_is_number, row))
-            raise errors.layout(
-                f"{name}, line {line}: {counted(len(row), 'cell')} came, and "
-                + (
-                    f"the header has {counted(len(columns), 'column')}."
-                    if header is None
-                    else f"{counted(len(columns), 'column')} ({', '.join(columns)}) are expected."
-                )
-                + (" A decimal comma makes two cells of a number: write it with a point." if comma else "")
-            )
+            came, wanted = counted(len(row), "cell"), counted(len(columns), "column")
+            listed = f"{wanted} ({', '.join(columns)}) are expected"
+            of = {"came": came, "expected": f"the header has {wanted}" if header is None else listed}
+            of |= {"name": name, "line": str(line)}
+            raise errors.layout(said("table.decimal_comma" if comma else "table.width", **of))
     cells = tuple(zip(*(row for _, row in found), strict=True))
     return TextTable(name, dict(zip(columns, cells, strict=True)), tuple(line for line, _ in found), errors)
 

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from reporting.sentences import said
+
 DEEPEST_NESTING = 32
 """Tables and lists within each other that a document may hold; no format of this project needs a third."""
 
@@ -42,10 +44,8 @@ def decoded(content: bytes, subject: str, error: type[Exception], otherwise: str
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as cause:
         if otherwise is None:
-            raise error(
-                f"{subject} is not text in UTF-8 ({cause.reason} at byte {cause.start + 1}): save it as "
-                "UTF-8."
-            ) from cause
+            byte = cause.start + 1
+            raise error(said("text.encoding", subject=subject, cause=cause, byte=byte)) from cause
         text = content.decode(otherwise)
     if "\0" in text:
         raise error(f"{subject} is not text: it holds a zero byte; save it as UTF-8.")

@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from reporting.sentences import said
 from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
 
 _PART = r"""(?:[\w-]++|"(?:[^"\\\n]++|\\.)*+"?+|'[^'\n]*+'?+)"""
@@ -60,9 +61,7 @@ def _parsed(text: str, subject: str, error: type[Exception]) -> dict[str, Any]:
     except RecursionError:
         raise error(too_deep(subject)) from None
     except ValueError:  # Python turns no text of more than 4,300 digits into an integer
-        raise error(
-            f"{subject} holds an integer of thousands of digits; 64 bits are what TOML allows."
-        ) from None
+        raise error(said("text.digits", subject=subject)) from None
     check_nesting(content, subject, error)
     _check_integers(content, "", subject, error)
     return content
@@ -78,10 +77,7 @@ def _check_integers(
             continue
         here = f"{place}.{key}".lstrip(".") if isinstance(node, dict) else f"{place}[{key}]"
         if large:
-            raise error(
-                f"{subject}: `{here}` is an integer of {item.bit_length()} bits, and 63 beside the sign are "
-                "what TOML allows."
-            )
+            raise error(said("text.bits", subject=subject, key=here, bits=item.bit_length()))
         _check_integers(item, here, subject, error)
 
 

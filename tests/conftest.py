@@ -70,15 +70,16 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Let one worker run all tests that share what is made once.
 
     That is all tests of a file, of all files that use a fixture of `SHARED`, and of all files in which a test
-    names the same group. The largest group comes first, then those with slow tests: at the end a long one
-    would keep one worker alone. Tests marked `long` are skipped unless they are asked for.
+    names the same group. The largest group comes first, and last those of `COMPILED`; among each of them slow
+    ones, then those with many tests that are not quick: at the end a long one would keep one worker alone.
+    Tests marked `long` are skipped unless they are asked for.
     """
     if not os.environ.get("UAV_TWIN_LONG_TESTS"):
         for item in items:
             if item.get_closest_marker("long"):
                 item.add_marker(pytest.mark.skip(LONG))
+    listed = set(NOT_QUICK.read_text("utf-8").split())
     if config.getoption("quick"):
-        listed = set(NOT_QUICK.read_text("utf-8").split())
         left_out = [
             item
             for item in items
@@ -99,12 +100,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             group[item.path] = named.args[0]
     slow = {group[item.path] for item in items if item.get_closest_marker("slow")}
     waiting = {group[item.path] for item in items if set(COMPILED) & set(item.path.parts)}
+    long = Counter(group[item.path] for item in items if item.nodeid.partition("[")[0] in listed)
     items.sort(
         key=lambda item: (
             group[item.path] != LARGEST,
             group[item.path] != COMPILING,
-            group[item.path] not in slow,
             group[item.path] in waiting,
+            group[item.path] not in slow,
+            -long[group[item.path]],
         )
     )
     for item in items:

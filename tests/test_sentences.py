@@ -11,7 +11,7 @@ from reporting.sentences import Sentences
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.parametrize("package", ["calibration", "discrepancy", "fe", "fmu_asset", "twin_master"])
+@pytest.mark.parametrize("package", sorted(path.parent.name for path in ROOT.glob("*/sentences.toml")))
 def test_every_sentence_is_said_with_its_values(package):
     tables = Sentences(str(ROOT / package / "sentences.py")).tables
     rows = ((table, own) for table, own in tables.items() if isinstance(own, dict))

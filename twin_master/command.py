@@ -10,6 +10,7 @@ import typer
 
 from reporting import terminal
 from twin_master.fleet.command import engine_of, fly_and_show
+from twin_master.sentences import said
 from twin_master.viewer.command import shown
 
 told = terminal.told_by("twin_master")
@@ -63,10 +64,7 @@ def run(
     loaded = None if scenario is None else load_scenario(scenario)
     if resume is not None:
         if out is not None or replace or policy is not None or overrides != Overrides():
-            raise typer.BadParameter(
-                "a run is continued with what its folder holds: give nothing beside it that would change it.",
-                param_hint="--resume",
-            )
+            raise typer.BadParameter(said("run_folder.resume"), param_hint="--resume")
         folder, fly = resume, partial(workflow.resume, resume, loaded)
     else:
         if loaded is None:
@@ -84,11 +82,7 @@ def run(
 def _alone(scenario: str | None, beside: bool) -> str:
     """Return the scenario of an ensemble; refuse what is for one mission."""
     if scenario is None or beside:
-        raise typer.BadParameter(
-            "many seeds need a scenario, and neither --resume (repeat the command), --seed, --policy nor "
-            "--view.",
-            param_hint="--seeds",
-        )
+        raise typer.BadParameter(said("fleet.seeds"), param_hint="--seeds")
     return scenario
 
 
@@ -96,9 +90,7 @@ def _flown(scenario: str | None, with_scenario: str | None) -> tuple[str | None,
     """Return the scenario, and the SSP file that is flown in the place of its asset."""
     if scenario is not None and Path(scenario).suffix.lower() == ".ssp":
         if with_scenario is None:
-            raise typer.BadParameter(
-                "an SSP file says what is flown, not how: name a scenario as well.", param_hint="--scenario"
-            )
+            raise typer.BadParameter(said("scenario.beside_ssp"), param_hint="--scenario")
         return with_scenario, Path(scenario)
     if with_scenario is not None:
         raise typer.BadParameter("belongs to an SSP file as SCENARIO.", param_hint="--scenario")

@@ -37,14 +37,15 @@ def plan(
     json: bool = False,
 ) -> None:
     """Plan on the belief: expected return with its bounds, beside simpler rules."""
-    from twin_master.mission.planning import compared, risk_of, write_policy
+    from reporting.files import atomic_write_bytes
+    from twin_master.mission.planning import compared, policy_file, risk_of
     from twin_master.report.plan import plan_figure
 
     knowledge, _ = _knowledge(scenario, seed, calibration)
     blind = _without(knowledge, [value_of]) if value_of is not None else None
     problem, plan, promised = _planned(knowledge)
     if out is not None:
-        write_policy(out, plan.policy, knowledge.model)
+        atomic_write_bytes(out, policy_file(plan.policy, knowledge.model))
     if picture is not None:
         _draw(picture, plan_figure(plan.policy, knowledge.model))
     record: dict[str, Any] = {
@@ -73,7 +74,7 @@ def _knowledge(
     """Return what the twin knows before any plan on the belief, and where its gauges are, see `_places`."""
     from twin_master.assets.candidates import with_candidates
     from twin_master.assets.resolution import Overrides, believed_source, resolve_scenario
-    from twin_master.mission.preparation import prepare_knowledge
+    from twin_master.mission.preparation import prepared_alone
     from twin_master.scenario.reading import load_scenario
 
     resolved = resolve_scenario(load_scenario(scenario), Overrides(seed=seed, calibration=calibration))
@@ -83,9 +84,7 @@ def _knowledge(
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         if candidates is not None:
             unplanned = with_candidates(unplanned, candidates, Path(folder, "candidates"))
-        source = believed_source(unplanned)
-        source.prepare(Path(folder), terminal.progress())
-        found = prepare_knowledge(unplanned, source, unplanned.mission.seed)
+        found = prepared_alone(unplanned, believed_source(unplanned), terminal.progress())
         places = _places(unplanned)
     return replace(found, scenario=unplanned.model_copy(update={"planner": planner})), places
 

@@ -255,9 +255,8 @@ def resumed_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
     if loaded is not None and file.get("sha256") != loaded.content_hash:
         does = "watches" if config.get("watched") else "flies"
         other = f"{scenario.mission.name}, {file.get('name')}"
-        raise NotResumableError(
-            said("mission.another", folder=folder, does=does, other=other, path=loaded.path)
-        )
+        there = {"folder": folder, "does": does, "other": other}
+        raise NotResumableError(said("mission.another", **there, path=loaded.path))
     with held(lock_run_folder(folder)):
         yield config, scenario.moved(folder)
 

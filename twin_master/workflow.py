@@ -1,11 +1,10 @@
 """The whole chain: design -> reduced model -> FMU -> calibration -> mission -> store -> report."""
 
-import io
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +18,7 @@ from twin_master.assets.resolution import Overrides, asset_source, given_overrid
 from twin_master.errors import NotResumableError
 from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile
-from twin_master.mission.planning import read_policy
+from twin_master.mission.planning import policy_file, read_policy
 from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
 from twin_master.mission.turns import History
 from twin_master.network.planner import BeliefPolicy
@@ -39,9 +38,6 @@ from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import another_truth
 from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
-
-if TYPE_CHECKING:
-    from xarray import DataTree
 
 POLICY_NAME = "policy.npy"
 """In the run folder: the policy that was given in the place of a plan, (S, U) or on the belief."""
@@ -95,7 +91,11 @@ def fly(
     resolved = resolve_scenario(loaded, given_overrides(overrides))
     folder = Path("runs") / resolved.mission.name if folder is None else Path(folder)
     progress = progress or SilentProgress()
-    files = {} if policy is None else {POLICY_NAME: _policy_file(policy, resolved)}
+    files = {}
+    if policy is not None:
+        model = build_graphical_model(resolved)
+        given = read_policy(policy, model) if isinstance(policy, Path) else policy
+        files[POLICY_NAME] = policy_file(given, model)
     if loaded.remark:
         progress.note(loaded.remark)
     restore(folder, progress)
@@ -104,17 +104,6 @@ def fly(
     opened = begun_folder(resolved, loaded.file, folder, source.files() | files, replace=replace)
     with opened as (config, located):
         return _run(folder, config, located, progress, begun, report=report)
-
-
-def _policy_file(policy: ArrayLike | BeliefPolicy | Path, scenario: Scenario) -> bytes:
-    """Return a policy as the run folder keeps it."""
-    model, kept = build_graphical_model(scenario), io.BytesIO()
-    given = read_policy(policy, model) if isinstance(policy, Path) else policy
-    if isinstance(given, BeliefPolicy):
-        np.savez(kept, **vars(given))
-    else:
-        np.save(kept, model.policy(given))
-    return kept.getvalue()
 
 
 def resume(
@@ -173,29 +162,30 @@ def _run(
     @contextmanager
     def timed(name: str) -> Iterator[None]:
         begin = time.perf_counter()
-        yield
+        with _noted(folder):
+            yield
         stages[name] = time.perf_counter() - begin
 
     source = asset_source(scenario)
-    with _noted(folder), timed("asset"):
-        hashes = dict(source.prepare(folder, progress))
-        policy = _given_policy(folder, hashes)
+    with timed("asset"):
+        hashes, policy, given = dict(source.prepare(folder, progress)), None, folder / POLICY_NAME
+        if given.is_file():
+            hashes["policy"] = hash_file(given)
+            policy = read_policy(given, build_graphical_model(scenario))
     config = with_inputs(folder, config, hashes)
-    with _noted(folder), timed("calibration"), progress.stage("Calibrating and planning"):
+    with timed("calibration"), progress.stage("Calibrating and planning"):
         knowledge = _known(folder, config, scenario, source, policy, progress)
-    with timed("mission"), _noted(folder):
+    with timed("mission"):
         result = _fly(folder, config, knowledge, source, progress)
-    with timed("store"), progress.stage("Storing"), _noted(folder):
-        write_field = _field_writer(source, result)
-        misfit = _misfit(knowledge, source)
+    with timed("store"), progress.stage("Storing"):
         stored = store_flight(
-            folder, config, result, source.origin, steps=scenario.mission.steps, misfit=misfit,
-            write_field=write_field,
+            folder, config, result, source.origin, steps=scenario.mission.steps,
+            misfit=_misfit(knowledge, source), write_field=_field_writer(source, result),
         )  # fmt: skip
     timing = _timing(result.flight)
-    del knowledge, result, write_field  # before the report is drawn
+    del knowledge, result  # before the report is drawn
     if report:
-        with timed("report"), progress.stage("Writing the report"), _noted(folder):
+        with timed("report"), progress.stage("Writing the report"):
             _report(folder, stored())
     timing |= {"stages_seconds": stages, "total_seconds": time.perf_counter() - start}
     atomic_write_text(folder / TIMING_NAME, to_json(timing))  # the only file with figures of a clock
@@ -224,19 +214,6 @@ def _known(
         compiling.turn(np.full(scenario.observation.count, np.nan), 0)
     compiling.smoothed()
     return knowledge
-
-
-def _given_policy(folder: Path, hashes: dict[str, str]) -> Float | BeliefPolicy | None:
-    """Return the policy that a run folder keeps, its hash noted, or None where it was planned."""
-    path = folder / POLICY_NAME
-    if not path.is_file():
-        return None
-    hashes["policy"] = hash_file(path)
-    try:
-        kept = np.load(path, allow_pickle=False)
-        return np.asarray(kept, dtype=np.float64) if isinstance(kept, np.ndarray) else BeliefPolicy.of(kept)
-    except (OSError, ValueError) as error:
-        raise NotResumableError(said("mission.given_policy", path=path, error=error)) from None
 
 
 def _tell_of_another_truth(knowledge: Knowledge, progress: Progress) -> None:
@@ -317,7 +294,7 @@ def _timing(flight: History) -> dict[str, Any]:
     return record
 
 
-def _report(folder: Path, tree: "DataTree") -> None:
+def _report(folder: Path, tree: Any) -> None:
     from twin_master.report.page import write_report
 
     write_report(folder, tree=tree)

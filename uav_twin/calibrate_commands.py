@@ -1,5 +1,6 @@
 """`uav-twin calibrate`, all three steps of a wing in order, and `calibrate campaign`: any model."""
 
+from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,11 +9,9 @@ import typer
 
 from reporting import terminal
 from uav_twin.calibrate_laboratory import calibrate_ringdown, calibrate_simulate
-from uav_twin.options import refuse_before, told
+from uav_twin.options import refuse_before, show, told
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from calibration.result.record import Calibration
 
 
@@ -46,15 +45,18 @@ def calibrate_campaign(
     choice = choose_model(model, progress)
     result = calibrate_parameters(data, choice, asset=name, samples=samples, seed=seed, progress=progress)
     written = None if out is None else write_calibration_folder(result, out, progress, report=not no_report)
-    show(result, written, json=json, report=not no_report)
+    conclude(result, written, json=json, report=not no_report)
 
 
-def show(result: "Calibration", written: Path | None, *, json: bool, report: bool) -> None:
+def conclude(result: "Calibration", written: Path | None, *, json: bool, report: bool) -> None:
     """Say what a calibration found, and where it was written."""
     if json:
         terminal.print_json({"calibration": None if written is None else str(written)} | _record(result))
         return
-    _show(result)
+    from calibration.result import text
+
+    headline, correlations = text.headline(result), text.correlation_lines(result)
+    show("calibration", words=text.WORDS, result=result, headline=headline, correlations=correlations)
     if written is None:
         terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
         return
@@ -67,8 +69,6 @@ def show(result: "Calibration", written: Path | None, *, json: bool, report: boo
 
 def _record(result: "Calibration") -> dict[str, Any]:
     """Return the calibration as plain data."""
-    from dataclasses import asdict
-
     from reporting.record_json import plain
 
     def posterior(name: str) -> dict[str, Any]:
@@ -96,24 +96,6 @@ def _record(result: "Calibration") -> dict[str, Any]:
         "channels": plain(result.channels),
         "findings": list(result.findings),
     }
-
-
-def _show(result: "Calibration") -> None:
-    from calibration.result import text
-
-    def table(name: str, rows: "Sequence[Any]") -> None:
-        if rows:
-            columns, cells = text.WORDS.table(name, rows, result=result)
-            terminal.print_table([column.name for column in columns], cells)
-
-    terminal.say(text.headline(result))
-    table("parameters", result.priors)
-    for line in text.correlation_lines(result):
-        terminal.say(line)
-    table("readings", result.readings)
-    table("channels", result.channels)
-    for sentence in result.findings:
-        terminal.say(f"- {sentence}")
 
 
 class ProcedureName(StrEnum):
@@ -174,7 +156,7 @@ def calibrate_wing(
         columns, rows = WORDS.table("table_1", calibration.table_1)
         terminal.print_table([column.name for column in columns], rows)
     written = None if out is None else write_wing_folder(calibration, out, progress, report=not no_report)
-    show(calibration.result, written, json=json, report=not no_report)
+    conclude(calibration.result, written, json=json, report=not no_report)
 
 
 calibrate_app = typer.Typer(no_args_is_help=False)

@@ -3,13 +3,17 @@
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
+from calibration.errors import ExperimentFileError
+from fe.runtime.state import DigitalState
 from reporting import terminal
+from reporting.files import atomic_write_text
 from uav_twin.options import told
 
 if TYPE_CHECKING:
@@ -55,7 +59,6 @@ def calibrate_ringdown(
     if out is not None:
         from calibration.dynamics.figures import ring_down_figure
         from reporting.figures import save_figure
-        from reporting.files import atomic_write_text
 
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows((headings, *_cells(rows, ".10g")))
@@ -89,15 +92,10 @@ def calibrate_simulate(
 ) -> None:
     """Measure a virtual wing: a folder as `calibrate` reads it, and truth.json beside it."""
     import json
-    from contextlib import nullcontext
-    from dataclasses import asdict
 
-    from calibration.errors import ExperimentFileError
     from calibration.result.record import STATE
     from calibration.virtual_wing import VirtualWing
-    from fe.runtime.state import DigitalState
     from fe.wing.design import load_design
-    from reporting.files import atomic_write_text
 
     if fmu is not None and frequency_error != (0.0, 0.0):
         raise typer.BadParameter("--frequency-error needs the reduced model; an FMU has its own frequencies.")

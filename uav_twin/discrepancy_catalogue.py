@@ -4,9 +4,12 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from discrepancy.errors import CatalogueError
 from reporting import terminal
+from reporting.files import refuse_filled
 from reporting.words import counted
 from uav_twin.options import told
+from uav_twin.sentences import said
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
@@ -70,7 +73,6 @@ def example(
     from discrepancy.model_choice import choose_model
     from discrepancy.sources.examples import plan_of, write_example
     from fe.runtime.patch import ModelPatch
-    from reporting.files import refuse_filled
 
     refuse_filled(out, "folder")
     choice = choose_model(model, terminal.progress())
@@ -101,7 +103,6 @@ def _hidden(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
     """Return the patch of ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,..; raises `CatalogueError`."""
     from discrepancy.catalogue.entry import Setting
     from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
-    from discrepancy.errors import CatalogueError
 
     head, named, numbers = text.partition(":")
     if not named:
@@ -127,13 +128,9 @@ def _hidden(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
 
 def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> dict[str, float]:
     """Return the values that `parts` give, "VALUE" in the order of `names` or "NAME=VALUE"."""
-    from discrepancy.errors import CatalogueError
-
     if len(parts) > len(names):
-        raise CatalogueError(
-            f"{identifier} has {counted(len(names), 'parameter')} ({', '.join(names)}), but "
-            f"{counted(len(parts), 'value')} came."
-        )
+        both = {"has": counted(len(names), "parameter"), "came": counted(len(parts), "value")}
+        raise CatalogueError(said("effects.count", identifier=identifier, names=names, **both))
     values = {}
     for position, part in enumerate(parts):
         name, equals, number = part.rpartition("=")
@@ -142,9 +139,8 @@ def _values(text: str, identifier: str, parts: list[str], names: list[str]) -> d
         try:
             values[name or names[position]] = float(number)
         except ValueError:
-            raise CatalogueError(
-                f"{text!r} must end with numbers, such as {identifier}:{names[0]}=0.1."
-            ) from None
+            example = {"identifier": identifier, "name": names[0]}
+            raise CatalogueError(said("effects.numbers", text=text, **example)) from None
     return values
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from reporting import terminal
-from uav_twin.options import told
+from uav_twin.options import show, told
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
@@ -82,31 +82,13 @@ def _show(
     able: "Separability | None",
     catalogue: "Sequence[Effect]",
 ) -> None:
-    from discrepancy.report.check_tables import (
-        HEADINGS,
-        confused_lines,
-        group_lines,
-        needs,
-        rows_of,
-        untested_lines,
-    )
-    from reporting.words import counted
+    from discrepancy.report import check_tables as said
+    from discrepancy.report.text import WORDS
 
-    held = [trial.name for trial in data.trials if trial.held_out]
-    terminal.say(
-        f"{data.name}: {counted(len(data.trials), 'trial')}, {counted(len(data.channels), 'channel')}, "
-        f"beside {model.name}; held out: {', '.join(held) or 'none'}."
-    )
-    for fault in faults:
-        terminal.say(f"{'Fault' if fault.fatal else 'Limit'}: {fault.sentence}")
-    for remark in data.remarks:
-        terminal.say(f"Note: {remark}")
-    if able is None:
-        return
-    shown = [at for at, title in enumerate(HEADINGS) if title not in ("testable", "confused with")]
-    rows = [[row[at] for at in shown] for row in rows_of(able)]
-    terminal.print_table([HEADINGS[at] for at in shown], rows)
-    told = group_lines(able, "to which is said above")
-    wanted = needs(able, data, catalogue, model.kinds)
-    for line in (*untested_lines(able), *confused_lines(able), *told, *wanted):
-        terminal.say(line)
+    rows, lines = [], list[str]()
+    if able is not None:
+        rows = [(name, *row[1:-1]) for name, *row in map(list, said.rows_of(able))]
+        lines = [*said.untested_lines(able), *said.confused_lines(able)]
+        lines += said.group_lines(able, "to which is said above")
+        lines += said.needs(able, data, catalogue, model.kinds)
+    show("check", words=WORDS, data=data, model=model, faults=faults, rows=rows, lines=lines)

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from discrepancy.errors import CampaignFileError
 from reporting import terminal
+from reporting.files import refuse_filled
 from reporting.words import counted
 from uav_twin.options import told
 
@@ -35,7 +37,6 @@ def import_files(
     from discrepancy.campaign.importing import OF_COLUMNS, OF_FILES, Understanding
     from discrepancy.campaign.sheet import read_sheet
     from discrepancy.campaign.writing import write_campaign
-    from reporting.files import refuse_filled
 
     folder = out or Path(files[0].stem)
     refuse_filled(folder)
@@ -72,8 +73,6 @@ def import_files(
 
 def _asked(found: "Understanding") -> "Understanding":
     """Return what is understood with one answer more; one that does not fit is told, and changes nothing."""
-    from discrepancy.errors import CampaignFileError
-
     (option, expected), (about, *_) = next(iter(found.questions.items()))
     said = typer.prompt(f"{about}, {option} ({expected})" if about else f"{option} ({expected})")
     try:

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from discrepancy.errors import CampaignFileError, DiscrepancyError
+from fmu_asset.errors import PatchFileError
 from reporting import terminal
-from uav_twin.options import told
+from uav_twin.options import show, told
 
 if TYPE_CHECKING:
     from discrepancy.campaign.records import Campaign
@@ -17,11 +19,9 @@ if TYPE_CHECKING:
     from discrepancy.model_choice import ModelChoice
     from discrepancy.report.figures import Pack
     from discrepancy.self_calibration import SelfCalibration
-    from discrepancy.verdict import ExplainedShare, Proof
+    from discrepancy.verdict import Proof, Verdict
     from discrepancy.workflow import Investigation
     from reporting.progress import Progress
-
-SHOWN_EXPERIMENTS = 3
 
 
 @told("discrepancy run")
@@ -42,7 +42,6 @@ def run(
 ) -> None:
     """Find out what the model lacks: verdict, report, patch, residuals."""
     from discrepancy.catalogue.library import load_catalogue
-    from discrepancy.errors import CampaignFileError
     from discrepancy.judgement.separability import separability
     from discrepancy.report.figures import ReportInput
     from discrepancy.verdict_folder import check_folder, write_verdict_folder
@@ -101,9 +100,7 @@ def _conclude(
         for sentence in (found.verdict.sentence, *(fault.sentence for fault in found.faults[1:])):
             typer.secho(sentence, fg="red", err=True)
     elif not silent:
-        _show(found, folder)
-        if tried is not None:
-            terminal.say(_trials_sentence(tried))
+        _show(found, tried, folder)
     if not silent:
         terminal.say(place)
     if fault:
@@ -118,7 +115,6 @@ def _compared(
 ) -> "tuple[Campaign, ModelChoice]":  # fmt: skip
     """Return what is measured, and what it is compared with."""
     from discrepancy.campaign.reading import read_campaign
-    from discrepancy.errors import DiscrepancyError
     from discrepancy.model_choice import choice_of_run, choose_model
     from discrepancy.sources.from_run import run_campaign
     from twin_master.watch.opening import flown
@@ -212,7 +208,6 @@ def _packing(choice: "ModelChoice", progress: "Progress") -> "Pack":
     def pack(patch_file: Path, target: Path) -> str:
         from discrepancy.application import pack_patched
         from discrepancy.files.verdict import read_patch
-        from fmu_asset.errors import PatchFileError
 
         patch = read_patch(patch_file).upon(choice.built_in)
         try:
@@ -224,76 +219,60 @@ def _packing(choice: "ModelChoice", progress: "Progress") -> "Pack":
     return pack
 
 
-# ---------------------------------------------------------------- summary
-
-
-def _show(found: "Investigation", folder: Path) -> None:
+def _show(found: "Investigation", tried: "SelfCalibration | None", folder: Path) -> None:
     from discrepancy.files.verdict import PATCH_NAME, read_patch
     from discrepancy.judgement.conclusion import probability_text
     from discrepancy.judgement.when import when_sentence
-    from discrepancy.report.text import (
-        estimate_text,
-        force_sentence,
-        headline,
-        remainders_sentence,
-        rests_on_force,
-        shares_sentence,
-        size_sentence,
-        unit_text,
-    )
+    from discrepancy.report import text
     from discrepancy.verdict import VerdictKind
 
-    verdict, proof = found.verdict, found.proof
-    terminal.say(f"Verdict: {verdict.kind.value}", bold=True)
-    terminal.say(headline(verdict))
+    verdict, sizes, probability = found.verdict, "", ""
     if (patch_file := folder / PATCH_NAME).is_file():
         stored = read_patch(patch_file)
-        if sizes := size_sentence(found, stored.effects, [effect.intervals for effect in stored.effects]):
-            terminal.say(sizes)
-    force = force_sentence(verdict.force) if verdict.force else ""
-    for sentence in (force, shares_sentence(verdict), remainders_sentence(verdict)):
-        if sentence:
-            terminal.say(sentence)
+        sizes = text.size_sentence(found, stored.effects, [effect.intervals for effect in stored.effects])
     when = when_sentence(verdict.windows)
-    if when and when not in verdict.sentence:
-        terminal.say(when)
     if isfinite(verdict.probability) and verdict.kind is not VerdictKind.UNEXPLAINED:
         against = f", ln Bayes factor against nothing missing {verdict.log_bayes_factor:.1f}"
         none = verdict.kind is VerdictKind.NOTHING_MISSING
-        terminal.say(f"Probability {probability_text(verdict.probability)}{'' if none else against}.")
-    if verdict.effects:
-        headings = ("effect", "place", "parameter", "value", "90 % interval", "unit")
-        rows = [
-            (
-                effect.identifier, effect.place, item.name.replace("_", " "), *estimate_text(item),
-                unit_text(item.unit),
-            )
-            for effect in verdict.effects
-            for item in (*effect.parameters, *effect.shape)
-        ]  # fmt: skip
-        terminal.print_table(headings, rows)
-    if proof is not None:
-        explained = None if rests_on_force(verdict) else verdict.explained
-        terminal.say(_proof_sentence(proof, explained, found.campaign))
-    for experiment in verdict.next_experiments[:SHOWN_EXPERIMENTS]:
-        terminal.say(f"Next: {experiment.description} ({experiment.information:.2f} nat)")
-    for fault in found.faults:
-        terminal.say(f"Data: {fault.sentence}")
-    said = {fault.sentence for fault in found.faults}
-    for remark in verdict.remarks:
-        if remark not in said:
-            terminal.say(f"Note: {remark}")
+        probability = f"Probability {probability_text(verdict.probability)}{'' if none else against}."
+    estimates = [
+        (
+            effect.identifier, effect.place, item.name.replace("_", " "), *text.estimate_text(item),
+            text.unit_text(item.unit),
+        )
+        for effect in verdict.effects
+        for item in (*effect.parameters, *effect.shape)
+    ]  # fmt: skip
+    conclusion = (
+        text.headline(verdict),
+        sizes,
+        text.force_sentence(verdict.force) if verdict.force else "",
+        text.shares_sentence(verdict),
+        text.remainders_sentence(verdict),
+        "" if when in verdict.sentence else when,
+        probability,
+    )
+    terminal.say(f"Verdict: {verdict.kind.value}", bold=True)
+    show(
+        "run",
+        words=text.WORDS,
+        verdict=verdict,
+        conclusion=conclusion,
+        estimates=estimates,
+        proof="" if found.proof is None else _proof_sentence(found.proof, verdict, found.campaign),
+        faults=[fault.sentence for fault in found.faults],
+        tried=tried,
+    )
 
 
-def _proof_sentence(proof: "Proof", explained: "ExplainedShare | None", campaign: "Campaign") -> str:
-    from discrepancy.report.text import number, percent, residual_sizes
+def _proof_sentence(proof: "Proof", verdict: "Verdict", campaign: "Campaign") -> str:
+    from discrepancy.report.text import number, percent, residual_sizes, rests_on_force, scored
 
-    first, second, where = proof.fitted_before, proof.fitted_after, "fitted trials (none is held out)"
-    if proof.held_out_before is not None and proof.held_out_after is not None:
-        first, second = proof.held_out_before, proof.held_out_after
-        where = f"held-out trials ({', '.join(trial.name for trial in campaign.held_out)})"
-    if explained is not None:
-        before, after = residual_sizes(explained)
+    first, second, which = scored(proof)
+    held_out = ", ".join(trial.name for trial in campaign.held_out)
+    where = f"{which} trials ({held_out if which == 'held-out' else 'none is held out'})"
+    if verdict.explained is not None and not rests_on_force(verdict):
+        before, after = residual_sizes(verdict.explained)
         return f"Residuals on {where}: rms of {before} noise deviations before, {after} with the effect."
     if not isfinite(first.chi_square_per_dof):
         return proof.remaining
@@ -302,15 +281,4 @@ def _proof_sentence(proof: "Proof", explained: "ExplainedShare | None", campaign
     return (
         f"χ²/dof on {where}: {number(first.chi_square_per_dof)} before, "
         f"{number(second.chi_square_per_dof)} with the effect{closed}.{why}"
-    )
-
-
-def _trials_sentence(tried: "SelfCalibration") -> str:
-    from reporting.words import counted
-
-    right, wrong = tried.share("right"), tried.share("wrong")
-    false = tried.share("wrong", null=True)
-    return (
-        f"Simulated campaigns: {right.count} of {right.total} hidden effects named, {wrong.count} "
-        f"wrongly; {counted(false.count, 'false name')} where nothing was hidden ({false.total})."
     )

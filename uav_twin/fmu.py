@@ -1,20 +1,24 @@
 """`uav-twin fmu ...`."""
 
 import re
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
 from reporting import terminal
+from reporting.files import atomic_write_text, refuse_existing
 from reporting.words import counted
-from uav_twin.options import told
+from scenarios import asset_scripts
+from uav_twin.options import say_packed, told
+from uav_twin.sentences import said
 from uav_twin.simulated import simulate
 from uav_twin.structure import fmu as build_structure
 from uav_twin.structure import names_structure
 
 if TYPE_CHECKING:
-    from fmu_asset.compiled.compiler import Platform
+    from fmu_asset.packing.contents import FmuInfo
 
 
 @told("fmu bind")
@@ -26,7 +30,6 @@ def bind(
 
     from fmu_asset.archive.fmu_file import read_fmu
     from fmu_asset.door.draft import draft_binding
-    from reporting.files import atomic_write_text, refuse_existing
 
     refuse_existing(out, replace=replace)
     gc.disable()  # of 100,000 variables nothing is garbage, and looking for it takes a third of the time
@@ -56,8 +59,6 @@ def check(
     json: bool = False,
 ) -> None:
     """Check an FMU in every way we know; exit code 1 if anything is wrong with it."""
-    from dataclasses import asdict
-
     from fmu_asset.check import check_fmu
 
     result = check_fmu(
@@ -87,14 +88,6 @@ def check(
 _SWITCH = re.compile(r"effect\.[A-Za-z0-9_]+\.active")
 """The switch of a missing effect among the variables of an FMU."""
 
-_Form = tuple[
-    Literal["python", "compiled", "source"],
-    Literal[2, 3],
-    Literal["co-simulation", "model-exchange"],
-    bool,
-]
-"""Kind, version of FMI, interface, and whether it is for Windows too."""
-
 fmu_app = typer.Typer(no_args_is_help=True, help="Build, describe, bind, check and simulate FMUs.")
 
 
@@ -117,9 +110,7 @@ def build(
     """Pack a wing, a structure or a model script as an FMU; equal input gives equal bytes."""
     if script is None and calibration is None and design is not None and names_structure(design):
         if patch is not None or activate or interface != "co-simulation" or windows:
-            raise typer.BadParameter(
-                "--patch, --activate, --interface and --windows are for wings; the design is a structure."
-            )
+            raise typer.BadParameter(said("fmu.of_wings"))
         build_structure(design, out=out, kind=kind, fmi=fmi, replace=replace)
         return
     out = out or Path("uav_wing.fmu")
@@ -128,51 +119,44 @@ def build(
     if activate and patch is None:
         raise typer.BadParameter("there is no --patch whose effects could be switched on.")
     if script is None:
-        form: _Form = (kind, 3 if fmi == 3 else 2, interface, windows)
-        _build_wing(out, design, form, calibration, patch, activate=activate, replace=replace)
+        form = {"kind": kind, "fmi": 3 if fmi == 3 else 2, "interface": interface}
+        info = _packed_wing(
+            out, design, calibration, patch, form, windows=windows, activate=activate, replace=replace
+        )
+        say_packed(info)
         return
     if any((design, calibration, patch, windows)) or (kind, fmi, interface) != ("python", 2, "co-simulation"):
-        raise typer.BadParameter(
-            "--design, --calibration, --patch, --kind, --fmi, --interface and --windows are for the wing.",
-            param_hint="--script",
-        )
-    _build_script(script, out, replace=replace)
-
-
-def _build_script(script: str, out: Path, *, replace: bool) -> None:
-    """Pack a model script, shipped or a file."""
+        raise typer.BadParameter(said("fmu.of_the_wing"), param_hint="--script")
     from fmu_asset.packing.script import build_script_fmu
-    from scenarios import asset_scripts
 
     built = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)
     terminal.say(f"{built.path}: {built.size / 1024:.0f} KiB, GUID {built.guid}")
 
 
-def _build_wing(
+def _packed_wing(
     out: Path,
     design: Path | None,
-    form: _Form,
     calibration: Path | None,
     patch: Path | None,
+    form: dict[str, Any],
     *,
+    windows: bool,
     activate: bool,
     replace: bool,
-) -> None:
-    """Pack a wing, tailored where it was calibrated."""
+) -> "FmuInfo":
+    """Pack a wing, tailored where it was calibrated; `form`: its kind, version of FMI and interface."""
     from fe.wing.design import load_design
     from fmu_asset.packing.contents import checked_target
     from fmu_asset.packing.patch_file import load_patch
     from fmu_asset.packing.structure_fmu import check_form
     from fmu_asset.packing.wing_packing import pack_wing
 
-    kind, fmi, interface, windows = form
     out = checked_target(out, replace=replace)
-    if windows and kind != "compiled":
+    if windows and form["kind"] != "compiled":
         raise typer.BadParameter("--windows is for --kind compiled.")
-    platforms: tuple[Platform, ...] = ("linux64", "win64") if windows else ("linux64",)
+    form["platforms"] = ("linux64", "win64") if windows else ("linux64",)
     effects = None if patch is None else load_patch(patch)
-    check_form(kind, fmi, interface, patched=effects is not None, platforms=platforms)
-    options = {}
+    check_form(**form, patched=effects is not None)
     if calibration is None:
         shape = load_design(design)
     else:
@@ -180,23 +164,13 @@ def _build_wing(
         from calibration.result.plain import tailoring
 
         wing = load_calibration(calibration)
-        shape, options = wing.wing_design, tailoring(wing)
-    info = pack_wing(
-        shape,
-        out,
-        kind=kind,
-        patch=effects,
-        activate=activate,
-        fmi=fmi,
-        interface=interface,
-        platforms=platforms,
-        replace=replace,
-        progress=terminal.progress(),
-        **options,
-    )
+        shape = wing.wing_design
+        form |= tailoring(wing)
+    progress = terminal.progress()
+    info = pack_wing(shape, out, patch=effects, activate=activate, replace=replace, progress=progress, **form)
     if calibration is not None:
         terminal.say(f"Calibrated for {wing.asset}.")
-    terminal.say(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
+    return info
 
 
 @fmu_app.command("info")

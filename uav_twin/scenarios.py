@@ -5,7 +5,8 @@ from pathlib import Path
 import typer
 
 from reporting import terminal
-from uav_twin.options import told
+from scenarios import scenario_files
+from uav_twin.options import show, told
 
 scenario_app = typer.Typer(no_args_is_help=True)
 
@@ -18,7 +19,6 @@ def scenario() -> None:
 @told("scenarios")
 def list_scenarios() -> None:
     """List the scenarios that are shipped."""
-    from scenarios import scenario_files
     from twin_master.scenario.reading import load_scenario
 
     rows = []
@@ -48,16 +48,5 @@ def check(file: str, *, calibration: Path | None = None, json: bool = False) -> 
     found = check_scenario(load_scenario(file), Overrides(calibration=calibration))
     if json:
         terminal.print_json(found)
-        return
-    levels = ", ".join(f"{name} ({count} levels)" for name, count in found["levels"].items())
-    for line in (
-        "{name}: {title}",
-        "Flown: {flown}.",
-        "Believed: {believed}.",
-        "Uncertain: {uncertain}, {draws} draws.",
-        f"State: {{states}} states, {levels}.",
-        f"Controls: {', '.join(found['controls'])}. Sensors: {{sensors}}.",
-        "Mission: {turns} {step_name}s, {prediction_steps} ahead.",
-        f"Memory of the twin: about {found['memory'] / 2**20:.3g} MiB.",
-    ):
-        terminal.say(line.format(**found))
+    else:
+        show("scenario check", **found)

@@ -4,8 +4,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fmu_asset.errors import FmuInputError
 from reporting import terminal
+from reporting.files import atomic_write_bytes, refuse_existing
 from uav_twin.options import told
+from uav_twin.sentences import said
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,9 +24,6 @@ _MOST_PANELS, _MOST_LINES = 8, 10
 
 def refuse_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
     """Refuse files that cannot be written, before anything is simulated."""
-    from fmu_asset.errors import FmuInputError
-    from reporting.files import refuse_existing
-
     for path, suffixes, option in ((out, (".csv", ".nc"), "--out"), (plot, (".png", ".svg"), "--plot")):
         if path is not None and path.suffix not in suffixes:
             raise FmuInputError(f"{path} must end in {' or '.join(suffixes)}: choose another {option}.")
@@ -32,8 +32,6 @@ def refuse_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
 
 def values_of(texts: list[str]) -> dict[str, float | list[float]]:
     """Return values by name: numbers, true and false, or for an array several with commas between."""
-    from fmu_asset.errors import FmuInputError
-
     found: dict[str, float | list[float]] = {}
     for text in texts:
         name, sign, value = text.rpartition("=")
@@ -43,18 +41,13 @@ def values_of(texts: list[str]) -> dict[str, float | list[float]]:
         except ValueError:
             numbers = []
         if not (name and sign and numbers):
-            raise FmuInputError(
-                f"--set {text} is not understood; write NAME=NUMBER, such as --set mass=2.5, and for an "
-                "array NAME=1,2,3."
-            )
+            raise FmuInputError(said("fmu.set", text=text))
         found[name] = numbers[0] if len(numbers) == 1 else numbers
     return found
 
 
 def interpolated(binding: "Binding", kind: str | None) -> "Binding":
     """Return a binding with inputs that go on between communication points as `--interpolation` says."""
-    from fmu_asset.errors import FmuInputError
-
     if kind is None:
         return binding
     if kind not in ("zero-order", "linear"):
@@ -111,7 +104,6 @@ def _columns(
 def _draw(path: Path, asset: "FmiAsset", history: "ObservationHistory") -> None:
     """Draw the outputs over time, those of one unit in one panel, and write the picture."""
     from reporting.figures import FULL_WIDTH, new_figure, publication_style, to_png, to_svg
-    from reporting.files import atomic_write_bytes
 
     panels: dict[str, list[tuple[str, npt.NDArray[np.float64]]]] = {}
     for name, unit, values in _columns(asset, history):
@@ -180,14 +172,9 @@ def _refuse_mixture(
     binding: Path | None, inputs: Path | None, interpolation: str | None, *, others: bool
 ) -> None:
     """Refuse half of a simulation under histories, and one that is half without."""
-    from fmu_asset.errors import FmuInputError
-
     if (binding is None) != (inputs is None):
         raise FmuInputError("--binding and --inputs go together: one names the columns of the other.")
     if binding is not None and others:
-        raise FmuInputError(
-            "--stop-time, --step-size and --set are for a simulation without --binding, which says these "
-            "itself."
-        )
+        raise FmuInputError(said("fmu.without_binding"))
     if interpolation is not None and inputs is None:
         raise FmuInputError("--interpolation says how inputs go on between the rows of --inputs: give these.")

@@ -1,12 +1,16 @@
 """`uav-twin ssp ...`."""
 
 import tempfile
+from dataclasses import asdict
 from pathlib import Path
 
 import typer
 
+from fmu_asset.errors import FmuInputError, SspError
 from reporting import terminal
-from uav_twin.options import told
+from reporting.errors import ReportingError
+from reporting.toml_file import read_toml
+from uav_twin.options import show, told
 from uav_twin.simulated import (
     finish,
     interpolated,
@@ -21,7 +25,6 @@ ssp_app = typer.Typer(no_args_is_help=True, help="Write, check and simulate syst
 @told("ssp export")
 def export(what: str, *, out: Path, seed: int | None = None, replace: bool = False) -> None:
     """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""
-    from fmu_asset.errors import SspError
     from fmu_asset.packing.contents import checked_target
     from twin_master.assets.system_export import export_design, export_scenario
     from twin_master.scenario.reading import load_scenario
@@ -38,9 +41,6 @@ def export(what: str, *, out: Path, seed: int | None = None, replace: bool = Fal
 
 def _is_design(what: str) -> bool:
     """Return whether a name or path is that of a wing design: a TOML file without a mission."""
-    from reporting.errors import ReportingError
-    from reporting.toml_file import read_toml
-
     if what == "uav_wing":
         return True
     try:
@@ -78,7 +78,8 @@ def simulate(
     given = _single_numbers(values or [])
     with tempfile.TemporaryDirectory() as folder:
         wiring = join_ssp(read_ssp(file, folder), delay or ())
-        _warn(left_out_sentence(wiring, file))
+        if left_out := left_out_sentence(wiring, file):
+            terminal.say(f"warning: {left_out}")
         described = system_description(wiring)
         planned = default_experiment(described, stop_time=stop_time, step_size=step_size, values=given)
         with CoupledAsset(
@@ -93,13 +94,7 @@ def simulate(
             finish(asset, history, (file, hash_file(file)), out, plot)
 
 
-def _warn(sentence: str) -> None:
-    if sentence:
-        terminal.say(f"warning: {sentence}")
-
-
 def _single_numbers(texts: list[str]) -> dict[str, float]:
-    from fmu_asset.errors import FmuInputError
 
     found: dict[str, float] = {}
     for name, value in values_of(texts).items():
@@ -113,26 +108,14 @@ def _single_numbers(texts: list[str]) -> dict[str, float]:
 @told("ssp check")
 def check(file: Path, *, json: bool = False) -> None:
     """Check an SSP file: archive, schemas, FMUs, connections, one step; exit code 1 if anything is wrong."""
-    from dataclasses import asdict
-
     from fmu_asset.ssp.check import check_ssp
 
     result = check_ssp(file)
-    if json:
-        terminal.print_json({"passed": not result.problems} | asdict(result))
     for problem in result.problems:
         typer.secho(f"problem: {problem}", fg="red", err=True)
-    if not json:
-        _warn(result.left_out)
-    for loop in () if json else result.loops:
-        terminal.say(
-            f"warning: {loop} `uav-twin ssp simulate` does so by --delay, --iterations, --algorithm jacobi."
-        )
+    if json:
+        terminal.print_json({"passed": not result.problems} | asdict(result))
+    else:
+        show("ssp check", file=file, result=result)
     if result.problems:
         raise typer.Exit(1)
-    order = ", ".join(f"{name} ({model})" for name, model in result.components)
-    if not json:
-        terminal.say(
-            f"{file}: no problem found; {result.connections} connections, {result.parameters} parameters, "
-            f"evaluated in the order {order}."
-        )

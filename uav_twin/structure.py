@@ -10,12 +10,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
+from fe.runtime.errors import DesignFileError
 from reporting import terminal
-from uav_twin.options import told
+from reporting.errors import FileNotWrittenError
+from reporting.files import atomic_write_text, refuse_existing, refuse_filled
+from reporting.toml_file import read_toml
+from scenarios import structure_files
+from uav_twin.options import say_packed, show, told
+from uav_twin.sentences import said
 from uav_twin.wing import Check, end_with, print_checks
 
 if TYPE_CHECKING:
-    from fe.reduction.reduced_basis import MeasuredErrors
     from fe.runtime.reduced import ReducedModel
     from fe.structure.affine import AffineStructure
     from fe.structure.operators import Structure
@@ -31,16 +36,12 @@ structure_app = typer.Typer(
 
 def located(file: Path) -> Path:
     """Return a structure file, or the shipped one of that name where there is no such file."""
-    from scenarios import structure_files
-
     return file if file.exists() else structure_files().get(str(file), file)
 
 
 def names_structure(design: Path) -> bool:
     """Return whether a design is that of a structure, and not of a wing."""
-    from fe.runtime.errors import DesignFileError
     from fe.structure.design import is_structure
-    from reporting.toml_file import read_toml
 
     return is_structure(read_toml(located(design), DesignFileError, what="wing design"))
 
@@ -83,24 +84,8 @@ def info(file: Path, *, modes: int = 6, memory_limit: float | None = None, json:
     if json:
         terminal.print_json(record)
         return
-    terminal.print_table(("fact", "value", "unit"), _facts(record))
-    for remark in record["remarks"]:
-        terminal.say(f"Note: {remark}")
-    parts = [
-        (part["what"], part["name"], part["set"], f"{part['count']:,} {part['of']}", part["note"])
-        for part in record["parts"]
-    ]
-    if parts:
-        terminal.print_table(("part", "name", "set", "holds", "note"), parts)
-    modes_found = [(f"{number}", f"{value:.6g}") for number, value in enumerate(record["frequencies"], 1)]
-    if modes_found:
-        terminal.print_table(("mode", "frequency [Hz]"), modes_found)
-    else:
-        terminal.say("No modes: nothing has mass. Give the materials a density.")
+    show("structure info", record=record)
     for load in record["loads"]:
-        of = f" at {load['control']} = {load['value']:g}" if load["control"] else ""
-        largest = f"largest displacement {1e3 * load['largest_displacement']:.6g} mm"
-        terminal.say(f"Load {load['name']}{of}: {largest}")
         outputs = [
             (what, name, f"{scale * value:.6g}", unit)
             for what, key, scale, unit in (
@@ -109,28 +94,7 @@ def info(file: Path, *, modes: int = 6, memory_limit: float | None = None, json:
             )
             for name, value in load[key].items()
         ]
-        if outputs:
-            terminal.print_table(("output", "name", "value", "unit"), outputs)
-
-
-def _facts(record: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    yield "name", record["name"], ""
-    if "mesh" not in record:
-        yield "matrices", ", ".join(record["matrices"]), f"N, s, {record['length_unit']}"
-        yield "unknowns", f"{record['unknowns']:,} free", ""
-        return
-    yield "mesh", f"{record['mesh']}: {record['elements']:,} {record['kind']}, {record['nodes']:,} nodes", ""
-    if record["linear_elements"]:
-        yield "elements", "linear: far too stiff in bending; take quadratic ones", ""
-    if record["loose_nodes"]:
-        first = ", ".join(str(number) for number in record["loose_nodes"][:3])
-        yield "nodes left out", f"{len(record['loose_nodes'])} touch no element, among them {first}", ""
-    yield "unknowns", f"{record['unknowns']:,} free, {record['held']:,} held", ""
-    yield "memory", f"about {record['memory'] / 2**30:.2g}", "GiB"
-    yield "mass", f"{record['mass']:.6g}", "kg"
-    for key, title in (("centre_of_gravity", "centre of gravity"), ("lower", "from"), ("upper", "to")):
-        unit = record["length_unit"]
-        yield title, ", ".join(f"{value:.6g}" for value in record[key]), unit
+        show("load of a structure", **load, outputs=outputs)
 
 
 def structure_record(structure: "AffineStructure", modes: int) -> dict[str, Any]:
@@ -234,7 +198,6 @@ def verify(
     """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
     from fe.verification.calculix_comparison import agreement, required_calculix
     from fe.verification.calculix_deck import structure_deck
-    from reporting.files import refuse_filled
 
     required_calculix()
     refuse_filled(out)
@@ -280,7 +243,6 @@ def field(
 ) -> None:
     """Solve the full structure under all its loads, and write its field as VTU for ParaView."""
     from fe.structure.operators import write_structure_vtu
-    from reporting.files import refuse_existing
 
     refuse_existing(out, replace=replace)
     structure = assembled(file, memory_limit)
@@ -293,14 +255,9 @@ def field(
         except ValueError:
             value = nan
         if name in values or not low <= value <= high:
-            known = ", ".join(
-                f"{own} from {low:g} to {high:g}" for own, (low, high) in structure.ranges.items()
-            )
-            raise typer.BadParameter(
-                f"NAME=VALUE is expected, each name once, but {text!r} came; there are {known}. Give a value "
-                "inside, or widen its range in the structure file.",
-                param_hint="--at",
-            )
+            ranges = structure.ranges.items()
+            known = [f"{own} from {low:g} to {high:g}" for own, (low, high) in ranges]
+            raise typer.BadParameter(said("structure.at", text=text, known=known), param_hint="--at")
         values[name] = value
     with terminal.progress().stage("Solving and writing the field"):
         write_structure_vtu(out, structure, values)
@@ -318,28 +275,18 @@ def reduce(file: Path, *, states: int = 4, memory_limit: float | None = None, js
         structure = assembled_of_any(file, memory_limit)
         with terminal.progress().stage("Comparing it with the full model"):
             errors = measured_errors(structure, model, states)
+    record = {
+        "name": model.name,
+        "design_hash": model.design_hash,
+        "static_basis": len(model.static_load.T),
+        "modal_basis": len(model.modal_load.T),
+        "ranges": {name: list(ends) for name, ends in model.validity.items()},
+        "errors": None if errors is None else asdict(errors),
+    }
     if json:
-        terminal.print_json(
-            {
-                "name": model.name,
-                "design_hash": model.design_hash,
-                "static_basis": len(model.static_load.T),
-                "modal_basis": len(model.modal_load.T),
-                "ranges": {name: list(ends) for name, ends in model.validity.items()},
-                "errors": None if errors is None else asdict(errors),
-            }
-        )
-        return
-    headings = ("what", "name", "least", "nominal", "largest")
-    terminal.print_table(headings, list(_ranges(model)))
-    terminal.say(
-        f"{model.name}: {len(model.static_load.T)} static and {len(model.modal_load.T)} modal basis vectors; "
-        f"gauges {len(model.gauges)}, displacements {len(model.displacements)}, "
-        f"accelerations {len(model.accelerations)}, modes {model.mode_count}."
-    )
-    if errors is not None:
-        heading = f"largest error at {errors.states} random states"
-        terminal.print_table(("of", heading), list(_errors(errors)))
+        terminal.print_json(record)
+    else:
+        show("structure reduce", model=model, record=record, ranges=list(_ranges(model)))
 
 
 def _ranges(model: "ReducedModel") -> Iterator[tuple[str, ...]]:
@@ -349,18 +296,6 @@ def _ranges(model: "ReducedModel") -> Iterator[tuple[str, ...]]:
     kinds |= {name: f"control [{unit}]" for name, unit in zip(model.controls, units, strict=True)}
     for (name, (low, high)), nominal in zip(model.validity.items(), model.nominal, strict=True):
         yield kinds[name], name, f"{low:g}", f"{nominal:g}", f"{high:g}"
-
-
-def _errors(errors: "MeasuredErrors") -> Iterator[tuple[str, str]]:
-    for what, value in (
-        ("strains, of the largest", errors.strain),
-        ("displacements, of the largest", errors.displacement),
-        ("certified bound of both", errors.bound),
-        ("frequencies", errors.frequency),
-    ):
-        if value == value:  # not where there are no such outputs
-            yield what, f"{value:.2g}"
-    yield "states in which an error exceeds its bound", f"{errors.broken}"
 
 
 @structure_app.command("fmu")
@@ -382,8 +317,6 @@ def fmu(
     from fmu_asset.packing.structure_fmu import build_fmu, check_form
     from fmu_asset.structures.binding import structure_binding_text
     from fmu_asset.structures.rig import rig_text
-    from reporting.errors import FileNotWrittenError
-    from reporting.files import atomic_write_text, refuse_existing
 
     version: Literal[2, 3] = 3 if fmi == 3 else 2
     check_form(kind, version)
@@ -407,7 +340,7 @@ def fmu(
             others.append((path, structure_binding_text(design), "its binding"))
     model = reduced(file, memory_limit)
     info = build_fmu(model, target, kind=kind, fmi=version, replace=replace)
-    terminal.say(f"{info.path}: {info.size / 1024:.0f} KiB, GUID {info.guid}, design {info.design_hash[:12]}")
+    say_packed(info)
     for path, text, what in others:
         atomic_write_text(path, text)
         terminal.say(f"{path}: {what}")

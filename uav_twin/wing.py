@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from fe.runtime.state import DigitalState
 from reporting import terminal
-from uav_twin.options import refuse_before, told
+from reporting.files import atomic_write_text, refuse_filled
+from uav_twin.options import refuse_before, show, told
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import Modes, ReducedModel
@@ -19,11 +21,6 @@ if TYPE_CHECKING:
     from fe.wing.operators import AffineOperators
     from reporting.progress import Progress
 
-PUBLISHED = {
-    "tip stiffness": "0.6770 (eq. 14)",
-    "first flapwise bending": "5.632 (step 3, e = 1)",
-    "second flapwise bending": "28.544 (step 3, e = 1)",
-}
 DAMAGED = (0.4, 0.6)
 REFINEMENTS = (0.5, 1.0, 2.0)
 QUICK_REFINEMENTS = (0.25, 0.5, 1.0)
@@ -48,25 +45,12 @@ def wing(
     written = [] if vtu is None else [str(path) for path in write_fields(wing_design, vtu)]
     if as_json:
         terminal.print_json(record | {"written": written})
-        return
-    rows = [
-        ("mass of the structure", f"{record['structural_mass']:.4f}", "", "kg"),
-        ("mass with two servos and pitot", f"{record['mass']:.4f}", "", "kg"),
-        ("tip stiffness", f"{1e-3 * record['tip_stiffness']:.4f}", PUBLISHED["tip stiffness"], "N/mm"),
-    ]
-    for mode in record["modes"]:
-        title = f"frequency {mode['number']}" + (f", {mode['shape']}" if mode["shape"] else "")
-        rows.append((title, f"{mode['frequency']:.3f}", PUBLISHED.get(mode["shape"], ""), "Hz"))
-    terminal.print_table(("figure", "this wing", "published model", "unit"), rows)
-    terminal.say("The published figures are of Kapteyn et al. 2021 and belong to the shipped wing.")
-    for path in written:
-        terminal.say(f"Wrote {path}")
+    else:
+        show("wing", record=record, written=written)
 
 
 def wing_record(design: "WingDesign", model: "ReducedModel") -> dict[str, Any]:
     """Return mass [kg], stiffness [N/m] and frequencies [Hz] of the undamaged wing by name."""
-    from fe.runtime.state import DigitalState
-
     state = DigitalState()
     modes = model.modes(state.values, state.stiffness_loss)
     structure = structural_mass(design)
@@ -104,7 +88,6 @@ def write_fields(design: "WingDesign", path: Path) -> tuple[Path, Path]:
     """Write the undamaged wing in a 3g turn, and its modes in a file beside it; return both paths."""
     from fe.reduction.fields import write_modes_vtu, write_wing_vtu
     from fe.reduction.model_cache import wing_fields
-    from fe.runtime.state import DigitalState
 
     state = DigitalState()
     fields = wing_fields(design, progress=terminal.progress())
@@ -150,7 +133,6 @@ def verify(*, design: Path | None = None, out: Path | None = None, quick: bool =
     """Check a wing's finite element model: balances, convergence, and CalculiX where it is installed."""
     from fe.verification.calculix_comparison import calculix_program
     from fe.wing.design import load_design
-    from reporting.files import refuse_filled
 
     wing_design = load_design(design)
     refuse_filled(out)
@@ -187,8 +169,6 @@ def end_with(checks: Sequence[Check]) -> None:
 
 def write_record(folder: Path, design: "WingDesign", checks: Sequence[Check]) -> Path:
     """Write `verification.json`: each check with its value and limit."""
-    from reporting.files import atomic_write_text
-
     rows = [
         {**asdict(check), "value": check.value if math.isfinite(check.value) else None}
         | {"passed": check.passed}
@@ -287,7 +267,6 @@ def convergence_checks(
 
 def calculix_checks(operators: "AffineOperators", jobs: Path) -> Iterator[Check]:
     """Yield the differences to CalculiX on the identical mesh: statics and six modes."""
-    from fe.runtime.state import DigitalState
     from fe.verification.calculix_comparison import agreement
     from fe.verification.calculix_deck import wing_deck
 

@@ -1,6 +1,6 @@
 """A candidate explanation: effects at given places, shapes fixed or free; where it stands, what it leaves."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -127,11 +127,6 @@ class Candidate:
         """Return some of the effects with their standard normal variables, of those of all (size,)."""
         chosen, parts = tuple(kept), self.parts(normal)
         return Candidate(tuple(self.terms[k] for k in chosen)), np.concatenate([parts[k] for k in chosen])
-
-    def each_without(self, normal: FloatArray) -> Iterator[tuple["Candidate", FloatArray]]:
-        """Yield this set less each of its effects, as `some` does; nothing where it has one only."""
-        for index in range(len(self.terms) if len(self.terms) > 1 else 0):
-            yield self.some((k for k in range(len(self.terms)) if k != index), normal)
 
 
 PARAMETER_STEP = 1e-2

@@ -45,22 +45,6 @@ def around(problem: Problem, found: CandidateFit) -> CandidateFit:
     return found
 
 
-def elsewhere(problem: Problem, found: CandidateFit) -> CandidateFit:
-    """Return the best fit of the same candidate begun at other places of the structure, or the fit itself.
-
-    A mass on either side of an antinode changes a frequency alike, and a fit that began on one side may stay
-    there though the other explains the data far better.
-    """
-    for number, item in enumerate(_parameters(found)):
-        if not isinstance(item, EffectParameter) or item.magnitude or not item.levels:
-            continue
-        for value in SEARCH.places:
-            effect = found.point.effect.copy()
-            effect[number] = value
-            found = _better(problem, found, effect, found)
-    return found
-
-
 def _parameters(found: CandidateFit) -> list[EffectParameter | ShapeParameter]:
     return [item for term in found.candidate.terms for item in term.parameters]
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -34,19 +35,21 @@ def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool =
     all trials, and its uncertainty is that of the remainder, which χ² against the noise shall show.
     """
     fitted = _predicted(problem, found, found, sensitivities=sensitivities)
-    held_out = problem.campaign.held_out
-    if held_out:
-        # what is shared stays as fitted, their own nuisances adapt to them
-        there = problem.with_trials(held_out)
-        nothing = tuple(np.zeros(data.unknowns.size) for data in there.trials)
-        start = replace(found.point, local=nothing)
-        adapted = fit(there, found.candidate, start, local_only=True)
+    if problem.campaign.held_out:
+        there, adapted = held_out_fit(problem, found)
         fitted += _predicted(there, found, adapted, held_out=True)
     trials = {item.trial.name: item for item in fitted}
     return ResidualSet(
         problem.campaign.channels,
         tuple(trials[trial.name] for trial in problem.campaign.trials if trial.name in trials),
     )
+
+
+def held_out_fit(problem: Problem, found: CandidateFit, **options: Any) -> tuple[Problem, CandidateFit]:
+    """Return the trials that are held out, and a fit with their own nuisances; what is shared stays."""
+    there = problem.with_trials(problem.campaign.held_out)
+    start = replace(there.start(found.candidate), shared=found.point.shared, effect=found.point.effect)
+    return there, fit(there, found.candidate, start, local_only=True, **options)
 
 
 def _predicted(

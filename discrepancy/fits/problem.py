@@ -119,7 +119,7 @@ class Problem:
                 measured = data.trial.values[:, column] - np.median(data.trial.values[:, column])
                 local = point.local[number]
                 if data.trial.release is not None and not data.trial.release.at_rest:
-                    local[data.unknowns.zeros] = 1.0 / data.unknowns.initial_scale
+                    local[data.unknowns.zeros] = 1.0 / data.unknowns.scale[data.unknowns.zeros]
                 response, _ = self.response(number, point.shared, local, ModelPatch())
                 size = float(np.abs(response[:, column]).max())
                 if size > 0.0:
@@ -236,8 +236,9 @@ class Problem:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the derivatives by the calibrated parameters and by the trial's own unknowns but zeros."""
         response, rates = self.response(number, shared, local, patch)
-        data, first = self.trials[number], self.trials[number].unknowns.zeros
+        data = self.trials[number]
         unknowns = data.unknowns
+        first, _, last, at = unknowns.ends
 
         def slope(by_shared: FloatArray, by_local: FloatArray, step: float = PARAMETER_STEP) -> FloatArray:
             return (self.response(number, by_shared, by_local, patch)[0] - response) / step
@@ -246,12 +247,11 @@ class Problem:
             slope(moved(shared, k, SHARED_STEP), local, SHARED_STEP)
             for k in range(len(self.shared.parameter_mean))
         ]
-        columns = [slope(shared, moved(local, first + k)) for k in range(unknowns.initials)]
-        if unknowns.time_zero_scale > 0.0:
-            at, scale = first + unknowns.initials, unknowns.time_zero_scale
-            columns.append(slope(shared, moved(local, at)) if rates is None else rates * scale)
+        columns = [slope(shared, moved(local, k)) for k in range(first, last)]
+        if unknowns.has_time_zero:
+            of_time = slope(shared, moved(local, last)) if rates is None else rates * unknowns.scale[last]
+            columns.append(of_time)
         if len(unknowns.health_rows):
-            at = unknowns.size - len(unknowns.health_rows)
             by_entry = np.zeros((len(unknowns.health_rows), *response.shape))
             for region in range(data.trial.health.shape[1]):
                 entries = np.flatnonzero(unknowns.health_columns == region)
@@ -293,7 +293,7 @@ class Problem:
         )
         shape = parts.response.shape
         zeros, of_gains = np.zeros((unknowns.zeros, *shape)), np.zeros((len(known), *shape))
-        zeros[np.arange(len(zeros)), :, unknowns.zero_columns] = unknowns.zero_scale[:, np.newaxis]
+        zeros[np.arange(len(zeros)), :, unknowns.zero_columns] = unknowns.scale[: len(zeros), np.newaxis]
         of_gains[np.arange(len(known)), :, column] = (parts.response[:, column] * shared.gain_scale[known]).T
         found = (zeros, parts.local * gains, parts.parameters * gains, of_gains, parts.effect[acting] * gains)
         count = len(parts.parameters)

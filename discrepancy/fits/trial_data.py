@@ -7,9 +7,10 @@ constants of inputs of a driven trial, health where it is uncertain.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from math import isinf
+from itertools import accumulate
+from math import isinf, prod
 
 import numpy as np
 
@@ -76,97 +77,69 @@ class GlobalUnknowns:
 
 @dataclass(frozen=True)
 class LocalUnknowns:
-    """Layout of the unknowns of one trial: zeros, initial state, constants of inputs, time zero, health.
+    """Unknowns of one trial: zeros, initial state, constants of inputs, time zero, health, in this order.
 
     Attributes
     ----------
+    scale, precision : (L,) ndarray
+        Value of a unit of each scaled variable, and its prior precision.
     zero_columns : (Z,) ndarray of int
         Columns whose zero is unknown.
-    zero_scale, zero_precision : (Z,) ndarray
-        Scale and prior precision.
     initial_shape : tuple of int
         (R, 1) or (R, 2): entries of the initial state that are unknown.
-    initial_scale : float
-        Their prior deviation.
-    initial_sizes : (initials,) ndarray
-        Natural sizes of an unknown initial state of a driven trial; empty for ring-downs.
-    offset_scale : tuple of float
-        Prior deviations of the constants that the recorded inputs lack; zero where none is lacking.
-    time_zero_scale : float
-        Zero if it is known.
+    offset_inputs : (O,) ndarray of int
+        Recorded inputs that lack a constant.
+    has_time_zero : bool
+        Whether it is unknown.
     health_rows, health_columns : (H,) ndarray of int
         Uncertain entries of the health, those of the first region first.
     """
 
+    scale: FloatArray
+    precision: FloatArray
     zero_columns: IntArray
-    zero_scale: FloatArray
-    zero_precision: FloatArray
     initial_shape: tuple[int, int]
-    initial_scale: float
-    time_zero_scale: float
+    offset_inputs: IntArray
+    has_time_zero: bool
     health_rows: IntArray
     health_columns: IntArray
-    offset_scale: tuple[float, ...] = ()
-    initial_sizes: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def size(self) -> int:
+        """Number of local unknowns."""
+        return len(self.scale)
 
     @property
     def zeros(self) -> int:
         """Number Z of unknown zeros."""
         return len(self.zero_columns)
 
-    @property
-    def initials(self) -> int:
-        """Number of unknown initial entries, and after them of unknown constants of inputs."""
-        return self.initial_shape[0] * self.initial_shape[1] + self.offsets
-
-    @property
-    def offsets(self) -> int:
-        """Number of unknown constants of inputs."""
-        return sum(scale > 0.0 for scale in self.offset_scale)
-
-    @property
-    def size(self) -> int:
-        """Number of local unknowns."""
-        return self.zeros + self.initials + (self.time_zero_scale > 0.0) + len(self.health_rows)
-
-    @property
-    def precision(self) -> FloatArray:
-        """Prior precision of each scaled variable."""
-        return np.concatenate((self.zero_precision, np.ones(self.size - self.zeros)))
+    @cached_property
+    def ends(self) -> list[int]:
+        """Where zeros, initial state, constants of inputs and time zero end."""
+        counts = (self.zeros, prod(self.initial_shape), len(self.offset_inputs), self.has_time_zero)
+        return list(accumulate(counts))
 
     def zero(self, u: FloatArray, columns: int) -> FloatArray:
         """Return the zeros (C,) of the trial's channels."""
         values = np.zeros(columns)
-        values[self.zero_columns] = self.zero_scale * u[: self.zeros]
+        values[self.zero_columns] = (self.scale * u)[: self.zeros]
         return values
 
     def conditions(self, trial: Trial, parameters: FloatArray, u: FloatArray) -> Conditions:
         """Return the conditions of the trial's response."""
-        at = self.zeros
-        initial = np.zeros((self.initial_shape[0], 2))
-        first = self.initials - self.offsets
-        if first:
-            entries = self.initial_scale * u[at : at + first]
-            if len(self.initial_sizes):
-                entries = entries * self.initial_sizes
-            initial[:, : self.initial_shape[1]] = entries.reshape(self.initial_shape)
-            at += first
-        offset = np.array(self.offset_scale)
-        if self.offsets:
-            offset[offset > 0.0] *= u[at : at + self.offsets]
-            at += self.offsets
-        time_zero = 0.0
-        if self.time_zero_scale > 0.0:
-            time_zero = self.time_zero_scale * float(u[at])
-            at += 1
+        _, entries, constants, time_zero, losses = np.split(self.scale * u, self.ends)
+        rows, width = self.initial_shape
+        initial, offset = np.zeros((rows, 2)), np.zeros(len(trial.inputs))
+        initial[:, :width] = entries.reshape(rows, width)
+        offset[self.offset_inputs] = constants
         health = trial.health[:1] if trial.is_dynamic else trial.health
-        if len(self.health_rows):
+        if losses.size:
             health = health.copy()
             entry = (self.health_rows, self.health_columns)
-            health[entry] = np.clip(
-                health[entry] + trial.health_deviation[entry] * u[at:], LEAST_LOSS, LARGEST_LOSS
-            )
-        return Conditions(parameters, initial, (0.0, time_zero), health, tuple(offset.tolist()))
+            health[entry] = np.clip(health[entry] + losses, LEAST_LOSS, LARGEST_LOSS)
+        times = (0.0, float(time_zero.sum()))
+        return Conditions(parameters, initial, times, health, tuple(offset.tolist()))
 
 
 def global_unknowns(
@@ -210,33 +183,27 @@ def global_unknowns(
 
 def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray, model: Model) -> LocalUnknowns:
     """Return the layout of the unknowns of one trial; `deviation` (C,) scales zeros nothing is known of."""
-    zero_scale = np.array([campaign.channels[name].offset_deviation for name in trial.channels])
-    columns = np.flatnonzero(zero_scale > 0.0)
-    free = np.isinf(zero_scale[columns])
+    zeros = np.array([campaign.channels[name].offset_deviation for name in trial.channels])
+    columns = np.flatnonzero(zeros > 0.0)
+    free = np.isinf(zeros[columns])
     release = trial.release if trial.kind is TrialKind.RINGDOWN else None
-    shape, scale, time_zero, sizes = (0, 1), 1.0, 0.0, np.zeros(0)
+    shape, entries, time_zero = (0, 1), np.zeros(0), np.zeros(0)
     if release is not None:
         shape = (release.mode_count, 1 if release.at_rest else 2)
-        scale = release.deviation if release.at_rest else FREE_MOTION
-        time_zero = release.time_zero_deviation
+        entries = np.full(prod(shape), release.deviation if release.at_rest else FREE_MOTION)
+        time_zero = np.full(int(release.time_zero_deviation > 0.0), release.time_zero_deviation)
     elif trial.begins is Start.UNKNOWN:
         sizes = model.initial_sizes(campaign, trial)
-        shape, scale = (-(-len(sizes) // 2), 2), FREE_MOTION
-        sizes = np.pad(sizes, (0, len(sizes) % 2))
+        shape = (-(-len(sizes) // 2), 2)
+        entries = FREE_MOTION * np.pad(sizes, (0, len(sizes) % 2))
+    offsets = np.array([item.offset_deviation for item in trial.inputs])
+    inputs = np.flatnonzero(offsets > 0.0)
     uncertain = trial.health_deviation[:1] if trial.is_dynamic else trial.health_deviation
     of_health, rows = np.nonzero(uncertain.T)  # region by region, as their derivatives are taken
-    return LocalUnknowns(
-        zero_columns=columns,
-        zero_scale=np.where(free, deviation[columns], zero_scale[columns]),
-        zero_precision=np.where(free, 0.0, 1.0),
-        initial_shape=shape,
-        initial_scale=scale,
-        time_zero_scale=time_zero,
-        health_rows=rows,
-        health_columns=of_health,
-        initial_sizes=sizes,
-        offset_scale=tuple(item.offset_deviation for item in trial.inputs),
-    )
+    known = np.where(free, deviation[columns], zeros[columns])
+    scale = np.concatenate((known, entries, offsets[inputs], time_zero, uncertain[rows, of_health]))
+    precision = np.concatenate((~free, np.ones(len(scale) - len(free))))
+    return LocalUnknowns(scale, precision, columns, shape, inputs, bool(time_zero.size), rows, of_health)
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,10 +80,8 @@ class Conclusion:
 
     def named(self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...], **more: Any) -> Outcome:
         """Return the verdict that names the effects of a fit; the first gate is that of absolute fit."""
-        named, limit = (
-            named_effects(self.found.problem, fit),
-            "" if gates[0].passed else f" {gates[0].reason}",
-        )
+        named = named_effects(self.found.problem, fit)
+        limit = "" if gates[0].passed else f" {gates[0].reason}"
         told = {"what": effects_text(named), "certain": probability_text(probability), "limit": limit}
         more |= {"effects": named, "gates": gates}
         return self.outcome(VerdictKind.NAMED, said("verdict.named", **told), probability, fit, **more)

@@ -150,12 +150,7 @@ def score_tests(
         if not count or freedom - count < LEAST_FREEDOM:
             continue
         own = np.diag(information)[rows]
-        alone = np.divide(
-            np.abs(gradient[rows]),
-            np.sqrt(np.abs(own)),
-            out=np.zeros(len(rows)),
-            where=own > SEPARATE * size**2,
-        )
+        alone = np.abs(gradient[rows]) / np.sqrt(np.where(own > SEPARATE * size**2, own, np.inf))
         labels = list(group)
         most = int(np.argmax(alone))
         tests.append(

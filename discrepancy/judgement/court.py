@@ -22,7 +22,7 @@ from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.shares import OF_READINGS, SHORTEST, WINDOWS, Share
 from discrepancy.search.honest_evidence import noise_levels, refitted
-from discrepancy.search.hypotheses import acts_within, are_related
+from discrepancy.search.starts import acts_within, are_related
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said

@@ -14,7 +14,7 @@ from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import absolute_gate
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.naming import Explained, ForceSearch
-from discrepancy.missing_force.shares import ForceShares, Share, missing_force, told_force
+from discrepancy.missing_force.shares import ForceShares, Share, missing_force
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
@@ -88,7 +88,7 @@ class ByForce(Court):
         missing = missing_force(self.force, self.force.best())
         if missing is None:
             return ""
-        told = told_force(missing, self.problem.model)
+        told = missing.told
         order = said("verdict.not_ordered")
         if told.ordered_by:
             most = 100.0 * max(told.orders.values())

@@ -14,7 +14,7 @@ from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, shape_gate
 from discrepancy.fits.other_optima import free_shape
 from discrepancy.fits.predictive import residual_set, with_draws
 from discrepancy.fits.problem import Problem
-from discrepancy.search.hypotheses import Tell, acts_within, in_silence
+from discrepancy.search.starts import Tell, acts_within, in_silence
 from discrepancy.search.strategy import Search, search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sentences import said
@@ -101,14 +101,11 @@ class Case:
     @cached_property
     def shape(self) -> tuple[Gate, CandidateFit | None]:
         """The gate of shape, and the fit with the shape free that gains most, where that gains too much."""
-        outcome, kept = shape_gate(self.best, None), None
-        for number in range(len(self.best.candidate.terms)):
-            family = free_shape(self.problem, self.best, number)
-            if family is not None:
-                gate = shape_gate(self.best, family)
-                if kept is None or gate.statistic > outcome.statistic:
-                    outcome, kept = gate, family
-        return outcome, kept if kept is not None and outcome.statistic > SHAPE_GAIN else None
+        numbers = range(len(self.best.candidate.terms))
+        free = (free_shape(self.problem, self.best, number) for number in numbers)
+        kept = max((item for item in free if item), key=lambda item: item.log_evidence, default=None)
+        outcome = shape_gate(self.best, kept)
+        return outcome, kept if outcome.statistic > SHAPE_GAIN else None
 
     @property
     def all_gates(self) -> tuple[Gate, ...]:

@@ -10,7 +10,7 @@ from math import nan, sqrt
 import numpy as np
 from scipy import stats
 
-from discrepancy.campaign.noise_tests import SHORTEST_SERIES, lag_products, ljung_box, variance_p_value
+from discrepancy.campaign.noise_tests import lag_products, ljung_box, variance_p_value
 from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.campaign.sampling import IntArray
 from discrepancy.errors import FitError
@@ -120,13 +120,7 @@ def _rms(residuals: ResidualSet) -> dict[str, float]:
 def _whiteness(residuals: ResidualSet, seed: int) -> float:
     """Return the least p-value of Ljung-Box over dynamic channels times their number."""
     white = residuals.white(np.random.default_rng(seed))
-    found = [
-        ljung_box(values[:, column])[1]
-        for item, values in zip(residuals.trials, white, strict=True)
-        if item.trial.is_dynamic and len(values) >= SHORTEST_SERIES
-        for column in range(values.shape[1])
-        if item.used[:, column].any()
-    ]
+    found = [ljung_box(series)[1] for _, _, series in residuals.series(white)]
     return min(1.0, len(found) * min(found)) if found else nan
 
 

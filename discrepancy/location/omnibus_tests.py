@@ -147,18 +147,15 @@ def serial_tests(
     found: dict[str, list[tuple[float, float, str]]] = {
         "Ljung-Box": [], "cumulative periodogram": [], "Fisher g": [],
     }  # fmt: skip
-    for item, values in zip(residuals.trials, white, strict=True):
-        if not item.trial.is_dynamic or len(values) < noise_tests.SHORTEST_SERIES:
+    for item, name, series in residuals.series(white):
+        if name in coloured:
             continue
-        for column, name in enumerate(item.trial.channels):
-            if name in coloured or not item.used[:, column].any():
-                continue
-            series, where = values[:, column], f"{item.trial.name}, {name}"
-            found["Ljung-Box"].append((*noise_tests.ljung_box(series), where))
-            found["cumulative periodogram"].append((*noise_tests.cumulative_periodogram(series), where))
-            share, p, place = noise_tests.fisher_g(series)
-            frequency = place / (len(series) * item.trial.interval)
-            found["Fisher g"].append((share, p, f"{where}, {frequency:.4g} Hz"))
+        where = f"{item.trial.name}, {name}"
+        found["Ljung-Box"].append((*noise_tests.ljung_box(series), where))
+        found["cumulative periodogram"].append((*noise_tests.cumulative_periodogram(series), where))
+        share, p, place = noise_tests.fisher_g(series)
+        frequency = place / (len(series) * item.trial.interval)
+        found["Fisher g"].append((share, p, f"{where}, {frequency:.4g} Hz"))
     tests = []
     for name, rows in found.items():
         if not rows:

@@ -6,12 +6,13 @@ S = J L / s0, J the derivatives of the predictions and L L^T the posterior covar
 trials have I + S S^T. The diagonal of S S^T is the leverage.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from discrepancy.campaign.noise_tests import SHORTEST_SERIES
 from discrepancy.campaign.records import BoolArray, Channel, FloatArray, Trial
 from discrepancy.errors import FitError
 from discrepancy.sentences import said
@@ -156,6 +157,17 @@ class ResidualSet:
                 residual = residual + item.sensitivity @ draw
             white.append(np.where(item.used, residual, filler))
         return tuple(white)
+
+    def series(self, white: Sequence[FloatArray]) -> Iterator[tuple[FittedTrial, str, FloatArray]]:
+        """Yield trial, channel and its white residuals (N,) of all that are long enough for tests in time.
+
+        `white` is what the method of this name returned.
+        """
+        for item, values in zip(self.trials, white, strict=True):
+            if item.trial.is_dynamic and len(values) >= SHORTEST_SERIES:
+                for column, name in enumerate(item.trial.channels):
+                    if item.used[:, column].any():
+                        yield item, name, values[:, column]
 
     def _held_out_draw(self, draw: FloatArray) -> FloatArray:
         """Return a draw of the parameters' error given the held-out trials.

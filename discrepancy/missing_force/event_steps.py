@@ -14,7 +14,6 @@ from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.campaign.sampling import IntArray
 from fe.compilation import compiled
 
-from .filtered import LEAST_PRECISION
 from .kalman_kernels import is_steady
 
 
@@ -189,18 +188,6 @@ def _roots(covers: FloatArray) -> FloatArray:
 
 def _turned(items: FloatArray) -> FloatArray:
     return np.swapaxes(items, -1, -2)
-
-
-def without(products: FloatArray, halves: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return products (..., W, W) and half log determinants (...) without the last, unknown, columns."""
-    if not len(precision):
-        return products, halves
-    prior = np.maximum(precision, LEAST_PRECISION)
-    count = products.shape[-1] - len(prior)
-    root = np.linalg.cholesky(products[..., count:, count:] + np.diag(prior))
-    along = np.asarray(np.linalg.solve(root, products[..., count:, :count]))
-    halves = halves + np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.log(prior).sum()
-    return products[..., :count, :count] - _turned(along) @ along, halves
 
 
 def joined(before: Sequence[FloatArray], after: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:

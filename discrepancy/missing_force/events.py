@@ -16,8 +16,8 @@ from scipy.optimize import minimize
 from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.campaign.sampling import IntArray
 
-from .event_steps import Steps, joined, without
-from .filtered import Filtered, Process
+from .event_steps import Steps, joined
+from .filtered import Filtered, Process, without
 from .kalman_kernels import discretised
 from .view import SIZE_DOUBT, TIME_DOUBT, View
 
@@ -83,24 +83,16 @@ class EventSearch:
     def steps(self, number: int, acting: Acting, parts: int = 1) -> Steps:
         """Return a trial as the kernels take it."""
         trial = self.view.trials[number]
-        one = Filtered(trial, {self.port: acting.event})
+        one = Filtered(trial, ((self.port, acting.event), (self.port, acting.rest)))
         generator, intensity, rows, start = one.system
-        f, n = len(trial.system.generator), len(generator) + 1  # the event's force, and last the other one
-        ratio = acting.rest.size / acting.event.size
-        wide = np.zeros((3, n, n))
-        for item, small in zip(wide, (generator, intensity, start), strict=True):
-            item[:-1, :-1] = small
-        wide[0, :f, -1] = generator[:f, f] * ratio
-        wide[:, -1, -1] = acting.rest.generator[0, 0], acting.rest.intensity, 1.0
-        wide[2, :f, -1] = wide[2, -1, :f] = start[:f, f] * ratio
-        begun = np.stack((wide[2], wide[2]))
-        begun[:, :f, :f] = np.outer(start[:f, f], start[:f, f]) * ratio**2
-        begun[1, :f, :f] += start[:f, :f]
-        begun[0, f], begun[0, :, f] = 0.0, 0.0
+        f = len(trial.system.generator)  # where the event's force stands
         lengths, which = trial.steps
-        on = discretised(wide[0], wide[1], lengths / parts)
-        wide[:2, f, :] = wide[:2, :, f] = 0.0
-        off = discretised(wide[0], wide[1], lengths / parts)
+        quiet, calm, still = generator.copy(), intensity.copy(), start.copy()
+        still[:f, :f] -= np.outer(start[:f, f], start[:f, f])
+        for item in (quiet, calm, still):
+            item[f], item[:, f] = 0.0, 0.0
+        on = discretised(generator, intensity, lengths / parts)
+        off = discretised(quiet, calm, lengths / parts)
         # kinds of steps: the force is off, begins at the end, ends there, is on
         moves, noises = (np.stack((no, no, yes, yes)) for no, yes in zip(off, on, strict=True))
         moves[:3, :, f] = 0.0
@@ -118,8 +110,16 @@ class EventSearch:
         columns[::parts] = np.moveaxis(self.columns[number] * one.white, 0, -1)
         length = np.concatenate((which[:1], np.repeat(which[1:], parts)))
         length[::parts] += half * self.flips[number]
-        rows = np.column_stack((rows, rows[:, f] * ratio))
-        return Steps(moves.reshape(-1, n, n), noises.reshape(-1, n, n), length, rows, used, columns, begun)
+        begun = np.stack((still, start))
+        return Steps(
+            moves.reshape(-1, *start.shape),
+            noises.reshape(-1, *start.shape),
+            length,
+            rows,
+            used,
+            columns,
+            begun,
+        )
 
     def whole(self, number: int, steps: Steps, on: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return products of residual and shared unknowns of a trial, and half log determinants."""
@@ -363,6 +363,13 @@ def events(view: View, port: int, process: Process, least: float = -np.inf) -> E
         best, steady = _in_full(best, view, turning, every), _in_full(steady, view, never, every)
     changed = any(len(changes(on)) for on in best.paths)
     return best if changed and best.score > max(least, steady.score) else steady
+
+
+def throughout(view: View, port: int, process: Process) -> Events:
+    """Return a force that acts in all records from the first sample to the last, nothing being weighed."""
+    search = EventSearch(view, port, process, turns(view, port)[0])
+    always = [np.ones(len(trial.time), dtype=bool) for trial in view.trials]
+    return Events(search, Acting(process, process), always, -np.inf)
 
 
 def _in_full(found: Events, view: View, turning: int, every: int) -> Events:

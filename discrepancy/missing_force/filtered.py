@@ -5,7 +5,7 @@ states (Hartikainen and Sarkka 2010, IEEE Workshop on Machine Learning for Signa
 Unknowns that act in proportion follow from what whitened readings and columns share.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -62,12 +62,12 @@ class Filtered:
     ----------
     trial : SeenTrial
         Which.
-    processes : mapping of int to Process
-        The force at each port, by its number.
+    processes : sequence of (int, Process)
+        Forces, each with the number of its port; there may be several at one.
     """
 
     trial: SeenTrial
-    processes: Mapping[int, Process]
+    processes: Sequence[tuple[int, Process]]
 
     @cached_property
     def _scale(self) -> FloatArray:
@@ -75,7 +75,7 @@ class Filtered:
         system = self.trial.system
         n = len(system.generator)
         pace = max(float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9)
-        pushes = [np.abs(system.actions[p]).max(initial=0.0) * one.size for p, one in self.processes.items()]
+        pushes = [np.abs(system.actions[p]).max(initial=0.0) * one.size for p, one in self.processes]
         push = max(*pushes, 1e-300)
         units = np.full(n, push / pace)
         half = n // 2 if 2 * (n // 2) == n else 0
@@ -85,7 +85,7 @@ class Filtered:
     @cached_property
     def _places(self) -> list[int]:
         """Where each force stands in the whole state."""
-        counts = [len(one.generator) for one in self.processes.values()]
+        counts = [len(one.generator) for _, one in self.processes]
         begin = len(self.trial.system.generator)
         return [begin + sum(counts[:number]) for number in range(len(counts))]
 
@@ -102,13 +102,13 @@ class Filtered:
         """Generator, noise intensity, rows of the readings, covariance at the first sample."""
         trial = self.trial
         n, units, noises = len(trial.system.generator), self._scale, len(trial.coloured)
-        begin = n + sum(len(one.generator) for one in self.processes.values())
+        begin = n + sum(len(one.generator) for _, one in self.processes)
         whole = begin + noises
         generator, intensity, start = np.zeros((3, whole, whole))
         generator[:n, :n] = trial.system.generator * units / units[:, None]
         rows = np.zeros((len(trial.deviation), whole))
         rows[:, :n] = trial.system.outputs * units / trial.deviation[:, None]
-        for (port, one), at in zip(self.processes.items(), self._places, strict=True):
+        for (port, one), at in zip(self.processes, self._places, strict=True):
             force = slice(at, at + len(one.generator))
             generator[:n, at] = -trial.system.actions[port] * one.size / units
             generator[force, force] = one.generator
@@ -170,14 +170,15 @@ class Filtered:
         parts = self.trial.parts
         fine = self._steps(lengths / parts)
         found = kernels.between(parts, *fine, which, slot, filtered, means, later)
-        sizes = np.array([one.size for one in self.processes.values()])
+        sizes = np.array([one.size for _, one in self.processes])
         forces = found[:, self._places].T * sizes[:, None]
         return np.asarray(found[:, : len(self._scale)] * self._scale), np.asarray(forces)
 
     def deviation(self, port: int) -> FloatArray:
         """Return the deviation (N,) of the missing force of a port at the samples, columns being known."""
         shown = np.zeros(len(self.system[0]))
-        shown[self._places[list(self.processes).index(port)]] = self.processes[port].size
+        at = [number for number, _ in self.processes].index(port)
+        shown[self._places[at]] = self.processes[at][1].size
         return self._deviations(shown, slice(None))
 
     def speed_deviation(self, port: int) -> float:
@@ -240,28 +241,16 @@ class Regression:
         return Solution(value, mean, np.outer(size, size) * cho_solve(factor, np.eye(len(prior))))
 
 
-def local_solution(
-    whitened: FloatArray, local: FloatArray, precision: FloatArray
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return how whitened columns (M, K) depend on unknowns of a trial (M, L), and what they take away.
-
-    Returns
-    -------
-    coefficients : (L, K) ndarray
-        Least squares with the prior.
-    products : (K, K) ndarray
-        Of the columns, these unknowns being gone.
-    half : float
-        Half the log determinant that they add [nat].
-    """
-    if not local.shape[1]:
-        return np.zeros((0, whitened.shape[1])), whitened.T @ whitened, 0.0
+def without(products: FloatArray, halves: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return products (..., W, W) and half log determinants (...) without the last, unknown, columns."""
+    if not len(precision):
+        return products, halves
     prior = np.maximum(precision, LEAST_PRECISION)
-    cross = local.T @ whitened
-    factor = cho_factor(local.T @ local + np.diag(prior))
-    coefficients = cho_solve(factor, cross)
-    half = float(np.sum(np.log(np.diag(factor[0])))) - 0.5 * float(np.sum(np.log(prior)))
-    return coefficients, whitened.T @ whitened - cross.T @ coefficients, half
+    count = products.shape[-1] - len(prior)
+    root = np.linalg.cholesky(products[..., count:, count:] + np.diag(prior))
+    along = np.asarray(np.linalg.solve(root, products[..., count:, :count]))
+    halves = halves + np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1) - 0.5 * np.log(prior).sum()
+    return products[..., :count, :count] - np.swapaxes(along, -1, -2) @ along, halves
 
 
 def regression(
@@ -273,8 +262,7 @@ def regression(
     for one, residual, given in zip(filtered, residuals, columns, strict=True):
         trial = one.trial
         whole = one.whitened(np.concatenate((residual[None], given, trial.local)))
-        split = 1 + len(given)
-        _, products, half = local_solution(whole[:, :split], whole[:, split:], trial.local_precision)
+        products, half = without(whole.T @ whole, np.zeros(()), trial.local_precision)
         total = total + products
-        log_determinant += one.log_determinant + half
+        log_determinant += one.log_determinant + float(half)
     return Regression(np.asarray(total), log_determinant)

@@ -268,7 +268,9 @@ class ForceSearch:
                 break
             beam = ranked[:BEAM]
         best = self._ranked(found, len(effects))[0]
-        for less, values in best.candidate.each_without(best.effect):
+        count = len(best.candidate.terms)
+        for left in range(count) if count > 1 else ():
+            less, values = best.candidate.some((k for k in range(count) if k != left), best.effect)
             if less.key not in found:
                 one = self.followed(self.whole, less, values)
                 if one is not None:

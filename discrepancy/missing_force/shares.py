@@ -3,7 +3,8 @@
 Shares are told of trials that were fitted, and of those that were not.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -14,7 +15,6 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Point
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.models.interface import Model
 from discrepancy.verdict import ForceAtPort, ForceMoment, ShareOfForce
 
 from .columns import Columns
@@ -142,7 +142,8 @@ class ForceShares:
         of_force, of_readings = [], []
         filters = view.filtered({**found.processes, **self.search.whole.processes})
         for trial, motion, bare, one in zip(view.trials, motions, without, filters, strict=True):
-            shown = dict(zip(one.processes, one.smoothed(_noise(trial))[1], strict=True))
+            forces = one.smoothed(_noise(trial))[1]
+            shown = {port: force for (port, _), force in zip(one.processes, forces, strict=True)}
             kinds = (bare.forces, motion.left, shown)
             count = len(trial.time)
             edges = np.linspace(0, count, min(WINDOWS, max(1, count // SHORTEST)) + 1).astype(int)
@@ -284,21 +285,15 @@ class MissingForce:
 
     Attributes
     ----------
-    port : str
-        Its name.
-    evidence : mapping of str to float
-        By port: over no missing force [nat].
-    correlation_time : float
-        [s].
+    told : ForceAtPort
+        What a verdict says of it.
     courses : sequence of ForceCourse
         Of the trials that were fitted.
     law : str
-        Name of the effect drawn beside it; empty: none.
+        Name of the effect at the port that is drawn through it; empty: none.
     """
 
-    port: str
-    evidence: Mapping[str, float]
-    correlation_time: float
+    told: ForceAtPort
     courses: Sequence[ForceCourse]
     law: str = ""
 
@@ -307,7 +302,7 @@ def missing_force(search: ForceSearch, found: Explained) -> MissingForce | None:
     """Return the missing force that a hypothesis is about, None where no force is missing at all.
 
     It is that at the port of its law, or else at the one with the most evidence; the law is drawn through it
-    if it acts at one port.
+    if it acts at one port. The share that the law is of it is not told.
     """
     nothing = max(of_nothing(one) for one in search.at.values())
     evidence = {name: one.log_evidence - nothing for name, one in search.at.items()}
@@ -323,31 +318,24 @@ def missing_force(search: ForceSearch, found: Explained) -> MissingForce | None:
     filters = found.view.filtered(found.processes)
     for trial, motion, one in zip(found.view.trials, found.motions, filters, strict=True):
         samples = slice(None, None, trial.parts)
-        position, speed = motion.positions[:, at], motion.speeds[:, at]
+        position, speed = motion.positions[samples, at], motion.speeds[samples, at]
         force, left = motion.forces[at][samples], motion.left[at][samples]
         law = force - left if named else None
-        motion_at = (position[samples], speed[samples])
-        courses.append(ForceCourse(trial.name, trial.time, *motion_at, force, one.deviation(at), law))
-    time = found.processes[at].time
-    return MissingForce(port, evidence, time, courses, named)
-
-
-def told_force(missing: MissingForce, model: Model) -> ForceAtPort:
-    """Return what is told of a missing force: size, motion, what orders it; not of the shares of a law."""
-    force, position, speed, at = (
-        np.concatenate([getattr(item, name) for item in missing.courses])
+        courses.append(ForceCourse(trial.name, trial.time, position, speed, force, one.deviation(at), law))
+    whole = [
+        np.concatenate([getattr(item, name) for item in courses])
         for name in ("force", "position", "speed", "time")
-    )
-    by_variable, ordered_by = orders(force, position, speed, at)
-    rms, displacement, velocity = (float(np.sqrt(np.mean(item**2))) for item in (force, position, speed))
-    course = max(missing.courses, key=lambda one: float(np.abs(one.force).max()))
+    ]
+    by_variable, ordered_by = orders(*whole)
+    rms, displacement, velocity = (float(np.sqrt(np.mean(item**2))) for item in whole[:3])
+    course = max(courses, key=lambda one: float(np.abs(one.force).max()))
     k = int(np.abs(course.force).argmax())
     most = (float(item[k]) for item in (course.time, course.force, course.position, course.speed))
-    return ForceAtPort(
-        missing.port, model.port_units(missing.port)[0], rms, displacement, velocity,
-        ForceMoment(course.trial, *most), missing.evidence, missing.correlation_time, by_variable,
-        ordered_by, missing.law,
+    told = ForceAtPort(
+        port, search.problem.model.port_units(port)[0], rms, displacement, velocity,
+        ForceMoment(course.trial, *most), evidence, found.processes[at].time, by_variable, ordered_by, named,
     )  # fmt: skip
+    return MissingForce(told, courses, named)
 
 
 def of_nothing(found: Explained) -> float:
@@ -357,8 +345,8 @@ def of_nothing(found: Explained) -> float:
 
 def seen_force(
     problem: Problem, force: ForceSearch | None, forces: Sequence[Explained], fit: CandidateFit
-) -> tuple[MissingForce | None, ForceAtPort | None]:
-    """Return the missing force beside the fit of a verdict, its law drawn through it, and what is told of it.
+) -> MissingForce | None:
+    """Return the missing force beside the fit of a verdict, its law drawn through it, and its share told.
 
     None where no force can be seen. `force`, `forces`: the missing force and hypotheses along it, if a search
     had any.
@@ -367,28 +355,24 @@ def seen_force(
     try:
         ports = problem.model.ports
         if not sees_forces(problem) or (terms and not any(term.place in ports for term in terms)):
-            return None, None
+            return None
         force = force or ForceSearch(problem)
         found = next((item for item in forces if item.candidate.key == fit.candidate.key), None)
         if found is None and terms:
             found = force.followed(force.whole, fit.candidate, fit.point.effect)
         missing = missing_force(force, force.whole if found is None else found)
     except CANNOT:
-        return None, None
-    if missing is None:
-        return None, None
-    told = told_force(missing, problem.model)
-    laws = [(term.effect.name, term.place) for term in terms if term.place in ports]
-    if missing.law and len({place for _, place in laws}) > 1:
+        return None
+    if missing is None or not missing.law or found is None:
+        return missing
+    told, laws = missing.told, [(term.effect.name, term.place) for term in terms if term.place in ports]
+    if len({place for _, place in laws}) > 1:
         told = replace(told, law=" and ".join(f"{name} at {place}" for name, place in laws))
-    if not missing.law or found is None:
-        return missing, told
-    try:
+    with suppress(*CANNOT):
         shares = ForceShares(force)
         outside = _told(shares.of(found, held_out=True)) if shares.has_held_out else None
-        return missing, replace(told, fitted=_told(shares.of(found, held_out=False)), held_out=outside)
-    except CANNOT:
-        return missing, told
+        told = replace(told, fitted=_told(shares.of(found, held_out=False)), held_out=outside)
+    return replace(missing, told=told)
 
 
 def _told(share: Share) -> ShareOfForce:

@@ -173,10 +173,7 @@ class SeenTrial:
             start = -np.linalg.lstsq(self.system.generator, pushes[0], rcond=1e-12)[0]
         rows = np.flatnonzero(np.any(pushes, axis=0))
         state = self._moved(start, np.eye(len(start))[:, rows], pushes[:, rows])
-        shown = added[:: self.parts] @ slope.outputs.T
-        for port, force in forces.items():
-            shown -= np.outer(force[:: self.parts], slope.through[port])
-        return state, self.readings(state) + self.over_noise(shown)
+        return state, self.readings(state) + self.over_noise(self._shown(slope, added, forces))
 
     def _moved(
         self, start: FloatArray, directions: FloatArray, pushes: FloatArray, which: IntArray | None = None
@@ -189,21 +186,25 @@ class SeenTrial:
 
     def readings(self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES) -> FloatArray:
         """Return what readings (N, C) show of an added state (F, n), and at once of forces (F,) at ports."""
-        shown = states[:: self.parts] @ self.system.outputs.T
+        return self.over_noise(self._shown(self.system, states, forces))
+
+    def _shown(
+        self, system: PortedSystem, states: FloatArray, forces: Mapping[int, FloatArray]
+    ) -> FloatArray:
+        shown = states[:: self.parts] @ system.outputs.T
         for port, force in forces.items():
-            shown -= np.outer(force[:: self.parts], self.system.through[port])
-        return self.over_noise(shown)
+            shown -= np.outer(force[:: self.parts], system.through[port])
+        return np.asarray(shown)
 
     def ahead(self, forces: Mapping[int, FloatArray], begin: int, end: int) -> FloatArray:
         """Return what forces at ports (F,) do to the readings from one sample until another, from nothing."""
         fine = slice(begin * self.parts, (end - 1) * self.parts + 1)
-        pushes = np.array([force[fine] for force in forces.values()]).T
-        directions = -np.array([self.system.actions[port] for port in forces]).T
+        acting = {port: force[fine] for port, force in forces.items()}
+        directions = -np.array([self.system.actions[port] for port in acting]).T
         which = np.ascontiguousarray(self.steps[1][begin:end])
+        pushes = np.array([*acting.values()]).T
         states = self._moved(np.zeros(len(directions)), directions, pushes, which)
-        shown = states[:: self.parts] @ self.system.outputs.T
-        for port, force in forces.items():
-            shown -= np.outer(force[fine][:: self.parts], self.system.through[port])
+        shown = self._shown(self.system, states, acting)
         return np.asarray(shown / self.deviation * self.used[begin:end])
 
     def over_noise(self, columns: FloatArray) -> FloatArray:
@@ -263,15 +264,13 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
         conditions = unknowns.conditions(trial, shared.parameters(of_all), local)
         return np.stack(model.port_motion(trial, conditions, count))
 
-    here, local = moving(point.shared, point.local[number]), point.local[number]
+    local = point.local[number]
+    here = moving(point.shared, local)
+    ways = [(k, point.shared[k], moved(point.shared, k), local) for k in range(len(shared.parameter_mean))]
+    own = range(unknowns.zeros, unknowns.size)
+    ways += [(shared.size + k, local[k], point.shared, moved(local, k)) for k in own]
     by_unknowns = [
-        PortMotion(k, float(point.shared[k]), (moving(moved(point.shared, k), local) - here) / PARAMETER_STEP)
-        for k in range(len(shared.parameter_mean))
-    ] + [
-        PortMotion(
-            shared.size + k, float(local[k]), (moving(point.shared, moved(local, k)) - here) / PARAMETER_STEP
-        )
-        for k in range(unknowns.zeros, unknowns.size)
+        PortMotion(k, float(about), (moving(*there) - here) / PARAMETER_STEP) for k, about, *there in ways
     ]
     residual, by_shared, by_local = (item / deviation * used for item in (residual, by_shared, by_local))
     return SeenTrial(

@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 from discrepancy.campaign.records import FloatArray
 
-from .filtered import Filtered, Process, Regression, Solution, local_solution, regression
+from .filtered import LEAST_PRECISION, Filtered, Process, Regression, Solution, regression
 from .trial import SeenTrial
 
 Processes = Mapping[int, Process]
@@ -204,7 +204,7 @@ class View:
 
     def filtered(self, processes: Processes) -> list[Filtered]:
         """Return the filters of missing forces."""
-        return [Filtered(trial, processes) for trial in self.trials]
+        return [Filtered(trial, tuple(processes.items())) for trial in self.trials]
 
     def products(self, processes: Processes) -> Regression:
         """Return the products of all columns beside missing forces."""
@@ -330,11 +330,11 @@ class View:
         for number, one in enumerate(self.filtered(processes)):
             trial = one.trial
             left = self.residuals[number] - np.tensordot(solution.mean, self.columns[number], 1)
-            values = np.zeros(0)
-            if len(trial.local):
-                whole = one.whitened(np.concatenate((left[None], trial.local)))
-                values = local_solution(whole[:, :1], whole[:, 1:], trial.local_precision)[0][:, 0]
-                left = left - np.tensordot(values, trial.local, 1)
+            whole = one.whitened(np.concatenate((left[None], trial.local)))
+            shown, own = whole[:, 0], whole[:, 1:].T
+            prior = np.diag(np.maximum(trial.local_precision, LEAST_PRECISION))
+            values = np.linalg.solve(own @ own.T + prior, own @ shown)
+            left = left - np.tensordot(values, trial.local, 1)
             free, forces = one.smoothed(left)
             added = free.copy()
             for k, turned in self.turned[number].items():

@@ -19,7 +19,7 @@ from discrepancy.location.residuals import ResidualSet
 from discrepancy.models.interface import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
 
-from .events import GROUND, MOST_EVENTS, Events, changes, events
+from .events import GROUND, MOST_EVENTS, Events, changes, events, throughout
 from .filtered import Process
 from .naming import Explained, ForceSearch, seen
 from .shares import of_nothing
@@ -96,11 +96,11 @@ def residual_windows(
             one, pattern = of_series(item.trial.name, item.trial.time, series, item.used)
             if one.log_evidence < of_nothing(one) + GROUND:
                 continue
+            shown = one.motions[0].forces[0][:, None] * pattern
             try:
                 best = events(one.view, 0, one.processes[0])
             except np.linalg.LinAlgError:  # a hypothesis that leaves millions of noises is off throughout
-                continue
-            shown = one.motions[0].forces[0][:, None] * pattern
+                best = throughout(one.view, 0, one.processes[0])
             found += _windows(best, [item.trial.channels], [shown], with_effect=with_effect)
     return found
 

@@ -196,15 +196,12 @@ class ParameterPosterior:
         Maxima that tell, the most probable first.
     marginal : Marginal
         The density.
-    cut : float
-        Share of the Gaussian at the best optimum that lies beyond the model's range [1].
     """
 
     procedure: Procedure
     draws: FloatArray
     optima: tuple[CandidateFit, ...]
     marginal: Marginal
-    cut: float
 
 
 def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPosterior:
@@ -243,7 +240,7 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
         draws = np.array(centres)[chosen]
         for at, spread in enumerate(spreads):
             draws[chosen == at] = cut_off(draws[chosen == at], spread, *ends, generator)
-    return ParameterPosterior(procedure, draws, optima, marginal, cut)
+    return ParameterPosterior(procedure, draws, optima, marginal)
 
 
 def is_gaussian(marginal: Marginal, centre: FloatArray, covariance: FloatArray) -> bool:

@@ -19,7 +19,7 @@ from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.shares import MissingForce
 from discrepancy.self_calibration import SelfCalibration
-from discrepancy.verdict import ForceAtPort, Scores
+from discrepancy.verdict import Scores
 from discrepancy.workflow import Investigation
 from fe.wing.design import WingDesign
 from reporting.figures import (
@@ -44,7 +44,6 @@ from .text import WORDS, added_label, force_sentence, motion_of, scored
 _LARGEST_DISTANCE = 1e4
 
 
-@publication_style()
 def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
     """Draw histograms of probability integral transforms; keys are titles, in order before and after."""
     if not scores:
@@ -80,7 +79,6 @@ def _map_of_names(
     return figure, axes, image
 
 
-@publication_style()
 def separability_figure(found: Separability) -> Figure | None:
     """Draw how well each effect can be told from each other one; None with fewer than two effects."""
     names = found.identifiers
@@ -106,7 +104,6 @@ def separability_figure(found: Separability) -> Figure | None:
     return figure
 
 
-@publication_style()
 def confusion_figure(found: SelfCalibration) -> Figure:
     """Draw the confusion matrix of the workflow on simulated campaigns of this geometry."""
     rows, columns, counts = found.confusion()
@@ -123,11 +120,10 @@ MOST_TURNS = 400
 """Samples of the course in time: the stretch where the force is largest."""
 
 
-@publication_style()
-def missing_force_figure(missing: MissingForce, told: ForceAtPort) -> Figure:
+def missing_force_figure(missing: MissingForce) -> Figure:
     """Draw a missing force and what is told of it, with its law and what is left where there is one."""
     parts = [("missing force", "force"), ("what is left", "left")][: 2 if missing.law else 1]
-    what, place, rate = motion_of(told)
+    what, place, rate = motion_of(missing.told)
     integral, state = ("displacement", "speed") if place else ("integral of the state", "state")
     along = (("position", ", ".join(filter(None, (integral, place)))), ("speed", f"{state}, {rate}"))
     every = slice(None, None, -(-sum(len(item.time) for item in missing.courses) // MOST_DOTS))
@@ -148,7 +144,7 @@ def missing_force_figure(missing: MissingForce, told: ForceAtPort) -> Figure:
         if law and strongest.law is not None:
             row[2].plot(time, strongest.law[stretch], "--", color=PREDICTION, lw=0.9)
         row[2].set_xlabel(f"time in {strongest.trial}, s")
-        row[0].set_ylabel(f"{what}, {told.unit}")
+        row[0].set_ylabel(f"{what}, {missing.told.unit}")
         for column, axes in enumerate(row):
             axes.axhline(0.0, color=REFERENCE, lw=0.6, zorder=0)
             axes.locator_params(axis="x", nbins=4)  # the integral of a state may have six digits
@@ -212,6 +208,7 @@ class ReportInput:
     pack: Pack | None = None
 
 
+@publication_style()
 def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     """Draw every figure that these data allow, by name; their words are in `words.toml`.
 
@@ -229,9 +226,8 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     investigation = content.investigation
     verdict, proof, missing = investigation.verdict, investigation.proof, investigation.missing
     before, after = investigation.before, investigation.after if added_label(investigation) else None
-    if missing is not None and verdict.force is not None:
-        figure = missing_force_figure(missing, verdict.force)
-        add("missing_force", figure, sentence=force_sentence(verdict.force))
+    if missing is not None:
+        add("missing_force", missing_force_figure(missing), sentence=force_sentence(missing.told))
     if before is not None:
         scale = {
             "held_out": _held_out_words(before),

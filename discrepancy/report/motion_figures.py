@@ -14,7 +14,7 @@ from discrepancy.errors import FitError
 from discrepancy.location.backbone import Backbone, backbones
 from discrepancy.location.dependence import predicted_frequencies
 from discrepancy.location.residuals import FittedTrial, ResidualSet
-from reporting.figures import OBSERVED, REFERENCE, TRUTH, publication_style
+from reporting.figures import OBSERVED, REFERENCE, TRUTH
 
 from .kit import draw_noise, models, panels, plain_powers
 from .residual_figures import size
@@ -50,7 +50,6 @@ def worst_record(items: Sequence[FittedTrial]) -> Worst | None:
     return Worst(*max(found)[1:]) if found else None
 
 
-@publication_style()
 def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure:
     """Draw the worst record: measured and predicted values, and the residuals against the noise."""
     item = before.trials[worst.trial]
@@ -79,7 +78,6 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     return figure
 
 
-@publication_style()
 def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure | None:
     """Draw spectra of the residuals of the worst channel over all dynamic trials, with that of the noise."""
     drawn = [
@@ -140,7 +138,6 @@ def mode_frequencies(residuals: ResidualSet) -> tuple[float, ...]:
 # ---------------------------------------------------------------- backbones
 
 
-@publication_style()
 def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
     """Draw frequency and damping ratio of the ring-downs over the amplitude, and name the channel.
 

@@ -16,7 +16,7 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.verdict import GapWindow
 from fe.wing.design import WingDesign
-from reporting.figures import LEVELS, OBSERVED, REFERENCE, publication_style
+from reporting.figures import LEVELS, OBSERVED, REFERENCE
 
 from .kit import Shown, draw_noise, heat_map, models, panels, scale_of, size_bar, titles
 
@@ -66,7 +66,6 @@ def gauge_places(channels: Sequence[Channel], design: WingDesign) -> dict[str, t
     return places
 
 
-@publication_style()
 def planform_figure(before: ResidualSet, after: ResidualSet | None, design: WingDesign) -> Figure | None:
     """Draw the sizes of the residuals on the planform, before and after at one scale; None without places."""
     places = gauge_places(list(before.channels.values()), design)
@@ -119,7 +118,6 @@ def _draw_gauge(
     axes.annotate(name, place, (0.0, -6.5), textcoords="offset points", ha="center", va="top", fontsize=6.5)
 
 
-@publication_style()
 def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
     """Draw the sizes of the residuals by channel and trial, before and after at one scale."""
     shown = models(before, after)
@@ -144,7 +142,6 @@ def _cells(value: float) -> str:
     return "" if np.isnan(value) else f"{value:.2g}" if value < 99.5 else f"{value:.0f}"
 
 
-@publication_style()
 def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None:
     """Draw residuals of static trials and flights over the load, by quantity; None without such trials."""
     found = []
@@ -199,7 +196,6 @@ def _draw_loads(axes: Axes, shown: Shown, kind: TrialKind, names: Sequence[str],
 # ---------------------------------------------------------------- when
 
 
-@publication_style()
 def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
     """Draw the windows of the records with the largest gaps; None without a window."""
     if not windows:

@@ -22,7 +22,7 @@ from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.problem import Problem
 from discrepancy.search_settings import SEARCH
 
-from .hypotheses import each
+from .starts import each
 from .strategy import Search
 
 LEVEL = 1e-3

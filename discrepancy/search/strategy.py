@@ -1,48 +1,118 @@
 """The search for the set of effects that explains a campaign: screen, fit, add, take away, try pairs."""
 
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
+from math import exp
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import logsumexp
 
-from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
-from discrepancy.errors import DiscrepancyError, ModelError
-from discrepancy.fits.candidate import Candidate, Point, Term
-from discrepancy.fits.fitting import CandidateFit, attempt, fit, objective
+from discrepancy.errors import ModelError
+from discrepancy.fits.candidate import Candidate, Key
+from discrepancy.fits.fitting import CandidateFit, attempt, fit
 from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
-from discrepancy.fits.other_optima import around, elsewhere, free_shape, is_box
+from discrepancy.fits.other_optima import around, free_shape, is_box
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Change, Screen, rescaled
-from discrepancy.missing_force.hypotheses import sees_forces
+from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import Explained, ForceSearch
 from discrepancy.search_settings import SEARCH
 
-from .hypotheses import Hypotheses, Tell, acts_within, each, in_silence, pairs, slips, starts
-
-Start = tuple[Candidate, Point]
-Starts = list[Start]
+from .starts import Starts, Tell, acts_within, beside, each, in_silence, pairs, slips, starts, tried
 
 
 @dataclass
-class Search(Hypotheses):
-    """Hypotheses, and the way to more of them.
+class Search:
+    """All candidates fitted so far, and the way to more of them.
 
     Attributes
     ----------
-    longest : int
-        Number of effects of the longest set that was the best one.
+    problem : Problem
+        Campaign and model.
+    effects : tuple of Effect
+        Those that can act here.
+    none : CandidateFit
+        Without effect.
+    exact : dict of Key to CandidateFit
+        Fitted to convergence.
+    rough : dict of Key to CandidateFit
+        Fitted by few steps only; their evidence is approximate.
+    judged : dict of Key to CandidateFit
+        Fitted with their remainders; where there are any, they alone are compared.
+    promised : dict of str to float
+        The most that a screen at the fit without effect promised of each effect [nat].
+    tell : callable
+        Takes a few words on what is fitted, and how much is left.
+    wide : Problem or None
+        That under what the best hypothesis leaves, by which the judged ones were fitted.
     forces : list of Explained
         Sets of effects along the missing force, if they were compared so, the most probable first.
     """
 
-    longest: int = field(init=False, default=0)
+    problem: Problem
+    effects: tuple[Effect, ...]
+    none: CandidateFit
+    exact: dict[Key, CandidateFit] = field(default_factory=dict)
+    rough: dict[Key, CandidateFit] = field(default_factory=dict)
+    judged: dict[Key, CandidateFit] = field(default_factory=dict)
+    promised: dict[str, float] = field(default_factory=dict)
+    tell: Tell = in_silence
+    wide: Problem | None = None
     forces: list[Explained] = field(init=False, default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.exact[()] = self.none
+
+    def log_prior(self, candidate: Candidate) -> float:
+        """Return ln of the prior probability of a candidate at its places."""
+        return log_prior(candidate, len(self.effects), self.problem.setting)
+
+    def score(self, found: CandidateFit | Explained) -> float:
+        """Return ln (evidence times prior), up to a constant."""
+        return found.log_evidence + self.log_prior(found.candidate)
+
+    def all(self) -> dict[Key, CandidateFit]:
+        """Return every candidate that is compared, the exact fit where there is one."""
+        return self.judged or {**self.rough, **self.exact}
+
+    def best(self) -> CandidateFit:
+        """Return the most probable candidate."""
+        return max((self.judged or self.exact).values(), key=self.score)
+
+    def best_of(self, identifiers: tuple[str, ...]) -> CandidateFit:
+        """Return the most probable fit of a set of effects."""
+        options = [item for item in self.all().values() if item.candidate.identifiers == identifiers]
+        return max(options, key=self.score)
+
+    def fitted(self) -> frozenset[str]:
+        """Return the identifiers of all effects that were fitted, alone or with others."""
+        kept = (*self.rough.values(), *self.exact.values(), *self.judged.values())
+        return frozenset(term.effect.identifier for item in kept for term in item.candidate.terms)
+
+    @property
+    def nothing(self) -> CandidateFit:
+        """The fit without effect as it is compared, with its remainder where others have theirs."""
+        return self.judged.get((), self.none)
+
+    def set_probabilities(self) -> dict[tuple[str, ...], float]:
+        """Return the probability of each set of identifiers, places summed, most probable first."""
+        scores: dict[tuple[str, ...], list[float]] = {}
+        for found in self.all().values():
+            scores.setdefault(found.candidate.identifiers, []).append(self.score(found))
+        sums = {identifiers: float(logsumexp(values)) for identifiers, values in scores.items()}
+        total = float(logsumexp(list(sums.values())))
+        ordered = sorted(sums.items(), key=lambda item: -item[1])
+        return {identifiers: min(exp(value - total), 1.0) for identifiers, value in ordered}
+
+    def keep(self, found: CandidateFit, *, exact: bool) -> None:
+        """Keep a fit if it is better than what is known of the same candidate."""
+        kept = self.exact if exact else self.rough
+        key = found.candidate.key
+        if key not in kept or kept[key].log_evidence < found.log_evidence:
+            kept[key] = found
 
     @cached_property
     def force(self) -> ForceSearch | None:
@@ -79,7 +149,12 @@ class Search(Hypotheses):
         found = self._scan_near(base, near)
         explained = any(absolute_gate(self.problem, item).passed for item in found)
         if self._misfits(base) or (self._far(base) and not explained):
-            found += self._scan_far(base, [one for one in effects if acts_within(one, self.problem.setting)])
+            # nuisances of a wrong model are far off, a bad start; beside a force that is free they are
+            # where they belong; beside trials at rest, which know no force, they are as before the data
+            there = self._unbiased(base)
+            within = [one for one in effects if acts_within(one, self.problem.setting)]
+            grids = [row for one in within if (row := tried(self.problem, there, one))]
+            found += self._best_of(grids, there, 0.0)
         best: dict[tuple[str, ...], CandidateFit] = {}
         for item in sorted(found, key=self.score):
             self.keep(item, exact=False)
@@ -103,18 +178,8 @@ class Search(Hypotheses):
             if (chosen := [change for change in changes if change.gain >= least])
         ]  # fmt: skip
         ranked.sort(key=lambda changes: -max(change.gain for change in changes))
-        starts = [[_beside(base, change.term, rescaled(change)) for change in row] for row in ranked]
+        starts = [[beside(base, change.term, rescaled(change)) for change in row] for row in ranked]
         return self._best_of(starts, base, least if base.candidate.terms else 0.0)
-
-    def _scan_far(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
-        """Fit effects from the best of a grid of their parameters, nuisances as the missing force has them.
-
-        Those of a wrong model are far off and make a bad start; beside a force that is free they are where
-        they belong. Beside trials at rest, which know no force, they are as expected before the data.
-        """
-        there = self._unbiased(base)
-        starts = [_tried(self.problem, there, effect) for effect in effects]
-        return self._best_of([row for row in starts if row], there, 0.0)
 
     def _unbiased(self, base: CandidateFit) -> CandidateFit:
         """Return a base with its nuisances where they are beside a missing force."""
@@ -172,9 +237,9 @@ class Search(Hypotheses):
     def run(self) -> None:
         """Search: simple causes before others.
 
-        One effect, one law of free shape, more effects, any two; then fewer again. The best candidate is
-        computed finely before what rests on its evidence: finely divided, a joint may have the shape of the
-        name in place of one that is free.
+        One effect, one law of free shape, more effects, any two. The best candidate is computed finely
+        before what rests on its evidence: finely divided, a joint may have the shape of the name in place of
+        one that is free.
         """
         self.singles()
         self.settle()
@@ -184,13 +249,7 @@ class Search(Hypotheses):
             self.longer()
         if self._open and len(self.effects) > 1 and self.unexplained():
             self.fit_pairs()
-        if self._open:
-            self.shorter()
         self.settle()
-        if self._open and 0 < len(self.best().candidate.terms) < self.longest:
-            self._extended(self.best())  # what stood in for a smaller set hid what is beside it
-        self.settle()
-        self.keep(elsewhere(self.problem, self.best()), exact=True)  # from other places of the structure
 
     @property
     def _open(self) -> bool:
@@ -242,8 +301,7 @@ class Search(Hypotheses):
         """Add one effect at a time to the best set while that makes a better one."""
         current: CandidateFit | None = self.best()
         while current is not None and current.candidate.terms:
-            self.longest = len(current.candidate.terms)
-            if self.longest > 1 and self._far(current):
+            if len(current.candidate.terms) > 1 and self._far(current):
                 break  # a third effect is looked for only where two nearly do
             current = self._extended(current)
 
@@ -332,15 +390,6 @@ class Search(Hypotheses):
         rough.sort(key=lambda item: -self.score(item))
         self.refine(rough, self.score(self.best()) - SEARCH.close)
 
-    def shorter(self) -> None:
-        """Fit the best set less one effect, for each."""
-        best = self.best()
-        for less, effect in best.candidate.each_without(best.effect):
-            # from here even a set that was fitted before may find a better optimum
-            found = attempt(self.problem, less, Point(best.point.shared, best.point.local, effect))
-            if found is not None:
-                self.keep(found, exact=True)
-
 
 def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence) -> Search:
     """Fit the model without effect, then search the catalogue.
@@ -373,25 +422,3 @@ def search(problem: Problem, effects: Sequence[Effect], tell: Tell = in_silence)
     if not found.by_force():
         found.run()
     return found
-
-
-def _beside(base: CandidateFit, term: Term, values: FloatArray) -> Start:
-    """Return a base with one more effect, and where a fit of it begins."""
-    effect = np.concatenate((base.effect, values))
-    return base.candidate.plus(term), replace(base.point, effect=effect)
-
-
-def _tried(problem: Problem, base: CandidateFit, effect: Effect) -> Starts:
-    """Return the most promising points of a grid of an effect's parameters, beside a base."""
-    found = []
-    for place in effect.places(problem.setting):
-        term = Term(effect, place)
-        known, size = SEARCH.far_levels, len(term.parameters)
-        count = known[min(size, len(known) - 1)]
-        levels = ndtri((np.arange(count) + 0.5) / max(count, 1))
-        for values in product(levels, repeat=size):
-            candidate, start = _beside(base, term, np.array(values))
-            with suppress(DiscrepancyError):  # more than the structure can carry
-                found.append((objective(problem, candidate, start), candidate, start))
-    found.sort(key=lambda row: row[0])
-    return [row[1:] for row in found[: SEARCH.far_starts]]

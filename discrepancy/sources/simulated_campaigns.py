@@ -93,7 +93,7 @@ class Simulator:
             free = data.trial.release is not None and not data.trial.release.at_rest
             local = _drawn(self.found.local[number], data.unknowns.precision, generator)
             if free:
-                initials = slice(data.unknowns.zeros, data.unknowns.zeros + data.unknowns.initials)
+                initials = slice(data.unknowns.zeros, data.unknowns.ends[2])
                 local[initials] = self.found.local[number][initials]
             acts = data.trial.kind in candidate.acts_on
             response, _ = problem.response(number, shared, local, patch if acts else nothing, REFINEMENT)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from calibration.result.file import load_calibration, save_calibration
-from scenarios import structure_files
 from tests.command_line import refused, said
 
 MODEL = """format = 1
@@ -135,12 +134,6 @@ def test_what_is_wrong_is_one_sentence_and_nothing_is_written(lab, old, new, sen
     assert not (lab.parent / "out").exists()
 
 
-def test_a_structure_without_its_mesh_is_refused(lab):
-    own = lab.parent / "my_part.toml"
-    own.write_text(structure_files()["bracket"].read_text(encoding="utf-8"))
-    assert "bracket.inp" in refused("calibrate", "campaign", lab, "--model", own, code=None)
-
-
 @pytest.fixture
 def plots(tmp_path: Path) -> Path:
     """Three records read off a plot, in the authors' layout."""
@@ -171,4 +164,3 @@ def test_ringdown(plots, tmp_path, options):
     assert found["mode 1, natural frequency"] == pytest.approx(5.65, rel=5e-3)
     assert found["mode 2, natural frequency"] == pytest.approx(29.9, rel=2e-2)
     assert {path.name for path in (out / "figures").iterdir()} >= {"ringdown.svg", "ringdown.png"}
-    assert "does not exist" in refused("calibrate", "ringdown", "--data", tmp_path / "nothing")

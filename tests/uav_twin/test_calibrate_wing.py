@@ -84,21 +84,6 @@ def test_a_laboratory_is_simulated_with_its_truth(tmp_path):
     said("calibrate", "ringdown", "--data", out, "--fitted")
 
 
-def test_what_cannot_be_simulated_is_refused(tmp_path):
-    out, none = tmp_path / "lab", tmp_path / "none.fmu"
-    for words, sentence in (
-        (("--servo-mass", 2), "servo_mass must lie between"),
-        (("--fmu", none, "--frequency-error", 0.01, 0.0), "--frequency-error needs the reduced model"),
-        (("--fmu", none), "none.fmu"),
-    ):
-        assert sentence in refused(*simulate(out, *words), code=None)
-        assert not out.exists()
-    out.mkdir()
-    (out / "mine.txt").write_text("mine", encoding="utf-8")
-    assert "is not an empty folder" in refused(*simulate(out), code=None)
-    assert [path.name for path in out.iterdir()] == ["mine.txt"]
-
-
 @pytest.mark.long
 def test_an_fmu_and_another_design_are_measured_alike(tmp_path):
     fmu, model, flown = tmp_path / "wing.fmu", tmp_path / "model", tmp_path / "flown"
@@ -456,34 +441,3 @@ def test_a_wrong_file_is_one_sentence_and_leaves_nothing(wings, tmp_path, name, 
     (lab / name).write_text(change((lab / name).read_text(encoding="utf-8")), encoding="utf-8")
     assert sentence in refused("calibrate", "--data", lab, "--out", out)
     assert not out.exists()
-
-
-def test_other_refusals(wings, tmp_path):
-    empty, file, renamed = tmp_path / "lab", tmp_path / "a file", tmp_path / "renamed"
-    (empty / "step1").mkdir(parents=True)
-    (tmp_path / "none").mkdir()
-    file.write_text("x", encoding="utf-8")
-    shutil.copytree(wings["soft"].lab, renamed)
-    (renamed / PAIRS).rename(renamed / "step2" / "pairs.csv")
-    for words, sentence, code in (
-        (["--data", tmp_path / "nowhere"], "is not there; give the folder", 1),
-        (["--data", empty], "does not hold step1/geometry_data.csv", 1),
-        (["--data", tmp_path / "none"], "holds none of the folders step1, step2 and step3", 1),
-        (["--data", renamed, "--out", tmp_path / "out"], f"does not hold {PAIRS}", 1),
-        (["--data", file], "is no folder", 1),
-        (["--out", file], "exists and is no folder", 1),
-        (["--asset", "a\nb"], "printable characters", 1),
-        (["--measured"], "--measured needs --data", 2),
-        (["--fitted"], "--fitted needs --data", 2),
-        (["--procedure", "other"], "other", 2),
-        (["--seed", "1", "simulate"], "options go behind the command", 2),
-        (["--seed", "0", "simulate"], "options go behind the command", 2),
-        (["--data", tmp_path, "ringdown"], "options go behind the command", 2),
-    ):
-        assert sentence in refused("calibrate", *words, code=code), words
-    refused("fmu", "build", "--calibration", "x.nc", "--design", "y.toml", code=2)
-    refused("fmu", "build", "--calibration", tmp_path / "x.nc", "--out", tmp_path / "x.fmu")
-    assert "cannot be read as NetCDF" in refused(
-        "run", "level_turns", "--calibration", file, "--out", tmp_path / "r"
-    )
-    assert {path.name for path in tmp_path.iterdir()} == {"lab", "none", "a file", "renamed"}

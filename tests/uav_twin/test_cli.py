@@ -74,32 +74,7 @@ def test_run_prints_figures_and_report(tmp_path, library_file):
     assert "reference" not in text  # the scenario has none, and no column for them
 
 
-def test_what_is_wrong_is_one_sentence_with_its_exit_code(tmp_path):
-    broken = written(tmp_path, "format = 3", name="broken.toml")
-    for words, sentence, code in (
-        (["run"], "", 2),
-        (["run", "level_turns", "--nonsense"], "", 2),
-        (["run", "level_turns", "--seed", "-1"], "", 2),
-        (["run", "--resume", tmp_path, "--seed", "3"], "", 2),
-        (["run", "--resume", tmp_path, "--out", tmp_path], "", 2),
-        (["nonsense"], "", 2),
-        (["wing", "nonsense"], "", 2),
-        (["wing", "--design", tmp_path / "no.toml", "verify"], "behind the command", 2),
-        (["scenario", "check", "level_turns", "-q", "-v"], "exclude each other", 2),
-        (["run", "no_such_scenario"], "no_such_scenario", 1),
-        (["run", broken], "format", 1),
-        (["run", "--resume", tmp_path / "nothing"], "no run folder", 1),
-        (["run", "level_turns", "--out", tmp_path / "x", "--strain-library", tmp_path], "UAVconfig.json", 1),
-        (["fmu", "info", tmp_path / "no.fmu"], "no.fmu", 1),
-        (["fmu", "info", broken], "broken.toml", 1),
-        (["fmu", "check", tmp_path / "no.fmu"], "no.fmu", 1),
-        (["wing", "--design", tmp_path / "no.toml"], "no.toml", 1),
-        (["wing", "verify", "--design", tmp_path / "no.toml"], "no.toml", 1),
-        (["calibrate", "ringdown", "--data", tmp_path / "no.csv"], "no.csv", 1),
-        (["scenario", "check", "level_turns", "--calibration", "no_such.nc"], "no_such.nc", 1),
-    ):
-        assert sentence in refused(*words, code=code)
-    assert not (tmp_path / "x").exists()
+def test_the_traceback_is_told_where_it_is_asked_for():
     sentence = refused("scenario", "check", "nowhere")
     told = command("scenario", "check", "nowhere", "-v").stderr
     assert "Traceback" in told

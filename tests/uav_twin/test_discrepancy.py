@@ -73,33 +73,3 @@ def test_the_catalogue():
     shown = said("discrepancy", "effects", "--show", "coulomb_friction")
     assert "friction_ratio" in shown
     assert "Den Hartog" in shown
-    assert "coulomb_friction" in refused("discrepancy", "effects", "--show", "gremlins")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("run", "nowhere", *RIG), "nowhere"),
-        (("run", "{campaign}", "--model", "no_such_rig"), "three_mass_chain"),
-        (("run", "{campaign}", "--model", "wing.fmu"), "FMU"),
-        (("run", "{campaign}", *RIG, "--effects", "none.toml"), "none.toml"),
-        (("run", "{campaign}", *RIG, "--out", "{campaign}"), "not touched"),
-        (("run", "--from-run", "a_run", "--from-turn", "9", "--to-turn", "8"), "--to-turn 8 lies before"),
-        (("check", "nowhere", *RIG), "nowhere"),
-        (("example", "dance", "{new}", *RIG), "the kinds are"),
-        (("example", "static", "{campaign}", *RIG), "not an empty folder"),
-        (("example", "static", "{new}", *RIG, "--effect", "gremlins=1"), "gremlins"),
-        (("example", "static", "{new}", *RIG, "--effect", "load_cell=much"), "must end with numbers"),
-        (("example", "static", "{new}", *RIG, "--effect", "load_cell=1,2,3"), "2 parameters"),
-        (("example", "static", "{new}", *RIG, "--effect", "load_cell:tara=1"), "no parameter 'tara'"),
-        (("example", "static", "{new}", *RIG, "--effect", "seating_offset@Z"), "its places are"),
-        (("example", "static", "{new}", *RIG, "--effect", "washout"), "cannot be hidden"),
-    ],
-)
-def test_bad_input_is_one_sentence(arguments, message, campaign, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    before = sorted(path.name for path in tmp_path.iterdir())
-    filled = [word.format(campaign=campaign, new=tmp_path / "new") for word in arguments]
-    error = refused("discrepancy", *filled).strip()
-    assert message in error
-    assert sorted(path.name for path in tmp_path.iterdir()) == before  # nothing half-written

@@ -140,41 +140,6 @@ def test_everything_that_is_not_said_is_named_at_once(tmp_path, monkeypatch):
     assert read.trials[1].release.displacement == -0.0127
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (("--kind", "fly"),
-         "--kind must be static, ringdown, forced, driven, flight or noise, and 'fly' came"),
-        (("--kind", "pul.csv=static"), "--kind must be NAME=... about 'pull.csv', and 'pul.csv' came"),
-        (("--unit", "Weg"), "--unit must be NAME=... about 'F', 'Weg', 'Temp', 'U' or 'q', and '' came"),
-        (("--unit", "Weg=kg"), "pull.csv, column 'Weg': 'kg' is no unit of a quantity that is measured here"),
-        (("--unit", "F=mm", "--column", "F=force"),
-         "column 'F': force must have a unit such as N, mN or kN, and 'mm' came"),
-        (("--column", "Temp=temperature"), "column 'Temp': a temperature must be in degC, and 'K' came"),
-        (("--quantity", "U=tension", "--column", "U=u"), "a quantity is strain, displacement"),
-        (("--quantity", "U=strain", "--column", "U=u"),
-         "column 'U': strain must have a unit such as 1, microstrain or percent"),
-        (("--kind", "ringdown", "--release", "1,5 mm"),
-         "--release must be a length or a voltage such as 15.5mm, and '1,5 mm' came"),
-        (("--column", "Weg=y", "--unit", "Weg=mm", "--model", MODEL),
-         "column 'Weg': the model has no output 'y'"),
-        (
-            ("--column", "Temp=temperature", "--unit", "Temp=°C", "--reference-temperature", "warm"),
-            "--reference-temperature must be in degC, and 'warm' came",
-        ),
-        (("--decimal", "x"), "--decimal must be . or ,, and 'x' came"),
-        (("--out", "."), ". exists and is not an empty folder"),
-    ],
-)  # fmt: skip
-def test_an_answer_that_does_not_fit_is_one_sentence(tmp_path, monkeypatch, options, sentence):
-    Path("pull.csv").write_bytes(TWO["pull.csv"])
-    done = call("pull.csv", *options)
-    assert done.returncode == 1
-    assert sentence in done.stderr
-    assert "\n" not in done.stderr.strip()
-    assert [path.name for path in Path().iterdir()] == ["pull.csv"]
-
-
 def test_faults_of_the_data_name_the_laboratory_s_own_lines(tmp_path, monkeypatch):
     rows = "".join(f"{t};1,5\n" for t in (0, 2, 4, 6, 5, 8, 10, 12, 14))
     Path("a.csv").write_text(f"Versuch\n\nt [ms];Weg [mm]\n{rows}", "utf-8")
@@ -267,14 +232,6 @@ def test_the_sheets_of_a_workbook_are_trials(tmp_path, monkeypatch):
     assert read.trials[1].values[:, 0].tolist() == [0.0, 0.0254, 0.0254]
     assert read.trials[0].force.tolist() == [0.0, 4.4482216152605, 8.896443230521]
     assert "Imported from lab.xlsx#pull 2 (SHA-256 " in read.remarks[1]
-
-
-def test_two_files_of_one_name_are_refused(tmp_path, monkeypatch):
-    for folder in ("a", "b"):
-        Path(folder).mkdir()
-        (Path(folder) / "pull.csv").write_bytes(TWO["pull.csv"])
-    done = call("a/pull.csv", "b/pull.csv", "--kind", "static")
-    assert (done.returncode, "Two files have one name" in done.stderr) == (1, True)
 
 
 def test_the_documented_files_print_the_documented_tables(tmp_path, monkeypatch):

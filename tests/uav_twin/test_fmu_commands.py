@@ -23,22 +23,6 @@ def test_the_version_and_interface_are_those_that_were_asked_for(tmp_path):
         assert all(part in text for part in expected)
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (("--fmi", "3"), "build the kind 'compiled' or 'source'"),
-        (("--kind", "source", "--windows"), "--windows is for --kind compiled"),
-        (("--fmi", "3", "--interface", "model-exchange"), "build the kind 'compiled' or 'source'"),
-        (("--script", "gear_pump", "--fmi", "3"), "are for the wing"),
-        (("--script", "gear_pump", "--kind", "source"), "are for the wing"),
-        (("--fmi", "4"), "less than or equal to 3"),
-    ],
-)
-def test_what_does_not_fit_together_is_refused(tmp_path, options, sentence):
-    assert sentence in refused("fmu", "build", *options, "--out", tmp_path / "w.fmu", code=None)
-    assert not list(tmp_path.iterdir())
-
-
 def test_an_fmu_is_bound_and_checked(foreign_fmu, tmp_path):
     fmu, file = foreign_fmu("ball2"), tmp_path / "ball.toml"
     drafted = said("fmu", "bind", fmu, "--out", file, "--step-size", "0.05")
@@ -67,10 +51,6 @@ def test_a_problem_is_named_and_the_exit_code_says_so(foreign_fmu, tmp_path):
     told = json.loads(command(*words, "--json").stdout)
     assert told["passed"] is False
     assert any(finding["verdict"] == "problem" for finding in told["findings"])
-    for word in ("bind", "check"):
-        assert "There is no FMU" in refused("fmu", word, tmp_path / "none.fmu", code=None)
-    wrong = written(tmp_path, "[binding]\nname = 1\n", name="wrong.toml")
-    assert "wrong.toml" in refused("fmu", "check", foreign_fmu("ball2"), "--binding", wrong, code=None)
 
 
 def test_an_fmu_is_described_whole_and_one_for_another_platform_said_not_to_fly(
@@ -134,20 +114,6 @@ def test_from_a_script_to_a_library(tmp_path):
     ):
         assert words in refused(*sample, *extra)
         assert out.read_bytes() == content
-
-
-def test_a_wrong_call_of_sampling_is_said_to_be_so(tmp_path):
-    out = ("--out", tmp_path / "x.nc")
-    for words, sentence, code in (
-        ((), "give a scenario, or --fmu and --binding", 2),
-        (("pump_wear", "--resume", "--replace"), "either --resume or --replace", 2),
-        (("pump_wear", "--role", "flow"), "the scenario says what is observed", 2),
-        (("pump_wear", "--grid", "speed=1000"), "the rest is said by the scenario", 1),
-    ):
-        assert sentence in refused("library", "sample", *words, *out, code=code)
-    missing = ("--library", tmp_path / "missing.nc", "--out", tmp_path / "run")
-    assert "there is no observation library" in refused("run", "pump_wear", *missing)
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.long

@@ -17,7 +17,9 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
 from reporting.progress import SilentProgress
 from tests.command_line import refused, said
+from tests.refusals import Inputs
 
+HISTORIES = Inputs(__file__).table("histories.toml")["refused"]
 ROOM = """
 binding = { name = "room", step_size = 60.0, start_time = 120.0 }
 control.power = { variable = "heater.u[1].P", unit = "kW" }
@@ -86,14 +88,6 @@ def test_an_fmu_alone(foreign_fmu, tmp_path):
     assert "500 steps to t = 0.4 s, every 0.0008 s" in said(
         "fmu", "simulate", fmu, "--in-process", "--stop-time", 0.4
     )
-    for wrong, sentence in (
-        (["--set", "mass=1"], "has no parameter or input 'mass' that takes numbers; it has e, g"),
-        (["--set", "e"], "--set e is not understood; write NAME=NUMBER"),
-        (["--stop-time", -1], "starts at 0 s and cannot end at -1 s"),
-        (["--set", "e=2"], "lies outside the range of 'e', 0.5 to 1"),
-        (["--binding", "b.toml"], "--binding and --inputs go together"),
-    ):
-        assert sentence in refused("fmu", "simulate", fmu, *wrong, code=None)
 
 
 @pytest.mark.parametrize("where", [(), ("--in-process",)], ids=["worker", "in process"])
@@ -105,19 +99,6 @@ def test_structural_parameters_size_the_arrays(foreign_fmu, tmp_path, where):
     rows = np.genfromtxt(out, delimiter=",", names=True, deletechars="")
     assert rows.dtype.names == ("time", "y[1]", "y[2]", "y[3]", "y[4]", "total")
     assert rows[-1].tolist() == (3.0, 3.0, 12.0, 0.0, -12.0, 3.0)
-    for wrong, sentence in (
-        (("n=2.5",), "structural_parameters.n must be a whole number, but is 2.5"),
-        (("n=-1",), "n = -1.0 lies outside the range of 'n', 0 to 8"),
-        (("n=9",), "n = 9.0 lies outside the range of 'n', 0 to 8"),
-        (("n=nan",), "structural_parameters.n must be finite"),
-        (("n=1,2",), "structural_parameters.n must be a number, but is [1.0, 2.0]"),
-        (("m=3",), "has no parameter or input 'm' that takes numbers; it has w, u, n"),
-        (("n=3",), "'u' of {} has 3 elements but 2 start values; give all of its values."),
-        (("n=3", "u=1,2"), "load.u takes 3 values, but 2 came"),
-    ):
-        given = [word for value in wrong for word in ("--set", value)]
-        error = refused("fmu", "simulate", fmu, *wanted[:4], *where, *given, code=None)
-        assert sentence.format(fmu) in error
 
 
 SIZED = """
@@ -205,30 +186,7 @@ def test_the_default_experiment_is_that_of_the_fmu(foreign_fmu):
     assert history.values[0].tolist() == [1.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        ("", "is empty: it needs a header line"),
-        ("time,power\n", "has a header line but no rows"),
-        ("power\n1\n", "has no column 'time', which a simulation needs; its columns are power"),
-        (
-            "time,pwer\n120,1\n",
-            "'pwer' .* is no input of the binding room; it has control.power, load.outside",
-        ),
-        ("time,power,power\n120,1,2\n", "has more than one column 'power'"),
-        ("time,power,control.power\n120,1,2\n", r"gives control\.power in more than one column"),
-        ("time,power[2]\n120,1\n", r"lacks the column control\.power\[1\]"),
-        ("time,power\n120,1\n180\n", "line 3: 1 cell came, and the header has 2 columns"),
-        ("time,power\n120,1\n\n180,nan\n", "line 4: column 'power' holds nan, and a finite number"),
-        ("time,power\n120,\n", "line 2: column 'power' must hold a number, and nothing came"),
-        ("time,power\n120,\u0663\n", "line 2: column 'power' must hold a number"),
-        ("time,power\n120,1_000\n", "line 2: column 'power' must hold a number"),
-        ("time,power\n120,9,81\n", "line 2: 3 cells came, and the header has 2 columns"),
-        ("time;power\n120;1\n", "not separated by commas"),
-        ("time,power\n120,1\n180,1\n250,1\n", "the time 250 s where step 2 begins at 240 s"),
-        ("time,power\n0,1\n", "the time 0 s where step 0 begins at 120 s"),
-    ],
-)
+@pytest.mark.parametrize(("content", "sentence"), HISTORIES)
 def test_files_that_are_refused(room, tmp_path, content, sentence):
     given = tmp_path / "inputs.csv"
     given.write_text(content, encoding="utf-8")

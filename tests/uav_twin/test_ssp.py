@@ -9,7 +9,6 @@ import pytest
 import xarray as xr
 
 from tests.command_line import refused, said
-from tests.twin_master.runs import text_of, written
 
 END = "</ssm:ParameterMapping>"
 
@@ -54,30 +53,6 @@ def test_export_check_and_run(monkeypatch, scenario, system, tmp_path):
     said("run", system, "--scenario", scenario, "--out", out, "--in-process", "-q")
     assert (out / "asset" / "system.ssp").read_bytes() == system.read_bytes()
     assert (out / "csv" / "observed.csv").is_file()
-
-
-def test_bad_calls_are_one_sentence(scenario, library_file, tmp_path):
-    bad, none, out = tmp_path / "bad.ssp", tmp_path / "none.ssp", tmp_path / "x.ssp"
-    bad.write_bytes(b"nothing")
-    library = f'[asset]\nkind = "strain_library"\nfile = "{library_file}"\n\n[belief]\nkind = "asset"\n\n'
-    text = text_of("level_turns")
-    flown = text[text.index("[asset]") : text.index("[calibration]")]
-    of_library = written(tmp_path, text, (flown, library), name="library.toml")
-    for words, code, sentence in (
-        (("ssp", "check", none), 1, "There is no SSP file"),
-        (("ssp", "check", bad), 1, "not a sound SSP archive"),
-        (("ssp", "export", "no_scenario", "--out", out), 1, "There is no scenario `no_scenario`"),
-        (("ssp", "export", scenario, "--out", tmp_path / "x.zip"), 1, "must have the suffix .ssp"),
-        (("ssp", "export", of_library, "--out", out), 1, "only FMUs can be exported"),
-        (("run", bad, "--scenario", scenario, "--out", tmp_path / "d"), 1, "not a sound SSP archive"),
-        (("ssp", "simulate", none), 1, "There is no SSP file"),
-        (("ssp", "simulate", bad, "--out", "x.txt"), 1, "x.txt must end in .csv or .nc"),
-        (("ssp", "simulate", bad, "--set", "a"), 1, "--set a is not understood"),
-        (("run", bad), 2, "name a scenario as well"),
-        (("run", scenario, "--scenario", scenario), 2, "belongs to an SSP file"),
-    ):
-        assert sentence in refused(*words, code=code)
-    assert {path.name for path in tmp_path.iterdir()} == {"bad.ssp", "library.toml"}
 
 
 def test_a_system_is_simulated_as_it_lies_there(system, tmp_path):

@@ -131,9 +131,8 @@ class ObservationLibrary:
             levels = np.array(factor.levels)
             for level in np.unique(asked):
                 if _place(levels[:, None], level) is None:
-                    raise InvalidObservationLibraryError(
-                        said("assets.levels", levels=_listed(levels), name=factor.name, level=level)
-                    )
+                    of = {"levels": _listed(levels), "name": factor.name}
+                    raise InvalidObservationLibraryError(said("assets.levels", level=level, **of))
         return [_place(self.states.coordinates, state) or 0 for state in wanted]
 
     def control_of(self, name: str, values: Mapping[str, float]) -> int:

@@ -266,9 +266,8 @@ def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) ->
     if learnt.transition is not None:
         own, names = learnt.transition.probability, sorted(entry["name"] for entry in table["control"])
         if sorted(own) != names or moves != "independent_worsening":
-            raise MissionInputError(
-                said("assets.learnt_controls", path=path, own=own, names=names, kind=moves)
-            )
+            both = {"own": own, "names": names}
+            raise MissionInputError(said("assets.learnt_controls", path=path, **both, kind=moves))
     if learnt.calibration is not None and learnt.calibration.parameter != given["parameter"]:
         of = learnt.calibration.parameter, given["parameter"]
         raise MissionInputError(said("assets.learnt_parameter", path=path, of=of))

@@ -226,10 +226,8 @@ class NamedStructure(AssetSource):
         advice = self.advice["state"] or f"give it in a table [[{table}]]"
         check_names("the scenario has the", where, [row], MissingObservationModelError, advice)
         if observation.count != known[role]:
-            has, count = known[role], observation.count
-            raise MissingObservationModelError(
-                said("assets.sensors", where=where, has=has, role=role, count=count)
-            )
+            both = {"has": known[role], "count": observation.count}
+            raise MissingObservationModelError(said("assets.sensors", where=where, role=role, **both))
         titles, own = [*observation.titles], names.get(role, [])
         if titles != own and sorted(titles) == sorted(own):
             raise MissionInputError(said("assets.titles", titles=titles, where=where, own=own))

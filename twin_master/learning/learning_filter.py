@@ -149,13 +149,14 @@ class LearningFilter:
             statistics = statistics + self._gauges.told(seen, self._draw, near.alone, scale, log_belief)
         count = count + ~np.isnan(seen)
         arrays = {"log_belief": log_belief, "statistics": statistics, "count": count}
+        carried = Carried(control_index, arrays)
         return Estimate(
             forecast=np.exp(forecast).sum(axis=0),
             filtered=filtered.sum(axis=0),
             log_evidence=evidence,
-            carried=Carried(control_index, arrays),
+            carried=carried,
             learnt=self._learnt(filtered, statistics, count),
-            expected=lambda: self._expected(filtered, statistics, count, control_index),
+            expected=lambda: self._expected(carried),
         )
 
     def _forecast(self, before: Carried | None) -> tuple[Float, Float, Float]:
@@ -172,10 +173,8 @@ class LearningFilter:
 
     def hypotheses(self, carried: Carried) -> Hypotheses:
         """Return what is believed of each hypothesis after a turn."""
-        arrays = carried.arrays
-        return self._hypotheses(np.exp(arrays["log_belief"]), arrays["statistics"], arrays["count"])
-
-    def _hypotheses(self, weight: Float, statistics: Float, count: Float) -> Hypotheses:
+        weight = np.exp(carried.arrays["log_belief"])
+        statistics, count = carried.arrays["statistics"], carried.arrays["count"]
         fitted = self._gauges.fitted(statistics)
         scale2, offset, gain = self._gauges.scale2(fitted, count), self._gauges.offset, self._gauges.gain
         covariance = np.stack(
@@ -186,11 +185,10 @@ class LearningFilter:
             scale2[..., None] * covariance, scale2,
         )  # fmt: skip
 
-    def _expected(
-        self, filtered: Float, statistics: Float, count: Float, control: int
-    ) -> tuple[Float, Float]:
+    def _expected(self, carried: Carried) -> tuple[Float, Float]:
         """Return for each sensor what it shows in the mean, and the deviation of its noise: two of (G,)."""
-        own = self._hypotheses(filtered, statistics, count).counting(filtered)
+        own, control = self.hypotheses(carried), carried.control_index
+        own = own.counting(own.weight)
         model = self.sensor_model
         in_force = slice(control, control + 1)
         mean, _, noise2 = shown_by(
@@ -253,10 +251,8 @@ class LearningFilter:
             low, high = (np.sqrt(0.5 * left / gammaincinv(shape, level)) for level in INTERVAL[::-1])
             mean = np.sqrt(0.5 * left) * np.exp(gammaln(shape - 0.5) - gammaln(shape))
             deviation = np.sqrt(np.maximum(0.5 * left / (shape - 1.0) - mean**2, 0.0))
-            for g in range(len(count)):
-                result[f"noise_scale[{g + 1}]"] = Learnt(
-                    float(mean[g]), float(deviation[g]), float(low[g]), float(high[g])
-                )
+            for g, figures in enumerate(np.column_stack([mean, deviation, low, high]).tolist(), 1):
+                result[f"noise_scale[{g}]"] = Learnt(*figures)
         for column, prior, name, unit in (
             (0, self._gauges.offset, "gauge_offset", self.priors.sensor_unit),
             (1, self._gauges.gain, "gauge_gain", "1"),

@@ -195,13 +195,7 @@ class GridSampler:
             return
         worst = int(np.argmax(change))
         sensor = self._asset.binding.observation[self._grid.role].variables[worst]
-        raise InvalidObservationLibraryError(
-            said(
-                "library.unsettled" if steps else "library.remembers",
-                fmu=self._grid.fmu,
-                steps=steps,
-                place=self._name(index),
-                shown=f"{sensor} = {before[worst]:.9g}",
-                later=again[worst],
-            )
-        )
+        shown = f"{sensor} = {before[worst]:.9g}"
+        of = {"grid": self._grid, "place": self._name(index), "shown": shown, "later": again[worst]}
+        why = said("library.unsettled" if steps else "library.remembers", **of)
+        raise InvalidObservationLibraryError(why)

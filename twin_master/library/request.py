@@ -103,10 +103,8 @@ def grid_of_fmu(
     controls = {}
     combinations = math.prod(len(values) for values in inputs.values())
     if combinations > LARGEST_COUNT:
-        most = LARGEST_COUNT
-        raise InvalidObservationLibraryError(
-            said("library.controls", inputs=inputs, combinations=combinations, most=most)
-        )
+        numbers = {"combinations": combinations, "most": LARGEST_COUNT}
+        raise InvalidObservationLibraryError(said("library.controls", inputs=inputs, **numbers))
     for values in itertools.product(*inputs.values()):
         setting = dict(zip(inputs, values, strict=True))
         controls[", ".join(f"{name} = {value:g}" for name, value in setting.items())] = setting

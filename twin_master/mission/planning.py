@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
-from reporting.files import atomic_write_bytes
 from twin_master.errors import PlanningError
 from twin_master.network.belief_planning import BeliefPlan, DecisionProblem, plan_on_belief
 from twin_master.network.graphical_model import GraphicalModel
@@ -133,21 +133,18 @@ def risk_of(
     return shares[0] / shares[1]
 
 
-def write_policy(path: Path, policy: BeliefPolicy, model: GraphicalModel) -> None:
-    """Write a policy on the belief to an NPZ file, with what it is for.
-
-    Raises
-    ------
-    FileNotWrittenError
-        The disk is full or the folder cannot be written.
-    """
+def policy_file(policy: ArrayLike | BeliefPolicy, model: GraphicalModel) -> bytes:
+    """Return a policy as files have it: (S, U) in NPY, or on the belief in NPZ, with what it is for."""
     content = io.BytesIO()
-    np.savez(content, **vars(policy), controls=np.array(model.controls))
-    atomic_write_bytes(path, content.getvalue())
+    if isinstance(policy, BeliefPolicy):
+        np.savez(content, **vars(policy), controls=np.array(model.controls))
+    else:
+        np.save(content, model.policy(policy))
+    return content.getvalue()
 
 
-def read_policy(path: Path, model: GraphicalModel) -> BeliefPolicy:
-    """Return the policy on the belief in a file, for the states and controls of a model.
+def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
+    """Return the policy in a file, for the states and controls of a model.
 
     Raises
     ------
@@ -155,15 +152,16 @@ def read_policy(path: Path, model: GraphicalModel) -> BeliefPolicy:
         It is none, or one for other states or controls.
     """
     try:
-        with np.load(path, allow_pickle=False) as kept:
+        kept = np.load(path, allow_pickle=False)
+        if isinstance(kept, np.ndarray):
+            return model.policy(kept)
+        with kept:
             policy, controls = BeliefPolicy.of(kept), tuple(kept["controls"].tolist())
     except (OSError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
         raise PlanningError(said("mission.no_policy", path=path, error=error)) from None
     if controls != model.controls or policy.vectors.shape[1] != model.states.size:
-        states = policy.vectors.shape[1]
-        raise PlanningError(
-            said("mission.another_policy", path=path, states=states, controls=controls, model=model)
-        )
+        own = {"states": policy.vectors.shape[1], "controls": controls}
+        raise PlanningError(said("mission.another_policy", path=path, **own, model=model))
     return policy
 
 

@@ -1,6 +1,7 @@
 """The journal of a run or a watch, read back: what was told, the twin as it was, turns to be stored."""
 
 import base64
+import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -144,6 +145,7 @@ def replay(
     wanted = [] if first_turn is None else [first_turn]
     wanted += [] if question is None else [question.from_turn]
     seen: dict[int, Reading] = {}
+    decided, stands = dict[int, int](), math.inf  # decisions from some turn on were revised by later lines
     settled, last = (-1, b""), dict[str, Any]()
     behind, place = -1, 0  # the turn of the line behind, and where it begins
     for record, begin, _ in records_backwards(path, end):
@@ -159,17 +161,24 @@ def replay(
                 # Only one before what is wanted, and before all models that are adopted behind it.
                 if all(kept < other for other in wanted):
                     settled = kept, zlib.decompress(base64.b64decode(state))
+            if turn < stands:
+                decided.setdefault(turn, record["next_control"])
             if "model" in record:
+                stands = min(stands, int(record["model"]["from_turn"]))
                 wanted.append(int(record["model"]["from_turn"]))
             elif "observed" in record:
-                seen.setdefault(int(record.get("observation_turn", turn)), reading_of(record))
+                observed = int(record.get("observation_turn", turn))
+                stands = min(stands, observed)
+                seen.setdefault(observed, reading_of(record))
         except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
             raise damaged(path, begin, f"it has another layout, {error}") from error
     found = filtered_again(seen, [*models, *([question] if question else [])], lag, settled)
-    if last and question is None and last["next_control"] != found.twin.proposed_control:
-        again = f"begin another watch, in another folder, with `--observations {path.parent}`"
-        advice = again if "intake" in last else "fly the mission again with --replace"
-        raise NotResumableError(said("mission.decided", turn=last["turn"], advice=advice))
+    for again in found.turns if question is None else ():
+        number, control = again.concluded.turn, again.concluded.next_control
+        if decided.get(number, control) != control:
+            other = f"begin another watch, in another folder, with `--observations {path.parent}`"
+            advice = other if "intake" in last else "fly the mission again with --replace"
+            raise NotResumableError(said("mission.decided", turn=number, advice=advice))
     return found, last
 
 

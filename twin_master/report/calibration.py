@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.special import ndtr
+from scipy.stats import truncnorm
 
 from reporting import figures as style
 from reporting.arrays import Float
@@ -90,9 +90,8 @@ def _density_panel(axes: Axes, run: Run, label: str) -> None:
         mean, deviation = prior["mean"], prior["standard_deviation"]
         ends = np.array(prior.get("range", ends))
         x = np.linspace(max(low, ends[0]), min(high, ends[1]), 200)
-        mass = np.subtract(*ndtr((ends[::-1] - mean) / deviation))
-        density = np.exp(-0.5 * ((x - mean) / deviation) ** 2) / (deviation * np.sqrt(2.0 * np.pi))
-        axes.plot(x, density / mass, color=style.PAST, linewidth=1.2, label="prior")
+        density = truncnorm.pdf(x, *(ends - mean) / deviation, mean, deviation)
+        axes.plot(x, density, color=style.PAST, linewidth=1.2, label="prior")
     if kept.get("posterior"):
         grid, density = (np.asarray(kept["posterior"][name], float) for name in ("grid", "density"))
         inside = (grid >= max(low, ends[0])) & (grid <= min(high, ends[1]))

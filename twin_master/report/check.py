@@ -58,13 +58,12 @@ def predictive_check(run: Run) -> PredictiveCheck:
         total = np.hypot(total, learnt)  # which has the error of the model
     residual = (run.observed - expected) / total
     known = np.isfinite(residual)
-    count, inside = known.sum(axis=0), (np.abs(residual) <= NORMAL_95).sum(axis=0)
-    coverage = np.divide(inside, count, out=np.full(len(count), np.nan), where=count > 0)
-    seen = residual[known]
-    whole = (
-        (float(np.mean(np.abs(seen) <= NORMAL_95)), float(np.sqrt(np.mean(seen**2)))) if len(seen) else None
-    )
-    return PredictiveCheck(residual, coverage, count, ndtr(seen), *(whole or (float("nan"),) * 2))
+    count, seen = known.sum(axis=0), residual[known]
+    with np.errstate(invalid="ignore"):
+        coverage = (np.abs(residual) <= NORMAL_95).sum(axis=0) / count
+        overall = np.divide((np.abs(seen) <= NORMAL_95).sum(), seen.size)
+        deviation = np.sqrt(np.divide((seen**2).sum(), seen.size))
+    return PredictiveCheck(residual, coverage, count, ndtr(seen), float(overall), float(deviation))
 
 
 @style.publication_style()

@@ -19,7 +19,8 @@ from twin_master.report.view import PrintedFactor, PrintedSensors, printed_facto
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.store.mission_result import MOMENTS, LearntQuantity, printed_learnt, titles_of
+from twin_master.sentences import said
+from twin_master.store.mission_result import MOMENTS, LearntQuantity, paths_of, printed_learnt, titles_of
 from twin_master.store.writing import RUN_NAME, SUMMARY_NAME, open_run
 
 if TYPE_CHECKING:
@@ -49,20 +50,8 @@ class Run:
     calibration: Mapping[str, Any]
 
     def __getitem__(self, path: str) -> Float:
-        """Return a variable.
-
-        Raises
-        ------
-        RunFolderError
-            The run is of another version, which did not have it.
-        """
-        try:
-            return np.asarray(self.tree[path].values)
-        except KeyError as error:
-            raise RunFolderError(
-                f"{RUN_NAME} does not have the layout of a run of this version (the variable {path} is "
-                "missing): fly the run again."
-            ) from error
+        """Return a variable."""
+        return np.asarray(self.tree[path].values)
 
     def get(self, path: str) -> Float | None:
         """Return a variable; None where the run does not have it."""
@@ -168,7 +157,7 @@ def read_run(folder: Path, tree: "xr.DataTree | None" = None) -> Run:
     Raises
     ------
     RunFolderError
-        There is no ``run.nc``, or it is damaged.
+        There is no ``run.nc``, it is damaged, or of another version.
     """
     tree = open_run(folder) if tree is None else tree
     config, summary, calibration = (
@@ -178,7 +167,11 @@ def read_run(folder: Path, tree: "xr.DataTree | None" = None) -> Run:
         scenario = parse_scenario(config.get("scenario", {}), str(folder / CONFIG_NAME))
     except TwinMasterError as error:
         raise RunFolderError(f"{error} The run cannot be shown: fly it again.") from error
-    return Run(tree, scenario, config, summary, calibration)
+    run = Run(tree, scenario, config, summary, calibration)
+    missing = [path for path in paths_of(scenario.observation.role) if run.get(path) is None]
+    if missing:
+        raise RunFolderError(said("run_folder.layout", name=RUN_NAME, path=missing[0]))
+    return run
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """The table of a scenario that says what is observed, and how well: sensors, or modes of a record."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +10,13 @@ from pydantic import Field, model_validator
 
 from twin_master.scenario.section import (
     Count,
+    Fault,
     Name,
     NotNegative,
     PerSensor,
     Positive,
     Section,
-    check_one_or_each,
+    one_or_each,
 )
 from twin_master.sentences import said
 
@@ -49,18 +50,14 @@ class ModesSection(Section):
     """Of each feature [Hz, 1, 1], beside that with which it was identified: what changes between records,
     and what the model is wrong by."""
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if any(high <= low for low, high in self.bands):
-            raise ValueError("each of `observation.modes.bands` is its least and then its largest frequency")
-        ordered = sorted(self.bands)
-        if any(after[0] < before[1] for before, after in pairwise(ordered)):
-            raise ValueError("`observation.modes.bands` overlap: a mode in both would be observed twice")
-        if self.numbers and len(self.numbers) != len(self.bands):
-            raise ValueError(said("scenario.mode_numbers", numbers=len(self.numbers), bands=len(self.bands)))
-        if not self.columns:
-            raise ValueError(said("scenario.mode_features"))
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield what bands, numbers and features may have wrong."""
+        ordered, numbers = pairwise(sorted(self.bands)), len(self.numbers or self.bands)
+        yield any(high <= low for low, high in self.bands), said("scenario.band")
+        yield any(after[0] < before[1] for before, after in ordered), said("scenario.bands")
+        told = said("scenario.mode_numbers", numbers=numbers, bands=len(self.bands))
+        yield numbers != len(self.bands), told
+        yield not self.columns, said("scenario.mode_features")
 
     @property
     def places(self) -> NDArray[np.int64]:
@@ -180,9 +177,8 @@ class ObservationSection(Section):
         """Unit of each sensor."""
         return (self.unit,) * self.count if isinstance(self.unit, str) else self.unit
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield keys that are given neither once nor for each sensor."""
         for key in ("unit", "standard_deviation", "titles"):
-            check_one_or_each(f"observation.{key}", getattr(self, key) or None, self.count)
-        check_one_or_each("observation.model_error_percent", self.model_error, self.count)
-        return self
+            yield one_or_each(f"observation.{key}", getattr(self, key) or None, self.count)
+        yield one_or_each("observation.model_error_percent", self.model_error, self.count)

@@ -5,7 +5,9 @@ what is kept here, and in `config.json` of a run, is in SI. Nothing here knows a
 another scenario file.
 """
 
-from collections.abc import Mapping
+import tomllib
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -17,16 +19,17 @@ from twin_master.scenario.asset import AssetSection, BeliefSection, FileSection
 from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.section import (
     Count,
+    Fault,
     Name,
     NotNegative,
     Number,
     Probability,
     Section,
     Seed,
-    check_known,
-    check_one_or_each,
-    check_same,
+    incomplete,
+    one_or_each,
     short,
+    unknown,
 )
 from twin_master.scenario.tables import (
     ROW_SUM_TOLERANCE,
@@ -48,20 +51,10 @@ _DECIMALS = 12
 """Sums of scripted gains are rounded to this many digits, so that ten times 2 % and 40 % are 60 %."""
 REWARD_NAMES = ("health", "control", "error")
 """The rewards (9)-(11)."""
-FALLBACK_FIGURES = (
-    "policy_switch_damage",
-    "damage_step",
-    "fallback_step",
-    "fallback_delay",
-    "early_fallback_step",
+FIGURES: dict[str, dict[str, tuple[str, str]]] = tomllib.loads(
+    Path(__file__).with_name("figures.toml").read_text(encoding="utf-8")
 )
-"""Figures of the summary that say when the control left that of the first turn."""
-MISFIT_FIGURES = ("model_misfit_rms", "model_misfit_largest")
-"""Figures of the summary that say by how much asset and twin's model differ."""
-
-
-NOTICE_FIGURES = ("alarm_step", "none_of_these", "gauge_off", "decided_by")
-"""Figures of the summary that say what was noticed."""
+"""Title and unit of each figure of the summary, by group and key."""
 
 
 class Mission(Section):
@@ -89,15 +82,14 @@ class StateFactor(Section):
     levels: Annotated[tuple[Number, ...], Field(min_length=1)]
     prior: Annotated[tuple[Probability, ...], Field(min_length=1)]
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if any(b <= a for a, b in zip(self.levels, self.levels[1:], strict=False)):
-            raise ValueError(f"`levels` of state `{self.name}` must increase, and {short(self.levels)} came")
-        if len(self.prior) != len(self.levels):
-            raise ValueError(said("scenario.prior", self=self, counts=(len(self.levels), len(self.prior))))
-        if abs(sum(self.prior) - 1.0) > ROW_SUM_TOLERANCE:
-            raise ValueError(said("scenario.prior_sum", name=self.name, total=sum(self.prior)))
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield levels that do not increase, and a prior that is none of them."""
+        name, levels, prior = self.name, len(self.levels), len(self.prior)
+        falls = any(b <= a for a, b in pairwise(self.levels))
+        yield falls, f"`levels` of state `{name}` must increase, and {short(self.levels)} came"
+        yield prior != levels, said("scenario.prior", name=name, levels=levels, prior=prior)
+        total = sum(self.prior)
+        yield abs(total - 1.0) > ROW_SUM_TOLERANCE, said("scenario.prior_sum", name=name, total=total)
 
     @property
     def start(self) -> float:
@@ -121,8 +113,6 @@ class Reference(Section):
     source: str
 
 
-OPTIONAL_TABLES = ("learning", "notice")
-"""Tables without which a scenario says what it said before there were any."""
 CALIBRATION_COPY = "asset/calibration.nc"
 """The calibration file inside a run folder."""
 
@@ -144,19 +134,14 @@ class Calibration(FileSection):
         """Return where the copy of the calibration file stands in a run folder."""
         return {"file": CALIBRATION_COPY}
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if (self.source == "file") != bool(self.file):
-            raise ValueError(
-                "calibration source `file` needs `file`, the path of a calibration.nc"
-                if self.source == "file"
-                else f"`file` belongs to the calibration source `file`, and the source is `{self.source}`"
-            )
-        if self.source in ("normal", "fixed") and self.mean is None:
-            raise ValueError(f"calibration source `{self.source}` needs `mean`")
-        if self.source == "normal" and self.standard_deviation is None:
-            raise ValueError("calibration source `normal` needs `standard_deviation`")
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield what a source needs, or does not take."""
+        source, given = self.source, bool(self.file)
+        yield source == "file" and not given, said("scenario.calibration_file")
+        yield source != "file" and given, said("scenario.no_calibration_file", source=source)
+        for key, sources in (("mean", ("normal", "fixed")), ("standard_deviation", ("normal",))):
+            missing = source in sources and getattr(self, key) is None
+            yield missing, f"calibration source `{source}` needs `{key}`"
 
 
 WATCHED_KIND = "watched"
@@ -237,26 +222,25 @@ class Scenario(Section):
     @property
     def figure_names(self) -> tuple[str, ...]:
         """Names of all figures that the summary of this scenario can give, and a reference can name."""
-        names = [*FALLBACK_FIGURES]
-        names += [f"filtered_rms_error_{name}" for name in self.state_names]
-        names += [f"mean_reward_{name}" for name in REWARD_NAMES]
-        names += [f"{self.calibration.parameter}_{moment}" for moment in ("mean", "standard_deviation")]
-        if self.learning is not None and self.learning.parameter:
-            moments = ["prior_mean", "prior_standard_deviation"]
-            moments += ["true"] * (self.calibration.parameter in self.asset.true_parameters)
-            names += [f"{self.calibration.parameter}_{moment}" for moment in moments]
-        names += ["log_evidence"]
-        if self.learning is not None:
-            names += self.learning.figure_names
-        if self.truth.received or any(fault.kind == "dropout" for fault in self.truth.sensor_faults):
-            names += ["lost_observations", "blind_steps"]
-        if self.another_model:
-            names += [*MISFIT_FIGURES]
-        if set(self.observation.sensor_units) == {"1"}:
-            names += ["strain_error_bound"]
-        if self.notice is not None:
-            names += [*NOTICE_FIGURES]
-        return tuple(names)
+        parameter, learning = self.calibration.parameter, self.learning
+        learns, told = learning is not None and learning.parameter, parameter in self.asset.true_parameters
+        lost = self.truth.received or any(fault.kind == "dropout" for fault in self.truth.sensor_faults)
+        given: list[tuple[str, object, list[dict[str, str]]]] = [
+            ("fallback", True, [{}]),
+            ("error", True, [{"state": name} for name in self.state_names]),
+            ("reward", True, [{"reward": name} for name in REWARD_NAMES]),
+            ("parameter_learnt" if learns else "parameter", True, [{"parameter": parameter}]),
+            ("parameter_true", learns and told, [{"parameter": parameter}]),
+            ("evidence", True, [{}]),
+            *(learning.figures if learning is not None else ()),
+            ("lost", lost, [{}]),
+            ("blind", lost, [{}]),
+            ("misfit", self.another_model, [{}]),
+            ("bound", {*self.observation.sensor_units} == {"1"}, [{}]),
+            ("notice", self.notice, [{}]),
+        ]
+        groups = ((FIGURES[group], words) for group, there, each in given if there for words in each)
+        return tuple(key.format(**words) for group, words in groups for key in group)
 
     def scripted_history(self) -> NDArray[np.float64]:
         """Return the scripted true state (T, F), SI: the gain of a step is in the state of that step."""
@@ -286,121 +270,100 @@ class Scenario(Section):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the scenario as plain data in SI; `Scenario.model_validate` reads it back."""
-        absent: dict[str, Any] = {name: True for name in OPTIONAL_TABLES if getattr(self, name) is None}
-        absent["truth"] = {name for name in ("probability", "record") if not getattr(self.truth, name)}
-        if self.observation.modes is None:
-            absent["observation"] = {"modes"}
-        if not self.action:
-            absent |= {"action": True}
-        if self.planner.policy == "mode":
-            absent |= {"planner": {"policy", "limit_probability", "inspections_a_turn"}}
-        return self.model_dump(mode="json", exclude=absent)
+        return self.model_dump(mode="json")
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        states, controls = self.state_names, self.control_names
+    def faults(self) -> Iterator[Fault]:
+        """Yield what the tables have wrong beside each other."""
+        yield from self._faults_of_controls()
+        yield from self._faults_of_truth()
+        yield from self._faults_of_sensors()
+        yield from self._faults_of_modes()
+
+    def _faults_of_controls(self) -> Iterator[Fault]:
+        states, controls, rewards = self.state_names, self.control_names, self.rewards
         for what, names in (("state", states), ("control", controls)):
-            if len(set(names)) != len(names):
-                raise ValueError(f"each {what} needs a name of its own, and the names are {short(names)}")
-        roles = set(self.control[0].values)
+            told = f"each {what} needs a name of its own, and the names are {short(names)}"
+            yield len({*names}) != len(names), told
+        inputs, norm = tuple(sorted(self.control[0].values)), rewards.normalise_error_by
         for control in self.control:
-            if set(control.values) != roles:
-                names = controls[0], control.name
-                given = short(sorted(roles)), short(sorted(control.values))
-                raise ValueError(said("scenario.inputs", names=names, given=given))
-        check_known(self.mission.first_control, controls, "mission.first_control", "control")
-        check_same(self.rewards.control, controls, "rewards.control", "control")
-        check_known(self.planner.safest or controls[0], controls, "planner.safest", "control")
-        norm = self.rewards.normalise_error_by
+            told = said("scenario.inputs", first=controls[0], roles=inputs, control=control)
+            yield {*control.values} != {*inputs}, told
+        yield unknown(self.mission.first_control, controls, "mission.first_control", "control")
+        yield incomplete(rewards.control, controls, "rewards.control", "control")
+        yield unknown(self.planner.safest or controls[0], controls, "planner.safest", "control")
         if norm is not None:
-            check_known(norm, tuple(sorted(roles)), "rewards.normalise_error_by", "control input")
-            if any(control.values[norm] <= 0.0 for control in self.control):
-                raise ValueError(said("scenario.normaliser", norm=norm))
-        self.transition.check(self.control_names, {factor.name: len(factor.levels) for factor in self.state})
-        true = self.truth.probability
-        if true and (self.truth.kind, self.transition.kind) != ("random_growth", "independent_worsening"):
-            raise ValueError(said("scenario.true_probability"))
-        if true:
-            check_same(true, controls, "truth.probability", "control")
-        self._check_actions()
+            yield unknown(norm, inputs, "rewards.normalise_error_by", "control input")
+            divisors = [control.values[norm] for control in self.control]
+            yield min(divisors) <= 0.0, said("scenario.normaliser", norm=norm)
+        levels = {factor.name: len(factor.levels) for factor in self.state}
+        yield from self.transition.faults_among(controls, levels)
+        for action in self.action:
+            yield unknown(action.control, controls, "action.control", "control")
+            for state in (*action.inspects, *action.repairs):
+                yield unknown(state, states, f"action.{action.name}", "state")
+
+    def _faults_of_truth(self) -> Iterator[Fault]:
+        truth, states, asset = self.truth, self.state_names, self.asset
+        grows = truth.kind == "random_growth"
+        if truth.probability:
+            worsens = self.transition.kind == "independent_worsening"
+            yield not (grows and worsens), said("scenario.true_probability")
+            yield incomplete(truth.probability, self.control_names, "truth.probability", "control")
+        for action in self.action:
+            follows = not action.repairs or grows or asset.kind == WATCHED_KIND
+            yield not follows, said("scenario.repairs", name=action.name, kind=truth.kind)
         referred = [entry.figure for entry in self.reference]
         for name in referred:
-            check_known(name, self.figure_names, "reference.figure", "figure of the summary")
-            if referred.count(name) > 1:
-                raise ValueError(f"`reference` gives `{name}` more than once: keep one of them")
-        if self.truth.kind == "asset":
-            if not self.asset.is_fmu:
-                raise ValueError(said("scenario.needs_fmu", kind=self.asset.kind))
-            check_same(self.truth.state, states, "truth.state", "state")
-        if self.truth.kind == "random_growth" and self.truth.gains:
-            raise ValueError("`truth.gains` belongs to the kind `scripted`, and the kind is `random_growth`")
-        for gain in self.truth.gains:
-            check_known(gain.state, states, "truth.gains.state", "state")
-        self._check_sensors()
-        self._check_modes()
-        for fault in self.truth.sensor_faults:
-            if fault.sensors != "all" and max(fault.sensors) > self.observation.count:
-                counts = self.observation.count, max(fault.sensors)
-                raise ValueError(said("scenario.faults", counts=counts))
-        return self
+            yield unknown(name, self.figure_names, "reference.figure", "figure of the summary")
+            yield referred.count(name) > 1, f"`reference` gives `{name}` more than once: keep one of them"
+        if truth.kind == "asset":
+            yield not asset.is_fmu, said("scenario.needs_fmu", kind=asset.kind)
+            yield incomplete(truth.state, states, "truth.state", "state")
+        yield grows and truth.gains, said("scenario.grown_gains")
+        for gain in truth.gains:
+            yield unknown(gain.state, states, "truth.gains.state", "state")
 
-    def _check_actions(self) -> None:
-        for action in self.action:
-            check_known(action.control, self.control_names, "action.control", "control")
-            for state in (*action.inspects, *action.repairs):
-                check_known(state, self.state_names, f"action.{action.name}", "state")
-            if action.repairs and self.truth.kind != "random_growth" and self.asset.kind != WATCHED_KIND:
-                raise ValueError(said("scenario.repairs", name=action.name, kind=self.truth.kind))
-        if self.readings and self.observation.modes is not None:
-            raise ValueError(said("scenario.modes_inspected"))
-        if self.planner.inspections_a_turn is not None and (self.learning or self.notice):
-            raise ValueError(said("scenario.inspections"))
-
-    def _check_modes(self) -> None:
-        modes, record = self.observation.modes, self.truth.record
-        if modes is None:
-            if record is not None:
-                raise ValueError("`truth.record` belongs to the role `modes` of `observation`")
-            return
-        for name in ("learning", "notice"):
-            if getattr(self, name) is not None:
-                raise ValueError(said("scenario.covariance", name=name))
-        if self.observation.average_over_draws == "inside":
-            raise ValueError("modes are averaged over the draws `outside`: leave out `average_over_draws`")
-        if self.asset.kind == WATCHED_KIND:
-            return
-        if record is None:
-            raise ValueError(said("scenario.record"))
-        check_known(
-            record.input, tuple(sorted(self.control[0].values)), "truth.record.input", "control input"
-        )
-        if modes.bands[-1][1] > 0.5 * record.sampling_rate:
-            rates = record.sampling_rate, 0.5 * record.sampling_rate, modes.bands[-1][1]
-            raise ValueError(said("scenario.sampling_rate", rates=rates))
-
-    def _check_sensors(self) -> None:
-        count, chosen = self.observation.count, self.rewards.health_sensors
-        if chosen != "all" and (max(chosen) > count or len(set(chosen)) != len(chosen)):
-            raise ValueError(said("scenario.health_sensors", count=count, chosen=short(chosen)))
+    def _faults_of_sensors(self) -> Iterator[Fault]:
+        observation, rewards, truth = self.observation, self.rewards, self.truth
+        count, chosen = observation.count, rewards.health_sensors
         limited = count if chosen == "all" else len(chosen)
-        check_one_or_each("rewards.health_limit", self.rewards.health_limit, limited)
-        check_one_or_each("rewards.error_scale", self.rewards.error_scale, count)
-        if self.learning is not None:
-            self.learning.check_sensors(count)
+        if chosen != "all":
+            wrong = max(chosen) > count or len({*chosen}) != limited
+            yield wrong, said("scenario.health_sensors", count=count, chosen=chosen)
+        yield one_or_each("rewards.health_limit", rewards.health_limit, limited)
+        yield one_or_each("rewards.error_scale", rewards.error_scale, count)
+        for key in ("gauge_gain", "gauge_offset"):
+            yield one_or_each(f"learning.{key}", getattr(self.learning, key, 0.0), count)
         for table in ("learning", "notice"):
-            if getattr(self, table) is not None and self.observation.average_over_draws == "inside":
-                raise ValueError(said("scenario.inside", table=table))
-        check_one_or_each("truth.noise.standard_deviation", self.truth.noise.standard_deviation, count)
-        for key, noise in (("observation", self.observation), ("truth.noise", self.truth.noise)):
-            self._check_strain_noise(f"{key}.standard_deviation", noise.standard_deviation)
+            inside = getattr(self, table) and observation.average_over_draws == "inside"
+            yield inside, said("scenario.inside", table=table)
+        shared = self.planner.inspections_a_turn is not None
+        yield shared and (self.learning or self.notice), said("scenario.inspections")
+        yield one_or_each("truth.noise.standard_deviation", truth.noise.standard_deviation, count)
+        # Noise in microstrain without its suffix; finer slips are seen when predictions are there.
+        for key, noise in (("observation", observation), ("truth.noise", truth.noise)):
+            each, units = np.broadcast_to(noise.standard_deviation, count), observation.sensor_units
+            given = max((own for own, unit in zip(each, units, strict=True) if unit == "1"), default=0.0)
+            absurd = observation.role == "strain" and given > LARGEST_STRAIN_NOISE
+            told = {"key": f"{key}.standard_deviation", "given": given, "most": LARGEST_STRAIN_NOISE}
+            yield absurd, said("scenario.strain_noise", **told)
+        for fault in truth.sensor_faults:
+            last = 0 if fault.sensors == "all" else max(fault.sensors)
+            yield last > count, said("scenario.faults", count=count, came=last)
 
-    def _check_strain_noise(self, key: str, deviation: float | tuple[float, ...]) -> None:
-        """Refuse noise in microstrain without its suffix; finer slips are seen when predictions are there."""
-        if self.observation.role != "strain":
+    def _faults_of_modes(self) -> Iterator[Fault]:
+        observation, record = self.observation, self.truth.record
+        if observation.modes is None:
+            yield record is not None, said("scenario.record_of_modes")
             return
-        units = self.observation.sensor_units
-        each = deviation if isinstance(deviation, tuple) else (deviation,) * len(units)
-        for unit, given in zip(units, each, strict=True):
-            if unit == "1" and given > LARGEST_STRAIN_NOISE:
-                most = LARGEST_STRAIN_NOISE
-                raise ValueError(said("scenario.strain_noise", key=key, given=given, most=most))
+        yield bool(self.readings), said("scenario.modes_inspected")
+        for name in ("learning", "notice"):
+            yield getattr(self, name) is not None, said("scenario.covariance", name=name)
+        yield observation.average_over_draws == "inside", said("scenario.modes_inside")
+        if self.asset.kind != WATCHED_KIND:
+            yield record is None, said("scenario.record")
+        if record is not None and self.asset.kind != WATCHED_KIND:
+            inputs, band = tuple(sorted(self.control[0].values)), observation.modes.bands[-1][1]
+            yield unknown(record.input, inputs, "truth.record.input", "control input")
+            rate = {"rate": record.sampling_rate, "highest": 0.5 * record.sampling_rate}
+            yield band > rate["highest"], said("scenario.sampling_rate", **rate, band=band)

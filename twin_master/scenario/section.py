@@ -1,7 +1,7 @@
 """A table of a scenario file: what all tables have in common, and the kinds of values that they hold."""
 
-from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Iterator, Mapping
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import InitErrorDetails, PydanticCustomError
@@ -59,10 +59,14 @@ def _check_percent(key: object, value: object) -> None:
             raise ValueError(f"`{key}` is in percent, at most 100, and {shown(item)} came")
 
 
-def check_one_or_each(key: str, value: object, count: int) -> None:
-    """Check that what may be given for each sensor is given once, or once for each of `count` of them."""
-    if isinstance(value, tuple) and len(value) != count:
-        raise ValueError(said("scenario.one_or_each", key=key, count=count, came=len(value)))
+Fault = tuple[object, str]
+"""Whether a table has it, and the sentence on it."""
+
+
+def one_or_each(key: str, value: object, count: int) -> Fault:
+    """Return the fault that what may be given for each sensor is given neither once nor `count` times."""
+    came = len(value) if isinstance(value, tuple) else count
+    return came != count, said("scenario.one_or_each", key=key, count=count, came=came)
 
 
 def _wrong_key(
@@ -111,6 +115,20 @@ class Section(BaseModel):
             converted[base] = _in_si(value, UNIT_DIVISOR[unit]) if unit else value
         return converted
 
+    def faults(self) -> Iterator[Fault]:
+        """Yield for each fault that it may have whether it has it, and the sentence on it.
+
+        A fault is looked for only in a table that has none of those before it.
+        """
+        yield from ()
+
+    @model_validator(mode="after")
+    def _refuse_faults(self) -> Self:
+        for found, sentence in self.faults():
+            if found:
+                raise ValueError(sentence)
+        return self
+
     @classmethod
     def split_unit(cls, key: str) -> tuple[str, str]:
         """Return the key without its unit, and the unit (empty without one)."""
@@ -132,14 +150,13 @@ def printed_state(unit: str, percent: str = "%") -> tuple[float, str]:
     return (100.0, percent) if unit == "1" else (1.0, unit)
 
 
-def check_known(name: str, names: tuple[str, ...], where: str, what: str) -> None:
-    """Check that a name is one of those there are."""
-    if name not in names:
-        raise ValueError(f"`{where}` must name a {what} ({short(names)}), and `{name}` came")
+def unknown(name: str, names: tuple[str, ...], where: str, what: str) -> Fault:
+    """Return the fault that a name is none of those there are."""
+    return name not in names, f"`{where}` must name a {what} ({short(names)}), and `{name}` came"
 
 
-def check_same(table: Mapping[str, object], names: tuple[str, ...], where: str, what: str) -> None:
-    """Check that a table has one entry for each name."""
-    if set(table) != set(names):
-        came = short(list(table)) or "none"
-        raise ValueError(f"`{where}` must have one entry for each {what} ({short(names)}), and has {came}")
+def incomplete(table: Mapping[str, object], names: tuple[str, ...], where: str, what: str) -> Fault:
+    """Return the fault that a table has not one entry for each name."""
+    came = short(list(table)) or "none"
+    told = f"`{where}` must have one entry for each {what} ({short(names)}), and has {came}"
+    return {*table} != {*names}, told

@@ -1,16 +1,17 @@
 """Tables of a scenario: how the state moves, the truth, actions, learning, notices, the watch."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field
 
 from scenarios import recording_files
 from twin_master.scenario.observation import RecordSection
 from twin_master.scenario.section import (
     Count,
+    Fault,
     Flag,
     Name,
     NotNegative,
@@ -20,8 +21,8 @@ from twin_master.scenario.section import (
     Probability,
     Section,
     Step,
-    check_one_or_each,
-    check_same,
+    incomplete,
+    one_or_each,
     short,
 )
 from twin_master.sentences import said
@@ -55,29 +56,23 @@ class Transition(Section):
     tables: dict[str, dict[str, tuple[tuple[Probability, ...], ...]]] = Field(default_factory=dict)
     """`independent_tables`: for each control and state a square table, rows from, columns to."""
 
-    def check(self, controls: tuple[str, ...], levels: Mapping[str, int]) -> None:
-        """Check that there is what it takes for each control and state with its number of levels."""
-        states = tuple(levels)
-        if self.kind == "independent_worsening":
-            if self.tables:
-                raise ValueError("`transition.tables` belongs to the kind `independent_tables`")
-            check_same(self.probability, controls, "transition.probability", "control")
-            for name, entry in self.probability.items():
-                if isinstance(entry, dict):
-                    check_same(entry, states, f"transition.probability.{name}", "state")
-            return
-        if self.probability:
-            raise ValueError("`transition.probability` belongs to the kind `independent_worsening`")
-        check_same(self.tables, controls, "transition.tables", "control")
-        for name, tables in self.tables.items():
-            check_same(tables, states, f"transition.tables.{name}", "state")
-            for state, size in levels.items():
-                table = tables[state]
-                if len(table) != size or any(len(row) != size for row in table):
-                    raise ValueError(said("scenario.table_size", name=name, state=state, size=size))
-                worst = max(abs(sum(row) - 1.0) for row in table)
-                if worst > ROW_SUM_TOLERANCE:
-                    raise ValueError(said("scenario.table_sum", name=name, state=state, worst=worst))
+    def faults_among(self, controls: tuple[str, ...], levels: Mapping[str, int]) -> Iterator[Fault]:
+        """Yield what is missing or too much for the controls, and states with their numbers of levels."""
+        worsening = self.kind == "independent_worsening"
+        key, other, kind = "probability", "tables", "independent_tables"
+        if not worsening:
+            key, other, kind = other, key, "independent_worsening"
+        yield getattr(self, other), f"`transition.{other}` belongs to the kind `{kind}`"
+        given: dict[str, Any] = getattr(self, key)
+        yield incomplete(given, controls, f"transition.{key}", "control")
+        for name, entry in given.items():
+            if isinstance(entry, dict):
+                yield incomplete(entry, tuple(levels), f"transition.{key}.{name}", "state")
+            for state, size in () if worsening else levels.items():
+                told, wide = {"name": name, "state": state}, {size} != {len(row) for row in entry[state]}
+                yield wide or len(entry[state]) != size, said("scenario.table_size", **told, size=size)
+                worst = max(abs(sum(row) - 1.0) for row in entry[state])
+                yield worst > ROW_SUM_TOLERANCE, said("scenario.table_sum", **told, worst=worst)
 
 
 class Span(Section):
@@ -86,11 +81,10 @@ class Span(Section):
     first_step: Step
     last_step: Step | None = None
 
-    @model_validator(mode="after")
-    def _check_steps(self) -> Self:
-        if self.last_step is not None and self.last_step < self.first_step:
-            raise ValueError(f"`last_step` {self.last_step} lies before `first_step` {self.first_step}")
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield an end before the beginning."""
+        before = self.last_step is not None and self.last_step < self.first_step
+        yield before, f"`last_step` {self.last_step} lies before `first_step` {self.first_step}"
 
 
 class Gain(Span):
@@ -117,11 +111,11 @@ class SensorFault(Span):
     sensors: Literal["all"] | Annotated[tuple[Count, ...], Field(min_length=1)]
     rate: Number | None = None
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if (self.kind == "drift") != (self.rate is not None):
-            raise ValueError("a drift needs `rate_microstrain_per_step`, and a dropout has none")
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield what a span has, and a rate that the kind has not."""
+        yield from super().faults()
+        drifts = self.kind == "drift"
+        yield drifts != (self.rate is not None), said("scenario.rate")
 
 
 class TruthSection(Section):
@@ -146,20 +140,16 @@ class TruthSection(Section):
     record: RecordSection | None = None
     """Where modes are observed: the record of each turn."""
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield keys that do not go together."""
+        faults, inside = self.sensor_faults or self.noise.standard_deviation, self.kind == "asset"
         if self.record is not None:
-            if self.kind == "asset" or self.sensor_faults or self.noise.standard_deviation:
-                raise ValueError(said("scenario.record_noise"))
-            return self
-        if self.kind == "asset":
-            if self.gains or self.sensor_faults or self.noise.standard_deviation:
-                raise ValueError(said("scenario.asset_truth"))
-        elif self.state or self.observation or self.received:
-            raise ValueError("`state`, `observation` and `received` of `truth` belong to the kind `asset`")
-        elif "noise" not in self.model_fields_set:
-            raise ValueError("`truth.noise` is missing")
-        return self
+            yield inside or faults, said("scenario.record_noise")
+        elif inside:
+            yield self.gains or faults, said("scenario.asset_truth")
+        else:
+            yield self.state or self.observation or self.received, said("scenario.told_truth")
+            yield "noise" not in self.model_fields_set, "`truth.noise` is missing"
 
 
 class Action(Section):
@@ -183,14 +173,13 @@ class Action(Section):
     ends: Flag = False
     """Whether the mission ends with that turn."""
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if bool(self.inspects) != (self.standard_deviation is not None):
-            raise ValueError(said("scenario.inspects", name=self.name))
-        check_one_or_each("action.standard_deviation", self.standard_deviation, len(self.inspects))
-        if not (self.inspects or self.repairs or self.ends):
-            raise ValueError(said("scenario.idle_action", name=self.name))
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield what is not given together, and that it does nothing."""
+        alone = bool(self.inspects) != (self.standard_deviation is not None)
+        yield alone, said("scenario.inspects", name=self.name)
+        yield one_or_each("action.standard_deviation", self.standard_deviation, len(self.inspects))
+        idle = not (self.inspects or self.repairs or self.ends)
+        yield idle, said("scenario.idle_action", name=self.name)
 
     @property
     def readings(self) -> tuple[tuple[str, str, float], ...]:
@@ -220,13 +209,12 @@ class Planner(Section):
     inspections_a_turn: Count | None = None
     """`belief` and `qmdp`: turns with an inspection that assets which fly side by side have among them."""
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if self.limit_probability is not None and self.policy != "belief":
-            raise ValueError("`planner.limit_probability` needs `planner.policy` `belief`")
-        if self.inspections_a_turn is not None and self.policy == "mode":
-            raise ValueError("`planner.inspections_a_turn` needs `planner.policy` `belief` or `qmdp`")
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield keys of another policy."""
+        limited = self.limit_probability is not None and self.policy != "belief"
+        yield limited, "`planner.limit_probability` needs `planner.policy` `belief`"
+        shared = self.inspections_a_turn is not None and self.policy == "mode"
+        yield shared, "`planner.inspections_a_turn` needs `planner.policy` `belief` or `qmdp`"
 
 
 def with_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -275,33 +263,21 @@ class Learning(Section):
     transition_factors: tuple[Positive, ...] = ()
     """Factors on the probabilities to leave a state, equally probable at first; none is not learnt."""
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        factors = self.transition_factors
-        if any(b <= a for a, b in pairwise(factors)):
-            raise ValueError(f"`learning.transition_factors` must increase, and {short(factors)} came")
-        if len(factors) == 1:
-            raise ValueError("`learning.transition_factors` needs two or more factors to choose from")
-        return self
+    def faults(self) -> Iterator[Fault]:
+        """Yield factors that do not increase, or are no choice."""
+        key, factors = "`learning.transition_factors`", self.transition_factors
+        yield any(b <= a for a, b in pairwise(factors)), f"{key} must increase, and {short(factors)} came"
+        yield len(factors) == 1, f"{key} needs two or more factors to choose from"
 
     @property
-    def figure_names(self) -> tuple[str, ...]:
-        """Names of the figures of the summary on what is learnt beside the parameter."""
-        names = [f"transition_factor_{moment}" for moment in ("mean", "standard_deviation")]
-        names = names if self.transition_factors else []
-        for name, learnt in (
-            ("noise_scale", self.noise),
-            ("gauge_offset", _any(self.gauge_offset)),
-            ("gauge_gain", _any(self.gauge_gain)),
-        ):
-            if learnt:
-                names += [f"{name}_{figure}" for figure in ("mean", "most", "most_standard_deviation")]
-        return tuple(names)
-
-    def check_sensors(self, count: int) -> None:
-        """Check that what is given for each sensor is given once, or once for each of `count`."""
-        check_one_or_each("learning.gauge_gain", self.gauge_gain, count)
-        check_one_or_each("learning.gauge_offset", self.gauge_offset, count)
+    def figures(self) -> list[tuple[str, object, list[dict[str, str]]]]:
+        """Groups of figures on what is learnt beside the parameter, whether it is, and their words."""
+        return [
+            ("learnt", self.transition_factors, [{"quantity": "transition_factor"}]),
+            ("learnt_of_sensors", self.noise, [{"quantity": "noise_scale"}]),
+            ("learnt_of_sensors", _any(self.gauge_offset), [{"quantity": "gauge_offset"}]),
+            ("learnt_of_sensors", _any(self.gauge_gain), [{"quantity": "gauge_gain"}]),
+        ]
 
 
 def _any(value: float | tuple[float, ...]) -> bool:

@@ -28,6 +28,15 @@ SCHEMA: dict[str, dict[str, list[str]]] = tomllib.loads(
 """Axes, unit and meaning of every variable of `run.nc`, by its group; and what is learnt, see `titles_of`."""
 
 
+def paths_of(role: str) -> list[str]:
+    """Return the variables that every run has, such as "filtered/mean"."""
+    found = [f"observed/{role}"]
+    for group in ("observed", "filtered", "smoothed", "predicted", "policy", "calibration"):
+        belief = SCHEMA["belief"] if group in ("filtered", "smoothed", "predicted") else {}
+        found += [f"{group}/{name}" for name in belief | SCHEMA[group] if "{" not in name]
+    return found
+
+
 def titles_of(name: str) -> list[str]:
     """Return what a learnt quantity is called: in `run.nc`, as a heading, and in short."""
     title = parameter_title(name)
@@ -78,28 +87,19 @@ def _learnt(result: "MissionResult", prior: Mapping[str, Learnt]) -> tuple[Learn
     """Return what was learnt; names are as the estimator gives them, such as `noise_scale[3]` of sensor 3."""
     scenario, names, values = result.scenario, result.flight.learnt_names, result.flight.learnt
     units = {scenario.calibration.parameter: result.parameter_unit, "gauge_offset": result.observation_unit}
-    parts: dict[str, list[tuple[int | None, int]]] = {}
-    for place, name in enumerate(names):
-        match = _OF_A_SENSOR.fullmatch(name)
-        base, sensor = (name, None) if match is None else (match[1], int(match[2]) - 1)
-        parts.setdefault(base, []).append((sensor, place))
+    parts: dict[str, Float] = {}  # the prior and then the course of each: (1 + T, 4), or (1 + T, G, 4)
+    for name, course in zip(names, values.swapaxes(0, 1), strict=True):
+        figures, match = np.vstack((prior[name].figures, course)), _OF_A_SENSOR.fullmatch(name)
+        if match is None:
+            parts[name] = figures
+            continue
+        if match[1] not in parts:
+            parts[match[1]] = np.full((len(figures), scenario.observation.count, 4), np.nan)
+        parts[match[1]][:, int(match[2]) - 1] = figures
     found = []
-    for name, places in parts.items():
-        before = np.array([prior[names[place]].figures for _, place in places])
-        course = values[:, [place for _, place in places]]
-        if places[0][0] is None:
-            course, before = course[:, 0], before[0]
-        else:
-            sensors, count = (
-                [sensor for sensor, _ in places if sensor is not None],
-                scenario.observation.count,
-            )
-            whole, first = np.full((len(values), count, 4), np.nan), np.full((count, 4), np.nan)
-            whole[:, sensors], first[sensors] = course, before
-            course, before = whole, first
-        truth = None if result.truth is None else _truth(scenario, name)
-        title = titles_of(name)[0]
-        found.append(LearntQuantity(name, title, units.get(name, "1"), course, before, truth))
+    for name, figures in parts.items():
+        truth, unit = None if result.truth is None else _truth(scenario, name), units.get(name, "1")
+        found.append(LearntQuantity(name, titles_of(name)[0], unit, figures[1:], figures[0], truth))
     return tuple(found)
 
 

@@ -91,7 +91,7 @@ class _Groups:
     def _variables(
         self, group: str, entries: Iterable[Entry], words: Mapping[str, str]
     ) -> Iterator[tuple[str, Variable]]:
-        known = SCHEMA["belief"] | SCHEMA[group] if "given" in words else SCHEMA[group]
+        known = SCHEMA["belief"] | SCHEMA["noise"] | SCHEMA[group] if "given" in words else SCHEMA[group]
         for name, values, own in entries:
             told = {**self._words, **words, **own}
             axes, unit, text = (part.format(**told) for part in known[name])

@@ -1,7 +1,7 @@
 """The figures of a mission, each beside the one that the scenario gives as its reference."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,19 +10,16 @@ from numpy.typing import NDArray
 from reporting.arrays import Float, Index
 from reporting.words import parameter_title
 from twin_master.network.graphical_model import GraphicalModel, StateSpace
-from twin_master.scenario.schema import (
-    FALLBACK_FIGURES,
-    MISFIT_FIGURES,
-    NOTICE_FIGURES,
-    REWARD_NAMES,
-    Scenario,
-)
+from twin_master.scenario.schema import FIGURES, REWARD_NAMES, Scenario
 from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import MissionResult, printed_learnt, titles_of
 
 _TOLERANCE = 1e-9
 _CHANGES_SAID = 3
 
+Words = Mapping[str, object]
+Told = tuple[str, Words, Sequence[float | int | str | None]]
+"""A group of figures, what stands in its braces, and the values."""
 TRUTH_IS_OFF = 3.0
 """Standard deviations beyond which the asset flown is not the one that was calibrated."""
 
@@ -153,97 +150,73 @@ def summarise(result: MissionResult, reward_mean: Float, misfit: Float | None = 
         Of the twin's model, (S, U, G), a share of what the asset shows, NaN where it shows nothing; where the
         asset is known to be another one.
     """
-    scenario, flight = result.scenario, result.flight
-    step = scenario.mission.step_name
-    figures = _scored(result) if flight.simulated else _watched(result)
+    flight, step = result.flight, {"step": result.scenario.mission.step_name}
+    told = [*(_scored(result) if flight.simulated else _watched(result))]
     for name, rewards in zip(REWARD_NAMES, reward_mean.T, strict=True):
         known = rewards[np.isfinite(rewards)]
-        mean = float(known.mean()) if len(known) else None
-        figures.append(Figure(f"mean_reward_{name}", f"mean reward for {name}", mean))
-    figures += _parameter_figures(result)
-    evidence = float(flight.log_evidence.sum())
-    figures.append(Figure("log_evidence", "log evidence of all observations", evidence))
-    figures += _learnt_figures(result)
-    figures += _sensor_figures(flight.observed, step)
+        told.append(("reward", {"reward": name}, [float(known.mean()) if len(known) else None]))
+    told += _of_the_parameter(result)
+    told.append(("evidence", {}, [float(flight.log_evidence.sum())]))
+    told += _learnt(result)
+    received = np.isfinite(flight.observed)
+    if not received.all():
+        told.append(("lost", {}, [100.0 * float(1.0 - received.mean())]))
+        if blind := np.flatnonzero(~received.any(axis=1)).tolist():
+            told.append(("blind", step, [", ".join(map(str, blind))]))
     if misfit is not None:
         worst = np.nanmax(np.abs(misfit), axis=(0, 1))
-        sensor = int(np.nanargmax(worst))
-        told_rms = (
-            "misfit of the twin's model, rms over sensors and states",
-            float(np.sqrt(np.nanmean(misfit**2))),
-        )
-        shares = told_rms, (f"largest misfit, at sensor {sensor + 1}", float(worst[sensor]))
-        for key, (title, share) in zip(MISFIT_FIGURES, shares, strict=True):
-            figures.append(Figure(key, title, 100.0 * share, "%"))
+        sensor, rms = int(np.nanargmax(worst)), float(np.sqrt(np.nanmean(misfit**2)))
+        told.append(("misfit", {"sensor": sensor + 1}, [100.0 * rms, 100.0 * float(worst[sensor])]))
     bound = flight.monitors.get("strain_error_bound")
-    if bound is not None and set(scenario.observation.sensor_units) == {"1"}:
-        worst = 1e6 * float(bound.max())
-        figures.append(Figure("strain_error_bound", "worst certified strain error", worst, "microstrain"))
+    if bound is not None and {*result.scenario.observation.sensor_units} == {"1"}:
+        told.append(("bound", {}, [1e6 * float(bound.max())]))
     if flight.suspicion:
         last = flight.suspicion[-1]
         first = next((turn for turn, notice in flight.notices if notice.kind == "alarm"), None)
-        told: tuple[tuple[str, float | str | None], ...] = (
-            (f"{step} of the first alarm", first),
-            ("probability that no state explains the sensors", last.none_of_these),
-            ("probability that a single sensor is off", last.gauge_off),
-            ("the last control is decided by", last.decided_by),
-        )
-        figures += [Figure(key, *one) for key, one in zip(NOTICE_FIGURES, told, strict=True)]
-    references = {entry.figure: entry for entry in scenario.reference}
-    return tuple(
-        replace(figure, reference=found.value, reference_source=found.source)
-        if (found := references.get(figure.key))
-        else figure
-        for figure in figures
-    )
+        told.append(("notice", step, [first, last.none_of_these, last.gauge_off, last.decided_by]))
+    return tuple(_figures(result.scenario, told))
 
 
-def _parameter_figures(result: MissionResult) -> list[Figure]:
-    """Return what is known of the calibrated parameter before the flight, and after it where it is learnt."""
+def _figures(scenario: Scenario, told: Iterable[Told]) -> Iterator[Figure]:
+    """Yield the figures of groups beside what the scenario gives as their references."""
+    references = {entry.figure: (entry.value, entry.source) for entry in scenario.reference}
+    for group, words, values in told:
+        for (key, (title, unit)), value in zip(FIGURES[group].items(), values, strict=True):
+            name = key.format(**words)
+            reference = references.get(name, ())
+            yield Figure(name, title.format(**words), value, unit.format(**words), *reference)
+
+
+def _of_the_parameter(result: MissionResult) -> Iterator[Told]:
+    """Yield what is known of the calibrated parameter before the flight, and after it where it is learnt."""
     draws = result.knowledge.draws
-    name, label = draws.name, parameter_title(draws.name)
-    before = {"mean": draws.mean, "standard_deviation": draws.standard_deviation}
-    own = next((quantity for quantity in result.learnt if quantity.name == name), None)
+    label, before = parameter_title(draws.name), [draws.mean, draws.standard_deviation]
+    words = {"parameter": draws.name, "label": label}
+    own = next((quantity for quantity in result.learnt if quantity.name == draws.name), None)
     if own is None:
         measured = result.scenario.calibration.source in ("static_test", "file")
-        whose, of = "posterior " if measured else "", label if " " not in label else f"the {label}"
-        return [
-            Figure(f"{name}_{moment}", f"{whose}{moment.replace('_', ' ')} of {of}", value)
-            for moment, value in before.items()
-        ]
-    after = dict(zip(before, own.course[-1, :2].tolist(), strict=True))
-    figures = [
-        Figure(f"{name}_{key}{moment}", f"{label} {when}, {moment.replace('_', ' ')}", value)
-        for key, when, moments in (("", "learnt", after), ("prior_", "before the first turn", before))
-        for moment, value in moments.items()
-    ]
+        words |= {"whose": "posterior " * measured, "of": f"the {label}" if " " in label else label}
+        yield "parameter", words, before
+        return
+    yield "parameter_learnt", words, [*own.course[-1, :2].tolist(), *before]
     if own.truth is not None:
-        figures.append(Figure(f"{name}_true", f"{label}, true", float(own.truth)))
-    return figures
+        yield "parameter_true", words, [float(own.truth)]
 
 
-def _learnt_figures(result: MissionResult) -> list[Figure]:
-    """Return what was learnt beside the parameter; the sensor that departs most stands for all of them."""
-    figures = []
-    sensor_word = "gauge" if result.scenario.observation.role == "strain" else "sensor"
+def _learnt(result: MissionResult) -> Iterator[Told]:
+    """Yield what was learnt beside the parameter; the sensor that departs most stands for all of them."""
+    sensor = "gauge" if result.scenario.observation.role == "strain" else "sensor"
     for quantity in result.learnt:
-        if quantity.name == result.scenario.calibration.parameter:
-            continue
         factor, unit = printed_learnt(quantity.name, quantity.unit)
-        word, last = f"{titles_of(quantity.name)[2]} learnt", factor * quantity.course[-1]
+        last, title = factor * quantity.course[-1], titles_of(quantity.name)[2]
+        words = {"quantity": quantity.name, "title": title, "unit": unit, "sensor": sensor}
         if quantity.of_sensors:
             departure = np.abs(last[:, 0] - factor * quantity.prior[:, 0]) / last[:, 1]
             most = int(np.nanargmax(departure))
-            mean = f"{word}, mean of the {sensor_word}s"
-            figures.append(Figure(f"{quantity.name}_mean", mean, float(np.nanmean(last[:, 0])), unit))
-            key, of, shown = f"{quantity.name}_most", f"{sensor_word} {most + 1}", last[most]
-            figures.append(Figure(key, f"{word}, {of} (departs most)", float(shown[0]), unit))
-        else:
-            key, of, shown = quantity.name, "", last
-            figures.append(Figure(f"{key}_mean", f"{word}, mean", float(shown[0]), unit))
-        deviation = ", ".join(part for part in (word, of, "standard deviation") if part)
-        figures.append(Figure(f"{key}_standard_deviation", deviation, float(shown[1]), unit))
-    return figures
+            values = [float(np.nanmean(last[:, 0])), *last[most, :2].tolist()]
+            yield "learnt_of_sensors", words | {"most": f"{most + 1}"}, values
+        elif quantity.name != result.scenario.calibration.parameter:
+            yield "learnt", words, last[:2].tolist()
 
 
 def noticed(result: MissionResult) -> dict[str, Any]:
@@ -253,34 +226,26 @@ def noticed(result: MissionResult) -> dict[str, Any]:
     return {"notices": [{"turn": turn} | notice.as_record() for turn, notice in result.flight.notices]}
 
 
-def _scored(result: MissionResult) -> list[Figure]:
-    """Return the figures that need the truth: how the control fell back, and errors of the estimate."""
+def _scored(result: MissionResult) -> Iterator[Told]:
+    """Yield the figures that need the truth: how the control fell back, and errors of the estimate."""
     scenario, flight, known = result.scenario, result.flight, result.knowledge
-    first, step = scenario.control_names.index(scenario.mission.first_control), scenario.mission.step_name
-    policy, states = known.plan.control_index, known.model.states
-    figures = _fallback_figures(
-        find_fallback(states, policy, first, flight.control_index, flight.state), scenario, step
+    first, policy = scenario.control_names.index(scenario.mission.first_control), known.plan.control_index
+    yield of_fallback(
+        find_fallback(known.model.states, policy, first, flight.control_index, flight.state), scenario
     )
     errors = filtered_rms_error(known.model, flight.filtered, flight.state)
     for factor, error in zip(scenario.state, errors.tolist(), strict=True):
         scale, unit = printed_state(factor.unit, "points")
-        key, title = f"filtered_rms_error_{factor.name}", f"filtered rms error of {factor.name}"
-        figures.append(Figure(key, title, scale * error, unit))
-    return figures
+        yield "error", {"state": factor.name, "unit": unit}, [scale * error]
 
 
-def _watched(result: MissionResult) -> list[Figure]:
-    """Return the figures of a watched asset: what is believed of it now."""
+def _watched(result: MissionResult) -> Iterator[Told]:
+    """Yield the figures of a watched asset: what is believed of it now."""
     states, belief = result.knowledge.model.states, result.flight.filtered[-1]
-    moments = {"mean": states.mean(belief), "standard_deviation": states.standard_deviation(belief)}
-    figures = []
-    for index, factor in enumerate(result.scenario.state):
+    moments = np.transpose((states.mean(belief), states.standard_deviation(belief)))
+    for factor, values in zip(result.scenario.state, moments, strict=True):
         scale, unit = printed_state(factor.unit)
-        for moment, values in moments.items():
-            title = f"last {moment.replace('_', ' ')} of {factor.name}"
-            key = f"last_{moment}_{factor.name}"
-            figures.append(Figure(key, title, scale * float(values[index]), unit))
-    return figures
+        yield "last", {"state": factor.name, "unit": unit}, (scale * values).tolist()
 
 
 def control_changes(
@@ -311,34 +276,18 @@ def control_changes(
     return ", ".join(changes) + (f", and {more} more change{'s' if more > 1 else ''}" if more else "")
 
 
-def _fallback_figures(fallback: Fallback, scenario: Scenario, step: str) -> list[Figure]:
-    name, level = fallback.switch_state, fallback.switch_level
+def of_fallback(fallback: Fallback, scenario: Scenario) -> Told:
+    """Return the figures that say how the control fell back."""
+    name, level, delay = fallback.switch_state, fallback.switch_level, fallback.delay
     if name is None or level is None:
-        title = "policy leaves the first control"
-        return [Figure(FALLBACK_FIGURES[0], title, "nowhere, or by several states")]
+        return "nowhere", {}, ["nowhere, or by several states"]
     scale, unit = printed_state(scenario.state[scenario.state_names.index(name)].unit)
-    if fallback.early_step is not None and fallback.delay == 0:  # in force since before the damage
-        fallback = replace(fallback, fallback_step=None)
-    delay = fallback.delay
-    told: tuple[tuple[str, float | None, str], ...] = (
-        (f"policy leaves the first control from {name}", scale * level, unit),
-        (f"{step} of the damage that calls for it", fallback.called_for_step, ""),
-        (f"{step} of the fallback", fallback.fallback_step, ""),
-        ("delay of the fallback", delay, step if delay == 1 else f"{step}s"),
-        (f"{step} of a fallback before the damage", fallback.early_step, ""),
-    )
-    return [Figure(key, *one) for key, one in zip(FALLBACK_FIGURES, told, strict=True)]
-
-
-def _sensor_figures(observed: Float, step_name: str) -> list[Figure]:
-    received = np.isfinite(observed)
-    if received.all():
-        return []
-    figures = [Figure("lost_observations", "observations lost", 100.0 * float(1.0 - received.mean()), "%")]
-    if blind := np.flatnonzero(~received.any(axis=1)).tolist():
-        title = f"{step_name}s without any observation (belief follows the dynamics)"
-        figures.append(Figure("blind_steps", title, ", ".join(map(str, blind))))
-    return figures
+    fell = fallback.fallback_step
+    if fallback.early_step is not None and delay == 0:  # in force since before the damage
+        fell = delay = None
+    step = scenario.mission.step_name
+    words = {"state": name, "unit": unit, "step": step, "steps": step if delay == 1 else f"{step}s"}
+    return "fallback", words, [scale * level, fallback.called_for_step, fell, delay, fallback.early_step]
 
 
 def another_truth(parameter: str, truth: float, mean: float, deviation: float) -> str | None:

@@ -18,6 +18,7 @@ from reporting.provenance import hash_record
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.errors import NotResumableError, RunFolderError
 from twin_master.run_folder import FIELD_NAME, read_config, to_json
+from twin_master.sentences import said
 from twin_master.store.mission_result import MissionResult, learnt_record
 from twin_master.store.results import groups_of, tables_of
 from twin_master.store.summary import Figure, control_changes, noticed, summarise
@@ -65,9 +66,7 @@ def open_run(folder: Path | str) -> "DataTree":
     restore_folder(Path(folder))
     path = Path(folder) / RUN_NAME
     if not path.is_file():
-        raise RunFolderError(
-            f"{folder} holds no run.nc, so there is no run to report: fly or resume the run first."
-        )
+        raise RunFolderError(said("run_folder.no_run", folder=folder))
     try:
         return read_groups(path)
     except DamagedFileError as error:

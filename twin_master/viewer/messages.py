@@ -6,9 +6,8 @@ One that was away, or is slow, asks for more at once, and nothing is kept for it
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,16 +18,9 @@ from pydantic import BaseModel
 from reporting.arrays import Float
 from reporting.errors import ReportingError
 from twin_master.errors import TwinMasterError
-from twin_master.mission.preparation import Knowledge
-from twin_master.report.structure import Planform, design_of, planform_of
-from twin_master.report.view import (
-    NORMAL_95,
-    PrintedFactor,
-    PrintedSensors,
-    printed_factors,
-    printed_sensors,
-)
-from twin_master.scenario.schema import REWARD_NAMES, Scenario
+from twin_master.report.structure import design_of, planform_of
+from twin_master.report.view import NORMAL_95, printed_factors, printed_sensors
+from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.viewer.flight import Belief, Flight, Record
 
 WINDOW = 240
@@ -37,69 +29,6 @@ LATEST = -1
 """Asked for in the place of a turn: the last one, whichever it is."""
 TALLEST_BAR = 0.82
 """Height of a probability of one, where a control has a row of height one."""
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What the page is made of.
-
-    Attributes
-    ----------
-    scenario : Scenario
-        What is flown.
-    factors : tuple of PrintedFactor
-        Of the state.
-    sensors : PrintedSensors
-        Where they have several units, as deviations from what is expected, in standard deviations of that.
-    standardised : bool
-        Whether they are.
-    ends : (lowest, highest)
-        What they can show without noise, printed.
-    planform : Planform or None
-        None for an asset that is no wing of this project.
-    """
-
-    scenario: Scenario
-    factors: tuple[PrintedFactor, ...]
-    sensors: PrintedSensors
-    standardised: bool
-    ends: tuple[float, float]
-    planform: Planform | None
-
-
-def scene_of(folder: Path, knowledge: Knowledge) -> Scene:
-    """Return what stays the same during the flight in a run folder."""
-    scenario, sensors = knowledge.scenario, printed_sensors(knowledge.scenario)
-    shown, several = sensors.scale * knowledge.sensor_model.mean, not sensors.unit
-    ends = (-NORMAL_95, NORMAL_95) if several else (float(shown.min()), float(shown.max()))
-    if several:
-        units = ("standard deviations",) * len(sensors.titles)
-        sensors = replace(sensors, quantity="deviation", units=units, scale=1.0)
-    planform = planform_of(design_of(folder), scenario)
-    return Scene(scenario, printed_factors(scenario), sensors, several, ends, planform)
-
-
-def page_html(scene: Scene) -> str:
-    """Return the page; its script draws the figures from what it is told."""
-    mission, planform = scene.scenario.mission, None
-    if scene.planform is not None:
-        outline, regions, gauges = scene.planform
-        planform = {"outline": outline.tolist(), "gauges": gauges.tolist()}
-        planform["regions"] = [region.tolist() for region in regions]
-    lowest, highest = scene.ends
-    sensors = {"unit": scene.sensors.unit, "lowest": lowest, "highest": highest}
-    record = {
-        "title": mission.title or mission.name, "step_name": mission.step_name,
-        "horizon": mission.prediction_steps, "factors": [asdict(factor) for factor in scene.factors],
-        "controls": scene.scenario.control_names, "rewards": REWARD_NAMES,
-        "sensors": asdict(scene.sensors) | sensors, "planform": planform,
-        "window": WINDOW, "latest": LATEST, "tallest_bar": TALLEST_BAR,
-    }  # fmt: skip
-    # Inside a script element only the beginning of a tag could end it.
-    content = json.dumps(record, allow_nan=False).replace("<", "\\u003c")
-    template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
-    page: str = Template(template, autoescape=True).render(scene=record, content=Markup(content))
-    return page
 
 
 class Request(BaseModel, frozen=True, extra="forbid", strict=True):
@@ -135,18 +64,49 @@ Tell = Callable[[str], None]
 class Teller:
     """Answers of one flight, for any number of viewers.
 
+    Sensors of several units are shown as deviations from what is expected, in standard deviations of that.
+
     Parameters
     ----------
     flight : Flight
         What is watched.
-    scene : Scene
-        Printed units.
     """
 
-    def __init__(self, flight: Flight, scene: Scene) -> None:
-        self._flight, self._scene = flight, scene
+    def __init__(self, flight: Flight) -> None:
+        self._flight, self._factors = flight, printed_factors(flight.scenario)
+        self._scales = np.array([factor.scale for factor in self._factors])
+        sensors = printed_sensors(flight.scenario)
+        self._standardised = not sensors.unit
+        if self._standardised:
+            units = ("standard deviations",) * len(sensors.titles)
+            sensors = replace(sensors, quantity="deviation", units=units, scale=1.0)
+        self._sensors = sensors
         self._waiting: dict[Tell, Request] = {}
         self._fault = ""
+
+    def page(self) -> str:
+        """Return the page; its script draws the figures from what it is told."""
+        flight, planform, sensors = self._flight, None, self._sensors
+        if (wing := planform_of(design_of(flight.folder), flight.scenario)) is not None:
+            regions = [region.tolist() for region in wing.regions]
+            planform = {"outline": wing.outline.tolist(), "regions": regions, "gauges": wing.gauges.tolist()}
+        shown = sensors.scale * flight.knowledge.sensor_model.mean  # without noise
+        lowest, highest = (
+            (-NORMAL_95, NORMAL_95) if self._standardised else (float(shown.min()), float(shown.max()))
+        )
+        mission = flight.scenario.mission
+        record = {
+            "title": mission.title or mission.name, "step_name": mission.step_name,
+            "horizon": mission.prediction_steps, "factors": [asdict(factor) for factor in self._factors],
+            "controls": flight.scenario.control_names, "rewards": REWARD_NAMES,
+            "sensors": asdict(sensors) | {"unit": sensors.unit, "lowest": lowest, "highest": highest},
+            "planform": planform, "window": WINDOW, "latest": LATEST, "tallest_bar": TALLEST_BAR,
+        }  # fmt: skip
+        # Inside a script element only the beginning of a tag could end it.
+        content = json.dumps(record, allow_nan=False).replace("<", "\\u003c")
+        template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
+        page: str = Template(template, autoescape=True).render(scene=record, content=Markup(content))
+        return page
 
     def ask(self, tell: Tell, request: Request) -> None:
         """Answer a viewer now or as soon as there is something new; a newer request replaces an older one."""
@@ -216,30 +176,28 @@ class Teller:
 
     def _past(self, seen: Sequence[Record]) -> dict[str, Any]:
         flight, folder = self._flight, f" {self._flight.folder}"
-        scales = np.array([factor.scale for factor in self._scene.factors])
         return self._printed(flight.believed(seen), flight.observed(seen)) | {
             "control": [turn["control_index"] for turn in seen],
             "notices": [
                 [notice["sentence"].replace(" DIR", folder) for notice in turn["notices"]] for turn in seen
             ],
             "learnt": [turn.get("learnt", {}) for turn in seen],
-            "truth": _plain(scales * flight.truth(seen)),
+            "truth": _plain(self._scales * flight.truth(seen)),
         }
 
     def _printed(self, belief: Belief, observed: Float | None) -> dict[str, Any]:
         """Return lists, a row for each turn, in printed units; None stands for what there is not."""
-        scene = self._scene
-        scales = np.array([factor.scale for factor in scene.factors])
-        levels = np.array([(factor.levels[0], factor.levels[-1]) for factor in scene.factors]).T
+        scales = self._scales
+        levels = np.array([(factor.levels[0], factor.levels[-1]) for factor in self._factors]).T
         states, expected = self._flight.knowledge.model.states, belief.expected
         mean = scales * states.mean(belief.probability)
         reach = 2.0 * scales * states.standard_deviation(belief.probability)
         reward, reward_reach = expected.reward_mean, NORMAL_95 * expected.reward_standard_deviation
         center, spread = expected.mean, np.hypot(expected.standard_deviation, expected.noise)
-        if scene.standardised:
+        if self._standardised:
             observed = None if observed is None else (observed - center) / spread
             center, spread = np.zeros_like(center), np.ones_like(spread)
-        scale, sensor_reach = scene.sensors.scale, NORMAL_95 * spread
+        scale, sensor_reach = self._sensors.scale, NORMAL_95 * spread
         record = {
             "state": mean,
             "state_lower": np.clip(mean - reach, *levels),

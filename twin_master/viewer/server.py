@@ -17,7 +17,7 @@ from reporting.page import script_source
 from twin_master.errors import ViewError
 from twin_master.sentences import said
 from twin_master.viewer.flight import Flight
-from twin_master.viewer.messages import Request, Teller, page_html, scene_of
+from twin_master.viewer.messages import Request, Teller
 
 ADDRESS = "127.0.0.1"
 POLL_MILLISECONDS = 15.0
@@ -87,8 +87,8 @@ def text_of(package: str, name: str) -> Callable[[], str]:
 
 
 async def _serve(flight: Flight, port: int, ready: Callable[[str], None], wanted: Callable[[], bool]) -> None:
-    scene = scene_of(flight.folder, flight.knowledge)
-    page, teller = page_html(scene), Teller(flight, scene)
+    teller = Teller(flight)
+    page = teller.page()
 
     def picture(number: str) -> str:
         return flight.pictures[int(number)].drawing.read_text(encoding="utf-8")

@@ -14,7 +14,7 @@ from discrepancy.fits.gates import ABSOLUTE_LEVEL, SHAPE_GAIN, absolute_gate, ab
 from discrepancy.fits.predictive import ensemble, residual_set, with_draws
 from discrepancy.fits.screening import Screen, grid, rescaled
 from discrepancy.judgement.conclusion import named_effects
-from discrepancy.search.hypotheses import pairs
+from discrepancy.search.starts import pairs
 from discrepancy.search_settings import SEARCH
 from discrepancy.workflow import patch_draws
 from fe.runtime.patch import ModelPatch, RunOffset

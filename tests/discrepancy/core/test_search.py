@@ -9,19 +9,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from benchmarks.cantilever import Cantilever, campaign
-from discrepancy.campaign.records import NoiseRecord, TrialKind
+from discrepancy.campaign.records import NoiseRecord
 from discrepancy.catalogue.entry import Prior
 from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
 from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.fits.candidate import Candidate, Term
 from discrepancy.fits.fitting import attempt, fit
-from discrepancy.fits.other_optima import elsewhere
 from discrepancy.fits.screening import Screen
 from discrepancy.judgement.separability import _distance
-from discrepancy.models.interface import Conditions
 from discrepancy.models.lumped import LumpedModel
-from discrepancy.models.sensing import observe
 from discrepancy.search.honest_evidence import left_by, refitted, widened
 from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.verdict import VerdictKind
@@ -42,44 +38,6 @@ def test_friction_that_ends_motions_is_found_among_its_many_optima():
     assert verdict.kind is VerdictKind.NAMED
     (named,) = verdict.effects
     assert named.patch.primitives[0].coefficient == pytest.approx(0.316, rel=2e-3)
-
-
-@pytest.mark.parametrize("place", [0.8, 1.2, 1.8])
-def test_a_mass_is_found_on_the_other_side_of_an_antinode(place):
-    truth = np.array([0.8, -0.6])  # mass and place, in prior deviations
-    bare, model = campaign(), Cantilever()
-    releases = tuple(trial for trial in bare.trials if trial.kind is TrialKind.RINGDOWN)
-    # With the readings' small noise, which of its narrow valleys a fit descends depends on the last bits.
-    channels = {
-        name: replace(
-            item, noise=replace(item.noise, standard_deviation=30.0 * item.noise.standard_deviation)
-        )
-        for name, item in bare.channels.items()
-    }
-    problem = kit.problem_of(replace(bare, trials=releases, channels=channels), model)
-    (effect,) = kit.chosen("point_mass")
-    candidate = Candidate((Term(effect, effect.places(problem.setting)[0]),))
-    for trial in releases:
-        patch = candidate.patch(problem.setting, truth)
-        trial.values[:] = observe(model, problem.campaign, trial, patch, Conditions(np.ones(1))).values
-    none = kit.fitted(problem)
-
-    def begun_at(begin, iterations):
-        at = replace(none.point, effect=np.array([0.5, begin]))
-        return fit(problem, candidate, at, iterations=iterations)
-
-    right, stuck = begun_at(-0.5, 20), begun_at(place, 2)
-    assert stuck.objective > 1000.0
-    assert abs(stuck.point.effect[1] - truth[1]) > 0.3
-    found = elsewhere(problem, stuck)
-    assert found.objective == pytest.approx(right.objective, abs=0.05)
-    np.testing.assert_allclose(found.point.effect, right.point.effect, atol=0.02)
-    deviation = np.sqrt(np.diag(found.effect_covariance))
-    assert np.all(np.abs(found.point.effect - truth) < 2.0 * deviation)
-    assert elsewhere(problem, right) is right
-
-
-"""Mass and place, in prior deviations."""
 
 
 # ---------------------------------------------------------------- candidates that no fit can follow

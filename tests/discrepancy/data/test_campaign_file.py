@@ -292,6 +292,14 @@ def test_releases_and_events_that_are_none_are_refused_in_python_too(tmp_path):
     plain = TOML.replace('displacement = 50, unit = "mm"', 'displacement = 50, unit = "1"')
     release = read_campaign(folder_of(tmp_path, plain)).trials[1].release
     assert (release.displacement, release.unit) == (50.0, "1")
+
+
+def test_samples_at_rest_go_before_a_stated_deviation(tmp_path):
+    stated = TOML.replace("offset_deviation = 2.0", "noise = { standard_deviation = 9.0 }")
+    assert read_campaign(folder_of(tmp_path, stated)).channels["g17"].noise.source == "pre-trigger"
+    for key in ("samples = [1.0]", "interval = 0.1", 'file = "noise.csv"'):
+        with pytest.raises(CampaignFileError, match=f"{key.split()[0]}' is not a key"):
+            read_campaign(folder_of(tmp_path, stated.replace("= 9.0", f"= 9.0, {key}")))
     assert not (tmp_path / "b").exists()
 
 

@@ -353,8 +353,11 @@ def test_values_that_are_not_used_may_be_anything():
     residual[7, 2] = np.nan
     changed = replace(item, trial=replace(item.trial, used=used), residual=residual)
     assert np.isnan(changed.standardised[7, 2])
-    white = ResidualSet(good.channels, (changed,)).white(np.random.default_rng(0))[0]
+    (white,) = ResidualSet(good.channels, (changed,)).white(np.random.default_rng(0))
     assert np.all(np.isfinite(white))
+    used[:, 2] = False  # of a channel of which nothing counts no test in time is made
+    told = [name for _, name, _ in ResidualSet(good.channels, (changed,)).series((white,))]
+    assert told == [name for name in item.trial.channels if name != item.trial.channels[2]]
 
 
 # ---------------------------------------------------------------- splitting a motion into its modes

@@ -105,7 +105,7 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven):
     used = random.uniform(size=(40, 2)) > 0.2
     trial = trial_of(time, residual, used=used)
     process = Process(2.0, 0.15, rough)
-    filtered = Filtered(trial, {0: process})
+    filtered = Filtered(trial, [(0, process)])
     covariance, cross = dense(trial, process)
     at = np.flatnonzero(used.ravel())
     covariance = covariance[np.ix_(at, at)] + np.eye(len(at))
@@ -127,12 +127,12 @@ def test_steady_gains_are_those_of_every_step():
     random = np.random.default_rng(4)
     time = 0.02 * np.arange(900)
     trial = trial_of(time, random.standard_normal((900, 2)))
-    filtered = Filtered(trial, {0: PROCESS})
+    filtered = Filtered(trial, [(0, PROCESS)])
     slots = filtered._passed[1]
     assert slots[-1] < 450  # most steps share one
     jittered = trial_of(time * (1.0 + 1e-12 * np.arange(900)), trial.residual)
     object.__setattr__(jittered, "steps", (np.full(900, 0.02), np.arange(900)))  # as if each were its own
-    every = Filtered(jittered, {0: PROCESS})
+    every = Filtered(jittered, [(0, PROCESS)])
     assert every._passed[1][-1] == 899
     np.testing.assert_allclose(
         filtered.whitened(trial.residual[None]), every.whitened(trial.residual[None]), atol=1e-7
@@ -147,11 +147,11 @@ def test_the_state_between_samples_is_that_of_samples_in_between():
     random = np.random.default_rng(5)
     count = 30
     residual = random.standard_normal((count, 2))
-    coarse = Filtered(trial_of(0.04 * np.arange(count), residual), {0: PROCESS})
+    coarse = Filtered(trial_of(0.04 * np.arange(count), residual), [(0, PROCESS)])
     dense_count = (count - 1) * PARTS + 1
     filled, used = np.zeros((dense_count, 2)), np.zeros((dense_count, 2), dtype=bool)
     filled[::PARTS], used[::PARTS] = residual, True
-    fine = Filtered(trial_of(0.04 / PARTS * np.arange(dense_count), filled, used=used), {0: PROCESS})
+    fine = Filtered(trial_of(0.04 / PARTS * np.arange(dense_count), filled, used=used), [(0, PROCESS)])
     added, (force,) = coarse.smoothed(residual)
     other, (again,) = fine.smoothed(filled)
     np.testing.assert_allclose(force, again[::PARTS], atol=1e-9)
@@ -161,7 +161,7 @@ def test_the_state_between_samples_is_that_of_samples_in_between():
 def test_states_and_noise_by_closed_forms():
     """Backwards a force of a long correlation would grow by e^1000 within a step, and stays finite."""
     trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
-    filtered = Filtered(trial, {0: Process(1.0, 1e-3)})
+    filtered = Filtered(trial, [(0, Process(1.0, 1e-3))])
     assert np.isfinite(filtered.log_determinant)
     assert np.all(np.isfinite(filtered.smoothed(trial.residual)[1]))
     # a pushed state
@@ -184,7 +184,7 @@ def test_unknowns_of_a_trial_and_coloured_noise_are_those_of_dense_conditioning(
     local = random.standard_normal((2, 60, 2))
     share, rate = 0.8, 12.0
     trial = trial_of(time, residual, local=local, coloured=((0, share, rate),))
-    found = regression([Filtered(trial, {0: PROCESS})], [residual], [np.zeros((0, 60, 2))])
+    found = regression([Filtered(trial, [(0, PROCESS)])], [residual], [np.zeros((0, 60, 2))])
     value = -0.5 * found.products[0, 0] - found.log_determinant
     covariance, _ = dense(trial, PROCESS)
     noise = np.eye(120)
@@ -304,6 +304,21 @@ def test_a_window_of_a_campaign_is_told_and_drawn():
     once = [replace(item, trial=replace(item.trial, time=0.0 * item.trial.time)) for item in fitted.trials]
     assert residual_windows(replace(fitted, trials=once)) == ()
     assert time_line_figure(()) is None
+
+
+def test_a_record_in_which_no_event_can_be_weighed_is_off_throughout(monkeypatch):
+    """It is told, not left out: the filter breaks down where a hypothesis leaves millions of noises."""
+
+    def broken(*_):
+        raise np.linalg.LinAlgError("Matrix is not positive definite")
+
+    event = np.zeros((300, 4))
+    event[120:200, 1] = 16.0
+    monkeypatch.setattr("discrepancy.missing_force.windows.events", broken)
+    (window,) = residual_windows(Bench(count=300).fit(np.random.default_rng(4), extra={1: event}))
+    assert (window.trial, window.channels, window.begin, window.end) == ("release 2", ("g2",), None, None)
+    assert window.size > 1.0
+    assert when_sentence((window,)) == "The gap is there throughout the records."
 
 
 def test_words_of_windows():

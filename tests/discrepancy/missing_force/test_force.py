@@ -130,7 +130,7 @@ def test_a_report_opens_with_the_missing_force(tmp_path):
     problem_of(tmp_path, CART)
     found = investigate(tmp_path / "campaign", tmp_path / "campaign" / "model.toml")
     missing = found.missing
-    assert missing.port == "rail"
+    assert missing.told.port == "rail"
     assert missing.law == "Coulomb friction"
     assert share_of(missing) > 0.9
     for item in missing.courses:  # a step: its size hardly varies where the cart moves
@@ -154,7 +154,7 @@ def test_a_report_opens_with_the_missing_force(tmp_path):
     said = force_sentence(told)
     assert said.startswith(f"A force of {told.rms:.3g} N (rms) is missing at rail, at most ")
     assert "Coulomb friction is" in said
-    assert len(missing_force_figure(missing, told).axes) == 6
+    assert len(missing_force_figure(missing).axes) == 6
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.05])
@@ -302,7 +302,7 @@ def test_friction_that_holds_is_the_law_of_the_missing_force():
     """The joint sticks half of the time; what is told of it is of the trials in motion."""
     problem = chain("laboratory", "coulomb_friction", "joint", friction_ratio=0.004)
     missing = seen_force(problem, FRICTION, "joint")
-    assert (missing.port, missing.law) == ("joint", "Coulomb friction")
+    assert (missing.told.port, missing.law) == ("joint", "Coulomb friction")
     assert share_of(missing) > 0.95
     for item in missing.courses:
         slips = np.abs(item.speed) > 0.02

@@ -220,6 +220,9 @@ def test_what_was_learnt_must_fit(grown, tmp_path):
     file.write_text('format = 1\n[calibration]\nparameter = "colour"\nmean = 1.0\nstandard_deviation = 0.1\n')
     with pytest.raises(MissionInputError, match="has learnt colour"):
         resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=file))
+    file.write_text(file.read_text().replace("colour", "young_modulus_factor"))
+    found = resolve_scenario(load_scenario("growing_damage"), Overrides(learnt=file)).calibration
+    assert (found.source, found.mean, found.standard_deviation, found.draws) == ("normal", 1.0, 0.1, 100)
     (tmp_path / "empty").mkdir()
     with pytest.raises(Exception, match="not the folder of a fleet"):
         learn_fleet(tmp_path / "empty")
@@ -244,7 +247,7 @@ def test_true_rates_may_differ_from_those_believed(tmp_path):
     scenario = load_fleet(path).groups[0].scenarios[0]
     assert scenario.truth.probability == {"2g": 0.0, "3g": 0.0}
     assert scenario.transition.probability == {"2g": 0.05, "3g": 0.1}
-    assert "probability" not in load_scenario("growing_damage").scenario.to_dict()["truth"]
+    assert load_scenario("growing_damage").scenario.to_dict()["truth"]["probability"] == {}
     path.write_text(path.read_text().replace("growing_damage", "level_turns"))
     with pytest.raises(FleetError, match=r"truth\.probability"):
         load_fleet(path)

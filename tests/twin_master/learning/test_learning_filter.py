@@ -342,3 +342,19 @@ def test_quantiles_are_those_of_the_mixture():
 
     expected = [brentq(lambda x, level=level: reached(x) - level, -9.0, 4.9) for level in levels[:2]]
     np.testing.assert_allclose(result[:, 0], [*expected, 5.0], atol=1e-3)
+
+
+def test_a_parameter_known_by_its_moments_stands_a_deviation_to_either_side():
+    sensor = sensors()
+    learner = LearningFilter(model(), sensor, LearntPriors("e", [1.1, 0.9, 1.0]))
+    rewards = RewardModel(sensor, RewardSettings(1.0, (0.0, 0.1), 1.0))
+    joint = np.zeros((1, 3, 2))
+    joint[0, 1, 1] = 1.0
+    told = {"e": Learnt(1.0, 0.05, 0.9, 1.1)}  # half way between draws on both sides
+    found = LearntExpectation(learner, rewards, np.full((3, 2), 0.5)).of_marginals(
+        told, joint, slice(None), None
+    )
+    value, weight = sensor.value_per_draw[:, 1, 1], np.array([0.25, 0.25, 0.5])
+    np.testing.assert_allclose(found.mean[0], weight @ value, rtol=1e-12)
+    spread = np.sqrt(weight @ (value - weight @ value) ** 2)
+    np.testing.assert_allclose(found.standard_deviation[0], spread, rtol=1e-9)

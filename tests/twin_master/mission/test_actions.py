@@ -27,10 +27,10 @@ from twin_master.mission.loop import fly
 from twin_master.mission.planning import (
     decision_problem,
     expected_plan,
+    policy_file,
     promised,
     read_policy,
     risk_of,
-    write_policy,
 )
 from twin_master.mission.preparation import (
     Knowledge,
@@ -150,7 +150,7 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
 def test_readings_are_kept_in_the_run_of_a_twin_that_learns_and_gives_notice(tmp_path):
     learning = ("steps = 120", "steps = 12"), ("[planner]", "[learning]\n[notice]\n[planner]")
     path, policy = written(tmp_path, TEXT, *learning), tmp_path / "policy.npz"
-    write_policy(policy, BeliefPolicy(np.ones((1, 25)), np.array([INSPECT])), knowledge().model)
+    policy.write_bytes(policy_file(BeliefPolicy(np.ones((1, 25)), np.array([INSPECT])), knowledge().model))
     said("run", path, "--policy", policy, "--out", tmp_path / "run", "--no-report")
     run = open_run(tmp_path / "run")
     observed, truth = run["observed"], run["truth"]
@@ -222,14 +222,14 @@ def test_a_limit_is_kept_by_the_plan():
 
 def test_a_policy_file_is_flown_and_kept_with_what_the_twin_knew(tmp_path):
     known, (_, plan) = knowledge(), planned()
-    write_policy(tmp_path / "policy.npz", plan.policy, known.model)
+    (tmp_path / "policy.npz").write_bytes(policy_file(plan.policy, known.model))
     policy = read_policy(tmp_path / "policy.npz", known.model)
     assert np.array_equal(policy.vectors, plan.policy.vectors)
     keep_knowledge(tmp_path, following(known, policy))
     again = kept_knowledge(tmp_path, known.scenario).plan.on_belief
     assert np.array_equal(again.vectors, policy.vectors)
     (tmp_path / "other.npz").write_bytes(b"no policy")
-    with pytest.raises(PlanningError, match="no policy of"):
+    with pytest.raises(PlanningError, match="is no policy"):
         read_policy(tmp_path / "other.npz", known.model)
 
 

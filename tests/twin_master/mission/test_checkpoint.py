@@ -15,6 +15,7 @@ from twin_master.mission import loop
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
+    line_of,
 )
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.truth import Plant
@@ -86,6 +87,16 @@ def test_a_changed_or_foreign_journal_is_refused(known, tmp_path):
         path.write_bytes(damaged)
         with pytest.raises(NotResumableError, match=rf"line {line} of .*changed or is damaged.*--replace"):
             fly(known, tmp_path, 3)
+
+
+def test_a_journal_that_decided_otherwise_in_any_turn_is_refused(known, tmp_path):
+    fly(known, tmp_path, 4)
+    lines = (tmp_path / JOURNAL_NAME).read_bytes().splitlines(keepends=True)
+    for turn, record in enumerate(journal(tmp_path)):
+        other = line_of(record | {"next_control": 1 - record["next_control"]})
+        (tmp_path / JOURNAL_NAME).write_bytes(b"".join([*lines[: turn + 1], other, *lines[turn + 2 :]]))
+        with pytest.raises(NotResumableError, match=f"decided otherwise after turn {turn} .*--replace"):
+            fly(known, tmp_path, 4)
 
 
 def test_large_states_are_kept_less_often_and_their_turns_flown_again(known, tmp_path, monkeypatch):

@@ -31,7 +31,7 @@ from twin_master.report.reading import Run
 from twin_master.run_folder import to_json
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.mission_result import LearntQuantity
-from twin_master.store.summary import Fallback, _fallback_figures
+from twin_master.store.summary import Fallback, of_fallback
 
 DRAWING = b'<svg viewBox="0 0 1 1"></svg>'
 
@@ -196,7 +196,7 @@ def test_a_fallback_that_came_before_the_damage_has_no_delay():
 
     def values(*steps: int | None) -> list[object]:
         fallback = Fallback("z1", 0.6, *steps)
-        return [figure.value for figure in _fallback_figures(fallback, scenario, "turn")]
+        return list(of_fallback(fallback, scenario)[2])
 
     assert values(30, 30, 12) == [60.0, 30, None, None, 12]
     assert values(30, 31, None) == [60.0, 30, 31, 1, None]
@@ -287,6 +287,7 @@ def test_another_layout_gives_one_sentence(run, tmp_path):
     for missing in ("filtered", "filtered__probability", "observed", "policy__action_value"):
         with pytest.raises(RunFolderError, match=f"layout of a run .*{missing.replace('__', '/')}"):
             report.write_report(stored(altered(run, **{missing: None}), tmp_path / missing))
+        assert not (tmp_path / missing / "figures").exists()
 
 
 def test_a_turn_that_is_none_of_the_run(folder):

@@ -30,10 +30,11 @@ from twin_master.assets.resolution import Overrides
 from twin_master.errors import RunFolderError
 from twin_master.mission.journal import JOURNAL_NAME, line_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME
+from twin_master.report.structure import design_of, planform_of
 from twin_master.scenario.reading import load_scenario
 from twin_master.store.writing import open_run
 from twin_master.viewer.flight import Belief, Flight
-from twin_master.viewer.messages import LATEST, Request, Teller, scene_of
+from twin_master.viewer.messages import LATEST, Request, Teller
 from twin_master.workflow import fly as new_run
 
 TURNS = 50
@@ -88,10 +89,6 @@ def whole(folder: Path) -> Flight:
 def wide(belief: Belief) -> np.ndarray:
     """Return the standard deviation of what each sensor shows, its noise included."""
     return np.hypot(belief.expected.standard_deviation, belief.expected.noise)
-
-
-def teller_of(flight: Flight) -> Teller:
-    return Teller(flight, scene_of(flight.folder, flight.knowledge))
 
 
 def of_turns(flight: Flight, first: int, end: int) -> Belief:
@@ -154,7 +151,7 @@ def test_turns_that_were_taken_back_are_forgotten(begun, lines):
     flight.update()
     assert (flight.turns, flight.number) == (10, number + 1)
     # A viewer that holds the twenty turns is told all ten again.
-    answer = told(teller_of(flight), 0, 20, flight=number, shown=19, count=20)
+    answer = told(Teller(flight), 0, 20, flight=number, shown=19, count=20)
     assert (answer["first"], answer["count"], len(answer["past"]["control"])) == (0, 10, 10)
 
 
@@ -187,7 +184,7 @@ def test_an_observation_that_came_late_stands_in_its_turn(begun, lines):
     journal = begun / JOURNAL_NAME
     journal.rename(begun / "before")
     journal.write_bytes(b"".join(lines[:4]))  # another flight
-    assert teller_of(flight).answer(asked()) is None  # until it is seen
+    assert Teller(flight).answer(asked()) is None  # until it is seen
     assert flight.update()
     assert flight.turns == 3
 
@@ -222,7 +219,7 @@ def told(teller: Teller, *words: int, **changed: int) -> dict[str, Any]:
 
 def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
     flight = whole(run)
-    teller = teller_of(flight)
+    teller = Teller(flight)
     everything = told(teller)
     assert (everything["turn"], everything["first"], everything["count"]) == (TURNS - 1, 0, TURNS)
     number = everything["flight"]
@@ -260,8 +257,8 @@ def test_a_request_of_another_form_is_refused(text):
 
 
 def test_the_wing_stands_in_its_place(run):
-    flight, design = Flight(run), load_design()
-    planform = scene_of(run, flight.knowledge).planform
+    design = load_design()
+    planform = planform_of(design_of(run), Flight(run).scenario)
     chords = planform.outline[:, 1]
     plan = design.planform
     assert chords[0] - chords[3] == pytest.approx(plan.root_chord)

@@ -22,7 +22,7 @@ from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import keep_knowledge, kept_knowledge
 from twin_master.mission.replay import replay
 from twin_master.network.inference import known_control
-from twin_master.viewer.messages import Request, Teller, scene_of
+from twin_master.viewer.messages import Request, Teller
 from twin_master.watch.feeds import CsvFeed
 from twin_master.watch.folder import Tutor, Watch
 from twin_master.watch.teaching import TRIED, Question, Search, Teaching, both_patches, trial_sentence
@@ -107,7 +107,7 @@ def test_the_view_shows_the_missing_force_of_a_verdict_on_motion(base, recorded,
     shutil.rmtree(folder)
     flight = viewed(watch)
     (picture,) = flight.pictures
-    teller = Teller(flight, scene_of(watch.folder, flight.knowledge))
+    teller = Teller(flight)
     assert b"<svg" in picture.drawing.read_bytes()
     asked = Request(number=1, flight=-1, first=0, end=0, turn=18, shown=-1, count=-1)
     assert json.loads(str(teller.answer(asked)))["picture"] is None  # as was known at the time

@@ -1,16 +1,16 @@
-"""Make the meshes of the shipped structures: `python -m scenarios.structures.make_meshes`."""
+"""Make the meshes of the shipped structures: `python -m evidence.make_meshes`."""
 
 import itertools
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import meshio
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from scenarios import STRUCTURE_FOLDER
+
 FloatArray = NDArray[np.float64]
 
-FOLDER = Path(__file__).parent
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
 EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
 
@@ -45,7 +45,7 @@ def bracket() -> None:
         "HEEL": [np.flatnonzero(heel)],
         "ARM": [np.flatnonzero((centres[:, 0] > 26) & (centres[:, 0] < 46))],
     }
-    file = FOLDER / "bracket.inp"
+    file = STRUCTURE_FOLDER / "bracket.inp"
     mesh.write(file)
     # meshio names the element by a variant with a pressure of its own
     file.write_text(file.read_text().replace("C3D20RH", "C3D20"))
@@ -70,7 +70,7 @@ def panel() -> None:
         cell_data={"gmsh:physical": [group], "gmsh:geometrical": [group]},
         field_data={name: np.array([number, 3]) for number, name in enumerate(names, start=1)},
     )
-    mesh.write(FOLDER / "stiffened_panel.msh", file_format="gmsh22", binary=False)
+    mesh.write(STRUCTURE_FOLDER / "stiffened_panel.msh", file_format="gmsh22", binary=False)
 
 
 if __name__ == "__main__":
