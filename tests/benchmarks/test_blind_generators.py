@@ -1,6 +1,7 @@
 """Hidden effects against closed forms and other integrators."""
 
 import ast
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -85,10 +86,55 @@ def test_structural_damping_has_the_same_decrement_at_every_amplitude() -> None:
     np.testing.assert_allclose(tops[1:] / tops[:-1], wanted, rtol=2e-3)
 
 
+def test_drag_follows_the_energy_balance_of_a_half_swing() -> None:
+    drag = 3.0
+    mass = STIFFNESS / W**2
+    tops = np.concatenate([[0.01], peaks(motion(Law("x", DRAG, (drag,)), seconds=1.0))])
+    # (1 + s x) exp(-s x), s = 2 c / m, is the same at both ends of a half swing.
+    for before, after in itertools.pairwise(tops[:4]):
+        half = _after_half_swing(2.0 * drag / mass, before)
+        assert _after_half_swing(2.0 * drag / mass, half) == pytest.approx(after, rel=1e-3)
+
+
+def _after_half_swing(s: float, start: float) -> float:
+    # x' = -v: v^2 = A exp(s x) + (w^2 / s^2)(2 + 2 s x) ... solved for the other turning point
+    from scipy.optimize import brentq
+
+    def kept(x: float) -> float:
+        return (1.0 + s * x) * np.exp(-s * x)
+
+    return -float(brentq(lambda x: kept(x) - kept(start), -start, -1e-9))
+
+
+@pytest.mark.parametrize("ratio", [pytest.param(ratio, marks=pytest.mark.long) for ratio in (0.1, 0.3, -0.2)])
+def test_cubic_spring_has_the_period_of_duffing(ratio: float) -> None:
+    amplitude = 0.01
+    values = motion(Law("x", POWER, (ratio * STIFFNESS / amplitude**2, 3.0, 0.0)), amplitude)
+    # Period by the energy integral, x = A sin t: T = 4/w int (1 + r (1 + sin^2 t) / 2)^(-1/2) dt.
+    t, weight = np.polynomial.legendre.leggauss(40)
+    t, weight = np.pi / 4.0 * (t + 1.0), np.pi / 4.0 * weight
+    period = 4.0 / W * float(weight @ (1.0 + 0.5 * ratio * (1.0 + np.sin(t) ** 2)) ** -0.5)
+    assert _period(values) == pytest.approx(period, rel=1e-4)
+
+
 def _period(values: np.ndarray) -> float:
     up = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
     crossing = (up + values[up] / (values[up] - values[up + 1])) / RATE
     return float((crossing[-1] - crossing[0]) / (len(crossing) - 1))
+
+
+def test_breathing_crack_has_half_a_period_of_each_spring() -> None:
+    values = motion(Law("x", POWER, (-0.4 * STIFFNESS, 1.0, -1.0)), seconds=4.0)
+    period = np.pi / W * (1.0 + 1.0 / np.sqrt(0.6))
+    assert _period(values) == pytest.approx(period, rel=1e-4)
+
+
+def test_free_play_lengthens_the_period_by_the_flight_through_the_gap() -> None:
+    amplitude, gap = 0.01, 0.002
+    values = motion(Law("x", GAP, (STIFFNESS, gap)), amplitude, 4.0)
+    bend = amplitude - gap
+    period = 2.0 * np.pi / W + 4.0 * gap / (W * bend)
+    assert _period(values) == pytest.approx(period, rel=1e-4)
 
 
 def test_drifting_stiffness_follows_airy_functions() -> None:
@@ -123,6 +169,17 @@ def test_jenkins_elements_hold_the_stated_force_when_all_slip() -> None:
     for chi in (-0.5, 0.0, -0.8):
         law = jenkins("x", stiffness, slip, chi, 4000)
         assert float(law.stiffness @ law.slip) == pytest.approx(slip, rel=2e-3)
+
+
+def test_bouc_wen_against_the_quadrature_of_its_loading_branch() -> None:
+    share, limit = 0.6, 0.004
+    force = 5.0
+    x = float(
+        oscillator().static(np.array([[force]]), [Law("x", BOUC_WEN, (share * STIFFNESS, limit, 1.0))])[0, 0]
+    )
+    # order 1: z = z_y (1 - exp(-x / z_y)) while loading
+    z = limit * (1.0 - np.exp(-x / limit))
+    assert (1.0 - share) * STIFFNESS * x + share * STIFFNESS * z == pytest.approx(force, rel=1e-4)
 
 
 @pytest.mark.parametrize(
