@@ -66,7 +66,6 @@ class FmuRuns:
         Longest motion that is waited for until it rests [s].
     tolerance : float
         At rest, no output moves by more than this share of its largest value.
-
     """
 
     refusals: Callable[[], AbstractContextManager[None]] = nullcontext
@@ -79,7 +78,13 @@ class FmuRuns:
 
     @cached_property
     def asset(self) -> FmiAsset:
-        """The door to the FMU, for what it declares."""
+        """The door to the FMU, for what it declares.
+
+        Raises
+        ------
+        FmuError
+            If the FMU is missing, or the binding does not fit it.
+        """
         path, binding, isolated = self._of
         return FmiAsset(path, binding, isolated=isolated)
 
