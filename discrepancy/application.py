@@ -7,8 +7,7 @@ from dataclasses import replace as changed
 from pathlib import Path
 from typing import Any
 
-from calibration.result.file import load_calibration
-from calibration.result.plain import tailoring
+from calibration.result.file import load_calibration, tailoring
 from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals

@@ -160,8 +160,7 @@ def _packed_wing(
     if calibration is None:
         shape = load_design(design)
     else:
-        from calibration.result.file import load_calibration
-        from calibration.result.plain import tailoring
+        from calibration.result.file import load_calibration, tailoring
 
         wing = load_calibration(calibration)
         shape = wing.wing_design

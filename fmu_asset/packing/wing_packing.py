@@ -27,7 +27,7 @@ def pack_wing(
     Parameters
     ----------
     design : WingDesign
-        The wing; of a calibrated one its tailored design, with what `calibration.result.plain.tailoring`
+        The wing; of a calibrated one its tailored design, with what `calibration.result.file.tailoring`
         gives among the options.
     path : path-like
         Where to write, with the suffix .fmu.

@@ -232,8 +232,7 @@ class CoupledSource(SeveralSource):
             return _given_fmu(component, target.parent)
         options = {}
         if component.design == CALIBRATED_DESIGN_NAME:
-            from calibration.result.file import load_calibration
-            from calibration.result.plain import tailoring
+            from calibration.result.file import load_calibration, tailoring
 
             wing = load_calibration(Path(self._scenario.calibration.file or ""))
             design, options = wing.wing_design, tailoring(wing)

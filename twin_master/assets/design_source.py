@@ -245,7 +245,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
 
         options = {}
         if self.calibration is not None:
-            from calibration.result.plain import tailoring  # takes a second to load
+            from calibration.result.file import tailoring  # takes a second to load
 
             options = tailoring(self.calibration)
         pack_wing(
