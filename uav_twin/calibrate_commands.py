@@ -132,7 +132,7 @@ def calibrate_wing(
         raise typer.BadParameter("--measured needs --data with ring-down records.")
     if fitted and (data is None or measured is False):
         raise typer.BadParameter("--fitted needs --data with ring-down records, and no --published.")
-    from calibration.dynamics.ringdown import Frequencies
+    from calibration.dynamics.trials import Frequencies
     from calibration.paper.table_1 import WORDS
     from calibration.result.file import check_folder
     from calibration.wing.calibrate import calibrate
