@@ -26,8 +26,8 @@ from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
 from fe.sentences import said
 from fe.structure.affine import AffineStructure
-from fe.structure.body import Body
 from fe.structure.design import Load
+from fe.structure.mesh import Body
 from fe.structure.operators import Structure
 from fe.wing.operators import AffineOperators
 from fe.wing.responses import wing_values
