@@ -29,8 +29,8 @@ from fe.reduction.fields import WingFields
 from fe.reduction.model_cache import MODELLING_ROOMS, entry, patch_arrays, reduced_model, wing_fields
 from fe.reduction.settings import StructureSettings
 from fe.runtime import kept_arrays
+from fe.runtime.arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
-from fe.runtime.kept_arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import WingDesign
 from tests.refusals import Inputs, refused
