@@ -20,10 +20,9 @@ from fmu_asset.errors import FmuEndedError, FmuError, FmuStateError, IterationEr
 from fmu_asset.instances.plan import Instance, Settings
 from fmu_asset.sentences import said
 
-from .schedule import Schedule
 from .structure import Endpoint
 from .system import Part, SystemDescription
-from .wiring import ConnectedVariable
+from .wiring import ConnectedVariable, Schedule
 
 FloatArray = npt.NDArray[np.float64]
 
