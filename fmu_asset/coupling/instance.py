@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.door.exchange import Exchange
+from fmu_asset.door.life import PackedState
 from fmu_asset.door.placement import Housing, ResetTrial, Start
-from fmu_asset.door.saved_state import PackedState
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import IDENTITY
 from fmu_asset.errors import FmuEndedError, FmuError, FmuStateError, IterationError
