@@ -127,7 +127,7 @@ def build(
         return
     if any((design, calibration, patch, windows)) or (kind, fmi, interface) != ("python", 2, "co-simulation"):
         raise typer.BadParameter(said("fmu.of_the_wing"), param_hint="--script")
-    from fmu_asset.packing.script import build_script_fmu
+    from fmu_asset.packing.contents import build_script_fmu
 
     built = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)
     terminal.say(f"{built.path}: {built.size / 1024:.0f} KiB, GUID {built.guid}")
