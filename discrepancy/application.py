@@ -18,7 +18,7 @@ from discrepancy.verdict import Hypothesis, Verdict, VerdictKind
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.state import DigitalState
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
-from fmu_asset.packing.wing_packing import pack_wing
+from fmu_asset.packing.structure_fmu import pack_wing
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_text, refuse_existing
 from reporting.folders import restore_folder

@@ -148,8 +148,7 @@ def _packed_wing(
     from fe.wing.design import load_design
     from fmu_asset.packing.contents import checked_target
     from fmu_asset.packing.patch_file import load_patch
-    from fmu_asset.packing.structure_fmu import check_form
-    from fmu_asset.packing.wing_packing import pack_wing
+    from fmu_asset.packing.structure_fmu import check_form, pack_wing
 
     out = checked_target(out, replace=replace)
     if windows and form["kind"] != "compiled":

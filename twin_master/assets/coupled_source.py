@@ -223,7 +223,7 @@ class CoupledSource(SeveralSource):
 
     def _packed(self, component: ComponentSection, progress: Progress) -> Path:
         """Return the FMU of a component in the run folder; packed if it is not there."""
-        from fmu_asset.packing.wing_packing import pack_wing
+        from fmu_asset.packing.structure_fmu import pack_wing
 
         target = self.path(component.copies()["fmu"])
         if target.exists():

@@ -241,7 +241,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         return effects
 
     def _pack(self, progress: Progress) -> None:
-        from fmu_asset.packing.wing_packing import pack_wing
+        from fmu_asset.packing.structure_fmu import pack_wing
 
         options = {}
         if self.calibration is not None:
@@ -287,7 +287,7 @@ class DesignSource(_Wing, StructureSource):
         """
         if patch is None or not patch.effects:
             return super().observation_table(draws, model)
-        from fmu_asset.packing.wing_packing import arrays_for
+        from fmu_asset.packing.structure_fmu import arrays_for
         from fmu_asset.slaves.base import UnacceptableValuesError
 
         scenario, where = self._scenario, str(self.patch_path)
