@@ -1,4 +1,4 @@
-"""The one reader of TOML: whatever is wrong with a file becomes one sentence of the caller's exception."""
+"""The one reader of TOML, and its tables as checked records; a fault is one sentence of the caller's error."""
 
 import json
 import re

@@ -1,4 +1,7 @@
-"""Several ring-down trials together: averages, and how frequency and damping change with the amplitude.
+"""Ring-down trials: two damped modes from each, averages, and their change with amplitude.
+
+Kapteyn et al. 2021, eq. (22): the signal is a sum of two damped cosines; eqs. (23) and (24) turn damped
+frequency and decay rate into natural frequency and damping ratio.
 
 Of records that were read off a plot, the extremes tell more. The middle of the ink in a column of pixels is
 not quite the average of the signal there, while its lowest and highest points are the signal's extremes

@@ -1,4 +1,4 @@
-"""The calibration of a wing: from the measurements of its laboratory to what tailors its twin."""
+"""The calibration of a wing: from its laboratory's measurements to what tailors its twin, and its page."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

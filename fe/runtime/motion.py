@@ -1,8 +1,9 @@
-"""Internal forces at ports: laws from a patch, and the static solution under them.
+"""Motion of a linear system with laws at its ports: the static solution, and steps to any time stamps.
 
-`fe.runtime.motion` moves a structure under them. NumPy and relative imports only: this file is
-copied into the FMU. The loops run as plain Python here; `fe.compilation` has the same
-functions compiled, to be given as `kernel`.
+Without laws it is exact between the stamps. Steps are those of `ModalSystem.exact_steps`; lengths that
+differ by less than `ALIKE` of the usual one are one. The loops run as plain Python here; `fe.compilation`
+has the same functions compiled, to be given as `kernel`. NumPy and relative imports only: this file is
+copied into the FMU.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence

@@ -1,6 +1,7 @@
-"""The mesh of a structure: nodes, cells of one kind and named sets, as the file has them, in metres.
+"""The mesh of a structure, and the body it becomes: cells, what they are made of, what holds them.
 
-Last what its supports hold, what springs they set, what is rigid, and whether it is free to move.
+Nodes, cells of one kind and named sets are as the file has them, in metres. Last what its supports hold,
+what springs they set, what is rigid, and whether it is free to move.
 """
 
 from collections.abc import Iterable, Mapping, Sized

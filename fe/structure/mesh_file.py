@@ -1,4 +1,9 @@
-"""Reading and checking a mesh file: Gmsh, Abaqus and CalculiX, VTU, Nastran and what else meshio reads.
+"""Files of finite element codes, read and checked: meshes, and matrices and vectors.
+
+Meshes are of Gmsh, Abaqus and CalculiX, VTU, Nastran and what else meshio reads. Of matrices, what stands in
+a file tells its format: MatrixMarket; archives of NumPy and SciPy (`.npz`, `.npy`); DMIG of Nastran; tables
+of `row column value` (CalculiX' `.sti` and `.mas`, Abaqus' COORDINATE) or of `node component node component
+value` (Abaqus' MATRIX INPUT). Those that name nodes bring their own unknowns.
 
 Last how much memory a structure of the mesh takes, before it is taken.
 """

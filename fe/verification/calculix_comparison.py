@@ -1,6 +1,12 @@
 """Structures and the wing against CalculiX on the identical mesh: statics, modes and a ring-down.
 
-First how CalculiX runs on an input, and the tables that it prints (`.dat`).
+CalculiX (`ccx`, Debian package calculix-ccx) is an independent finite element code. It gets nodes, cells,
+local material constants with their orientations, supports and springs, rigid sets as equations on two
+reference nodes, and point masses as blocks tied to the structure; it integrates, assembles and solves on its
+own, and applies pressures and acceleration fields itself. What is read are nodes whose displacement is the
+strain or displacement, by an equation, because printed displacements hold seven digits only.
+
+First the input, then how CalculiX runs on it, and the tables that it prints (`.dat`).
 """
 
 import itertools

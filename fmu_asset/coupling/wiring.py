@@ -1,4 +1,11 @@
-"""A system of FMUs checked against the FMUs themselves: every end exists, fits, and has one source."""
+"""A system of FMUs checked against the FMUs themselves: every end exists, fits, and has one source.
+
+First in which order they are evaluated, and where the order must break, by two graphs. In the graph of
+*components*, a connection leads from one to another. In the graph of *variables*, a connection leads from an
+output to an input, and direct feedthrough from an input to an output of the same FMU; a circle in it is an
+algebraic loop. A circle of components alone is none: somewhere on it stands a state, whose value at the
+beginning of the step can be used.
+"""
 
 import difflib
 import math

@@ -1,4 +1,7 @@
-"""An FMU flown without a binding: its default experiment, and values set by the names of its variables."""
+"""An FMU flown without a binding: its default experiment, values by names of variables, files of histories.
+
+Inputs are read from CSV, outputs written as CSV or NetCDF.
+"""
 
 import csv
 import io

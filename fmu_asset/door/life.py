@@ -1,4 +1,7 @@
-"""The life of an asset: what it is, how it is opened, started again and closed, and what its failures say."""
+"""The life of an asset: opened, started again and closed, what its failures say, and its state as bytes.
+
+The bytes are what a mission's checkpoint keeps of an FMU, or of several.
+"""
 
 import math
 import os

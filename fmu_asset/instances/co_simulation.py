@@ -1,4 +1,8 @@
-"""Co-simulation of FMI 1.0, 2.0 and 3.0 through fmpy's slaves."""
+"""Co-simulation of FMI 1.0, 2.0 and 3.0 through fmpy's slaves, and model exchange as if it were that.
+
+Models of model exchange are solved by SUNDIALS CVODE. The solver is fmpy's, with the failures and the memory
+that its wrapper lets slip.
+"""
 
 import ctypes
 import math

@@ -1,7 +1,17 @@
-"""What all FMUs that are built here have in common: a hash as their name, pythonfmu's files, a fixed archive.
+"""What all FMUs that are built here have in common, and packing one of a Python script for pythonfmu.
 
 The files of an FMU are first written with a placeholder wherever its content hash will stand (identifier,
 GUID, module names). The hash is taken over them, and then fills the places.
+
+pythonfmu's own builder takes the same scripts, but leaves out units and ranges, and stamps a time and a
+random GUID, so that no two builds are alike. Here equal scripts give equal bytes. A script may say more in
+two class attributes, both optional:
+
+- `unit_table`: for each unit its exponents of `kg, m, s, A, K, mol, cd, rad`, a `factor` and an `offset` to
+  them (1 and 0 by default), and `displays`, the factors of display units;
+- `variable_table`: for each variable causality, unit, least, largest and start value (or None), and meaning.
+
+The script runs once in this process, to be asked for its variables.
 """
 
 import hashlib

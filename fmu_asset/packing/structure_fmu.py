@@ -1,4 +1,4 @@
-"""Packing a reduced model, of a wing or a structure, as an FMU of FMI 2.0 or 3.0, reproducible to the byte.
+"""From a wing design or any reduced model to an FMU of FMI 2.0 or 3.0, reproducible to the byte.
 
 What goes into the compiled kind is in `compiled`. Of the Python kind, slave base class and binaries are
 pythonfmu's; the archive is packed here and not by its builder, which stamps times, a random GUID and module
