@@ -1,4 +1,4 @@
-"""The one reader of TOML, and its tables as checked records; a fault is one sentence of the caller's error."""
+"""The one reader of TOML, and its tables as checked records; a fault is one sentence of the caller's."""
 
 import json
 import re
