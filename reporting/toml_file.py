@@ -3,10 +3,12 @@
 import json
 import re
 import tomllib
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from reporting.sentences import said
 from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
@@ -165,7 +167,8 @@ def require(met: object, otherwise: str) -> None:
         raise ValueError(otherwise)
 
 
-_Description = TypeVar("_Description", bound=BaseModel)
+_Description = TypeVar("_Description")
+_reader: Callable[[Any], TypeAdapter[Any]] = cache(TypeAdapter)
 
 
 def checked(
@@ -181,7 +184,7 @@ def checked(
 
     Parameters
     ----------
-    description : type of BaseModel
+    description : type of BaseModel or dataclass
         What the file may hold.
     content : object
         What it holds.
@@ -200,7 +203,7 @@ def checked(
         The sentence names `source`, the place, what came and what was expected.
     """
     try:
-        return description.model_validate(content)
+        return cast(_Description, _reader(description).validate_python(content))
     except ValidationError as cause:
         raise error(f"{source}: {_sentence(cause, what, first_index)}.") from None
 
