@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -15,9 +15,18 @@ from pydantic import (
     model_validator,
 )
 
-from discrepancy.campaign.protocol import LIST, Event, Release
-from discrepancy.campaign.records import Channel, Hold, Quantity, Start, TrialKind
-from discrepancy.campaign.units import conversion, conversion_of
+from discrepancy.campaign.protocol import IN_FILES, LIST, Event, Release
+from discrepancy.campaign.records import (
+    Channel,
+    Hold,
+    InTables,
+    Quantity,
+    RecordedInput,
+    Start,
+    TrialKeys,
+    TrialKind,
+)
+from discrepancy.campaign.units import Conversion, conversion, conversion_of
 from discrepancy.errors import CampaignFileError
 from discrepancy.sentences import said
 from fe.runtime.patch import EVERY_CHANNEL
@@ -31,8 +40,6 @@ INPUT_COLUMNS = (
 """Columns of the tables that are no channels."""
 OF_REGION = "health."
 """Begins the column of the losses of a damage region by its name."""
-
-Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class ParameterSection(Section):
@@ -49,44 +56,9 @@ class NoiseFileSection(Section):
     interval: Positive | None = None
 
 
-class InputSection(Section):
-    """`[[input]]`: a recorded input of driven trials, or what is held in each row of a static one."""
-
-    name: Name
-    quantity: Quantity = Field(strict=False)
-    unit: Name
-    column: Name = ""
-    hold: Hold | None = Field(default=None, strict=False)
-    reference: bool = False
-    offset_deviation: NotNegative = 0.0
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        _check_unit(self)
-        if self.table_column in INPUT_COLUMNS and self.table_column != "force":
-            raise ValueError(said("campaign.reserved", item=self))
-        if self.quantity.moving and not self.reference and self.hold not in (None, Hold.SMOOTH):
-            raise ValueError(said("campaign.motion", item=self))
-        return self
-
-    @property
-    def table_column(self) -> str:
-        """Column of the tables."""
-        return self.column or self.name
-
-    @property
-    def holds(self) -> Hold | None:
-        """What it does between its samples: a motion is smooth, of the rest it is said or not."""
-        return Hold.SMOOTH if self.quantity.moving and not self.reference else self.hold
-
-
-Column = Channel | InputSection
-"""What has a column of the tables."""
-
-
-def _check_unit(item: Column) -> None:
+def _factor(item: InTables) -> Conversion:
     try:
-        conversion_of(item.quantity, item.unit)
+        return conversion_of(item.quantity, item.unit)
     except ValueError as cause:
         raise ValueError(f"the unit of {item.name!r}: {cause}") from None
 
@@ -101,16 +73,25 @@ def _scaled(channel: Channel, scale: Callable[[float], float]) -> Channel:
 def _read(channel: Channel) -> Channel:
     if channel.name == EVERY_CHANNEL or channel.name.startswith("#"):
         raise ValueError(f"a channel cannot be called {channel.name!r}")
-    _check_unit(channel)
-    return _scaled(channel, conversion_of(channel.quantity, channel.unit).to_si)
+    return _scaled(channel, _factor(channel).to_si)
 
 
 def _written(channel: Channel, dump: SerializerFunctionWrapHandler) -> object:
-    return dump(_scaled(channel, conversion_of(channel.quantity, channel.unit).from_si))
+    return dump(_scaled(channel, _factor(channel).from_si))
 
 
 ChannelInFile = Annotated[Channel, AfterValidator(_read), WrapSerializer(_written)]
 """Its deviations are in its unit there."""
+
+
+def _read_input(item: RecordedInput) -> RecordedInput:
+    held = _factor(item).to_si(item.offset_deviation)
+    if item.table_column in INPUT_COLUMNS and item.table_column != "force":
+        raise ValueError(said("campaign.reserved", item=item))
+    smooth = item.quantity.moving and not item.reference
+    if smooth and item.hold not in (None, Hold.SMOOTH):
+        raise ValueError(said("campaign.motion", item=item))
+    return replace(item, offset_deviation=held, hold=Hold.SMOOTH if smooth else item.hold)
 
 
 def _in_si(release: Release) -> Release:
@@ -121,40 +102,21 @@ def _in_si(release: Release) -> Release:
     return replace(release, displacement=held, unit=unit)
 
 
-class HealthSection(Section):
-    """`health` of a trial: fractions by damage region."""
+@dataclass(frozen=True, kw_only=True)
+class TrialSection(TrialKeys):
+    """`[[trial]]`; `health` has losses by damage region, and `deviation`."""
 
-    model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, Fraction]
+    __pydantic_config__ = IN_FILES
 
-    deviation: NotNegative = 0.0
-
-    @property
-    def losses(self) -> dict[str, float]:
-        """Losses by region."""
-        return dict(self.__pydantic_extra__)
-
-
-class TrialSection(Section):
-    """`[[trial]]`."""
-
-    name: Name
-    kind: TrialKind = Field(strict=False)
-    file: Name
-    run: str = ""
-    held_out: bool = False
-    noise_factor: Positive = 1.0
     start: NotNegative | None = None
     temperature: Number | None = None
-    load_place: Name | tuple[Number, Number] = Field(default="tip_load", union_mode="left_to_right")
-    health: HealthSection | None = None
+    health: dict[Name, NotNegative] = field(default_factory=dict)
     release: Annotated[Release, AfterValidator(_in_si)] | None = None
     channels: Annotated[tuple[Name, ...], LIST] | None = None
-    left_out: dict[str, Annotated[tuple[Annotated[int, Field(ge=1)], ...], LIST]] = Field(
+    left_out: dict[str, Annotated[tuple[Annotated[int, Field(strict=True, ge=1)], ...], LIST]] = field(
         default_factory=dict
     )
-    begins: Start | None = Field(default=None, strict=False)
-    hold: Hold | None = Field(default=None, strict=False)
+    begins: Start | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -179,6 +141,9 @@ class TrialSection(Section):
         for key, allowed in {**kinds, "hold": {TrialKind.FORCED}}.items():
             if getattr(self, key) is not None and self.kind not in allowed:
                 raise ValueError(said(f"campaign.no_{key}", trial=self))
+        for region, loss in self.health.items():
+            if region != "deviation" and loss > 1.0:
+                raise ValueError(f"the loss of {region!r} is a fraction from 0 to 1, and {loss:g} came")
         return self
 
 
@@ -190,20 +155,22 @@ def _twice(names: Iterable[str]) -> str | None:
 class CampaignSection(Section):
     """The whole file."""
 
+    model_config = ConfigDict(strict=False)
+
     format: Literal[1]
     name: str
-    reference_temperature: Annotated[float, Field(allow_inf_nan=False, ge=-273.15)] | None = None
+    reference_temperature: Annotated[Number, Field(ge=-273.15)] | None = None
     parameters: dict[Name, ParameterSection] = Field(default_factory=dict)
     noise: NoiseFileSection | None = None
     channel: Annotated[tuple[ChannelInFile, ...], Field(min_length=1), LIST]
-    input: Annotated[tuple[InputSection, ...], LIST] = ()
+    input: Annotated[tuple[Annotated[RecordedInput, AfterValidator(_read_input)], ...], LIST] = ()
     trial: Annotated[tuple[TrialSection, ...], Field(min_length=1), LIST]
     event: Annotated[tuple[Event, ...], LIST] = ()
     remarks: Annotated[tuple[str, ...], LIST] = ()
     loggers: dict[Name, Annotated[tuple[Name, ...], LIST]] = Field(default_factory=dict)
 
     @property
-    def columns(self) -> tuple[Column, ...]:
+    def columns(self) -> tuple[InTables, ...]:
         """Channels and inputs."""
         return (*self.channel, *self.input)
 
