@@ -70,8 +70,8 @@ _CALCULIX = """
 import sys
 from pathlib import Path
 from fe.runtime.state import DigitalState
-from fe.verification.calculix_deck import Step
-from fe.verification.calculix_deck import wing_deck
+from fe.verification.calculix_comparison import Step
+from fe.verification.calculix_comparison import wing_deck
 from fe.wing.design import load_design
 from fe.wing.operators import assemble
 operators = assemble(load_design().changed(mesh={"refinement": float(sys.argv[1])}))

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from calibration.dynamics.ringdown import Frequencies
-from calibration.dynamics.trials import fit_trials
+from calibration.dynamics.trials import Frequencies, fit_trials
 from calibration.errors import CalibrationError, ExperimentDataError
 from calibration.joint.measurement import measured_modes
 from calibration.joint.posterior import joint_posterior

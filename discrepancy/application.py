@@ -7,8 +7,7 @@ from dataclasses import replace as changed
 from pathlib import Path
 from typing import Any
 
-from calibration.result.file import load_calibration
-from calibration.result.plain import tailoring
+from calibration.result.file import load_calibration, tailoring
 from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
@@ -19,7 +18,7 @@ from discrepancy.verdict import Hypothesis, Verdict, VerdictKind
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.state import DigitalState
 from fmu_asset.packing.patch_file import SCHEMA, parse_patch
-from fmu_asset.packing.wing_packing import pack_wing
+from fmu_asset.packing.structure_fmu import pack_wing
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_text, refuse_existing
 from reporting.folders import restore_folder

@@ -169,7 +169,7 @@ def _choose_when_compiled(choice: Callable[..., Any], table: tuple[Callable[...,
 
 @functools.cache
 def compiled_kernel() -> Kernel:
-    """Return the compiled loops of `fe.runtime.stepwise.advance` and `static_solution`, for their `kernel`.
+    """Return the compiled loops of `fe.runtime.motion.advance` and `static_solution`, for their `kernel`.
 
     The functions of `fe.runtime` stay plain; they can be called from compiled ones from then on.
     """

@@ -132,12 +132,11 @@ def calibrate_wing(
         raise typer.BadParameter("--measured needs --data with ring-down records.")
     if fitted and (data is None or measured is False):
         raise typer.BadParameter("--fitted needs --data with ring-down records, and no --published.")
-    from calibration.dynamics.ringdown import Frequencies
+    from calibration.dynamics.trials import Frequencies
     from calibration.paper.table_1 import WORDS
     from calibration.result.file import check_folder
-    from calibration.wing.calibrate import calibrate
+    from calibration.wing.calibrate import calibrate, write_wing_folder
     from calibration.wing.lab_data import Targets, published_data, read_lab_folder
-    from calibration.wing.page import write_wing_folder
     from fe.wing.design import load_design
 
     drawn = load_design(design)

@@ -32,10 +32,11 @@ def calibrate_ringdown(
 ) -> None:
     """Natural frequencies and damping ratios of two modes from ring-down records."""
     from calibration.dynamics.records import read_records
-    from calibration.dynamics.ringdown import FIRST_PEAK, Frequencies
     from calibration.dynamics.trials import (
+        FIRST_PEAK,
         PUBLISHED_DAMPING_RATIOS,
         PUBLISHED_FREQUENCIES,
+        Frequencies,
         ModalFigure,
         fit_trials,
         refine_by_extremes,

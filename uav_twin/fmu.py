@@ -127,7 +127,7 @@ def build(
         return
     if any((design, calibration, patch, windows)) or (kind, fmi, interface) != ("python", 2, "co-simulation"):
         raise typer.BadParameter(said("fmu.of_the_wing"), param_hint="--script")
-    from fmu_asset.packing.script import build_script_fmu
+    from fmu_asset.packing.contents import build_script_fmu
 
     built = build_script_fmu(asset_scripts().get(script, Path(script)), out, replace=replace)
     terminal.say(f"{built.path}: {built.size / 1024:.0f} KiB, GUID {built.guid}")
@@ -148,8 +148,7 @@ def _packed_wing(
     from fe.wing.design import load_design
     from fmu_asset.packing.contents import checked_target
     from fmu_asset.packing.patch_file import load_patch
-    from fmu_asset.packing.structure_fmu import check_form
-    from fmu_asset.packing.wing_packing import pack_wing
+    from fmu_asset.packing.structure_fmu import check_form, pack_wing
 
     out = checked_target(out, replace=replace)
     if windows and form["kind"] != "compiled":
@@ -160,8 +159,7 @@ def _packed_wing(
     if calibration is None:
         shape = load_design(design)
     else:
-        from calibration.result.file import load_calibration
-        from calibration.result.plain import tailoring
+        from calibration.result.file import load_calibration, tailoring
 
         wing = load_calibration(calibration)
         shape = wing.wing_design

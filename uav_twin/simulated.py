@@ -63,7 +63,7 @@ def finish(
     plot: Path | None,
 ) -> None:
     """Write and draw what was simulated from `source`, a file and its SHA-256, and say so."""
-    from fmu_asset.door.history_file import write_history
+    from fmu_asset.door.experiment import write_history
 
     file, digest = source
     if out is not None:
@@ -143,8 +143,7 @@ def simulate(
     """Simulate an FMU: its default experiment, or with --binding and --inputs under histories."""
     from fmu_asset.archive.fmu_file import read_fmu
     from fmu_asset.door.binding import load_binding
-    from fmu_asset.door.experiment import default_experiment, fly, fly_histories
-    from fmu_asset.door.history_file import read_histories
+    from fmu_asset.door.experiment import default_experiment, fly, fly_histories, read_histories
     from fmu_asset.door.session import FmiAsset
 
     refuse_files(out, plot, replace=replace)

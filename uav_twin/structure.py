@@ -196,8 +196,7 @@ def verify(
     json: bool = False,
 ) -> None:
     """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
-    from fe.verification.calculix_comparison import agreement, required_calculix
-    from fe.verification.calculix_deck import structure_deck
+    from fe.verification.calculix_comparison import agreement, required_calculix, structure_deck
 
     required_calculix()
     refuse_filled(out)

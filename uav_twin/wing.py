@@ -267,8 +267,7 @@ def convergence_checks(
 
 def calculix_checks(operators: "AffineOperators", jobs: Path) -> Iterator[Check]:
     """Yield the differences to CalculiX on the identical mesh: statics and six modes."""
-    from fe.verification.calculix_comparison import agreement
-    from fe.verification.calculix_deck import wing_deck
+    from fe.verification.calculix_comparison import agreement, wing_deck
 
     damaged = tuple(DAMAGED[number % 2] for number in range(len(operators.regions)))
     for health, loss in (("healthy", ()), ("damaged", damaged)):

@@ -7,8 +7,7 @@ from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from reporting.figures import OBSERVED, PAST, PREDICTION, PRESENT, panel_label, panels, publication_style
 
-from .ringdown import RingDownFit, spectrum
-from .trials import ModalFigure, RingDownTrials, amplitude_dependence
+from .trials import ModalFigure, RingDownFit, RingDownTrials, amplitude_dependence, spectrum
 
 
 @publication_style()

@@ -1,4 +1,7 @@
-"""Several ring-down trials together: averages, and how frequency and damping change with the amplitude.
+"""Ring-down trials: two damped modes from each, averages, and their change with amplitude.
+
+Kapteyn et al. 2021, eq. (22): the signal is a sum of two damped cosines; eqs. (23) and (24) turn damped
+frequency and decay rate into natural frequency and damping ratio.
 
 Of records that were read off a plot, the extremes tell more. The middle of the ink in a column of pixels is
 not quite the average of the signal there, while its lowest and highest points are the signal's extremes
@@ -8,19 +11,222 @@ within a few columns.
 
 import cmath
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.signal import decimate, detrend, find_peaks
 
 from calibration.errors import ExperimentDataError
 from calibration.sentences import said
 
 from .damped_cosine import DampedCosines, FloatArray, RingDownMode
-from .records import RingDownRecord
-from .ringdown import FIRST_PEAK, Frequencies, RingDownFit, fit_ring_down, refuse_growing
+from .records import MINIMUM_COUNT, RingDownRecord
+
+FIRST_PEAK = 0.00548
+"""Instant of the first peak in the published records, at which the authors crop them [s]."""
+
+WORKING_RATE = 2000.0
+"""Rate to which faster records are decimated, as in the authors' script [Hz]."""
+
+SEARCH_BAND = (2.0, 80.0)
+"""Band in which the two spectral peaks are sought; drift lies below [Hz]."""
+
+_PADDING = 64  # zero padding of the spectrum: bins of 1/64 of the record's own resolution
+_PROMINENCE = 3.5  # of a spectral peak, over the median amplitude of the noise
+# Smallest peak, of the highest amplitude: smaller ripples come from the end of a record that still rings
+# there, and from the skirts of the first mode where it has died away.
+_SMALLEST_PEAK = (0.003, 0.02)
+_END_SHARE = 0.05  # of a record, in which its end is judged
+_SEARCH_DECAY = 3.0  # 1/s, put upon a record in which the first search finds too little
+_STARTING_RATIOS = (0.01, 0.03, 0.08)
+_STEADY_SHARE = 0.7  # rms of the last third over the first; above it nothing decays
+
+
+class Frequencies(Enum):
+    """How the damped frequencies are found.
+
+    `PEAKS` is the authors' procedure: the two highest peaks of the spectrum, held fixed while amplitudes,
+    decay rates and phases are fitted. `FITTED` fits the frequencies along with them.
+    """
+
+    PEAKS = "peaks"
+    FITTED = "fitted"
+
+
+@dataclass(frozen=True, eq=False)
+class RingDownFit:
+    """Two modes of one record.
+
+    Attributes
+    ----------
+    modes : (RingDownMode, RingDownMode)
+        By ascending frequency.
+    record : RingDownRecord
+        The record as fitted: decimated and cropped.
+    fitted : (N,) array
+        The fitted signal [V].
+    residual_deviation : float
+        Standard deviation of the residuals [V].
+    procedure : Frequencies
+        How the frequencies were found.
+    """
+
+    modes: tuple[RingDownMode, RingDownMode]
+    record: RingDownRecord
+    fitted: NDArray[np.float64]
+    residual_deviation: float
+    procedure: Frequencies
+
+
+def prepare(record: RingDownRecord, start: float | None = FIRST_PEAK) -> RingDownRecord:
+    """Decimate a fast record to about 2 kHz and crop it to begin at `start` [s] (None: as it is).
+
+    Decimation runs forwards and backwards through a low-pass in stages of at most 10, so that it shifts no
+    phase. Drift is not taken out here but fitted along with the modes, which biases neither.
+
+    Raises
+    ------
+    ExperimentDataError
+        If the record is too short, or less than a quarter of it remains.
+    """
+    time, signal = record.time, record.signal
+    lowest, highest = record.lowest, record.highest
+    factor = int(record.sampling_rate / WORKING_RATE + 0.5)
+    if factor > 1 and record.count // factor < MINIMUM_COUNT:
+        length = record.time[-1] - record.time[0]
+        raise ExperimentDataError(said("ringdown.short", record=record, length=length))
+    while factor > 1:
+        stage = max(divisor for divisor in range(1, 11) if factor % divisor == 0)
+        if stage == 1:
+            factor -= 1
+            continue
+        time, signal = time[::stage], np.asarray(decimate(signal, stage, zero_phase=True))
+        lowest = highest = None
+        factor //= stage
+    after = time > start if start is not None else np.ones(time.shape, dtype=bool)
+    if np.count_nonzero(after) < 0.25 * time.size:
+        left = np.count_nonzero(after), time.size
+        raise ExperimentDataError(said("ringdown.cropped", record=record, start=start, left=left))
+    lowest, highest = (None if column is None else column[after] for column in (lowest, highest))
+    return replace(record, time=time[after], signal=signal[after], lowest=lowest, highest=highest)
+
+
+def spectrum(record: RingDownRecord) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return frequency [Hz] and amplitude [V] of the zero-padded spectrum of the detrended record."""
+    size = _PADDING * record.count
+    transform = np.fft.rfft(detrend(record.signal), size)
+    frequency = np.fft.rfftfreq(size, 1.0 / record.sampling_rate)
+    inside = (frequency >= SEARCH_BAND[0]) & (frequency <= min(SEARCH_BAND[1], 0.5 * record.sampling_rate))
+    amplitude = np.asarray(2.0 / record.count * np.abs(transform[inside]), dtype=np.float64)
+    return np.asarray(frequency[inside], dtype=np.float64), amplitude
+
+
+def spectral_peaks(record: RingDownRecord) -> tuple[float, float]:
+    """Return the two most prominent peaks of the spectrum, by ascending frequency [Hz].
+
+    Raises
+    ------
+    ExperimentDataError
+        If the record is sampled too slowly, or fewer than two peaks rise by 3.5 times the median noise
+        and by 2 % of the highest amplitude (less, down to 0.3 %, if the record has died away at its end),
+        in the record itself or in its beginning.
+    """
+    if 0.5 * record.sampling_rate < 4.0 * SEARCH_BAND[0]:
+        highest = 0.5 * record.sampling_rate
+        raise ExperimentDataError(said("ringdown.slow", record=record, highest=highest))
+    found = _peaks(record, 0.0)
+    if len(found) < 2:
+        found = _peaks(record, _SEARCH_DECAY)
+    if len(found) < 2:
+        seen = "none" if not found else f"one, at {found[0]:.3g} Hz"
+        top = min(SEARCH_BAND[1], 0.5 * record.sampling_rate)
+        band = SEARCH_BAND[0], top
+        raise ExperimentDataError(said("ringdown.peaks", record=record, band=band, seen=seen))
+    first, second = sorted(found[:2])
+    return first, second
+
+
+def _peaks(record: RingDownRecord, decay: float) -> list[float]:
+    """Return the peaks that count [Hz], the most prominent first, of a record times exp(-decay t).
+
+    A second mode that is gone after a tenth of the record drowns in the noise of the rest and in the skirts
+    of the first; the decay [1/s] takes both away and moves no frequency.
+    """
+    weight = np.exp(-decay * (record.time - record.time[0]))
+    # The noise in a spectrum: a Hann window, of mean square 3/8, hides a mode that dies away at the start.
+    window = np.hanning(record.count) / math.sqrt(0.375)
+    noise = 2.0 / record.count * np.abs(np.fft.rfft(window * detrend(record.signal)))
+    place = np.fft.rfftfreq(record.count, 1.0 / record.sampling_rate)
+    floor = float(np.median(noise[(place >= SEARCH_BAND[0]) & (place <= SEARCH_BAND[1])]))
+    floor *= math.sqrt(float(np.mean(weight**2)))
+    faded = RingDownRecord(record.time, weight * detrend(record.signal), source=record.source)
+    frequency, amplitude = spectrum(faded if decay else record)
+    level = detrend(faded.signal)
+    end = level[-max(int(_END_SHARE * record.count), 8) :]
+    left = math.sqrt(2.0 * float(np.mean(end**2))) / float(np.abs(level).max())
+    needed = max(_PROMINENCE * floor, float(np.clip(left, *_SMALLEST_PEAK)) * float(amplitude.max()))
+    places, found = find_peaks(amplitude, prominence=needed)
+    return [float(frequency[places[place]]) for place in np.argsort(found["prominences"])[::-1]]
+
+
+def fit_ring_down(
+    record: RingDownRecord,
+    procedure: Frequencies = Frequencies.PEAKS,
+    *,
+    start: float | None = FIRST_PEAK,
+) -> RingDownFit:
+    """Fit two damped cosines, an offset and a drift to one record by Levenberg-Marquardt.
+
+    Decay rates (and, for `Frequencies.FITTED`, damped frequencies) are the unknowns of the iteration; the
+    cosine and sine amplitudes, offset and drift are eliminated by linear least squares at each step. Where a
+    record holds averages over intervals, the model is averaged over them too, exactly.
+
+    Parameters
+    ----------
+    record : RingDownRecord
+        One trial, as read.
+    procedure : Frequencies
+        How the frequencies are found.
+    start : float, optional
+        Where the record is cropped [s]; None if it begins at the release already.
+
+    Raises
+    ------
+    ExperimentDataError
+        If the record does not decay, or shows fewer than two modes.
+    """
+    record = prepare(record, start)
+    _refuse_steady(record)
+    omega = 2.0 * math.pi * np.array(spectral_peaks(record))
+    model = DampedCosines(record.time, record.signal, record.averaging_width)
+    free = procedure is Frequencies.FITTED
+    searches = [model.fit((1j - ratio) * omega, frequencies_fitted=free) for ratio in _STARTING_RATIOS]
+    found = min(searches, key=lambda search: float(search.deviation[0]))
+    first, second = sorted(found.modes, key=lambda mode: mode.pole.imag)
+    refuse_growing((first, second), record.source)
+    return RingDownFit((first, second), record, found.fitted[:, 0], float(found.deviation[0]), procedure)
+
+
+def refuse_growing(modes: Iterable[RingDownMode], source: str) -> None:
+    """Raise ExperimentDataError for what is no decaying oscillation."""
+    for number, mode in enumerate(modes, start=1):
+        if not 0.0 < -mode.pole.real < mode.pole.imag:
+            where, fitted = (source, number), (mode.damped_frequency, -mode.pole.real)
+            raise ExperimentDataError(said("ringdown.no_decay", where=where, fitted=fitted))
+
+
+def _refuse_steady(record: RingDownRecord) -> None:
+    signal = detrend(record.signal)
+    third = record.count // 3
+    first, last = (math.sqrt(float(np.mean(part**2))) for part in (signal[:third], signal[-third:]))
+    if last > _STEADY_SHARE * first:
+        raise ExperimentDataError(said("ringdown.steady", record=record, share=last / first))
+
 
 PUBLISHED_FREQUENCIES = (5.6492, 29.9699)
 """Natural frequencies found by the authors in the raw records, mean of five trials [Hz]."""

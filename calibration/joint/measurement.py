@@ -7,10 +7,11 @@ import numpy as np
 from scipy.special import chdtri
 
 from calibration.dynamics.damped_cosine import DampedCosines, RingDownMode
-from calibration.dynamics.ringdown import Frequencies, RingDownFit
 from calibration.dynamics.trials import (
     PUBLISHED_DAMPING_RATIOS,
     PUBLISHED_FREQUENCIES,
+    Frequencies,
+    RingDownFit,
     RingDownTrials,
     amplitude_dependence,
 )

@@ -9,8 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from calibration.dynamics.records import STEP_FOLDER, RingDownRecord, find_records, read_records
-from calibration.dynamics.ringdown import Frequencies
-from calibration.dynamics.trials import RingDownTrials, fit_trials, refine_by_extremes
+from calibration.dynamics.trials import Frequencies, RingDownTrials, fit_trials, refine_by_extremes
 from calibration.errors import ExperimentDataError, ExperimentFileError
 from calibration.geometry import GEOMETRY_FILE, PUBLISHED_NAMES, Lengths, published_lengths, read_lengths
 from calibration.joint.measurement import PUBLISHED_MODES, measured_modes

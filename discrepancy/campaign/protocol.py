@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, ConfigDict, Field
 from discrepancy.errors import CampaignFileError
 from discrepancy.sentences import said
 from fe.runtime.expression import RESERVED
-from reporting.section import Name, NotNegative, Number, Positive
+from reporting.toml_file import Name, NotNegative, Number, Positive
 
 MOST_MODES = 100
 IN_FILES = ConfigDict(extra="forbid", strict=False)

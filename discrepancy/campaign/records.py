@@ -17,7 +17,7 @@ from pydantic_core import PydanticKnownError
 
 from discrepancy.campaign.protocol import IN_FILES, Event, Release
 from discrepancy.campaign.sampling import IntArray, nearly_even
-from reporting.section import Name, NotNegative, Number, Positive
+from reporting.toml_file import Name, NotNegative, Number, Positive
 from reporting.words import brief
 
 FloatArray = NDArray[np.float64]

@@ -21,7 +21,7 @@ from discrepancy.campaign.units import conversion, conversion_of
 from discrepancy.errors import CampaignFileError
 from discrepancy.sentences import said
 from fe.runtime.patch import EVERY_CHANNEL
-from reporting.section import Name, NotNegative, Number, Positive, Section, checked
+from reporting.toml_file import Name, NotNegative, Number, Positive, Section, checked
 
 FORMAT = 1
 """Version of the format."""

@@ -21,8 +21,8 @@ from discrepancy.campaign.units import conversion, quantities_of
 from discrepancy.errors import CampaignFileError
 from discrepancy.sentences import said
 from reporting.provenance import hash_file
-from reporting.section import shown
 from reporting.text_file import read_text
+from reporting.toml_file import shown
 from reporting.words import counted, listing, one_line
 
 SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas"}

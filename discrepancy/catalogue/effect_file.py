@@ -56,8 +56,7 @@ from discrepancy.sentences import said
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.expression import RESERVED, Expression
 from fe.runtime.patch import PRIMITIVES, ModelPatch, Primitive, Window
-from reporting.section import Section, checked
-from reporting.toml_file import read_toml
+from reporting.toml_file import Section, checked, read_toml
 
 from .entry import Effect, EffectParameter, Number, Setting, ShapeParameter
 from .needs import DYNAMIC, NEEDS, PLACES, USUAL, Entry, Target, first_reason, targets_of

@@ -10,7 +10,7 @@ from discrepancy.models.acting import DEFAULT_PLACE
 from discrepancy.models.model_file import ModelDescription, NamedSection, ParameterSection, Section
 from discrepancy.sentences import said
 from fe.runtime.patch import LOADS, PRIMITIVES, STRUCTURE, StiffnessDrift
-from reporting.section import Name, Number, Positive
+from reporting.toml_file import Name, Number, Positive
 from scenarios import binding_files
 
 CARRIED = tuple(item.kind for item in (*STRUCTURE, *LOADS, StiffnessDrift))

@@ -21,10 +21,9 @@ from discrepancy.sentences import said
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import PLACE
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import Laws, static_solution
+from fe.runtime.motion import ALIKE, Boundaries, Laws, static_solution, steps_under
 from fe.runtime.motion_arrays import ModalMotion
 from fe.runtime.motion_arrays import State as Moving
-from fe.runtime.stepwise import ALIKE, Boundaries, steps_under
 from fmu_asset.door.runs import Run, State
 
 CONVERGED = 1e-4

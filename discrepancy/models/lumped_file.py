@@ -17,7 +17,7 @@ from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws import LAWS
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
-from reporting.section import Name, NotNegative, Number, Positive, require
+from reporting.toml_file import Name, NotNegative, Number, Positive, require
 from reporting.words import counted
 
 SHIPPED_MODELS = Path(__file__).parents[1] / "lumped_models"

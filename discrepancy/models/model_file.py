@@ -10,8 +10,7 @@ from calibration.result.record import ParameterPrior
 from discrepancy.campaign.records import Quantity
 from discrepancy.errors import ModelError
 from discrepancy.models.interface import Model
-from reporting.section import Name, NotNegative, Number, checked
-from reporting.toml_file import read_toml
+from reporting.toml_file import Name, NotNegative, Number, checked, read_toml
 
 
 class Section(BaseModel):

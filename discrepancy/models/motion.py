@@ -1,7 +1,7 @@
 """Motion of a linear system with internal forces at its ports: after a release, or under what acts.
 
 A model makes a `LinearSystem` of its parameters and the structural part of a patch, keeps it, and asks for a
-`Motion`, which says what outputs show. Between the stamps the linear part is exact (`fe.runtime.stepwise`).
+`Motion`, which says what outputs show. Between the stamps the linear part is exact (`fe.runtime.motion`).
 """
 
 from collections.abc import Sequence
@@ -17,9 +17,8 @@ from discrepancy.models.interface import Response
 from discrepancy.models.linear_system import LinearSystem
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import FADING, LAGGED
-from fe.runtime.motion import Laws
+from fe.runtime.motion import Begin, Boundaries, Laws, advance, steps_under, substeps
 from fe.runtime.motion_arrays import ModalMotion, Steps
-from fe.runtime.stepwise import Begin, Boundaries, advance, steps_under, substeps
 
 LEAST_PARTICIPATION = 0.03
 """A mode that moves the release point less than this share of the most moving one is scaled by the share."""

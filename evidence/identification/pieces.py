@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from fe.elements.cells import mass_blocks, stiffness_blocks
-from fe.structure.body import Body
+from fe.structure.mesh import Body
 from fe.wing.design import WingDesign
 from fe.wing.mesh import WingMesh, build_mesh
 from fe.wing.operators import gauge_output, section_displacement, turn_load, upward, wing_body

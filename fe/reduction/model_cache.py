@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from fe.runtime.kept_arrays import KeptArrays
+from fe.runtime.arrays import KeptArrays
 from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.structure.design import load_structure, structure_hash

@@ -1,7 +1,7 @@
 """Motion of a few modes with internal forces at ports: loops over numbers, and nothing else.
 
 q'' + D q' + W^2 (1 + r t) q = f(t) - sum_j p_j F_j(p_j . q, p_j . v, memory_j). The linear part is advanced
-exactly, in steps of any lengths that come from `fe.runtime.stepwise`; internal forces are split off
+exactly, in steps of any lengths that come from `fe.runtime.motion`; internal forces are split off
 symmetrically (Strang 1968): laws of speed, laws of position, linear motion, laws of position, laws of speed.
 Laws of speed have a closed form. Where friction turns over inside a step, the impulse and its first moment
 are corrected for the moment of the turn; where it holds, the port is held in place by the impulses that this

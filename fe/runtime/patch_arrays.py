@@ -11,8 +11,7 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from .arrays import FloatArray, IntArray
-from .kept_arrays import KeptArrays
+from .arrays import FloatArray, IntArray, KeptArrays
 from .state import wing_names
 
 Positive = Annotated[float, float_info.min, inf]

@@ -13,8 +13,7 @@ import numpy as np
 from numpy import einsum
 from numpy.linalg import solve
 
-from .arrays import FloatArray, IntArray
-from .kept_arrays import KeptArrays
+from .arrays import FloatArray, IntArray, KeptArrays
 from .state import Losses
 
 

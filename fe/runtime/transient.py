@@ -3,7 +3,7 @@
 Kapteyn et al. 2021, eq. (12), in modal coordinates: q'' + 2 zeta omega q' + omega^2 q = shape^T f, one
 equation for each mode, because Rayleigh damping (17) leaves the modes uncoupled; exact for loads that are
 held. Modes that are not kept follow the load without delay (static correction). Laws at ports couple the
-modes: `fe.runtime.stepwise` steps them, and omitted modes follow their forces with the lag of the damping.
+modes: `fe.runtime.motion` steps them, and omitted modes follow their forces with the lag of the damping.
 
 NumPy and relative imports only: this file is copied into the FMU. Laws are imported where there are any.
 """
@@ -220,7 +220,7 @@ class ModalIntegrator:
         self, state: TransientState, acting: FloatArray, duration: float, time: float
     ) -> "ModalMotion":
         """Return the motion under laws and loads (L,) that are held, at the begin and the end."""
-        from .stepwise import Begin, advance, steps_under, substeps
+        from .motion import Begin, advance, steps_under, substeps
 
         assert self._laws is not None
         boundaries = substeps(self._system, self._laws, np.array([0.0, duration]))

@@ -21,9 +21,8 @@ from fe.elements.kinds import KINDS, ElementKind
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.errors import MeshError
 from fe.sentences import said
-from reporting.section import shown
 from reporting.text_file import read_text
-from reporting.toml_file import parse_toml
+from reporting.toml_file import parse_toml, shown
 
 from .mesh import StructureMesh
 

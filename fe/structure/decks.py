@@ -15,7 +15,7 @@ import numpy as np
 
 from fe.elements.kinds import KINDS
 from fe.runtime.arrays import FloatArray
-from reporting.section import shown
+from reporting.toml_file import shown
 
 from .deck import FLAT, GLOBAL, Deck, System, fail, frame, lines_of, real, whole, words_of
 

@@ -19,8 +19,7 @@ from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.runtime.state import MOST_REGIONS
 from fe.sentences import said
-from reporting.section import checked
-from reporting.toml_file import read_toml
+from reporting.toml_file import checked, read_toml
 
 from . import tables
 

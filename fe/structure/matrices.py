@@ -20,7 +20,7 @@ from fe.sentences import said
 
 from .affine import AffineStructure, StiffnessTerm, designed
 from .design import Extension, MatrixDesign, MatrixLoad, MatrixMass, unit_vector
-from .matrix_files import Place, read_matrix, read_unknowns, read_vector
+from .mesh_file import Place, read_matrix, read_unknowns, read_vector
 from .tables import MOTIONS, Vector
 
 Shares = Mapping[int, tuple[float, ...]]

@@ -16,11 +16,10 @@ from fe.sentences import said
 from reporting.files import atomic_file
 
 from .affine import AffineStructure, static_response
-from .body import Body, PointMass
 from .design import MatrixDesign, MeshDesign, load_structure, structure_hash, unit_vector
 from .location import gauge_rows, nodal_load, point_shares
 from .matrices import assemble_matrices
-from .mesh import StructureMesh, supported
+from .mesh import Body, PointMass, StructureMesh, supported
 from .mesh_file import check_memory, read_mesh
 
 

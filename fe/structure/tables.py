@@ -7,7 +7,7 @@ from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_v
 
 from fe.runtime.state import MOST_REGIONS
 from fe.sentences import said
-from reporting.section import Section
+from reporting.toml_file import Section
 
 Vector = tuple[float, float, float]
 Name = Annotated[str, Field(max_length=32, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]

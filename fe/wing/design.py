@@ -17,8 +17,7 @@ from fe.runtime.errors import DesignFileError, InvalidDesignError
 from fe.runtime.state import MOST_REGIONS, Geometry, region_names, wing_names
 from fe.sentences import said
 from fe.structure.tables import Part, StructureDesign
-from reporting.section import checked
-from reporting.toml_file import read_toml
+from reporting.toml_file import checked, read_toml
 
 from . import parts
 

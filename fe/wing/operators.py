@@ -18,8 +18,7 @@ from fe.elements.kinds import gauss_points
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.state import TIP_FORCE
 from fe.structure.affine import AffineStructure
-from fe.structure.body import Body, PointMass
-from fe.structure.mesh import RigidSet, Supports, supports
+from fe.structure.mesh import Body, PointMass, RigidSet, Supports, supports
 
 from .design import WingDesign, wing_structure
 from .mesh import WingMesh, build_mesh

@@ -10,10 +10,9 @@ from fmu_asset.errors import AlgebraicLoopError, BindingError, CouplingError
 from fmu_asset.sentences import said
 
 from .instance import CoupledFmus, naming
-from .schedule import Schedule, loop_sentence
 from .structure import SystemStructure
 from .system import parts_of, system_description, wiring_hash
-from .wiring import Wiring
+from .wiring import Schedule, Wiring, loop_sentence
 
 Algorithm = Literal["gauss_seidel", "jacobi"]
 ALGORITHMS: tuple[Algorithm, ...] = ("gauss_seidel", "jacobi")

@@ -12,18 +12,17 @@ import numpy as np
 import numpy.typing as npt
 
 from fmu_asset.door.exchange import Exchange
+from fmu_asset.door.life import PackedState
 from fmu_asset.door.placement import Housing, ResetTrial, Start
-from fmu_asset.door.saved_state import PackedState
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.door.units import IDENTITY
 from fmu_asset.errors import FmuEndedError, FmuError, FmuStateError, IterationError
 from fmu_asset.instances.plan import Instance, Settings
 from fmu_asset.sentences import said
 
-from .schedule import Schedule
 from .structure import Endpoint
 from .system import Part, SystemDescription
-from .wiring import ConnectedVariable
+from .wiring import ConnectedVariable, Schedule
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -34,8 +34,7 @@ from fmu_asset.errors import BindingError
 from fmu_asset.instances.plan import Interface
 from fmu_asset.sentences import said
 from fmu_asset.worker.client import WorkerLimits
-from reporting.section import Section, checked
-from reporting.toml_file import read_toml
+from reporting.toml_file import Section, checked, read_toml
 
 from .units import same_dimension
 

@@ -11,8 +11,7 @@ from reporting.progress import Progress, SilentProgress, Stage
 
 from .exchange import Histories, Values, plain_values
 from .layout import Observation, ObservationHistory
-from .life import OpenedFmu
-from .saved_state import SavedState
+from .life import OpenedFmu, SavedState
 
 _BLOCK_BYTES = 2**20
 """Of the requests or replies that are sent in one message."""

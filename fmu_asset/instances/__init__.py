@@ -18,7 +18,7 @@ def open_instance(plan: Plan) -> "FmuInstance":
     """
     if plan.fmu.interface == "model-exchange":
         # Its solver is a library of its own; those who do not need it shall not load it.
-        from .model_exchange import ModelExchange
+        from .co_simulation import ModelExchange
 
         return ModelExchange(plan)
     from .co_simulation import CoSimulation

@@ -1,4 +1,4 @@
-"""Packing a reduced model, of a wing or a structure, as an FMU of FMI 2.0 or 3.0, reproducible to the byte.
+"""From a wing design or any reduced model to an FMU of FMI 2.0 or 3.0, reproducible to the byte.
 
 What goes into the compiled kind is in `compiled`. Of the Python kind, slave base class and binaries are
 pythonfmu's; the archive is packed here and not by its builder, which stamps times, a random GUID and module
@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace as changed
 from typing import Any, Literal, TypedDict, Unpack
 
+from fe.reduction.model_cache import patch_arrays, reduced_model
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch
 from fe.runtime.patch_arrays import PatchArrays
@@ -21,6 +22,7 @@ from fe.runtime.reduced import ReducedModel
 from fe.runtime.sensors import needs_structure
 from fe.runtime.state import DigitalState
 from fe.runtime.transient import ModalIntegrator
+from fe.wing.design import WingDesign
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
 from fmu_asset.compiled.compiler import PLATFORM, Platform, find_compiler
 from fmu_asset.compiled.package import DATA_FILE, FmiVersion, binaries_of, compiled_members
@@ -30,6 +32,7 @@ from fmu_asset.instances.plan import Interface
 from fmu_asset.sentences import said
 from fmu_asset.slaves.effects import effect_rows, switch_of
 from fmu_asset.slaves.table import is_wing, structure_table
+from reporting.progress import Progress
 
 from .contents import (
     FmuInfo,
@@ -278,3 +281,52 @@ def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
     found = re.search(r'(?:guid|instantiationToken)="([^"]*)"', root)
     declared = "" if found is None else found[1]
     return declared, guid_of(content_hash_of(exchanged(members, (tag, declared), (PLACEHOLDER, PLACEHOLDER))))
+
+
+def pack_wing(
+    design: WingDesign,
+    path: str | os.PathLike[str],
+    *,
+    replace: bool = False,
+    progress: Progress | None = None,
+    **options: Unpack[FmuOptions],
+) -> FmuInfo:
+    """Reduce a wing design and pack it as an FMU; equal input gives equal bytes.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing; of a calibrated one its tailored design, with what `calibration.result.file.tailoring`
+        gives among the options.
+    path : path-like
+        Where to write, with the suffix .fmu.
+    replace, **options
+        See `fmu_asset.packing.structure_fmu.build_fmu`.
+    progress : Progress, optional
+        Shows what takes long.
+
+    Raises
+    ------
+    FiniteElementError
+        The design cannot be modelled.
+    FmuBuildError, PatchFileError
+        See `fmu_asset.packing.structure_fmu.build_fmu`.
+    """
+    model = reduced_model(design, progress=progress)
+    options["arrays"] = arrays_for(design, options.get("patch"), progress)
+    return build_fmu(model, path, replace=replace, **options)
+
+
+def arrays_for(
+    design: WingDesign, patch: PatchFile | None, progress: Progress | None = None
+) -> PatchArrays | None:
+    """Return the wing in the basis for patches; None where the patch does not need it.
+
+    Raises
+    ------
+    FiniteElementError
+        The design cannot be modelled.
+    """
+    if patch is None or not needs_structure(patch.patch):
+        return None
+    return patch_arrays(design, progress)

@@ -16,7 +16,7 @@ from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorke
 from fmu_asset.folders import remove_folder
 from fmu_asset.instances.plan import REPORT_PERIOD, Floats, Instance, Plan, Settings
 from fmu_asset.sentences import said
-from reporting.section import Section
+from reporting.toml_file import Section
 
 from .process import CLOSE_LIMIT, WorkerProcess
 from .protocol import CALL, FAILURE, HEADER, LARGEST_MESSAGE, PART, RESULT, STEP, look, send, separated

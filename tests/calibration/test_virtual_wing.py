@@ -7,8 +7,7 @@ import pytest
 
 from calibration import virtual_wing
 from calibration.dynamics.records import read_records
-from calibration.dynamics.ringdown import Frequencies
-from calibration.dynamics.trials import fit_trials
+from calibration.dynamics.trials import Frequencies, fit_trials
 from calibration.errors import ExperimentDataError
 from calibration.geometry import published_lengths, read_lengths
 from calibration.joint.wing_table import weighed

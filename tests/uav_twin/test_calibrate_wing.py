@@ -17,8 +17,7 @@ from fmpy import read_model_description
 from fmpy.validation import validate_fmu
 
 from calibration.dynamics.records import read_records
-from calibration.dynamics.ringdown import Frequencies
-from calibration.dynamics.trials import fit_trials
+from calibration.dynamics.trials import Frequencies, fit_trials
 from calibration.geometry import published_lengths, read_lengths
 from calibration.joint.wing_table import weighed
 from calibration.result.file import load_calibration

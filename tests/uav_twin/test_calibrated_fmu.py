@@ -11,7 +11,7 @@ import xarray as xr
 from calibration.result.file import load_calibration, result_bytes
 from fmu_asset.door.binding import load_binding
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.packing.script import build_script_fmu
+from fmu_asset.packing.contents import build_script_fmu
 from scenarios import asset_scripts, binding_files
 from tests.command_line import refused, said
 from tests.twin_master.runs import loaded_from, table_of

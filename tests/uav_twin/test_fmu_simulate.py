@@ -11,8 +11,7 @@ import xarray as xr
 
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.door.binding import load_binding, parse_binding
-from fmu_asset.door.experiment import default_experiment, fly
-from fmu_asset.door.history_file import read_histories
+from fmu_asset.door.experiment import default_experiment, fly, read_histories
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
 from reporting.progress import SilentProgress

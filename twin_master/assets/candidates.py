@@ -8,8 +8,7 @@ from fe.structure.design import Gauge, Gauged, MeshDesign, load_structure, parse
 from fe.structure.location import gauge_rows, spread_rosettes
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import read_mesh
-from reporting.section import checked
-from reporting.toml_file import read_toml
+from reporting.toml_file import checked, read_toml
 from twin_master.assets.asset_source import keep_files, read_files
 from twin_master.assets.structure_source import MODEL_COPY, StructureBelief
 from twin_master.errors import MissionInputError

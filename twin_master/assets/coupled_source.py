@@ -223,7 +223,7 @@ class CoupledSource(SeveralSource):
 
     def _packed(self, component: ComponentSection, progress: Progress) -> Path:
         """Return the FMU of a component in the run folder; packed if it is not there."""
-        from fmu_asset.packing.wing_packing import pack_wing
+        from fmu_asset.packing.structure_fmu import pack_wing
 
         target = self.path(component.copies()["fmu"])
         if target.exists():
@@ -232,8 +232,7 @@ class CoupledSource(SeveralSource):
             return _given_fmu(component, target.parent)
         options = {}
         if component.design == CALIBRATED_DESIGN_NAME:
-            from calibration.result.file import load_calibration
-            from calibration.result.plain import tailoring
+            from calibration.result.file import load_calibration, tailoring
 
             wing = load_calibration(Path(self._scenario.calibration.file or ""))
             design, options = wing.wing_design, tailoring(wing)

@@ -241,11 +241,11 @@ class WingFmuSource(_Wing, StructureFmuSource):
         return effects
 
     def _pack(self, progress: Progress) -> None:
-        from fmu_asset.packing.wing_packing import pack_wing
+        from fmu_asset.packing.structure_fmu import pack_wing
 
         options = {}
         if self.calibration is not None:
-            from calibration.result.plain import tailoring  # takes a second to load
+            from calibration.result.file import tailoring  # takes a second to load
 
             options = tailoring(self.calibration)
         pack_wing(
@@ -287,7 +287,7 @@ class DesignSource(_Wing, StructureSource):
         """
         if patch is None or not patch.effects:
             return super().observation_table(draws, model)
-        from fmu_asset.packing.wing_packing import arrays_for
+        from fmu_asset.packing.structure_fmu import arrays_for
         from fmu_asset.slaves.base import UnacceptableValuesError
 
         scenario, where = self._scenario, str(self.patch_path)

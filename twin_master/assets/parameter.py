@@ -80,7 +80,7 @@ def draw_parameter(
         found = read_calibration(calibration)
         assert found is not None  # the schema asks for it
         values = found.stratified_draws(name, count, seed_sequence(seed, "calibration"))
-        from calibration.result.plain import run_record
+        from calibration.result.file import run_record
 
         return ParameterDraws(
             name, values, found.mean(name), found.standard_deviation(name),

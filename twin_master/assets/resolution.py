@@ -7,8 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from reporting.section import checked
-from reporting.toml_file import read_toml
+from reporting.toml_file import checked, read_toml
 from twin_master.assets.asset_source import AssetSource, PairedSource
 from twin_master.assets.parameter import is_of_parameters
 from twin_master.assets.strain_library_source import FILE_NAME

@@ -20,7 +20,7 @@ from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.binding import INPUT_ROLES, Binding, Parameter, load_binding
 from fmu_asset.door.exchange import Exchange
 from fmu_asset.folders import scratch_folder
-from fmu_asset.packing.wing_packing import pack_wing
+from fmu_asset.packing.structure_fmu import pack_wing
 from fmu_asset.ssp.writer import write_ssp
 from reporting.progress import Progress
 from scenarios import binding_files

@@ -10,8 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from reporting.provenance import hash_file
-from reporting.section import checked
-from reporting.toml_file import read_toml
+from reporting.toml_file import checked, read_toml
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME

@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fe.runtime.arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
-from fe.runtime.kept_arrays import arrays_from_bytes, arrays_to_bytes
 from reporting.arrays import Float
 from reporting.words import brief
 from twin_master.errors import InvalidModelError, InvalidObservationError

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Self
 
 from pydantic import ModelWrapValidatorHandler, model_validator
 
-from reporting.section import shown
+from reporting.toml_file import shown
 from scenarios import asset_scripts, binding_files, structure_files
 from twin_master.scenario.section import Section, short
 

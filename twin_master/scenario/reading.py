@@ -9,8 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from reporting.section import shown
-from reporting.toml_file import read_toml
+from reporting.toml_file import read_toml, shown
 from reporting.words import brief
 from scenarios import scenario_files
 from twin_master.errors import ScenarioError, UnknownScenarioError

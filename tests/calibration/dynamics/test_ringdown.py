@@ -10,8 +10,16 @@ from hypothesis import strategies as st
 
 from calibration.dynamics.damped_cosine import DampedCosines, RingDownMode
 from calibration.dynamics.records import RingDownRecord, read_records
-from calibration.dynamics.ringdown import FIRST_PEAK, Frequencies, fit_ring_down, prepare, spectrum
-from calibration.dynamics.trials import amplitude_dependence, fit_trials, refine_by_extremes
+from calibration.dynamics.trials import (
+    FIRST_PEAK,
+    Frequencies,
+    amplitude_dependence,
+    fit_ring_down,
+    fit_trials,
+    prepare,
+    refine_by_extremes,
+    spectrum,
+)
 from calibration.errors import CalibrationError, ExperimentDataError
 
 TRUE = ((5.65, 29.97), (0.0281, 0.0717), (0.0115, 0.0137), (0.3, -0.8))

@@ -15,8 +15,7 @@ from scipy import stats
 
 from calibration.dynamics.damped_cosine import RingDownMode
 from calibration.dynamics.records import RingDownRecord, read_records
-from calibration.dynamics.ringdown import Frequencies
-from calibration.dynamics.trials import fit_trials
+from calibration.dynamics.trials import Frequencies, fit_trials
 from calibration.errors import CalibrationError, ExperimentDataError, OutsideValidityError, PosteriorError
 from calibration.joint.inference import infer
 from calibration.joint.measurement import PUBLISHED_MODES, _mean_of, measured_modes, modal_readings

@@ -28,9 +28,9 @@ from fe.reduction.built_once import built_once, cache_folder
 from fe.reduction.fields import WingFields
 from fe.reduction.model_cache import MODELLING_ROOMS, entry, patch_arrays, reduced_model, wing_fields
 from fe.reduction.settings import StructureSettings
-from fe.runtime import kept_arrays
+from fe.runtime import arrays as array_records
+from fe.runtime.arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
-from fe.runtime.kept_arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.reduced import ReducedModel
 from fe.wing.design import WingDesign
 from tests.refusals import Inputs, refused
@@ -133,7 +133,7 @@ def test_arrays_of_a_wrong_kind_are_refused(kept: KeptArrays, value: np.ndarray,
         if item.type is str or (arrays[item.name].shape == value.shape == () and value.dtype.kind == "f"):
             continue
         given = {**arrays, item.name: value}
-        monkeypatch.setattr(kept_arrays, "arrays_from_bytes", lambda *_, own=given: own)
+        monkeypatch.setattr(array_records, "arrays_from_bytes", lambda *_, own=given: own)
         with pytest.raises(ReducedModelFileError):
             type(kept).from_bytes(b"")
 

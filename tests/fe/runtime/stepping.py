@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import NO_LAWS, PLAIN, Kernel, Laws
+from fe.runtime.motion import NO_LAWS, PLAIN, Begin, Kernel, Laws, advance, steps_under
+from fe.runtime.motion import substeps as divided
 from fe.runtime.motion_arrays import ModalMotion
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
-from fe.runtime.stepwise import Begin, advance, steps_under
-from fe.runtime.stepwise import substeps as divided
 
 FloatArray = NDArray[np.float64]
 

@@ -30,12 +30,12 @@ from fe.runtime.motion import (
     at_stations,
     laws_of,
     static_solution,
+    substeps,
 )
 from fe.runtime.motion_arrays import ModalMotion
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.static_path import settle_port
-from fe.runtime.stepwise import substeps
 from fe.runtime.wing_rows import planform_stations
 from tests.fe.runtime.stepping import exact, force_of, rates_of, second_order, simulate, states_of
 

@@ -20,8 +20,7 @@ from fe.structure.location import attach, face_areas, gauge_rows, on_surface
 from fe.structure.mesh import StructureMesh
 from fe.structure.mesh_file import memory_estimate, read_mesh
 from fe.structure.operators import Structure, load_and_assemble, weighed, write_structure_vtu
-from fe.verification.calculix_comparison import agreement
-from fe.verification.calculix_deck import structure_deck
+from fe.verification.calculix_comparison import agreement, structure_deck
 from tests.calculix_decks import needs_calculix
 from tests.refusals import Inputs, refused
 

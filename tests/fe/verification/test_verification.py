@@ -10,7 +10,7 @@ from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
 from fe.verification import calculix_comparison as comparison
 from fe.verification import wing_checks as answers
-from fe.verification.calculix_deck import wing_deck
+from fe.verification.calculix_comparison import wing_deck
 from fe.wing.operators import assemble
 from tests.calculix_decks import needs_calculix
 from tests.refusals import Inputs

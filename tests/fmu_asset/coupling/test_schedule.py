@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components, shortest_path
 
-from fmu_asset.coupling.schedule import Link, algebraic_loops, schedule, strong_components
 from fmu_asset.coupling.structure import Endpoint
+from fmu_asset.coupling.wiring import Link, algebraic_loops, schedule, strong_components
 
 NAMES = "abcd"
 edges = st.sets(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=16)

@@ -10,7 +10,7 @@ import pytest
 
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.door.layout import Observation
-from fmu_asset.door.saved_state import SavedState
+from fmu_asset.door.life import SavedState
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import FmuInputError, FmuStateError
 from tests.fmu_asset.coupling.reference import coupled, of_ours

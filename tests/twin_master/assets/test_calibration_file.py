@@ -9,8 +9,14 @@ import numpy as np
 import pytest
 
 from calibration.errors import CalibrationRecordError
-from calibration.result.file import load_calibration, result_bytes, save_calibration
-from calibration.result.plain import description, plain_record, run_record
+from calibration.result.file import (
+    description,
+    load_calibration,
+    plain_record,
+    result_bytes,
+    run_record,
+    save_calibration,
+)
 from calibration.result.record import Calibration as Calibrated
 from calibration.result.record import ParameterPrior
 from reporting.progress import SilentProgress

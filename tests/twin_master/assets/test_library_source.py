@@ -13,7 +13,7 @@ import xarray as xr
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-from fmu_asset.packing.script import build_script_fmu
+from fmu_asset.packing.contents import build_script_fmu
 from reporting.arrays import Float
 from reporting.progress import SilentProgress
 from scenarios import asset_scripts

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fmu_asset.errors import FmuCallError, FmuTimeoutError, FmuWorkerError
-from fmu_asset.packing.script import build_script_fmu
+from fmu_asset.packing.contents import build_script_fmu
 from twin_master.assets.library_source import load_observation_library
 from twin_master.errors import InvalidObservationLibraryError
 from twin_master.library.grid import SamplingGrid

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from fe.runtime.kept_arrays import arrays_to_bytes
+from fe.runtime.arrays import arrays_to_bytes
 from scenarios import scenario_files
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
 from twin_master.errors import ImpossibleObservation, InvalidModelError

@@ -14,7 +14,7 @@ import pytest
 import xarray as xr
 from numpy.testing import assert_allclose, assert_array_equal
 
-from calibration.result.plain import run_record
+from calibration.result.file import run_record
 from reporting.errors import DiskFullError
 from reporting.figures import to_svg
 from reporting.words import number
