@@ -3,12 +3,12 @@
 import json
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, Self, TypeVar, cast
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from reporting.sentences import said
 from reporting.text_file import DEEPEST_NESTING, check_nesting, decoded, read_text, too_deep
@@ -155,16 +155,28 @@ NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)]
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
+Fault = tuple[object, str]
+"""Whether a table has it, and the sentence on it."""
+
+
 class Section(BaseModel):
     """A table of a file: unknown keys are refused, and numbers and words are not turned into each other."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
+    def faults(self) -> Iterator[Fault]:
+        """Yield for each fault that it may have whether it has it, and the sentence on it.
 
-def require(met: object, otherwise: str) -> None:
-    """Refuse a table with a sentence, in validators; raises `ValueError`."""
-    if not met:
-        raise ValueError(otherwise)
+        A fault is looked for only in a table that has none of those before it.
+        """
+        yield from ()
+
+    @model_validator(mode="after")
+    def _refuse_faults(self) -> Self:
+        for found, sentence in self.faults():
+            if found:
+                raise ValueError(sentence)
+        return self
 
 
 _Description = TypeVar("_Description")

@@ -240,14 +240,10 @@ USUAL_REGIONS = ("z1", "z2")
 
 @dataclass(frozen=True, kw_only=True)
 class TrialKeys:
-    """What a trial has as its file says it.
+    """What a trial has as its file says it: a name that is unique in the campaign, and what was done.
 
     Attributes
     ----------
-    name : str
-        Unique in the campaign.
-    kind : TrialKind
-        What was done.
     file : str
         That holds it; empty where there is none.
     run : str

@@ -1,9 +1,9 @@
 """The schema of `campaign.toml`: what it may say, checked strictly; units are still those of the file."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
@@ -30,7 +30,7 @@ from discrepancy.campaign.units import Conversion, conversion, conversion_of
 from discrepancy.errors import CampaignFileError
 from discrepancy.sentences import said
 from fe.runtime.patch import EVERY_CHANNEL
-from reporting.toml_file import Name, NotNegative, Number, Positive, Section, checked
+from reporting.toml_file import Fault, Name, NotNegative, Number, Positive, Section, checked
 
 FORMAT = 1
 """Version of the format."""
@@ -135,8 +135,7 @@ class TrialSection(TrialKeys):
             return tuple(value)
         return value
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def __post_init__(self) -> None:
         kinds = {"release": {TrialKind.RINGDOWN}, "begins": {TrialKind.FORCED, TrialKind.DRIVEN}}
         for key, allowed in {**kinds, "hold": {TrialKind.FORCED}}.items():
             if getattr(self, key) is not None and self.kind not in allowed:
@@ -144,7 +143,6 @@ class TrialSection(TrialKeys):
         for region, loss in self.health.items():
             if region != "deviation" and loss > 1.0:
                 raise ValueError(f"the loss of {region!r} is a fraction from 0 to 1, and {loss:g} came")
-        return self
 
 
 def _twice(names: Iterable[str]) -> str | None:
@@ -174,51 +172,47 @@ class CampaignSection(Section):
         """Channels and inputs."""
         return (*self.channel, *self.input)
 
-    @model_validator(mode="after")
-    def _check(self) -> Self:
+    def faults(self) -> Iterator[Fault]:
+        """Yield what does not fit together."""
         for kind in ("channel", "input", "trial"):
-            if twice := _twice(item.name for item in getattr(self, kind)):
-                raise ValueError(f"there is more than one {kind} called {twice!r}: rename one")
-        if self.input and not any(item.kind in (TrialKind.DRIVEN, TrialKind.STATIC) for item in self.trial):
-            raise ValueError('[[input]] is for trials of the kind "driven" or "static", and there is none')
-        if twice := _twice(item.table_column for item in self.columns):
-            what = "channel or input" if self.input else "channel"
-            raise ValueError(f"more than one {what} reads the column {twice!r}: give each its own `column`")
+            twice = _twice(item.name for item in getattr(self, kind))
+            yield twice, f"there is more than one {kind} called {twice!r}: rename one"
+        lost = self.input and not any(
+            item.kind in (TrialKind.DRIVEN, TrialKind.STATIC) for item in self.trial
+        )
+        yield lost, '[[input]] is for trials of the kind "driven" or "static", and there is none'
+        twice, what = (
+            _twice(item.table_column for item in self.columns),
+            "channel or input" if self.input else "channel",
+        )
+        yield twice, f"more than one {what} reads the column {twice!r}: give each its own `column`"
         # the force is one of static and forced trials only: a load cell may be called so in a driven one
         forced = any(item.kind in (TrialKind.STATIC, TrialKind.FORCED) for item in self.trial)
         taken = {name for name in INPUT_COLUMNS if name != "force" or forced}
         for channel in self.channel:
-            if channel.table_column in taken:
-                raise ValueError(said("campaign.taken", item=channel))
+            yield channel.table_column in taken, said("campaign.taken", item=channel)
         scales = {item.unit == "K" for item in self.columns if item.quantity is Quantity.TEMPERATURE}
-        if len(scales) > 1:
-            raise ValueError("temperatures are given in degC and in K: give all of them in one of the two")
-        self._check_loggers()
+        yield len(scales) > 1, "temperatures are given in degC and in K: give all of them in one of the two"
+        yield from self._wrong_loggers()
         known = {item.name for item in self.channel}
+        names = ", ".join(sorted(known))
         for item in self.trial:
             for name in (*(item.channels or ()), *item.left_out):
-                if name not in known:
-                    names = ", ".join(sorted(known))
-                    raise ValueError(said("campaign.unknown_channel", trial=item, name=name, known=names))
-        return self
+                yield name not in known, said("campaign.unknown_channel", trial=item, name=name, known=names)
 
-    def _check_loggers(self) -> None:
-        """Refuse a logger of nothing, a name that none or two of them record, and inputs on two of them."""
-        if not self.loggers:
-            return
+    def _wrong_loggers(self) -> Iterator[Fault]:
+        """Yield loggers of nothing, names that none or two of them record, and inputs on two of them."""
         inputs = {item.name for item in self.input}
         inputs |= {"force"} if any(item.kind is TrialKind.FORCED for item in self.trial) else set()
-        wanted = [*(item.name for item in self.channel), *sorted(inputs)]
+        wanted = [*(item.name for item in self.channel), *sorted(inputs)] if self.loggers else []
         recorded = [name for names in self.loggers.values() for name in names]
         for name in recorded:
-            if name not in wanted:
-                raise ValueError(said("campaign.no_such_record", name=name, wanted=", ".join(wanted)))
+            yield name not in wanted, said("campaign.no_such_record", name=name, wanted=", ".join(wanted))
         for name in wanted:
-            if recorded.count(name) != 1:
-                came = "none" if name not in recorded else "more than one"
-                raise ValueError(f"{name!r} must be on one of the `loggers`, and it is on {came}")
-        if sum(bool(inputs & set(names)) for names in self.loggers.values()) > 1:
-            raise ValueError("all inputs must be on one of the `loggers`, and they are on several")
+            came = "more than one" if name in recorded else "none"
+            yield recorded.count(name) != 1, f"{name!r} must be on one of the `loggers`, and it is on {came}"
+        several = sum(bool(inputs & {*names}) for names in self.loggers.values()) > 1
+        yield several, "all inputs must be on one of the `loggers`, and they are on several"
 
 
 def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:
